@@ -36,6 +36,22 @@ DWELL_EXPORT void dwell_post_event(const Tables* tables, i64 at_ns, i64 key) noe
   queue.save(tables->clock[0]);
 }
 
+// Copies the instants of cycles from the logs: when jobs became ready and completed, (n, tasks),
+// and when the messages of `n_flows` flows arrived, (n, n_flows); -1 for never.
+DWELL_EXPORT void dwell_logged_instants(const Tables* tables, i64 cell, i64 first, i64 n,
+                                        const i64* flows, i64 n_flows, i64* ready_ns, i64* end_ns,
+                                        i64* arrived_ns) noexcept {
+  const Simulation<false, false> s(*tables);
+  for (i64 cycle = first; cycle < first + n; ++cycle) {
+    const i64 row = s.log_row(cell, cycle);
+    for (i64 at = row * s.n_tasks; at < (row + 1) * s.n_tasks; ++at) {
+      *ready_ns++ = s.log[at].ready_ns;
+      *end_ns++ = s.log_outcome[at] == kDone ? s.log[at].end_ns : -1;
+    }
+    for (i64 i = 0; i < n_flows; ++i) *arrived_ns++ = s.log_arrived[row * s.n_flows + flows[i]];
+  }
+}
+
 // Sends the state of a task that moves (see send_state); `out`: at_ns, has_arrived, attempt.
 DWELL_EXPORT void dwell_send_state(const Tables* tables, i64 hop, i64 cycle, i64 attempt, i64 now,
                                    i64* out) noexcept {

@@ -6,22 +6,27 @@ import ctypes
 from functools import cache
 from typing import Any
 
+import numpy as np
+
 from dwell.kernels.arrays import Arrays
 from dwell.kernels.codes import Status
 from dwell.kernels.library import library
+from dwell.kernels.rows import Ints
 
 I64, TABLES = ctypes.c_int64, ctypes.c_void_p
 
 
 @cache
-def _functions() -> tuple[Any, Any, Any]:
+def _functions() -> tuple[Any, Any, Any, Any]:
     """Return the functions of the library, with the types of their arguments."""
     loaded = library()
     advance, post, send = loaded.dwell_advance, loaded.dwell_post_event, loaded.dwell_send_state
+    logged = loaded.dwell_logged_instants
+    logged.argtypes, logged.restype = (TABLES, I64, I64, I64, TABLES, I64, *3 * (TABLES,)), None
     advance.argtypes, advance.restype = (TABLES,), ctypes.c_int32
     post.argtypes, post.restype = (TABLES, I64, I64), None
     send.argtypes, send.restype = (TABLES, I64, I64, I64, I64, ctypes.POINTER(I64)), None
-    return advance, post, send
+    return advance, post, send, logged
 
 
 def play(arrays: Arrays) -> Status:
@@ -48,6 +53,32 @@ def play(arrays: Arrays) -> Status:
 def post_event(arrays: Arrays, at_ns: int, key: int) -> None:
     """Add an event of the caller's; there is always room for a few (see `play`)."""
     _functions()[1](arrays.address, at_ns, key)
+
+
+def logged_instants(
+    arrays: Arrays, cell: int, first: int, last: int, flows: Ints
+) -> tuple[Ints, Ints, Ints]:
+    """Return instants of cycles that the logs still have, nanoseconds; -1 for never.
+
+    Parameters
+    ----------
+    first, last : int
+        Cycles, the last excluded.
+    flows : int64 array, shape (flows,)
+        Which flows, in the order of the kernel's.
+
+    Returns
+    -------
+    ready_ns, end_ns : int64 array, shape (cycles, tasks)
+        When all inputs of a job were there, and when it had completed.
+    arrived_ns : int64 array, shape (cycles, flows)
+    """
+    count, tasks = last - first, int(arrays.tables.clock[0]["n_tasks"])
+    ready_ns, end_ns = np.empty((2, count, tasks), np.int64)
+    arrived_ns = np.empty((count, len(flows)), np.int64)
+    out = (table.ctypes.data for table in (ready_ns, end_ns, arrived_ns))
+    _functions()[3](arrays.address, cell, first, count, flows.ctypes.data, len(flows), *out)
+    return ready_ns, end_ns, arrived_ns
 
 
 def send_state(

@@ -113,13 +113,19 @@ class Arrays:
         new = (old // n_slots) * 2 * n_slots + (cycle & (2 * n_slots - 1))
 
         def larger(table: NDArray[Any]) -> NDArray[Any]:
-            by_slot = table.reshape(len(t.slots), -1)
+            by_slot = table.reshape(len(t.slots), table.size // len(t.slots))
             moved = np.zeros((2 * len(by_slot), by_slot.shape[1]), table.dtype)
             moved[new] = by_slot[old]
-            return moved.reshape(-1, *table.shape[1:])
+            return moved.reshape(2 * len(table), *table.shape[1:])
 
         clock["n_slots"] = 2 * n_slots
-        rings = {"slots": t.slots, "jobs": t.jobs, "attempts": t.attempts}
+        rings: dict[str, NDArray[Any]] = {
+            "slots": t.slots,
+            "jobs": t.jobs,
+            "attempts": t.attempts,
+        }
+        if len(t.log) and not clock["logs_all"]:
+            rings |= {"log": t.log, "log_outcome": t.log_outcome, "log_arrived": t.log_arrived}
         self._use(t._replace(**{name: larger(table) for name, table in rings.items()}))
 
 
@@ -128,6 +134,7 @@ def lay_out(
     *,
     shared: Collection[str] = (),
     log_jobs: bool = False,
+    log_windows: bool = False,
     shadows: Realisation | None = None,
 ) -> Arrays:
     """Build the tables of one or more cells.
@@ -139,10 +146,12 @@ def lay_out(
         that of the first cell. Links are never shared.
     log_jobs : bool
         Whether every job's instants are kept.
+    log_windows : bool
+        Whether those of a window are kept until it has closed.
     shadows : Realisation, optional
         Draws for the shadow jobs of a single cell (see `draw_shadows`); it gets a shadow then.
     """
-    return _Layout(cells, shared, log_jobs, shadows).arrays()
+    return _Layout(cells, shared, log_jobs, log_windows, shadows).arrays()
 
 
 class _Layout:
@@ -152,10 +161,12 @@ class _Layout:
         self,
         cells: Sequence[tuple[Problem, Realisation]],
         shared: Collection[str],
-        log: bool,
+        logs_all: bool,
+        logs_windows: bool,
         shadows: Realisation | None,
     ) -> None:
-        self.cells, self.shared, self.log = cells, frozenset(shared), log
+        self.cells, self.shared = cells, frozenset(shared)
+        self.logs_all, self.logs_windows = logs_all, logs_windows
         self.shadows = shadows
         self.reals = [real for _, real in cells]
         self.cycles = max(real.cycles for _, real in cells)
@@ -507,7 +518,7 @@ class _Layout:
         for server, workers in zip(rows["servers"], self.server_workers, strict=True):
             server["base"] = base
             base += max(workers, 1) + self._foreign(server, changes)
-        windows = max(real.windows for _, real in self.cells)
+        windows, slots = max(real.windows for _, real in self.cells), self._slots()
         margin = 64 + sum(len(rows[name]) for name in ("sites", "flows", "tasks", "servers"))
         n_layers = 1 + max((layer for known in self.layers for layer in known), default=0)
         layers = np.zeros((len(self.layers), n_layers), np.uint64)
@@ -515,7 +526,7 @@ class _Layout:
             for layer, address in known.items():
                 layers[hop, layer] = address
         clock = {
-            "n_slots": RING_START,
+            "n_slots": slots,
             "n_tasks": self.max_tasks,
             "n_flows": self.max_flows,
             "n_layers": n_layers,
@@ -524,20 +535,21 @@ class _Layout:
             "n_windows": windows,
             "margin": margin,
             "budget": BUDGET,
+            "logs_all": self.logs_all,
             "end_ns": max(int(close_ns[-1]) for close_ns in self.close_ns),
         }
         rows["clock"].append(clock)
         self._announce_first(changes)
         stamps = np.zeros((cells, cycles), np.int16)
         stamps[[row["parent"] >= 0 for row in rows["cells"]]] = -1
-        logged = cells * cycles if self.log else 0
+        logged = cells * (cycles if self.logs_all else slots if self.logs_windows else 0)
         # Rows beyond those that are laid out.
         room = {
             "events": 4 * margin,
             "running": base,
             "waiting": base,
-            "jobs": cells * RING_START * self.max_tasks,
-            "slots": cells * RING_START,
+            "jobs": cells * slots * self.max_tasks,
+            "slots": cells * slots,
         }
         structs: dict[str, Any] = {
             name: _table(name, rows[name], room.get(name, 0)) for name in rows
@@ -567,7 +579,7 @@ class _Layout:
             stamps=stamps,
             dirty=np.zeros(len(rows["servers"]), np.int32),
             ready=np.zeros(margin, np.int64),
-            attempts=np.zeros((cells * RING_START, max(self.max_flows, 1)), np.int64),
+            attempts=np.zeros((cells * slots, max(self.max_flows, 1)), np.int64),
             own_ns=np.zeros((cells, self.max_nodes)),
             ages=np.zeros(max(problem.window_cycles for problem, _ in self.cells), np.int64),
             latency_ns=np.full((cells, cycles), NEVER_NS),
@@ -577,9 +589,23 @@ class _Layout:
             opened=np.zeros((cells, windows, 3, self.max_nodes)),
             closed=np.zeros((cells, windows, 3, self.max_nodes)),
             shares=np.zeros((cells, windows, 3, self.max_nodes)),
+            shadow_bytes=np.zeros(cycles if self.shadows is not None else 0, np.int64),
             log_outcome=np.zeros(logged * self.max_tasks, np.int8),
             log_arrived=np.full((logged, self.max_flows), -1, np.int64),
         )
+
+    def _slots(self) -> int:
+        """Cycles that the ring has room for at first, a power of two: a window's, where logged."""
+        held = RING_START
+        if self.logs_windows and not self.logs_all:
+            for (problem, real), close_ns in zip(self.cells, self.close_ns, strict=True):
+                # Cycles that are released between a window's last one and its close.
+                after = 0
+                if (close_ns > real.release_ns[1:]).any():
+                    released = np.searchsorted(real.release_ns[:-1], close_ns)
+                    after = int((released - np.arange(1, real.cycles + 1)).max())
+                held = max(held, problem.window_cycles + after)
+        return 1 << (held - 1).bit_length()
 
     def _announce_first(self, changes: Rows) -> None:
         """Put the first release of every cell, and the first change of a node, into the queue."""

@@ -9,9 +9,19 @@ namespace dwell {
 template <class S>
 void log_job(S& s, i64 cell, i64 cycle, i64 task, const Job& job, Outcome outcome, i64 end_ns) {
   if (S::kPlain || s.log.size == 0) return;
-  const i64 entry = s.output(cell, cycle) * s.n_tasks + task;
+  const i64 entry = s.log_row(cell, cycle) * s.n_tasks + task;
   s.log[entry] = Log{job.ready_ns, job.started_ns, end_ns};
   s.log_outcome[entry] = outcome;
+}
+
+// Forgets what the logs have of an earlier cycle in the place of this one.
+template <class S>
+void clear_log(S& s, i64 cell, i64 cycle) {
+  if (S::kPlain || s.log.size == 0) return;
+  const i64 row = s.log_row(cell, cycle);
+  std::fill_n(&s.log[row * s.n_tasks], s.n_tasks, Log{-1, -1, -1});
+  std::fill_n(&s.log_outcome[row * s.n_tasks], s.n_tasks, i8{kInFlight});
+  std::fill_n(&s.log_arrived[row * s.n_flows], s.n_flows, i64{-1});
 }
 
 // Loses a ready job, and with it its cycle.
@@ -109,13 +119,20 @@ i64 shared_by(const S& s, i64 cell, i64 cycle, i64 task) {
   return s.shadow_parts[pair * s.n_tasks + task] == kShared ? shadow : -1;
 }
 
+// A sink of a shadow has all that it waits for; the last one completes the shadow.
+template <class S>
+void finish_shadow(S& s, i64 shadow, i64 cycle, i64 now) {
+  if (--s.slot(shadow, cycle).sinks_left > 0) return;
+  s.latency_ns[s.output(shadow, cycle)] = now - s.cell(shadow).release_ns[cycle];
+}
+
 // Counts an input in; the last one makes the job ready and names its critical path.
 template <class S>
 void hand_over(S& s, i64 cell, i64 cycle, i64 flow, i64 now) {
   const Flow& ends = s.flow(cell, flow);
   Job& job = s.job(cell, cycle, ends.target);
   if (!S::kPlain && s.log_arrived.size > 0) {
-    s.log_arrived[s.output(cell, cycle) * s.n_flows + flow] = now;
+    s.log_arrived[s.log_row(cell, cycle) * s.n_flows + flow] = now;
   }
   job.missing -= 1;
   if (job.missing == 0 && !is_discarded(s, cell, cycle, ends.target)) {
@@ -125,6 +142,7 @@ void hand_over(S& s, i64 cell, i64 cycle, i64 flow, i64 now) {
     note_ready(s, job_key(cell, cycle, ends.target));
   } else {
     s.slot(cell, cycle).live -= 1;
+    if (job.missing == 0) finish_shadow(s, cell, cycle, now);
   }
 }
 
@@ -146,7 +164,9 @@ void arrive(S& s, i64 cell, i64 cycle, i64 flow, i64 now) {
 
 // A sink has completed; the last one completes the cycle.
 template <class S>
-void finish(S& s, i64 cell, i64 cycle, const Job& job, i64 now) {
+void finish(S& s, i64 cell, i64 cycle, i64 task, const Job& job, i64 now) {
+  const i64 shadow = shared_by(s, cell, cycle, task);
+  if (shadow >= 0) finish_shadow(s, shadow, cycle, now);
   Slot& slot = s.slot(cell, cycle);
   slot.live -= 1;
   slot.sinks_left -= 1;
@@ -177,6 +197,10 @@ void send_outputs(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
       if (hop < 0) {
         hand_over(s, to, cycle, flow, now);
       } else {
+        if (!S::kPlain && s.cell(to).parent >= 0) {
+          // No more than 64 bits hold, as with times.
+          s.shadow_bytes[cycle] = later(s.shadow_bytes[cycle], s.hops[hop].payload_bytes);
+        }
         send(s, to, cycle, flow, hop, 0, now);
       }
     }
@@ -202,7 +226,7 @@ void complete(S& s, i64 key, i64 now) {
   log_job(s, cell, cycle, task, job, kDone, now);
   free_worker(s, site);
   if (s.task(cell, task).n_out == 0) {
-    finish(s, cell, cycle, job, now);
+    finish(s, cell, cycle, task, job, now);
   } else {
     job.network_ns = now - job.network_ns;
     send_outputs(s, cell, cycle, task, now);
@@ -225,7 +249,7 @@ void begin_cycle(S& s, i64 cell, i64 cycle, i64 active, bool is_shadow, i64 now)
   const i64 stamp = s.stamp(cell, cycle);
   const i64 candidate = of.candidate_0 + stamp;
   const i64 pair = of.pair_0 + active * of.n_candidates + stamp;
-  i32 sources = 0;
+  i32 sources = 0, sinks = of.n_sinks;
   for (i64 task = 0; task < of.n_tasks; ++task) {
     const Task& fixed = s.task(cell, task);
     Job& job = s.job(cell, cycle, task);
@@ -235,7 +259,11 @@ void begin_cycle(S& s, i64 cell, i64 cycle, i64 active, bool is_shadow, i64 now)
     job.compute_ns = 0;
     job.network_ns = 0;
     if (fixed.n_in > 0) continue;
-    if (is_shadow && s.shadow_parts[pair * s.n_tasks + task] != kShadowed) continue;
+    if (is_shadow) {
+      const i8 part = s.shadow_parts[pair * s.n_tasks + task];
+      if (part == kDiscarded) --sinks;  // there is nothing that it waits for
+      if (part != kShadowed) continue;
+    }
     ++sources;
     if (!is_shadow && fixed.offset_ns == 0) {
       note_ready(s, job_key(cell, cycle, task));
@@ -244,18 +272,22 @@ void begin_cycle(S& s, i64 cell, i64 cycle, i64 active, bool is_shadow, i64 now)
     }
   }
   s.slot(cell, cycle) =
-      Slot{cycle, static_cast<i32>(candidate), static_cast<i32>(pair), sources, of.n_sinks, 0};
+      Slot{cycle, static_cast<i32>(candidate), static_cast<i32>(pair), sources, sinks, 0};
+  if (sinks == 0) s.latency_ns[s.output(cell, cycle)] = 0;
 }
 
 // Releases a cycle, and its shadow if it has one; the next release is announced.
 template <class S>
 void release(S& s, i64 cell, i64 cycle, i64 now) {
   const i64 active = s.stamp(cell, cycle);
+  clear_log(s, cell, cycle);
   begin_cycle(s, cell, cycle, active, false, now);
   if (!S::kPlain) {
     const i64 shadow = s.cell(cell).shadow;
-    if (shadow >= 0 && s.stamp(shadow, cycle) >= 0) {
-      begin_cycle(s, shadow, cycle, active, true, now);
+    if (shadow >= 0) {
+      clear_log(s, shadow, cycle);
+      s.slot(shadow, cycle).cycle = cycle;  // its place in the logs, also without a shadow
+      if (s.stamp(shadow, cycle) >= 0) begin_cycle(s, shadow, cycle, active, true, now);
     }
   }
   const i64 following = cycle + 1;

@@ -33,6 +33,7 @@ using Times = const i64*;
   field(i64, n_nodes) /* of a cell */                                                            \
   field(i64, n_cycles) field(i64, n_windows) field(i64, n_priced) /* columns of the outputs */    \
   field(i64, margin) field(i64, budget)                                                          \
+  field(i64, logs_all) /* whether logs are of all cycles, or of those in the ring */             \
   field(i64, n_events) field(i64, is_heap) /* of the queue */                                    \
   field(i64, next_change)                                                                        \
   field(i64, pauses) /* whether a call ends when a window closes */                              \
@@ -205,8 +206,8 @@ DWELL_ROWS(DWELL_STRUCT)
 
 // clang-format off
 
-// Fixed, then state, then outputs: per cycle, per window, and per job where a log is kept. Shapes
-// are in rows.py.
+// Fixed, then state, then outputs: per cycle, per window, and logs where they are kept. Shapes are
+// in rows.py.
 #define DWELL_TABLES(table)                                                                      \
   table(Clock, clock) table(Cell, cells) table(Task, tasks) table(Flow, flows)                   \
   table(i32, outputs) table(i32, cell_nodes) table(f64, capacity) table(Node, nodes)             \
@@ -221,7 +222,7 @@ DWELL_ROWS(DWELL_STRUCT)
   table(i64, latency_ns) table(i64, compute_ns) table(i64, network_ns) table(i8, outcome)        \
   table(f64, opened) table(f64, closed) table(Seen, seen) table(f64, shares)                     \
   table(Decided, decided) table(f64, priced)                                                     \
-  table(Log, log) table(i8, log_outcome) table(i64, log_arrived)
+  table(i64, shadow_bytes) table(Log, log) table(i8, log_outcome) table(i64, log_arrived)
 
 // clang-format on
 

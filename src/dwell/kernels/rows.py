@@ -75,7 +75,7 @@ class Tables(NamedTuple):
     """Every array of a simulation, in the kernel's order.
 
     Fixed: what the problem and the realisation say. State: what changes as the clock goes on.
-    Outputs: per cycle, per window, and per job where a log is kept. Columns of a table of structs
+    Outputs: per cycle, per window, and logs where they are kept. Columns of a table of structs
     are those of its row in ``rows.h``. N is the number of cycles, "tasks" and "flows" of a cell are
     those of the cell with most.
     """
@@ -134,9 +134,10 @@ class Tables(NamedTuple):
     priced: (
         Floats  # (windows, columns) by candidate: J, L95, V_D, U of each node, is within, excess
     )
-    log: Rows  # (cells * N * tasks,), or empty
+    shadow_bytes: Ints  # (N,) what the shadow of each cycle put on links, or empty
+    log: Rows  # (cells * L * tasks,), L being N or the slots (`logs_all`); or empty
     log_outcome: NDArray[np.int8]
-    log_arrived: Ints  # (cells * N, flows), or empty
+    log_arrived: Ints  # (cells * L, flows), or empty
 
     def addresses(self) -> NDArray[np.uint64]:
         """Return what the kernel is handed: address and length of every table.

@@ -51,6 +51,11 @@ struct Simulation : Tables {
   i64 output(i64 cell, i64 cycle) const { return (kPlain ? 0 : cell * n_cycles) + cycle; }
   i16& stamp(i64 cell, i64 cycle) const { return stamps[output(cell, cycle)]; }
 
+  // Place of a cycle in the logs.
+  i64 log_row(i64 cell, i64 cycle) const {
+    return clock[0].logs_all ? output(cell, cycle) : slot_row(cell, cycle);
+  }
+
   // Hop that a flow takes in a cycle, -1 on the same node.
   i64 hop(i64 cell, i64 cycle, i64 flow) const {
     return route[slot(cell, cycle).candidate * n_flows + flow];

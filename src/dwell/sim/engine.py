@@ -20,9 +20,9 @@ from dwell.control import (
     shadow_stamps,
 )
 from dwell.errors import SimulationError
-from dwell.kernels.advance import play
+from dwell.kernels.advance import logged_instants, play
 from dwell.kernels.arrays import Arrays, lay_out, ordered_flows
-from dwell.kernels.codes import BuiltInPolicy, CycleOutcome, EventKind, Status, Tier, kind_of
+from dwell.kernels.codes import BuiltInPolicy, EventKind, Status, Tier, kind_of
 from dwell.kernels.random_draws import draw, draw_shadows
 from dwell.kernels.realisation import NodeChanges, Realisation
 from dwell.model import Problem
@@ -163,8 +163,9 @@ def _play(
     controller = Controller(problem, policy, estimator)
     shadow = shadow or controller.shadow_fraction > 0
     shadows = draw_shadows(problem, realisation) if shadow else None
-    log_jobs = jobs or controller.learns or shadow
-    arrays = lay_out([(problem, realisation)], log_jobs=log_jobs, shadows=shadows)
+    arrays = lay_out(
+        [(problem, realisation)], log_jobs=jobs, log_windows=controller.learns, shadows=shadows
+    )
     guarded = guard and controller.guarded
     stamper = _Stamper(problem, realisation, controller, arrays, guarded=guarded)
     if not (guarded or by_window or any(stamper.host_down)):
@@ -408,34 +409,22 @@ def _evidence(
     problem: Problem, realisation: Realisation, arrays: Arrays
 ) -> Callable[[int, int, int], Evidence]:
     """Return the function that cuts a window's evidence out of the logs."""
-    tasks = len(problem.pipeline.tasks)
     order = ordered_flows(problem.pipeline)
-    column = [order.index(flow) for flow in problem.pipeline.flows]
-    tables = arrays.tables
-    cells = len(tables.cells)
-    log = tables.log.reshape(cells, realisation.cycles, tasks)
-    arrived_ns = tables.log_arrived.reshape(cells, realisation.cycles, -1)
-    outcome = tables.log_outcome.reshape(cells, realisation.cycles, tasks)
-
-    def instants(cell: int, first: int, last: int) -> Instants:
-        jobs = log[cell, first:last]
-        return Instants(
-            ready_ns=jobs["ready_ns"].copy(),
-            end_ns=np.where(outcome[cell, first:last] == CycleOutcome.DONE, jobs["end_ns"], -1),
-            arrived_ns=arrived_ns[cell, first:last][:, column],
-        )
+    flows = np.array([order.index(flow) for flow in problem.pipeline.flows], np.int64)
+    shadowed, stamps = len(arrays.tables.cells) > 1, arrays.tables.stamps
 
     def cut(first: int, last: int, close_ns: int) -> Evidence:
-        shadowed = cells > 1
         return Evidence(
             close_ns=close_ns,
             release_ns=realisation.release_ns[first:last],
-            placement=tables.stamps[0, first:last].copy(),
-            cycles=instants(0, first, last),
+            placement=stamps[0, first:last].copy(),
+            cycles=Instants(*logged_instants(arrays, 0, first, last, flows)),
             shadow_placement=(
-                tables.stamps[1, first:last].copy() if shadowed else np.full(last - first, -1)
+                stamps[1, first:last].copy() if shadowed else np.full(last - first, -1)
             ),
-            shadows=instants(1, first, last) if shadowed else None,
+            shadows=(
+                Instants(*logged_instants(arrays, 1, first, last, flows)) if shadowed else None
+            ),
         )
 
     return cut

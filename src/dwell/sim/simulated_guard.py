@@ -17,11 +17,11 @@ from dwell.control import (
 )
 from dwell.kernels.advance import post_event
 from dwell.kernels.arrays import Arrays
-from dwell.kernels.codes import LAST_NS, CycleOutcome, EventKind, ShadowPart, make_key
+from dwell.kernels.codes import LAST_NS, CycleOutcome, EventKind, make_key
 from dwell.kernels.realisation import LinkSegments, NodeChanges, Realisation
 from dwell.kernels.rows import Row
 from dwell.model import Problem
-from dwell.model.instants import EVIDENCE_NS, HORIZON_NS
+from dwell.model.instants import EVIDENCE_NS, HORIZON_NS, NEVER_NS
 
 
 class SimulatedGuard:
@@ -43,7 +43,7 @@ class SimulatedGuard:
         self.patience_ns = min(problem.controller.guard_cycles * period_ns, HORIZON_NS)
         self.presence_ns = Presence.of(problem).within_ns
         self.probation = Probation.of(problem)
-        self.probes = _Probes(problem, realisation, arrays)
+        self.probes = _Probes(realisation, arrays)
         self.since: int | None = 0
         self._round = FallbackRound(problem.controller.fallbacks)
         # What the guard itself has moved to, with its first cycle, until an order takes effect;
@@ -348,18 +348,9 @@ class _ProbeRequest:
 class _Probes:
     """Probes: the cycles that are sent as probes, and their completions."""
 
-    def __init__(self, problem: Problem, realisation: Realisation, arrays: Arrays) -> None:
+    def __init__(self, realisation: Realisation, arrays: Arrays) -> None:
         self.arrays = arrays
         self.release_ns, self.cycles = realisation.release_ns, realisation.cycles
-        names = list(problem.pipeline.tasks)
-        flows = sorted(problem.pipeline.flows, key=lambda flow: names.index(flow.target))
-        #: Row of every sink, and the columns of its inputs among the flows in the kernels' order.
-        self.sinks = [
-            (row, [i for i, flow in enumerate(flows) if flow.target == name])
-            for row, name in enumerate(names)
-            if not problem.pipeline.outputs(name)
-        ]
-        self.tasks, self.candidates = len(names), len(problem.candidates)
         self._requests: list[_ProbeRequest] = []
         self._open: list[int] = []
         self._next = 0
@@ -409,26 +400,16 @@ class _Probes:
         return sorted(found, key=order)
 
     def heard_ns(self, cycle: int) -> int | None:
-        """Instant at which the completion of a probe is heard: all sinks have their inputs.
+        """Instant at which the completion of a probe is heard, None if it has not completed.
 
-        A sink that the probe shares with its cycle must have completed.
+        All sinks have their inputs then; one that it shares with its cycle must have completed.
         """
         tables = self.arrays.tables
-        active, other = (int(code) for code in tables.stamps[:, cycle])
-        parts = tables.shadow_parts[active * self.candidates + other]
-        at_ns = 0
-        for row, inputs in self.sinks:
-            if parts[row] == ShadowPart.SHARED:
-                entry = cycle * self.tasks + row
-                done = tables.log_outcome[entry] == CycleOutcome.DONE
-                ends = [int(tables.log["end_ns"][entry]) if done else -1]
-            else:
-                arrived = tables.log_arrived[self.cycles + cycle]
-                ends = [int(arrived[i]) for i in inputs] or [int(self.release_ns[cycle])]
-            if min(ends) < 0:
-                return None
-            at_ns = max(at_ns, *ends)
-        return at_ns + int(tables.back_ns[other])
+        latency_ns = int(tables.latency_ns[1, cycle])
+        if latency_ns >= NEVER_NS:
+            return None
+        back_ns = tables.back_ns[tables.stamps[1, cycle]]
+        return int(self.release_ns[cycle]) + latency_ns + int(back_ns)
 
     def _under_way(self, cycle: int) -> bool:
         """Whether anything of a cycle or its probe may still happen."""

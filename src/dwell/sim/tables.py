@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from dwell.control import Controller, final_l95_ms
 from dwell.kernels.arrays import Arrays
-from dwell.kernels.codes import CycleOutcome, ShadowPart
 from dwell.kernels.realisation import Realisation
 from dwell.kernels.rows import Rows
 from dwell.model import REASONS, Problem
@@ -207,7 +206,7 @@ def _shadow_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray
         return {}
 
     def sent_bytes() -> Ints:
-        sent = played.by_window(_shadow_bytes(played))
+        sent = played.by_window(played.arrays.tables.shadow_bytes)
         # What 64 bits do not hold is as good as that.
         held = sent.sum(axis=1, dtype=np.float64) < HORIZON_NS
         return np.where(held, sent.sum(axis=1), HORIZON_NS)
@@ -222,30 +221,6 @@ def _shadow_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray
             for i, node in enumerate(played.problem.fabric.nodes)
         },
     }
-
-
-def _shadow_bytes(played: PlayedRealisation) -> Ints:
-    """Bytes that the shadow of every cycle put on links, shape (N,)."""
-    problem, tables = played.problem, played.arrays.tables
-    pipeline, cycles = problem.pipeline, played.realisation.cycles
-    names = list(pipeline.tasks)
-    candidates = list(problem.candidates.values())
-    log = tables.log.reshape(len(tables.cells), cycles, len(names))
-    done = tables.log_outcome.reshape(len(tables.cells), cycles, len(names)) == CycleOutcome.DONE
-    done &= log["end_ns"] >= 0
-    active, other = tables.stamps[0].astype(np.int64), tables.stamps[1].astype(np.int64)
-    shadowed = other >= 0
-    pair = np.where(shadowed, active * len(candidates) + other, 0)
-    parts = tables.shadow_parts[pair]
-    total = np.zeros(cycles, np.int64)
-    for flow in pipeline.flows:
-        source, target = names.index(flow.source), names.index(flow.target)
-        crosses = np.array([place[flow.source] != place[flow.target] for place in candidates])
-        own = parts[:, source] != ShadowPart.SHARED
-        ended = np.where(own, done[1, :, source], done[0, :, source])
-        sent = shadowed & (parts[:, target] != ShadowPart.SHARED) & crosses[other] & ended
-        total += sent * flow.payload_bytes
-    return total
 
 
 def _seen(played: PlayedRealisation) -> dict[str, Floats]:

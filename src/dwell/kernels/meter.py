@@ -1,0 +1,129 @@
+"""The times of the parts of a window's cycles (see ``meter.cpp``)."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from ctypes import POINTER, c_int64, c_void_p
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.kernels.library import library
+
+Ints = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+
+class _Cycles(ctypes.Structure):
+    """A window's cycles or their shadows; ``meter.cpp`` has the same structs."""
+
+    _fields_ = tuple((name, c_void_p) for name in ("placement", "ready_ns", "end_ns", "arrived_ns"))
+
+
+class _Layout(ctypes.Structure):
+    _fields_ = (
+        ("n_tasks", c_int64),
+        ("n_flows", c_int64),
+        ("sources", c_void_p),
+        ("parts", c_void_p),
+        ("shared", c_void_p),
+    )
+
+
+class _Found(ctypes.Structure):
+    _fields_ = (
+        ("ms", c_void_p),
+        ("count", c_void_p),
+        ("order", c_void_p),
+        ("most", c_int64),
+        ("n_parts", c_int64),
+    )
+
+
+class CyclesLayout:
+    """What cycles under one candidate, and their shadows, go through.
+
+    Parameters
+    ----------
+    sources : int64 array, shape (flows,)
+        Source of each flow.
+    parts : int64 array, shape (1 + candidates, tasks + flows)
+        Number of the part of each task, then of each flow, for the cycles themselves, then for
+        their shadows through each candidate; -1 where they have none of their own.
+    shared : bool array, shape (1 + candidates, flows)
+        Whether the source of a flow is shared with the cycle.
+    """
+
+    def __init__(self, sources: Ints, parts: Ints, shared: NDArray[np.bool_]) -> None:
+        flows = len(sources)
+        # Rows have addresses in these.
+        self._behind = tuple(map(np.ascontiguousarray, (sources, parts, shared)))
+        addresses = (table.ctypes.data for table in self._behind)
+        self.row = _Layout(parts.shape[1] - flows, flows, *addresses)
+
+
+class WindowTimes:
+    """Times of the parts of one window's cycles, milliseconds, infinite where lost.
+
+    Parameters
+    ----------
+    cycles, shadows : sequence of four int64 arrays
+        Of the cycles, and of their shadows: the candidate that each went through, shape (n,), -1
+        for none; when its jobs became ready and when they had completed, (n, tasks); and when its
+        messages arrived, (n, flows). -1 for an instant that had not come.
+    limit_ns : int
+        A job or message that began before this, and has not ended, counts as lost.
+    parts : int
+        Number of parts.
+    """
+
+    def __init__(
+        self,
+        cycles: Sequence[NDArray[np.integer]],
+        shadows: Sequence[NDArray[np.integer]] | None,
+        limit_ns: int,
+        parts: int,
+    ) -> None:
+        count = len(cycles[0])
+        self._limit_ns = limit_ns
+        self._tables: list[Ints] = []
+        self._cycles = self._row(cycles)
+        self._shadows = None if shadows is None else self._row(shadows)
+        self._ms = np.empty((parts, 2 * count))
+        self._count, self._order = np.zeros((2, parts), np.int64)
+        tables = (table.ctypes.data for table in (self._ms, self._count, self._order))
+        self._found = _Found(*tables, 2 * count, 0)
+
+    def _row(self, tables: Sequence[NDArray[np.integer]]) -> _Cycles:
+        kept = [np.ascontiguousarray(table, np.int64) for table in tables]
+        self._tables += kept
+        return _Cycles(*(table.ctypes.data for table in kept))
+
+    def add(self, active: int, layout: CyclesLayout) -> None:
+        """Add the times of the cycles under one candidate, and then of their shadows."""
+        count = len(self._tables[0])
+        _meter()(
+            layout.row, count, active, self._cycles, self._shadows, self._limit_ns, self._found
+        )
+
+    def by_part(self) -> dict[int, Floats]:
+        """Return the times by number of part, in the order in which they were found."""
+        counts = self._count.tolist()
+        order = self._order[: self._found.n_parts].tolist()
+        return {part: self._ms[part, : counts[part]] for part in order}
+
+
+@cache
+def _meter() -> Any:
+    """Return the function of the library, with the types of its arguments."""
+    function = library().dwell_meter
+    cycles = POINTER(_Cycles)
+    function.argtypes = (
+        *(POINTER(_Layout), c_int64, c_int64),
+        *(cycles, cycles, c_int64, POINTER(_Found)),
+    )
+    function.restype = None
+    return function
