@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.spans import patience_ns
-from dwell.kernels.meter import CyclesLayout, WindowTimes
+from dwell.kernels.meter import CyclesLayout, PartTimes
 from dwell.model.pipeline import Pipeline
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
@@ -66,28 +66,25 @@ class Meter:
         self._placements = tuple(problem.candidates.values())
         every = (parts_of(problem.pipeline, placed) for placed in self._placements)
         self._parts = tuple(dict.fromkeys(part for parts in every for part in parts))
+        self._times = PartTimes(len(self._parts))
         self._layouts: dict[int, CyclesLayout] = {}
 
     def times(self, evidence: Evidence) -> dict[Part, Floats]:
-        """Times of every part that the window has any of, milliseconds, infinite where lost."""
+        """Times of every part that the window has any of, milliseconds, infinite where lost.
+
+        They are overwritten by those of the next window.
+        """
         limit_ns = evidence.close_ns - self._patience_ns
         cycles, shadows = evidence.cycles, evidence.shadows
-        times = WindowTimes(
-            (evidence.placement, cycles.ready_ns, cycles.end_ns, cycles.arrived_ns),
-            None
-            if shadows is None
-            else (
-                evidence.shadow_placement,
-                shadows.ready_ns,
-                shadows.end_ns,
-                shadows.arrived_ns,
-            ),
-            limit_ns,
-            len(self._parts),
-        )
+        own = evidence.placement, cycles.ready_ns, cycles.end_ns, cycles.arrived_ns
+        sent = None
+        if shadows is not None:
+            through = evidence.shadow_placement
+            sent = through, shadows.ready_ns, shadows.end_ns, shadows.arrived_ns
+        self._times.begin(own, sent, limit_ns)
         for active, _ in groups(evidence.placement):
-            times.add(active, self._layout(active))
-        return {self._parts[part]: found for part, found in times.by_part().items()}
+            self._times.add(active, self._layout(active))
+        return {self._parts[part]: found for part, found in self._times.by_part().items()}
 
     def _layout(self, active: int) -> CyclesLayout:
         """Return what cycles under a candidate, and their shadows, have for themselves."""

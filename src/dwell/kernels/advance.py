@@ -22,7 +22,7 @@ def _functions() -> tuple[Any, Any, Any, Any]:
     loaded = library()
     advance, post, send = loaded.dwell_advance, loaded.dwell_post_event, loaded.dwell_send_state
     logged = loaded.dwell_logged_instants
-    logged.argtypes, logged.restype = (TABLES, I64, I64, I64, TABLES, I64, *3 * (TABLES,)), None
+    logged.argtypes, logged.restype = (TABLES, I64, I64, I64, TABLES, I64, TABLES), None
     advance.argtypes, advance.restype = (TABLES,), ctypes.c_int32
     post.argtypes, post.restype = (TABLES, I64, I64), None
     send.argtypes, send.restype = (TABLES, I64, I64, I64, I64, ctypes.POINTER(I64)), None
@@ -73,12 +73,14 @@ def logged_instants(
         When all inputs of a job were there, and when it had completed.
     arrived_ns : int64 array, shape (cycles, flows)
     """
-    count, tasks = last - first, int(arrays.tables.clock[0]["n_tasks"])
-    ready_ns, end_ns = np.empty((2, count, tasks), np.int64)
-    arrived_ns = np.empty((count, len(flows)), np.int64)
-    out = (table.ctypes.data for table in (ready_ns, end_ns, arrived_ns))
-    _functions()[3](arrays.address, cell, first, count, flows.ctypes.data, len(flows), *out)
-    return ready_ns, end_ns, arrived_ns
+    count, tasks = last - first, arrays.tables.jobs.size // arrays.tables.slots.size
+    table = np.empty(count * (2 * tasks + len(flows)), np.int64)
+    _functions()[3](
+        *(arrays.address, cell, first, count),
+        *(flows.ctypes.data, len(flows), table.ctypes.data),
+    )
+    jobs = table[: 2 * count * tasks].reshape(2, count, tasks)
+    return jobs[0], jobs[1], table[2 * count * tasks :].reshape(count, len(flows))
 
 
 def send_state(

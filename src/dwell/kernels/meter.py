@@ -64,49 +64,72 @@ class CyclesLayout:
         addresses = (table.ctypes.data for table in self._behind)
         self.row = _Layout(parts.shape[1] - flows, flows, *addresses)
 
+    def __reduce__(self) -> tuple[type[CyclesLayout], tuple[NDArray[Any], ...]]:
+        # A copy has addresses of its own.
+        return CyclesLayout, self._behind
 
-class WindowTimes:
-    """Times of the parts of one window's cycles, milliseconds, infinite where lost.
+
+class PartTimes:
+    """Times of the parts of a window's cycles, milliseconds, infinite where lost.
 
     Parameters
     ----------
-    cycles, shadows : sequence of four int64 arrays
-        Of the cycles, and of their shadows: the candidate that each went through, shape (n,), -1
-        for none; when its jobs became ready and when they had completed, (n, tasks); and when its
-        messages arrived, (n, flows). -1 for an instant that had not come.
-    limit_ns : int
-        A job or message that began before this, and has not ended, counts as lost.
     parts : int
         Number of parts.
     """
 
-    def __init__(
+    def __init__(self, parts: int) -> None:
+        self._count, self._order = np.zeros((2, parts), np.int64)
+        self._cycles, self._shadows = _Cycles(), _Cycles()
+        self._found = _Found(None, self._count.ctypes.data, self._order.ctypes.data)
+        self._ms = np.empty((parts, 0))
+
+    def __reduce__(self) -> tuple[type[PartTimes], tuple[int]]:
+        # As in a copy of `CyclesLayout`; what has been found stays here.
+        return PartTimes, (len(self._count),)
+
+    def begin(
         self,
         cycles: Sequence[NDArray[np.integer]],
         shadows: Sequence[NDArray[np.integer]] | None,
         limit_ns: int,
-        parts: int,
     ) -> None:
-        count = len(cycles[0])
-        self._limit_ns = limit_ns
-        self._tables: list[Ints] = []
-        self._cycles = self._row(cycles)
-        self._shadows = None if shadows is None else self._row(shadows)
-        self._ms = np.empty((parts, 2 * count))
-        self._count, self._order = np.zeros((2, parts), np.int64)
-        tables = (table.ctypes.data for table in (self._ms, self._count, self._order))
-        self._found = _Found(*tables, 2 * count, 0)
+        """Begin a window; the times of the one before are overwritten.
 
-    def _row(self, tables: Sequence[NDArray[np.integer]]) -> _Cycles:
+        Parameters
+        ----------
+        cycles, shadows : sequence of four int64 arrays
+            Of the cycles, and of their shadows: the candidate that each went through, shape (n,),
+            -1 for none; when its jobs became ready and when they had completed, (n, tasks); and
+            when its messages arrived, (n, flows). -1 for an instant that had not come.
+        limit_ns : int
+            A job or message that began before this, and has not ended, counts as lost.
+        """
+        self._cycles_of, self._limit_ns = len(cycles[0]), limit_ns
+        if self._ms.shape[1] < 2 * self._cycles_of:
+            self._ms = np.empty((len(self._count), 2 * self._cycles_of))
+            self._found.ms, self._found.most = self._ms.ctypes.data, self._ms.shape[1]
+        self._behind = self._set(self._cycles, cycles)
+        self._has_shadows = shadows is not None
+        if shadows is not None:
+            self._behind += self._set(self._shadows, shadows)
+        self._count[:] = 0
+        self._found.n_parts = 0
+
+    def _set(self, row: _Cycles, tables: Sequence[NDArray[np.integer]]) -> list[Ints]:
+        """Have a row be of some tables; returns what must be kept for it."""
         kept = [np.ascontiguousarray(table, np.int64) for table in tables]
-        self._tables += kept
-        return _Cycles(*(table.ctypes.data for table in kept))
+        row.placement, row.ready_ns, row.end_ns, row.arrived_ns = (
+            table.ctypes.data for table in kept
+        )
+        return kept
 
     def add(self, active: int, layout: CyclesLayout) -> None:
         """Add the times of the cycles under one candidate, and then of their shadows."""
-        count = len(self._tables[0])
+        shadows = self._shadows if self._has_shadows else None
         _meter()(
-            layout.row, count, active, self._cycles, self._shadows, self._limit_ns, self._found
+            *(layout.row, self._cycles_of, active, self._cycles, shadows),
+            *(self._limit_ns, self._found),
         )
 
     def by_part(self) -> dict[int, Floats]:
