@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dwell.control import shadow_stamps
+from dwell.control import ShadowPlan, shadow_stamps
 
 
 @given(
@@ -37,3 +37,13 @@ def test_a_stretch_is_the_sum_of_its_parts(first: int, length: int, cut: int) ->
 def test_without_a_fraction_or_an_alternative_there_is_none() -> None:
     assert set(shadow_stamps(0, 50, 0, 3, 0.0)) == {-1}
     assert set(shadow_stamps(0, 50, 0, 1, 0.5)) == {-1}
+
+
+@given(candidates=st.integers(1, 6), active=st.integers(0, 5), percent=st.integers(0, 20))
+def test_the_same_cycles_are_sent_whatever_they_run_under(
+    candidates: int, active: int, percent: int
+) -> None:
+    stamps = shadow_stamps(0, 500, active % candidates, candidates, percent / 100)
+    expected = np.flatnonzero(stamps >= 0)
+    plan = ShadowPlan(0, 500, candidates, percent / 100)
+    np.testing.assert_array_equal(plan.sent, expected)

@@ -15,6 +15,7 @@ import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 import dwell
 from dwell.control import shadow_stamps
@@ -32,9 +33,12 @@ from dwell.model import (
     LogNormal,
     Node,
     NodeDisturbance,
+    Normal,
     Problem,
+    Process,
     QoS,
     Task,
+    Uniform,
 )
 from tests.cells.generated import MS, make_problem, make_realisation
 from tests.reference.simulator import ITSELF, SHADOW, shadow_stamp, simulate
@@ -456,6 +460,82 @@ def test_a_shadow_draws_its_own_times_and_shares_what_belongs_to_cycle_and_fabri
     assert (shadow.delay_ns != real.delay_ns).mean() > 0.9
     assert (shadow.extra_ns != real.extra_ns).mean() > 0.9
     assert set(shadow.loss_keys.tolist()).isdisjoint(real.loss_keys.tolist())
+
+
+# ------------------------------------------------------------------------- drawn where needed
+
+LONG_MS: dict[str, Process] = {
+    "lognormal": LogNormal(10.0, 0.4),
+    "normal": Normal(10.0, 2.0, 0.0),
+    "uniform": Uniform(5.0, 15.0),
+    "ar1": AR1(10.0, 0.4, 0.9),
+}
+
+
+def drawn_problem(process: Process, **more: Any) -> Problem:
+    """B on E takes what a process says, times a scale that the cycle brings."""
+    tasks = [
+        task("S", 1),
+        Task("B", {"R": Execution(Constant(3.0)), "E": Execution(process)}, scale="scene"),
+        task("K", 1),
+    ]
+    links = [
+        Link("R", "E", LogNormal(1, 0.3), loss=0.1),
+        Link("E", "R", LogNormal(1, 0.3), loss=0.1),
+    ]
+    return make_problem(
+        [R, E],
+        tasks,
+        [Flow("S", "B"), Flow("B", "K")],
+        links=links,
+        candidates=MOVES,
+        scales={"scene": AR1(1.0, 0.2, 0.9)},
+        scenario=[LinkDisturbance("R", "E", 0.2, 900.0, add_delay_ms=LogNormal(5, 0.3))],
+        **more,
+    )
+
+
+@pytest.mark.parametrize("kind", LONG_MS)
+def test_shadows_that_are_drawn_by_need_take_as_long_as_if_all_were(kind: str) -> None:
+    problem = drawn_problem(LONG_MS[kind])
+    real = dwell.draw(problem, scenario="disturbed", seed=3, windows=1_000)
+    sent = np.arange(0, real.cycles, 5)
+    whole, some = draw_shadows(problem, real), draw_shadows(problem, real, sent)
+    scale = real.exec_ns[real.sites.index(("B", "R"))][sent] / (3 * MS)
+    site = real.sites.index(("B", "E"))
+    pairs = [(whole.exec_ns[site][sent] / scale, some.exec_ns[site][sent] / scale)]
+    for name in ("delay_ns", "extra_ns"):
+        pairs += zip(getattr(whole, name)[:, sent], getattr(some, name)[:, sent], strict=True)
+    for expected, drawn in pairs:
+        assert ks_distance(expected, drawn) < 2.0 * np.sqrt(2 / len(sent))
+        assert not np.array_equal(expected, drawn)
+    # A process with a memory has it between the cycles that are sent.
+    first, then = (np.log(pairs[0][1][part]) for part in (slice(-1), slice(1, None)))
+    memory = 0.9**5 if kind == "ar1" else 0.0
+    assert np.corrcoef(first, then)[0, 1] == pytest.approx(memory, abs=0.15)
+
+
+def ks_distance(one: NDArray[np.generic], other: NDArray[np.generic]) -> float:
+    """Greatest distance between two empirical distributions."""
+    every = np.concatenate((one, other))
+    ranks = [np.searchsorted(np.sort(of), every, side="right") / len(of) for of in (one, other)]
+    return float(np.abs(ranks[0] - ranks[1]).max())
+
+
+def test_what_is_drawn_of_a_shadow_does_not_depend_on_probes() -> None:
+    problem = drawn_problem(LogNormal(10.0, 0.4))
+    real = dwell.draw(problem, scenario="disturbed", seed=3, windows=40)
+    sent = np.arange(3, real.cycles, 7)
+    rest = np.setdiff1d(np.arange(real.cycles), sent)
+    alone, both = draw_shadows(problem, real, sent), draw_shadows(problem, real, sent, others=True)
+    whole = draw_shadows(problem, real)
+    for name in ("exec_ns", "delay_ns", "extra_ns"):
+        mine, with_others, of_all = (getattr(of, name) for of in (alone, both, whole))
+        np.testing.assert_array_equal(with_others[:, sent], mine[:, sent])
+        np.testing.assert_array_equal(with_others[:, rest], of_all[:, rest])
+        assert not mine[:, rest].any()
+    assert (alone.loss_keys == whole.loss_keys).all()
+    assert alone.release_ns is real.release_ns
 
 
 # ---------------------------------------------------------------------- nothing else changes

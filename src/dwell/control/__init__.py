@@ -11,7 +11,7 @@ from dwell.control.guard import (
     rest_cycles,
 )
 from dwell.control.plain_rule import plain_rule
-from dwell.control.shadows import shadow_stamps
+from dwell.control.shadows import ShadowPlan, shadow_stamps
 from dwell.control.windows import final_l95_ms
 from dwell.estimators import Estimator, Evidence, Instants
 from dwell.policies import MinimalPolicy
@@ -29,6 +29,7 @@ __all__ = [
     "MinimalPolicy",
     "Presence",
     "Probation",
+    "ShadowPlan",
     "final_l95_ms",
     "parts_of",
     "plain_rule",

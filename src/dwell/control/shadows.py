@@ -33,9 +33,33 @@ def shadow_stamps(
     -------
     int16 array, shape (last - first,)
     """
-    alternatives = np.array([i for i in range(candidates) if i != active] + [-1], np.int16)
-    if fraction <= 0 or candidates < 2:
-        return np.full(last - first, -1, np.int16)
-    place = (np.arange(first, last) * GOLDEN % 1.0 / fraction).astype(np.int64)
-    stamps: NDArray[np.int16] = alternatives[np.minimum(place, candidates - 1)]
-    return stamps
+    plan = ShadowPlan(first, last, candidates, fraction)
+    return plan.stamps(first, last, active)
+
+
+class ShadowPlan:
+    """Which cycles of a stretch are also sent through an alternative (see `shadow_stamps`)."""
+
+    def __init__(self, first: int, last: int, candidates: int, fraction: float) -> None:
+        self._first, self._candidates = first, candidates
+        #: Which alternative each cycle is sent through; the last one stands for none.
+        self._place = np.full(last - first, max(candidates - 1, 0), np.int16)
+        if fraction > 0 and candidates > 1:
+            turned = np.arange(first, last) * GOLDEN
+            turned -= np.floor(turned)
+            turned /= fraction
+            np.minimum(turned, candidates - 1, out=turned)
+            self._place[:] = turned
+
+    @property
+    def sent(self) -> NDArray[np.int64]:
+        """The cycles that are sent through any, whatever they run under, ascending."""
+        return self._first + np.flatnonzero(self._place < self._candidates - 1)
+
+    def stamps(self, first: int, last: int, active: int) -> NDArray[np.int16]:
+        """Return the stamps of some of the cycles where they run under a candidate."""
+        alternatives = [i for i in range(self._candidates) if i != active]
+        stamps: NDArray[np.int16] = np.array([*alternatives, -1], np.int16)[
+            self._place[first - self._first : last - self._first]
+        ]
+        return stamps

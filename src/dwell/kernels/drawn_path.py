@@ -44,6 +44,11 @@ def path_of(process: Process, rng: np.random.Generator, *, independent: bool = F
     return SampledPath(process, rng)
 
 
+def independent(process: Process) -> bool:
+    """Whether a process has no memory, so that any values of a path do for any cycles."""
+    return not isinstance(process, AR1)
+
+
 class Path(ABC):
     """Values of one process, in order; each call goes on where the one before ended."""
 
@@ -86,6 +91,28 @@ class ReplayedPath(Path):
         rows = self.rows[self.taken : self.taken + count]
         self.taken += count
         return self.recorded[rows]
+
+
+class PickedPath(Path):
+    """Some cycles of a path that is drawn for every cycle: all at once.
+
+    Parameters
+    ----------
+    path : Path
+    cycles : int
+        Cycles of the whole path.
+    picked : int64 array
+        The cycles that are asked for.
+    """
+
+    def __init__(self, path: Path, cycles: int, picked: Ints) -> None:
+        self.path, self.cycles, self.picked = path, cycles, picked
+
+    def values(self, count: int) -> Floats:
+        """Return the values of the cycles that are picked, which the caller may change."""
+        if count != len(self.picked):
+            raise ValueError(f"{count} values are not those of {len(self.picked)} cycles")
+        return self.path.values(self.cycles)[self.picked]
 
 
 class _DrawnPath(ctypes.Structure):

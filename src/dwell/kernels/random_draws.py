@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from dwell.errors import Fault, ProblemError, SimulationError
 from dwell.kernels.disturbances import LEVELS, LinkFault, NodeEffect, link_segments, node_changes
-from dwell.kernels.drawn_path import BLOCK, Path, ReplayedPath, path_of
+from dwell.kernels.drawn_path import BLOCK, Path, PickedPath, ReplayedPath, independent, path_of
 from dwell.kernels.on_off_intervals import OnOffIntervals, drawn_intervals, interval, ramp
 from dwell.kernels.realisation import LinkSegments, NodeChanges, Phase, Realisation, TraceStart
 from dwell.model import (
@@ -134,16 +134,38 @@ def draw_changes(
     return drawing.episodes(), *drawing.changes
 
 
-def draw_shadows(problem: Problem, realisation: Realisation) -> Realisation:
+def draw_shadows(
+    problem: Problem, realisation: Realisation, sent: Ints | None = None, *, others: bool = False
+) -> Realisation:
     """Draw what shadow jobs meet in a realisation: times, delays and losses of their own.
 
     Releases, disturbances, scales and the rows of traces are those of the realisation itself: they
     belong to the cycle or to the fabric, not to a job.
+
+    Parameters
+    ----------
+    sent : int64 array, optional
+        Cycles that are known to be sent as shadows, ascending; no other is drawn (its times are 0).
+        Every cycle where None.
+    others : bool
+        Whether other cycles than `sent` are drawn, too; these are then drawn as without them.
     """
-    windows, seed = realisation.windows, realisation.seed or 0
-    drawing = Drawing(problem, realisation.scenario, seed=seed, windows=windows, shadow=True)
-    drawing.release_ns = realisation.release_ns
-    return drawing.take(windows)
+
+    def drawing(sent: Ints | None) -> Drawing:
+        drawing = Drawing(
+            problem,
+            realisation.scenario,
+            seed=realisation.seed or 0,
+            windows=realisation.windows,
+            shadow=True,
+        )
+        drawing.release_ns, drawing.sent = realisation.release_ns, sent
+        return drawing
+
+    if sent is None:
+        return drawing(None).take(realisation.windows)
+    whole = drawing(None).take(realisation.windows) if others else None
+    return drawing(sent).take_sent(realisation, whole)
 
 
 class Drawing:
@@ -175,6 +197,8 @@ class Drawing:
         self.seed, self.windows, self.shadow = seed, windows, shadow
         self.cycles = problem.cycles_of(windows)
         self.drawn = 0
+        #: The cycles that are drawn, where it is not every one (see `draw_shadows`).
+        self.sent: Ints | None = None
         tasks = problem.pipeline.tasks
         self.sites = tuple((task, node) for task in tasks for node in tasks[task].on)
         self.hops = _hops(problem)
@@ -223,9 +247,7 @@ class Drawing:
             exec_ns=exec_ns,
             hops=self.hops,
             delay_ns=delay_ns,
-            loss_keys=np.array(
-                [self._key(f"loss/{_hop_name(hop)}") for hop in self.hops], np.uint64
-            ),
+            loss_keys=self._loss_keys(),
             layers=layers,
             extra_ns=extra_ns,
             node_changes=node_changes,
@@ -233,6 +255,34 @@ class Drawing:
             phases=self._phases(),
             trace_starts=tuple(self._trace_starts()),
         )
+
+    def take_sent(self, realisation: Realisation, whole: Realisation | None) -> Realisation:
+        """Draw the cycles that are sent; the others are those of `whole`, or 0."""
+        sent, layers = self.sent, self._layers()
+        sizes = len(self.sites), len(self.hops), len(layers)
+        ends = np.cumsum(sizes)
+        drawn = np.empty((ends[-1], 0 if sent is None else len(sent)), np.int64)
+        exec_ns, delay_ns, extra_ns = np.split(drawn, ends[:-1])
+        if drawn.size:
+            self._fill_extra(extra_ns)
+            self._fill_executions(exec_ns)
+            self._fill_delays(delay_ns)
+        table = np.zeros((ends[-1], self.cycles), np.int64)
+        if whole is not None:
+            np.concatenate((whole.exec_ns, whole.delay_ns, whole.extra_ns), out=table)
+        for row, values in zip(table, drawn, strict=True):
+            row[sent] = values
+        exec_ns, delay_ns, extra_ns = np.split(table, ends[:-1])
+        return replace(
+            realisation,
+            exec_ns=exec_ns,
+            delay_ns=delay_ns,
+            loss_keys=self._loss_keys(),
+            extra_ns=extra_ns,
+        )
+
+    def _loss_keys(self) -> NDArray[np.uint64]:
+        return np.array([self._key(f"loss/{_hop_name(hop)}") for hop in self.hops], np.uint64)
 
     @cached_property
     def changes(self) -> tuple[NodeChanges, LinkSegments]:
@@ -262,17 +312,27 @@ class Drawing:
         return int(self._stream(name).generate_state(1, np.uint64)[0])
 
     def _stream(self, name: str) -> np.random.SeedSequence:
-        own = self.shadow and name.startswith(OF_A_JOB)
-        return stream(self.seed, f"shadow/{name}" if own else name)
+        if self.shadow and name.startswith(OF_A_JOB):
+            # Losses have a key, whichever cycles are drawn.
+            sent = self.sent is not None and not name.startswith("loss/")
+            return stream(self.seed, f"shadow/sent/{name}" if sent else f"shadow/{name}")
+        return stream(self.seed, name)
 
     def _path(self, process: Process, name: str) -> Path:
         """Return the path of a stream, from where it was left."""
         if name not in self.paths:
-            self.paths[name] = (
-                ReplayedPath(process.values, self._table_rows(process.table))
-                if isinstance(process, Trace)
-                else path_of(process, self._rng(name))
-            )
+            if isinstance(process, Trace):
+                rows = self._table_rows(process.table)
+                path: Path = ReplayedPath(
+                    process.values, rows if self.sent is None else rows[self.sent]
+                )
+            else:
+                path = path_of(process, self._rng(name))
+                if self.sent is not None and not (
+                    name.startswith(OF_A_JOB) and independent(process)
+                ):
+                    path = PickedPath(path, self.cycles, self.sent)
+            self.paths[name] = path
         return self.paths[name]
 
     def _releases(self) -> Ints:

@@ -16,8 +16,8 @@ from dwell.control import (
     Evidence,
     Instants,
     MinimalPolicy,
+    ShadowPlan,
     plain_rule,
-    shadow_stamps,
 )
 from dwell.errors import SimulationError
 from dwell.kernels.advance import logged_instants, play
@@ -161,13 +161,18 @@ def _play(
 ) -> PlayedRealisation:
     """Play a realisation with or without a shadow."""
     controller = Controller(problem, policy, estimator)
-    shadow = shadow or controller.shadow_fraction > 0
-    shadows = draw_shadows(problem, realisation) if shadow else None
+    fraction = controller.shadow_fraction
+    shadow = shadow or fraction > 0
+    guarded = guard and controller.guarded
+    plan = shadows = None
+    if shadow:
+        plan = ShadowPlan(0, realisation.cycles, len(problem.candidates), fraction)
+        # Probes may be of any cycle.
+        shadows = draw_shadows(problem, realisation, plan.sent, others=guarded)
     arrays = lay_out(
         [(problem, realisation)], log_jobs=jobs, log_windows=controller.learns, shadows=shadows
     )
-    guarded = guard and controller.guarded
-    stamper = _Stamper(problem, realisation, controller, arrays, guarded=guarded)
+    stamper = _Stamper(problem, realisation, controller, arrays, plan, guarded=guarded)
     if not (guarded or by_window or any(stamper.host_down)):
         stamper.leave_to_kernel()
     while (status := play(arrays)) != Status.FINISHED:
@@ -211,6 +216,7 @@ class _Stamper:
         realisation: Realisation,
         controller: Controller,
         arrays: Arrays,
+        plan: ShadowPlan | None,
         *,
         guarded: bool,
     ) -> None:
@@ -227,9 +233,7 @@ class _Stamper:
         table = _host_changes(problem, realisation)
         self.host_at_ns, self.host_down = table[:, 0].tolist(), table[:, 3].tolist()
         self.cold = ColdMigration(problem, realisation) if settings.migration == "cold" else None
-        self.fraction = controller.shadow_fraction
-        #: Stamps of all shadows, by the candidate that the cycles run under.
-        self.plans: dict[int, NDArray[np.int16]] = {}
+        self.plan = plan
         self.placement = controller.incumbent
         self.evidence = _evidence(problem, realisation, arrays) if controller.learns else None
         arrays.tables.clock[0]["pauses"] = 1
@@ -241,14 +245,9 @@ class _Stamper:
         """Stamp cycles with the placement, and with what they are also sent through."""
         tables, code = self.arrays.tables, self.code[self.placement]
         tables.stamps[0, start:stop] = code
-        if len(tables.cells) > 1 and start < self.cycles:
-            # A cold migration stamps all that is left: it must not be computed each time.
-            if code not in self.plans:
-                self.plans[code] = shadow_stamps(
-                    0, self.cycles, code, len(self.code), self.fraction
-                )
+        if self.plan is not None and start < self.cycles:
             stop = min(stop, self.cycles)
-            tables.stamps[1, start:stop] = self.plans[code][start:stop]
+            tables.stamps[1, start:stop] = self.plan.stamps(start, stop, code)
         if self.watch is not None:
             self.watch.probes.stamp(start, stop)
 
