@@ -462,6 +462,46 @@ def test_a_shadow_draws_its_own_times_and_shares_what_belongs_to_cycle_and_fabri
     assert set(shadow.loss_keys.tolist()).isdisjoint(real.loss_keys.tolist())
 
 
+# ------------------------------------------------------------------- what a window leaves behind
+
+
+@pytest.mark.parametrize("delay_ms", [1.0, 9_000.0])
+@pytest.mark.parametrize("grace_ms", [0.0, 700.0])
+def test_evidence_is_the_same_with_and_without_a_log_of_all_jobs(
+    delay_ms: float, grace_ms: float
+) -> None:
+    problem = cell(
+        [task("S", 1), task("B", 30, "R", "E"), task("C", 20, "R", "E"), task("K", 1)],
+        [Flow("S", "B"), Flow("B", "C"), Flow("C", "K")],
+        moves={"LOC": {}, "OFF": {"B": "E"}, "FAR": {"B": "E", "C": "E"}},
+        window_cycles=50,
+    )
+    links = {
+        name: replace(link, delay_ms=LogNormal(delay_ms, 0.5))
+        for name, link in problem.fabric.links.items()
+    }
+    problem = replace(
+        problem,
+        fabric=replace(problem.fabric, links=links),
+        controller=replace(problem.controller, close_grace_ms=grace_ms),
+    )
+    found = []
+    for jobs in (False, True):
+        probe = Probe(0.2)
+        policy = Replay(["OFF", "OFF", "FAR", "LOC", "OFF", "OFF", "FAR", "FAR", "LOC"])
+        run = dwell.simulate(problem, policy=policy, estimator=probe, seed=1, windows=9, jobs=jobs)
+        found.append((probe.evidence, run.windows, run.cycles))
+    (some, *tables), (every, *same) = found
+    assert len(some) == len(every) >= 7
+    assert all(one.equals(other) for one, other in zip(tables, same, strict=True))
+    for one, other in zip(some, every, strict=True):
+        for of, expected in ((one.cycles, other.cycles), (one.shadows, other.shadows)):
+            assert of is not None
+            assert expected is not None
+            for name in ("ready_ns", "end_ns", "arrived_ns"):
+                np.testing.assert_array_equal(getattr(of, name), getattr(expected, name))
+
+
 # ------------------------------------------------------------------------- drawn where needed
 
 LONG_MS: dict[str, Process] = {
