@@ -502,6 +502,18 @@ def test_evidence_is_the_same_with_and_without_a_log_of_all_jobs(
                 np.testing.assert_array_equal(getattr(of, name), getattr(expected, name))
 
 
+def test_evidence_of_a_pipeline_without_flows_where_cycles_pile_up() -> None:
+    busy = Task("S", {"R": Execution(Constant(50_000.0), workers=200)})
+    problem = make_problem([R], [busy], [], candidates={"LOC": {}}, period_ms=100, window_cycles=50)
+    probe = Probe(0.0)
+    dwell.simulate(problem, policy="LOC", estimator=probe, seed=1, windows=4)
+    assert len(probe.evidence) == 4
+    for window in probe.evidence:
+        assert (window.cycles.ready_ns[:, 0] == window.release_ns).all()
+        assert (window.cycles.end_ns == -1).all()
+        assert window.cycles.arrived_ns.shape == (50, 0)
+
+
 # ------------------------------------------------------------------------- drawn where needed
 
 LONG_MS: dict[str, Process] = {

@@ -22,7 +22,7 @@ def _functions() -> tuple[Any, Any, Any, Any]:
     loaded = library()
     advance, post, send = loaded.dwell_advance, loaded.dwell_post_event, loaded.dwell_send_state
     logged = loaded.dwell_logged_instants
-    logged.argtypes, logged.restype = (TABLES, I64, I64, I64, TABLES, I64, TABLES), None
+    logged.argtypes, logged.restype = (TABLES, I64, I64, TABLES, I64, TABLES), None
     advance.argtypes, advance.restype = (TABLES,), ctypes.c_int32
     post.argtypes, post.restype = (TABLES, I64, I64), None
     send.argtypes, send.restype = (TABLES, I64, I64, I64, I64, ctypes.POINTER(I64)), None
@@ -56,8 +56,8 @@ def post_event(arrays: Arrays, at_ns: int, key: int) -> None:
 
 
 def logged_instants(
-    arrays: Arrays, cell: int, first: int, last: int, flows: Ints
-) -> tuple[Ints, Ints, Ints]:
+    arrays: Arrays, first: int, last: int, flows: Ints
+) -> list[tuple[Ints, Ints, Ints]]:
     """Return instants of cycles that the logs still have, nanoseconds; -1 for never.
 
     Parameters
@@ -69,18 +69,25 @@ def logged_instants(
 
     Returns
     -------
-    ready_ns, end_ns : int64 array, shape (cycles, tasks)
-        When all inputs of a job were there, and when it had completed.
-    arrived_ns : int64 array, shape (cycles, flows)
+    list of (ready_ns, end_ns, arrived_ns)
+        By cell: when all inputs of a job were there, when it had completed, int64 arrays of shape
+        (cycles, tasks), and when messages arrived, (cycles, flows).
     """
-    count, tasks = last - first, arrays.tables.jobs.size // arrays.tables.slots.size
-    table = np.empty(count * (2 * tasks + len(flows)), np.int64)
+    tables, count = arrays.tables, last - first
+    jobs = count * (tables.jobs.size // tables.slots.size)
+    found = np.empty((len(tables.cells), 2 * jobs + count * len(flows)), np.int64)
     _functions()[3](
-        *(arrays.address, cell, first, count),
-        *(flows.ctypes.data, len(flows), table.ctypes.data),
+        *(arrays.address, first, count),
+        *(flows.ctypes.data, len(flows), found.ctypes.data),
     )
-    jobs = table[: 2 * count * tasks].reshape(2, count, tasks)
-    return jobs[0], jobs[1], table[2 * count * tasks :].reshape(count, len(flows))
+    return [
+        (
+            of[:jobs].reshape(count, -1),
+            of[jobs : 2 * jobs].reshape(count, -1),
+            of[2 * jobs :].reshape(count, len(flows)),
+        )
+        for of in found
+    ]
 
 
 def send_state(

@@ -9,13 +9,12 @@
 namespace dwell {
 namespace {
 
-// A window's cycles, or their shadows: the candidate that each went through, -1 for none, and its
-// instants by task and by flow, -1 for what had not come.
-struct Cycles {
-  const i64* placement;
-  const i64* ready_ns;
-  const i64* end_ns;
-  const i64* arrived_ns;
+// A row a cycle of a window: the candidate that it went through, when its jobs became ready, when
+// they completed, and when its messages arrived, -1 for what had not come; then, where there are
+// shadows, the same of its shadow, the candidate being -1 where it has none.
+struct Window {
+  const i64* rows;
+  i64 n, width;
 };
 
 // What cycles under one candidate go through: the source of each flow, then in row 0 for the cycles
@@ -52,11 +51,12 @@ void add_span(Found& found, i64 part, i64 begin_ns, i64 end_ns, i64 limit_ns) {
 }
 
 // The next candidate that cycles under `active` were also sent through; -1 if there is none.
-i64 next_other(const Cycles& cycles, const Cycles& shadows, i64 n, i64 active, i64 after) {
+i64 next_other(const Window& window, i64 shadow, i64 active, i64 after) {
   i64 next = -1;
-  for (i64 i = 0; i < n; ++i) {
-    const i64 other = shadows.placement[i];
-    if (cycles.placement[i] == active && other > after && (next < 0 || other < next)) next = other;
+  for (i64 i = 0; i < window.n; ++i) {
+    const i64* row = window.rows + i * window.width;
+    const i64 other = row[shadow];
+    if (row[0] == active && other > after && (next < 0 || other < next)) next = other;
   }
   return next;
 }
@@ -66,32 +66,33 @@ i64 next_other(const Cycles& cycles, const Cycles& shadows, i64 n, i64 active, i
 
 using namespace dwell;
 
-// Adds the times of the cycles under one candidate among `n`, part after part, then those of their
-// shadows, if there are any, by candidate.
-DWELL_EXPORT void dwell_meter(const Layout* layout, i64 n, i64 active, const Cycles* cycles,
-                              const Cycles* shadows, i64 limit_ns, Found* found) noexcept {
+// Adds the times of the cycles under one candidate, part after part, then those of their shadows by
+// candidate.
+DWELL_EXPORT void dwell_meter(const Layout* layout, const Window* window, i64 active, i64 limit_ns,
+                              Found* found) noexcept {
   const i64 n_tasks = layout->n_tasks, n_flows = layout->n_flows;
+  const i64 shadow = 1 + 2 * n_tasks + n_flows;  // where its columns begin
   i64 other = -1;
   do {
-    const bool is_own = other < 0;
-    const Cycles& through = is_own ? *cycles : *shadows;
+    const i64 begin = other < 0 ? 0 : shadow;
     const i64* parts = layout->parts + (other + 1) * (n_tasks + n_flows);
     const i8* shared = layout->shared + (other + 1) * n_flows;
     for (i64 column = 0; column < n_tasks + n_flows; ++column) {
       const i64 part = parts[column], flow = column - n_tasks;
       if (part < 0) continue;
-      const Cycles& from = flow >= 0 && shared[flow] ? *cycles : through;
-      for (i64 i = 0; i < n; ++i) {
-        if (cycles->placement[i] != active || (!is_own && through.placement[i] != other)) continue;
+      const i64 source = flow < 0 ? 0 : layout->sources[flow];
+      for (i64 i = 0; i < window->n; ++i) {
+        const i64* cycle = window->rows + i * window->width;
+        if (cycle[0] != active || (begin > 0 && cycle[begin] != other)) continue;
+        const i64 *ready_ns = cycle + begin + 1, *end_ns = ready_ns + n_tasks;
         if (flow < 0) {
-          const i64 at = i * n_tasks + column;
-          add_span(*found, part, through.ready_ns[at], through.end_ns[at], limit_ns);
+          add_span(*found, part, ready_ns[column], end_ns[column], limit_ns);
         } else {
-          const i64 sent_ns = from.end_ns[i * n_tasks + layout->sources[flow]];
-          add_span(*found, part, sent_ns, through.arrived_ns[i * n_flows + flow], limit_ns);
+          const i64* sent_ns = shared[flow] ? cycle + 1 + n_tasks : end_ns;
+          add_span(*found, part, sent_ns[source], end_ns[n_tasks + flow], limit_ns);
         }
       }
     }
-    other = shadows == nullptr ? -1 : next_other(*cycles, *shadows, n, active, other);
+    other = window->width > shadow ? next_other(*window, shadow, active, other) : -1;
   } while (other >= 0);
 }

@@ -17,10 +17,10 @@ Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
 
-class _Cycles(ctypes.Structure):
-    """A window's cycles or their shadows; ``meter.cpp`` has the same structs."""
+class _Window(ctypes.Structure):
+    """A window's cycles; ``meter.cpp`` has the same structs."""
 
-    _fields_ = tuple((name, c_void_p) for name in ("placement", "ready_ns", "end_ns", "arrived_ns"))
+    _fields_ = (("rows", c_void_p), ("n", c_int64), ("width", c_int64))
 
 
 class _Layout(ctypes.Structure):
@@ -80,7 +80,7 @@ class PartTimes:
 
     def __init__(self, parts: int) -> None:
         self._count, self._order = np.zeros((2, parts), np.int64)
-        self._cycles, self._shadows = _Cycles(), _Cycles()
+        self._window = _Window()
         self._found = _Found(None, self._count.ctypes.data, self._order.ctypes.data)
         self._ms = np.empty((parts, 0))
 
@@ -105,32 +105,23 @@ class PartTimes:
         limit_ns : int
             A job or message that began before this, and has not ended, counts as lost.
         """
-        self._cycles_of, self._limit_ns = len(cycles[0]), limit_ns
-        if self._ms.shape[1] < 2 * self._cycles_of:
-            self._ms = np.empty((len(self._count), 2 * self._cycles_of))
-            self._found.ms, self._found.most = self._ms.ctypes.data, self._ms.shape[1]
-        self._behind = self._set(self._cycles, cycles)
-        self._has_shadows = shadows is not None
+        columns = [cycles[0][:, None], *cycles[1:]]
         if shadows is not None:
-            self._behind += self._set(self._shadows, shadows)
+            columns += [shadows[0][:, None], *shadows[1:]]
+        # One table has one address, which takes as long to find as to copy it.
+        self._rows = np.concatenate(columns, axis=1, dtype=np.int64)
+        (count, width), self._limit_ns = self._rows.shape, limit_ns
+        self._window.rows, self._window.n = self._rows.ctypes.data, count
+        self._window.width = width
+        if self._ms.shape[1] < 2 * count:
+            self._ms = np.empty((len(self._count), 2 * count))
+            self._found.ms, self._found.most = self._ms.ctypes.data, self._ms.shape[1]
         self._count[:] = 0
         self._found.n_parts = 0
 
-    def _set(self, row: _Cycles, tables: Sequence[NDArray[np.integer]]) -> list[Ints]:
-        """Have a row be of some tables; returns what must be kept for it."""
-        kept = [np.ascontiguousarray(table, np.int64) for table in tables]
-        row.placement, row.ready_ns, row.end_ns, row.arrived_ns = (
-            table.ctypes.data for table in kept
-        )
-        return kept
-
     def add(self, active: int, layout: CyclesLayout) -> None:
         """Add the times of the cycles under one candidate, and then of their shadows."""
-        shadows = self._shadows if self._has_shadows else None
-        _meter()(
-            *(layout.row, self._cycles_of, active, self._cycles, shadows),
-            *(self._limit_ns, self._found),
-        )
+        _meter()(layout.row, self._window, active, self._limit_ns, self._found)
 
     def by_part(self) -> dict[int, Floats]:
         """Return the times by number of part, in the order in which they were found."""
@@ -143,10 +134,7 @@ class PartTimes:
 def _meter() -> Any:
     """Return the function of the library, with the types of its arguments."""
     function = library().dwell_meter
-    cycles = POINTER(_Cycles)
-    function.argtypes = (
-        *(POINTER(_Layout), c_int64, c_int64),
-        *(cycles, cycles, c_int64, POINTER(_Found)),
-    )
+    layout, window, found = POINTER(_Layout), POINTER(_Window), POINTER(_Found)
+    function.argtypes = layout, window, c_int64, c_int64, found
     function.restype = None
     return function

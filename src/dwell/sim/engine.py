@@ -413,17 +413,16 @@ def _evidence(
     shadowed, stamps = len(arrays.tables.cells) > 1, arrays.tables.stamps
 
     def cut(first: int, last: int, close_ns: int) -> Evidence:
+        instants = [Instants(*of) for of in logged_instants(arrays, first, last, flows)]
         return Evidence(
             close_ns=close_ns,
             release_ns=realisation.release_ns[first:last],
             placement=stamps[0, first:last].copy(),
-            cycles=Instants(*logged_instants(arrays, 0, first, last, flows)),
+            cycles=instants[0],
             shadow_placement=(
                 stamps[1, first:last].copy() if shadowed else np.full(last - first, -1)
             ),
-            shadows=(
-                Instants(*logged_instants(arrays, 1, first, last, flows)) if shadowed else None
-            ),
+            shadows=instants[1] if shadowed else None,
         )
 
     return cut
