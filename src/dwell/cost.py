@@ -219,7 +219,8 @@ def busiest(qos: QoS) -> float:
     A saturated node counts as full, observed or estimated: an observation of 0.997 is no less than
     an estimate of 1.
     """
-    largest = max(qos.utilisation.values(), default=0.0)
+    used = qos.utilisation
+    largest = max(used.values()) if used else 0.0
     return largest if largest < SATURATED else max(largest, 1.0)
 
 
@@ -236,4 +237,6 @@ def excess(qos: QoS, objective: Objective) -> float:
     caps = objective.caps
     # No latency, a lost one either, is over a cap that is not there.
     latency = qos.uncut_l95_ms / caps.latency_ms if caps.latency_ms < math.inf else 0.0
-    return max(latency, busiest(qos) / caps.utilisation) - 1.0
+    # A condition and not max(): this runs for every candidate at the close of every window.
+    load = busiest(qos) / caps.utilisation
+    return (load if load > latency else latency) - 1.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from operator import add
 from typing import TypeAlias
 
 import numpy as np
@@ -142,6 +143,8 @@ class Controller:
         self.wanted: str | None = None
         self.nodes = tuple(problem.fabric.nodes)
         self._names = tuple(problem.candidates)
+        #: What the log has where nothing is known of the candidates.
+        self._none: list[float | bool | None] = [None] * len(self._names)
         self.log = DecisionLog()
         self._cores = np.array([node.capacity for node in problem.fabric.nodes.values()], float)
         self._pricing = Pricing(problem.candidates, problem.objective)
@@ -247,10 +250,10 @@ class Controller:
         shares : float64 array, shape (3, nodes)
             Busy, own and shadow share of every node's cores.
         """
-        used, own, shadow = shares
-        utilisation = FrozenDict(zip(self.nodes, used.tolist(), strict=True))
+        used, own, shadow = shares.tolist()
+        utilisation = FrozenDict(zip(self.nodes, used, strict=True))
         # Neither the cell's jobs nor its shadow jobs are foreign.
-        mine = dict(zip(self.nodes, (own + shadow).tolist(), strict=True))
+        mine = dict(zip(self.nodes, map(add, own, shadow), strict=True))
         observed = QoS(l95_ms, violation_rate, utilisation, uncut_ms)
         return self.decide(observed, mine, proven=proven)
 
@@ -387,13 +390,14 @@ class Controller:
         )
         log.seen.append((observed.l95_ms, observed.violation_rate, measured))
         known = [estimates[name] for name in names]
+        used = [estimate.utilisation for estimate in known]
         log.decisions.append(
             (
                 *fixed,
-                *[costs.get(name) for name in names],
+                *(map(costs.get, names) if costs else self._none),
                 *[estimate.l95_ms for estimate in known],
                 *[estimate.violation_rate for estimate in known],
-                *[estimate.utilisation.get(node) for node in self.nodes for estimate in known],
+                *[shares.get(node) for node in self.nodes for shares in used],
                 *self._capped(known),
                 *self._supported(),
             )
@@ -401,9 +405,10 @@ class Controller:
 
     def _capped(self, known: Iterable[QoS]) -> list[float | bool | None]:
         """Whether candidates are within the caps, then by how much they are over them."""
+        if not self.has_caps:
+            return [True for _ in known] + self._none
         excesses = [excess(estimate, self.objective) for estimate in known]
-        within = [over <= 0 for over in excesses]
-        return [*within, *(excesses if self.has_caps else [None] * len(excesses))]
+        return [over <= 0 for over in excesses] + excesses
 
     @property
     def supports(self) -> bool:

@@ -110,16 +110,16 @@ class Profile:
         used = observed.utilisation
         foreign, full = {}, {}
         try:
-            for node in self._nodes:
-                busy, load = used[node], used[node] - own[node]
+            for node, shown in self._shown.items():
+                busy, mine = used[node], own[node]
+                load = busy - mine
                 foreign[node] = load if load > 0.0 else 0.0
-                shown = self._shown[node]
                 if busy < SATURATED:
                     shown.clear()
                     shown[incumbent] = busy
                 else:
                     shown[incumbent] = 1.0
-                    if own[node] < SATURATED:
+                    if mine < SATURATED:
                         full[node] = shown
         except KeyError as error:
             what = "own" if error.args[0] in used else "observed.utilisation"

@@ -14,6 +14,7 @@ from dwell.kernels.library import library
 from dwell.kernels.rows import Ints
 
 I64, TABLES = ctypes.c_int64, ctypes.c_void_p
+STATUSES = tuple(Status)
 
 
 @cache
@@ -47,7 +48,7 @@ def play(arrays: Arrays) -> Status:
         elif status == Status.GROW_RING:
             arrays.grow_ring()
         elif status != Status.BUSY:
-            return Status(status)
+            return STATUSES[status]
 
 
 def post_event(arrays: Arrays, at_ns: int, key: int) -> None:

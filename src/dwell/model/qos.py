@@ -14,6 +14,7 @@ from dwell.model.placement import Placement
 Reason: TypeAlias = Literal["dwell", "hold", "migrate", "capped", "infeasible", "guard"]
 #: Every reason, in the order in which they are looked at.
 REASONS: tuple[Reason, ...] = get_args(Reason)
+INFINITY = math.inf
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,23 +45,23 @@ class QoS:
     cut_from_ms: float | None = None
 
     def __post_init__(self) -> None:
+        l95_ms, cut_from_ms = self.l95_ms, self.cut_from_ms
         # Comparisons with NaN are false, so each test is written to pass only for a good value.
-        if not 0 <= self.l95_ms < math.inf:
-            raise MetricError(f"l95_ms is {self.l95_ms!r}; it must be finite and at least 0")
+        if not 0 <= l95_ms < INFINITY:
+            raise MetricError(f"l95_ms is {l95_ms!r}; it must be finite and at least 0")
         if not 0 <= self.violation_rate <= 1:
             raise MetricError(f"violation_rate is {self.violation_rate!r}; it must lie in [0, 1]")
         for node, value in self.utilisation.items():
-            if not 0 <= value < math.inf:
+            if not 0 <= value < INFINITY:
                 raise MetricError(
                     f"utilisation of {node} is {value!r}; it must be finite and at least 0"
                 )
-        if self.cut_from_ms is not None:
-            if not self.cut_from_ms >= self.l95_ms:
+        if cut_from_ms is not None:
+            if not cut_from_ms >= l95_ms:
                 raise MetricError(
-                    f"cut_from_ms is {self.cut_from_ms!r}; it must be at least l95_ms, "
-                    f"{self.l95_ms!r}"
+                    f"cut_from_ms is {cut_from_ms!r}; it must be at least l95_ms, {l95_ms!r}"
                 )
-            if self.cut_from_ms == self.l95_ms:
+            if cut_from_ms == l95_ms:
                 object.__setattr__(self, "cut_from_ms", None)
         if type(self.utilisation) is not FrozenDict:
             object.__setattr__(self, "utilisation", FrozenDict(self.utilisation))

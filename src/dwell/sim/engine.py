@@ -34,6 +34,9 @@ from dwell.sim.simulated_guard import SimulatedGuard
 from dwell.sim.tables import PlayedRealisation, make_tables
 from dwell.sim.versions import versions
 
+#: Columns of the kernel's table `seen`.
+SEEN = "first_cycle", "missed", "l95_ms", "uncut_ms"
+
 
 def simulate(
     problem: Problem,
@@ -236,26 +239,35 @@ class _Stamper:
         self.plan = plan
         self.placement = controller.incumbent
         self.evidence = _evidence(problem, realisation, arrays) if controller.learns else None
-        arrays.tables.clock[0]["pauses"] = 1
+        # What every close reads; these tables never grow.
+        tables = arrays.tables
+        self.stamps, self.shares = tables.stamps, tables.shares
+        self.closed = tables.cells["window"]
+        self.seen = [tables.seen[name] for name in SEEN]
+        self.by_rule = False
+        tables.clock[0]["pauses"] = 1
         self.watch = SimulatedGuard(problem, realisation, arrays) if guarded else None
         self.stamped = self._reach(self.window_cycles)
         self._stamp(0, self.stamped)
 
     def _stamp(self, start: int, stop: int) -> None:
         """Stamp cycles with the placement, and with what they are also sent through."""
-        tables, code = self.arrays.tables, self.code[self.placement]
-        tables.stamps[0, start:stop] = code
+        stamps, code = self.stamps, self.code[self.placement]
+        stamps[0, start:stop] = code
         if self.plan is not None and start < self.cycles:
             stop = min(stop, self.cycles)
-            tables.stamps[1, start:stop] = self.plan.stamps(start, stop, code)
+            stamps[1, start:stop] = self.plan.stamps(start, stop, code)
         if self.watch is not None:
             self.watch.probes.stamp(start, stop)
 
     def _reach(self, boundary: int) -> int:
         """Cycles that may be released before the decision of the window closing at `boundary`."""
-        if boundary > self.cycles or self.close_ns[boundary - 1] <= self.release_ns[boundary]:
+        if boundary > self.cycles:
             return boundary
-        return int(np.searchsorted(self.release_ns, self.close_ns[boundary - 1], side="right"))
+        close_ns = self.close_ns.item(boundary - 1)
+        if close_ns <= self.release_ns.item(boundary):
+            return boundary
+        return int(np.searchsorted(self.release_ns, close_ns, side="right"))
 
     def leave_to_kernel(self) -> None:
         """Have the kernel decide at closes, if it has a second body of the controller's rule."""
@@ -275,15 +287,15 @@ class _Stamper:
             switching=plain.switching,
             tiers=np.array(tiers, np.int8),
         )
+        self.by_rule = True
 
     def close_window(self) -> None:
         """Carry out what was decided for the window that has just closed, or have it decided."""
-        tables = self.arrays.tables
-        index = int(tables.cells[0]["window"]) - 1
-        boundary = int(tables.seen[0, index]["first_cycle"]) + self.window_cycles
-        close_ns = int(self.close_ns[boundary - 1])
-        if len(tables.rule):
-            order = self.names[tables.rule[0]["incumbent"]]
+        index = self.closed.item(0) - 1
+        boundary = self.seen[0].item(0, index) + self.window_cycles
+        close_ns = self.close_ns.item(boundary - 1)
+        if self.by_rule:
+            order = self.names[self.arrays.tables.rule[0]["incumbent"]]
         elif self._host_down(close_ns):
             self.controller.miss()
             order = self.placement
@@ -301,16 +313,16 @@ class _Stamper:
 
     def _decide(self, index: int, boundary: int, close_ns: int) -> str:
         """Ask the controller, and send the probes that it wants."""
-        watch, controller, tables = self.watch, self.controller, self.arrays.tables
+        watch, controller = self.watch, self.controller
         if self.evidence is not None:
             first = boundary - self.window_cycles
             controller.learn(partial(self.evidence, first, boundary, close_ns))
-        _, missed, l95_ms, uncut_ms = tables.seen[0, index].item()
-        seen = l95_ms, missed / self.window_cycles, uncut_ms, tables.shares[0, index]
+        _, missed, l95_ms, uncut_ms = [column.item(0, index) for column in self.seen]
+        seen = l95_ms, missed / self.window_cycles, uncut_ms, self.shares[0, index]
         if watch is None or not watch.on_fallback:
             return controller.decide_on(*seen)
         order = controller.decide_on(*seen, proven=watch.proven(close_ns))
-        if controller.wanted is not None and len(tables.cells) < 2:
+        if controller.wanted is not None and len(self.closed) < 2:
             raise _ProbesWantedError
         if order == self.placement:
             first = self._takes_effect(boundary, close_ns)
