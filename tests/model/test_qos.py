@@ -5,7 +5,8 @@ import math
 import pytest
 
 from dwell.errors import MetricError
-from dwell.model import QoS
+from dwell.model import FrozenDict, QoS
+from dwell.model.qos import unchecked_qos
 
 
 @pytest.mark.parametrize("l95_ms", [math.nan, math.inf, -0.1])
@@ -31,3 +32,9 @@ def test_it_may_be_over_1_and_cannot_be_changed() -> None:
     with pytest.raises(TypeError):
         seen.utilisation["E"] = 0.0  # type: ignore[index]
     assert hash(seen) == hash(QoS(1.0, 1.0, {"E": 1.2}))
+
+
+@pytest.mark.parametrize("cut_from_ms", [None, 7.0])
+def test_one_that_is_not_checked_is_the_same(cut_from_ms: float | None) -> None:
+    used = FrozenDict({"E": 0.5})
+    assert unchecked_qos(5.0, 0.1, used, cut_from_ms) == QoS(5.0, 0.1, used, cut_from_ms)

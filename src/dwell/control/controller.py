@@ -406,9 +406,9 @@ class Controller:
     def _capped(self, known: Iterable[QoS]) -> list[float | bool | None]:
         """Whether candidates are within the caps, then by how much they are over them."""
         if not self.has_caps:
-            return [True for _ in known] + self._none
+            return [*[True for _ in known], *self._none]
         excesses = [excess(estimate, self.objective) for estimate in known]
-        return [over <= 0 for over in excesses] + excesses
+        return [*[over <= 0 for over in excesses], *excesses]
 
     @property
     def supports(self) -> bool:

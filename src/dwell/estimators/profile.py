@@ -44,7 +44,7 @@ from dwell.model.pipeline import Execution, Flow, Pipeline, Task
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.process import Process, Trace
-from dwell.model.qos import QoS
+from dwell.model.qos import QoS, unchecked_qos
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -87,10 +87,13 @@ class Profile:
         self.l95_ms: Mapping[str, float] = FrozenDict(l95_ms)
         self.uncut_l95_ms, self.violation_rate, self.own = uncut_l95_ms, violation_rate, own
         self._nodes = tuple(problem.fabric.nodes)
-        self._table = tuple(
-            (name, l95_ms[name], uncut_l95_ms[name], violation_rate[name], tuple(own[name].items()))
-            for name in problem.candidates
-        )
+        table = []
+        for name in problem.candidates:
+            # Once through the checks: what differs from window to window is a share of the cores.
+            known = QoS(l95_ms[name], violation_rate[name], {}, uncut_l95_ms[name])
+            metrics = known.l95_ms, known.violation_rate, known.cut_from_ms
+            table.append((name, *metrics, tuple(own[name].items())))
+        self._table = tuple(table)
         self.start(problem)
 
     def __repr__(self) -> str:
@@ -128,14 +131,15 @@ class Profile:
                 f"it must hold each of {', '.join(self._nodes)}"
             ) from None
         estimates = {}
-        for name, l95_ms, uncut_ms, violation_rate, work in self._table:
+        for name, l95_ms, violation_rate, cut_from_ms, work in self._table:
             utilisation = {}
             for node, share in work:
                 busy = foreign[node] + share
                 utilisation[node] = busy if busy < 1.0 else 1.0
             for node, shown in full.items():
                 utilisation[node] = shown.get(name, 1.0)
-            estimates[name] = QoS(l95_ms, violation_rate, FrozenDict(utilisation), uncut_ms)
+            shares = FrozenDict(utilisation)
+            estimates[name] = unchecked_qos(l95_ms, violation_rate, shares, cut_from_ms)
         return estimates
 
 

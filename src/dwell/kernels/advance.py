@@ -42,7 +42,7 @@ def play(arrays: Arrays) -> Status:
     """
     advance = _functions()[0]
     while True:
-        status = advance(arrays.address)
+        status: int = advance(arrays.address)
         if status == Status.GROW_EVENTS:
             arrays.grow_events()
         elif status == Status.GROW_RING:
