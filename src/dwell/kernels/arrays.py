@@ -17,7 +17,7 @@ from dwell.kernels.realisation import LinkSegments, NodeChanges, Phase, Realisat
 from dwell.kernels.rows import Ints, Rows, Tables, row_types
 from dwell.model import Flow, Node, Pipeline, Placement, Problem, Quota, Task
 from dwell.model.instants import NEVER_NS
-from dwell.model.window_close import window_close_ns
+from dwell.model.window_close import close_after_ns, window_close_ns
 
 SCHEDULERS = {"fair": Scheduler.FAIR, "fifo": Scheduler.FIFO, "priority": Scheduler.PRIORITY}
 RING_START = 64
@@ -39,8 +39,6 @@ class Arrays:
         What the kernel works on; replaced as a whole when a part of it grows.
     nodes : tuple of tuple of str
         By cell: its nodes, in the order of the snapshots' columns.
-    close_ns : tuple of int64 array, shape (N,)
-        By cell: the close of the window that a cycle is the last of.
     address : int
         What the kernel is handed.
     """
@@ -49,10 +47,9 @@ class Arrays:
         self,
         tables: Tables,
         nodes: tuple[tuple[str, ...], ...],
-        close_ns: tuple[Ints, ...],
         behind: Sequence[Ints],
     ) -> None:
-        self.nodes, self.close_ns = nodes, close_ns
+        self.nodes = nodes
         # Rows have addresses in these.
         self._behind = behind
         self._use(tables)
@@ -180,7 +177,7 @@ class _Layout:
             name: [] for name, kind in row_types().items() if kind.names
         }
         self.behind: list[Ints] = []
-        self.close_ns: list[Ints] = []
+        self.end_ns = 0
         self.outputs: list[int] = []
         self.cell_nodes: list[int] = []
         self.capacity: list[float] = []
@@ -203,7 +200,7 @@ class _Layout:
             self._add_shadow(problem, self.shadows)
         self._check_keys()
         nodes = tuple(tuple(problem.fabric.nodes) for problem, _ in self.cells)
-        return Arrays(self._tables(), nodes, tuple(self.close_ns), self.behind)
+        return Arrays(self._tables(), nodes, self.behind)
 
     def _addresses(self, table: Ints) -> list[int]:
         """Return the address of every row of a realisation's table."""
@@ -305,11 +302,12 @@ class _Layout:
     def _add_cell(self, index: int, problem: Problem, real: Realisation) -> None:
         pipeline, release_ns = problem.pipeline, real.release_ns
         names, hop_0 = list(pipeline.tasks), len(self.rows["hops"])
-        close_ns = window_close_ns(problem, release_ns[:-1], release_ns[1:])
-        self.close_ns.append(close_ns)
+        due_ns, grace_ns = close_after_ns(problem)
+        self.end_ns = max(self.end_ns, int(release_ns[-1]) + grace_ns, int(release_ns[-2]) + due_ns)
         cell = {
             "release_ns": self._addresses(release_ns[None])[0],
-            "close_ns": self._addresses(close_ns[None])[0],
+            "due_ns": due_ns,
+            "grace_ns": grace_ns,
             "n_cycles": real.cycles,
             "deadline_ns": round(pipeline.deadline_ms * 1e6),
             "longest_ms": round(problem.censor_ms * 1e6) / 1e6,
@@ -536,7 +534,7 @@ class _Layout:
             "margin": margin,
             "budget": BUDGET,
             "logs_all": self.logs_all,
-            "end_ns": max(int(close_ns[-1]) for close_ns in self.close_ns),
+            "end_ns": self.end_ns,
         }
         rows["clock"].append(clock)
         self._announce_first(changes)
@@ -598,7 +596,8 @@ class _Layout:
         """Cycles that the ring has room for at first, a power of two: a window's, where logged."""
         held = RING_START
         if self.logs_windows and not self.logs_all:
-            for (problem, real), close_ns in zip(self.cells, self.close_ns, strict=True):
+            for problem, real in self.cells:
+                close_ns = window_close_ns(problem, real.release_ns[:-1], real.release_ns[1:])
                 # Cycles that are released between a window's last one and its close.
                 after = 0
                 if (close_ns > real.release_ns[1:]).any():

@@ -41,12 +41,13 @@ using Times = const i64*;
   field(i64, step_key) field(i64, step_ns)                                                       \
   field(i64, end_ns) /* of the last close that any cell can have */
 
-// `close_ns` has the close of the window that a cycle is the last of. `looks_ns` is when the guard
-// looks next, -1 for never, and `patience_ns` is g periods; `waited` is the first cycle that no
-// completion has been heard of or after, `moved` the first one of the newest placement that is
-// waited for; once a completion has been heard, no cycle before `rested` is.
+// A window closes no earlier than `due_ns` after the release of its last cycle, and `grace_ns` after
+// that of the one beyond it. `looks_ns` is when the guard looks next, -1 for never, and
+// `patience_ns` is g periods; `waited` is the first cycle that no completion has been heard of or
+// after, `moved` the first one of the newest placement that is waited for; once a completion has
+// been heard, no cycle before `rested` is.
 #define DWELL_CELL(field)                                                                        \
-  field(Times, release_ns) field(Times, close_ns)                                                \
+  field(Times, release_ns) field(i64, due_ns) field(i64, grace_ns)                               \
   field(i64, n_cycles) field(i64, window) field(i64, window_first) field(i64, close_cycle)       \
   field(i64, close_pending) field(i64, window_cycles) field(i64, migrating)                      \
   field(i64, deadline_ns) field(f64, longest_ms) /* with which latencies beyond it count */       \
@@ -189,8 +190,8 @@ using Times = const i64*;
   row(Site, DWELL_SITE) row(Server, DWELL_SERVER) row(Quota, DWELL_QUOTA)                        \
   row(Pace, DWELL_PACE) row(Node, DWELL_NODE) row(Change, DWELL_CHANGE) row(Hop, DWELL_HOP)      \
   row(Link, DWELL_LINK) row(Segment, DWELL_SEGMENT) row(Rate, DWELL_RATE)                        \
-  row(Event, DWELL_EVENT) row(Running, DWELL_RUNNING) row(Waiting, DWELL_WAITING) row(Job, DWELL_JOB)                    \
-  row(Slot, DWELL_SLOT) row(Log, DWELL_LOG) row(Seen, DWELL_SEEN) row(Rule, DWELL_RULE)          \
+  row(Event, DWELL_EVENT) row(Running, DWELL_RUNNING) row(Waiting, DWELL_WAITING)                \
+  row(Job, DWELL_JOB) row(Slot, DWELL_SLOT) row(Log, DWELL_LOG) row(Seen, DWELL_SEEN) row(Rule, DWELL_RULE)          \
   row(Option, DWELL_OPTION) row(Decided, DWELL_DECIDED)
 
 // clang-format on
@@ -212,8 +213,8 @@ DWELL_ROWS(DWELL_STRUCT)
   table(Clock, clock) table(Cell, cells) table(Task, tasks) table(Flow, flows)                   \
   table(i32, outputs) table(i32, cell_nodes) table(f64, capacity) table(Node, nodes)             \
   table(i32, site_of) table(i32, route) table(i64, back_ns) table(i8, shadow_parts)              \
-  table(Hop, hops) table(Times, layers) table(Segment, segments) table(Rate, rates) table(Change, changes)          \
-  table(Pace, paces) table(f64, work) table(f64, switching) table(i8, tiers)                      \
+  table(Hop, hops) table(Times, layers) table(Segment, segments) table(Rate, rates)              \
+  table(Change, changes) table(Pace, paces) table(f64, work) table(f64, switching) table(i8, tiers)                      \
   table(i16, stamps)                                                                             \
   table(Site, sites) table(Server, servers) table(Quota, quotas) table(Link, links)              \
   table(Event, events) table(Running, running) table(Waiting, waiting)                           \

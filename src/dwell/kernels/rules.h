@@ -319,9 +319,9 @@ void stamp_next(S& s) {
   Rule& rule = s.rule[0];
   i64 reach = cell.close_cycle;
   if (reach <= cell.n_cycles) {
-    const i64 close_ns = cell.close_ns[reach - 1];
-    if (close_ns > cell.release_ns[reach]) {
-      while (reach <= cell.n_cycles && cell.release_ns[reach] <= close_ns) ++reach;
+    const i64 closed_ns = close_ns(cell, reach - 1);
+    if (closed_ns > cell.release_ns[reach]) {
+      while (reach <= cell.n_cycles && cell.release_ns[reach] <= closed_ns) ++reach;
     }
   }
   const i16 stamp = static_cast<i16>(rule.incumbent);

@@ -54,13 +54,18 @@ void open_window(S& s, i64 cell, i64 cycle, i64 now) {
   }
 }
 
+// Close of the window that a cycle is the last of.
+inline i64 close_ns(const Cell& cell, i64 cycle) {
+  return std::max(cell.release_ns[cycle + 1] + cell.grace_ns, cell.release_ns[cycle] + cell.due_ns);
+}
+
 // Announces a cell's next close; returns whether the cell waits for one, or migrates.
 template <class S>
 bool announce_close(S& s, i64 cell) {
   Cell& of = s.cell(cell);
   if (!of.close_pending && of.close_cycle <= of.n_cycles) {
     of.close_pending = 1;
-    s.post(of.close_ns[of.close_cycle - 1], make_key(kClose, cell, of.close_cycle, 0));
+    s.post(close_ns(of, of.close_cycle - 1), make_key(kClose, cell, of.close_cycle, 0));
   }
   return of.close_pending || of.migrating;
 }

@@ -36,8 +36,13 @@ def window_close_ns(
         and D is at most P, that is the first, also where P is no whole number of nanoseconds: a
         deadline between two of them is over after the first.
     """
-    grace_ns = round(problem.controller.close_grace_ms * 1e6)
-    # 28.6 ms are 28600000 ns, though their product in floating point may be a little less.
-    deadline_ns = math.floor(round(problem.pipeline.deadline_ms * 1e6, 3))
-    close_ns: Ints = np.maximum(beyond_ns + grace_ns, last_ns + deadline_ns)
+    due_ns, grace_ns = close_after_ns(problem)
+    close_ns: Ints = np.maximum(beyond_ns + grace_ns, last_ns + due_ns)
     return close_ns
+
+
+def close_after_ns(problem: Problem) -> tuple[int, int]:
+    """Least times to a window's close: from its last release, and from the first beyond it."""
+    # 28.6 ms are 28600000 ns, though their product in floating point may be a little less.
+    due_ns = math.floor(round(problem.pipeline.deadline_ms * 1e6, 3))
+    return due_ns, round(problem.controller.close_grace_ms * 1e6)

@@ -28,6 +28,7 @@ from dwell.kernels.realisation import NodeChanges, Realisation
 from dwell.model import Problem
 from dwell.model.document import to_document
 from dwell.model.table_columns import require_apart
+from dwell.model.window_close import close_after_ns
 from dwell.record import Run
 from dwell.sim.cold_migration import ColdMigration
 from dwell.sim.simulated_guard import SimulatedGuard
@@ -232,7 +233,7 @@ class _Stamper:
         settings = problem.controller
         self.lead = settings.order_lead_cycles
         self.delay_ns = round(settings.order_delay_ms * 1e6)
-        self.close_ns = arrays.close_ns[0]
+        self.due_ns, self.grace_ns = close_after_ns(problem)
         table = _host_changes(problem, realisation)
         self.host_at_ns, self.host_down = table[:, 0].tolist(), table[:, 3].tolist()
         self.cold = ColdMigration(problem, realisation) if settings.migration == "cold" else None
@@ -264,10 +265,15 @@ class _Stamper:
         """Cycles that may be released before the decision of the window closing at `boundary`."""
         if boundary > self.cycles:
             return boundary
-        close_ns = self.close_ns.item(boundary - 1)
+        close_ns = self._close_ns(boundary)
         if close_ns <= self.release_ns.item(boundary):
             return boundary
         return int(np.searchsorted(self.release_ns, close_ns, side="right"))
+
+    def _close_ns(self, boundary: int) -> int:
+        """Close of the window that ends before the cycle `boundary` (see `window_close_ns`)."""
+        due_ns: int = self.release_ns.item(boundary - 1) + self.due_ns
+        return max(due_ns, self.release_ns.item(boundary) + self.grace_ns)
 
     def leave_to_kernel(self) -> None:
         """Have the kernel decide at closes, if it has a second body of the controller's rule."""
@@ -293,7 +299,7 @@ class _Stamper:
         """Carry out what was decided for the window that has just closed, or have it decided."""
         index = self.closed.item(0) - 1
         boundary = self.seen[0].item(0, index) + self.window_cycles
-        close_ns = self.close_ns.item(boundary - 1)
+        close_ns = self._close_ns(boundary)
         if self.by_rule:
             order = self.names[self.arrays.tables.rule[0]["incumbent"]]
         elif self._host_down(close_ns):
@@ -342,9 +348,9 @@ class _Stamper:
         self.placement = order
         if self.watch is not None:
             self.watch.moved(following)
-        cell = self.arrays.tables.cells[0]
-        cell["window_first"] = following
-        cell["close_cycle"] = following + self.window_cycles
+        cells = self.arrays.tables.cells
+        cells["window_first"][0] = following
+        cells["close_cycle"][0] = following + self.window_cycles
         self.stamped = self._reach(following + self.window_cycles)
         self._stamp(following, self.stamped)
         self.arrays.tables.rule["stamped"] = self.stamped
@@ -408,7 +414,7 @@ class _Stamper:
 
     def _takes_effect(self, boundary: int, close_ns: int) -> int:
         """First cycle that an order given at a close stamps; those before are out already."""
-        arrived = np.searchsorted(self.release_ns[: self.cycles], close_ns + self.delay_ns)
+        arrived = self.release_ns[: self.cycles].searchsorted(close_ns + self.delay_ns)
         return max(boundary + self.lead, int(arrived))
 
     def _host_down(self, at_ns: int) -> bool:

@@ -17,6 +17,7 @@ from dwell.kernels.realisation import Realisation
 from dwell.kernels.rows import Rows
 from dwell.model import REASONS, Problem
 from dwell.model.instants import HORIZON_NS, NEVER_NS
+from dwell.model.window_close import window_close_ns
 from dwell.record import OUTCOMES, Feature, Names, TableArrays, frame_of
 
 if TYPE_CHECKING:
@@ -92,9 +93,8 @@ class PlayedRealisation:
     @property
     def close_ns(self) -> Ints:
         """Instant of every close, shape (windows,)."""
-        last = self.first + self.problem.window_cycles - 1
-        close: Ints = self.arrays.close_ns[0][last]
-        return close
+        release_ns, beyond = self.realisation.release_ns, self.first + self.problem.window_cycles
+        return window_close_ns(self.problem, release_ns[beyond - 1], release_ns[beyond])
 
     @cached_property
     def missed(self) -> NDArray[np.bool_]:
