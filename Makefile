@@ -43,11 +43,14 @@ $(VENV)/.pinned: $(VENV)/.uv requirements/dev.txt requirements/zig.txt
 		--require-hashes -r requirements/zig.txt || true
 	@touch $@
 
-# Compiles the kernel; where that is not possible, says so, and tries again the next time.
+# Compiles the kernel; where that is not possible, says so, and tries again the next time. A short
+# run has Python compile the modules that runs need.
 $(VENV)/.installed: $(VENV)/.pinned pyproject.toml hatch_build.py $(SOURCES) $(if $(wildcard $(KERNEL)),,again)
 	$(UV) pip install --quiet --python $(BIN)/python --no-build-isolation --no-deps --editable .
 	$(UV) pip check --quiet --python $(BIN)/python
 	@test -f $(KERNEL) || $(BIN)/python hatch_build.py || true
+	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -m dwell run examples/canonical.yaml --windows 20 \
+		--out build/first-run --force >/dev/null 2>&1 || true
 	@touch $@
 
 demo: env ## Simulate and report an example into demo-out/ (REAL=path: on a real trace)

@@ -15,14 +15,18 @@ from benchmarks.machine import available_cores, describe, pin
 # Name of each benchmark, and where it is; in the order in which they run.
 BENCHMARKS = {
     "peers": ("chain", "measure"),
+    "loop": ("loop", "measure"),
     "canonical": ("canonical", "measure"),
     "length": ("canonical", "length"),
     "closing": ("closing", "measure"),
+    "deciding": ("deciding", "measure"),
     "clairvoyant": ("clairvoyant", "measure"),
     "fleet": ("fleet", "measure"),
     "study": ("study", "measure"),
     "memory": ("memory", "measure"),
     "draw": ("drawing", "measure"),
+    "start": ("starting", "measure"),
+    "size": ("size", "measure"),
     "import": ("importing", "measure"),
     "link": ("link", "measure"),
     "testbed-link": ("testbed_link", "measure"),

@@ -58,13 +58,12 @@ def measure(quick: bool) -> Section:
     notes = [
         f"{cycles / 1e6:.1f} million cycles in {said[0]['runs']} runs, each summed up",
         f"{share:.0%} of the elapsed time of {CORES} cores was CPU time{busy}",
-        "processes, imports and loading of compiled kernels included, compiling them not",
+        "processes and imports included",
     ]
     return Section(f"Study of one hour, {CORES} processes", figures, notes)
 
 
 def _run_alone(seeds: int | None) -> None:
-    import dwell
     from dwell.study import load_study, run_study
 
     if hasattr(os, "sched_setaffinity"):
@@ -73,7 +72,6 @@ def _run_alone(seeds: int | None) -> None:
     study = load_study(STUDY)
     if seeds is not None:
         study = replace(study, seeds=study.seeds[:seeds])
-    dwell.simulate(study.points[0].problem, policy="dtp", seed=0, windows=1)  # loads all
     with tempfile.TemporaryDirectory() as folder:
         before, begin = _spent(), time.perf_counter()
         result = run_study(study, folder=Path(folder) / "study", processes=CORES)

@@ -16,6 +16,8 @@ from typing import TypeVar
 #: Folder from which `python -m benchmarks...` works.
 ROOT = Path(__file__).resolve().parents[1]
 
+CPP = ("g++", "-O3", "-march=native", "-std=c++17")
+
 Key = TypeVar("Key")
 
 
@@ -110,8 +112,12 @@ def shared_core(runs: Iterable[Took]) -> list[str]:
     return [f"{text}; {total.system_s / total.cpu_s:.0%} of it was the system's"]
 
 
-def run_program(command: Sequence[str], environment: Mapping[str, str] | None = None) -> str:
-    """Run a program in the folder of the project and return what it printed.
+def run_program(
+    command: Sequence[str],
+    environment: Mapping[str, str] | None = None,
+    folder: Path = ROOT,
+) -> str:
+    """Run a program in a folder, else that of the project, and return what it printed.
 
     Raises
     ------
@@ -120,7 +126,7 @@ def run_program(command: Sequence[str], environment: Mapping[str, str] | None = 
     """
     done = subprocess.run(
         command,
-        cwd=ROOT,
+        cwd=folder,
         env={**os.environ, **(environment or {})},
         capture_output=True,
         text=True,
@@ -136,10 +142,26 @@ def run_module(
     name: str, *arguments: str, environment: Mapping[str, str] | None = None
 ) -> tuple[str, Took]:
     """Run ``python -m name`` and return what it printed and what the whole process took."""
+    return run_timed([sys.executable, "-m", name, *arguments], environment)
+
+
+def run_timed(
+    command: Sequence[str],
+    environment: Mapping[str, str] | None = None,
+    folder: Path = ROOT,
+) -> tuple[str, Took]:
+    """Run a program and return what it printed and what its processes took."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     wall = time.perf_counter()
-    said = run_program([sys.executable, "-m", name, *arguments], environment)
+    said = run_program(command, environment, folder)
     wall = time.perf_counter() - wall
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
     return said, Took(wall, cpu)
+
+
+def compile_cpp_loop(folder: Path) -> str:
+    """Compile the peers' C++ loop into a folder and return the program's path."""
+    program = str(folder / "cpp_loop")
+    run_program([*CPP, "-o", program, str(ROOT / "benchmarks" / "peers" / "cpp_loop.cpp")])
+    return program

@@ -1,0 +1,75 @@
+"""Chain and canonical cell over the C++ loop of the peers: CPU time of both, fresh processes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from benchmarks.figures import Figure, Goal, Section
+from benchmarks.timing import ROOT, Took, compile_cpp_loop, in_turns, ratios, run_module, run_timed
+
+CHAIN, CANONICAL = "benchmarks/peer-chain.yaml", "examples/canonical.yaml"
+PROFILE = Goal(low=0.33)
+#: What is played: cell, policy with its estimator, cycles, and which share of the loop's speed.
+WORK = {
+    "chain": (CHAIN, "ONE", 1_000_000, Goal(low=0.65)),
+    "DTP": (CANONICAL, "dtp+profile", 300_000, PROFILE),
+    "CUSUM": (CANONICAL, "cusum+profile", 300_000, PROFILE),
+    "ATP": (CANONICAL, "atp+profile", 300_000, PROFILE),
+    "latency-first": (CANONICAL, "latency-first+profile", 300_000, PROFILE),
+    "DTP, corrected": (CANONICAL, "dtp+corrected", 60_000, Goal(low=0.035)),
+}
+LOOP_CYCLES = 1_000_000
+
+
+def measure(quick: bool) -> Section:
+    """Cycles a second of CPU time over those of the loop."""
+    title = "Draw, simulate, windows and decisions, over a C++ loop"
+    if shutil.which("g++") is None:
+        return Section(title, (), ["skipped: no g++ here"])
+    with tempfile.TemporaryDirectory() as folder:
+        program = compile_cpp_loop(Path(folder))
+        variants: dict[str, Callable[[], Took]] = {name: partial(_ours, name) for name in WORK}
+        variants["C++ loop"] = lambda: run_timed([program, str(LOOP_CYCLES)])[1]
+        runs = in_turns(variants, 3 if quick else 5)
+    loop = [1e9 * run.cpu_s / LOOP_CYCLES for run in runs["C++ loop"]]
+    figures = [Figure("C++ loop", loop, "ns/cycle")]
+    for name, (_, _, cycles, goal) in WORK.items():
+        spent = [1e9 * run.cpu_s / cycles for run in runs[name]]
+        figures.append(Figure(name, spent, "ns/cycle"))
+        figures.append(Figure(f"{name}, over the loop", ratios(loop, spent), "times", goal))
+    notes = [
+        "CPU time of a process each; the loop's whole process, ours after a run of 20 windows",
+    ]
+    return Section(title, figures, notes)
+
+
+def _ours(name: str) -> Took:
+    return Took(**json.loads(run_module("benchmarks.loop", name)[0]))
+
+
+def _run_alone(name: str) -> None:
+    import dwell
+    from benchmarks.canonical import simulate_in_parts
+
+    cell, policy, cycles, _ = WORK[name]
+    problem = dwell.load(ROOT / cell)
+
+    def play(seed: int, windows: int) -> None:
+        simulate_in_parts(problem, "baseline", policy=policy, seed=seed, windows=windows)
+
+    play(1, 20)
+    wall, cpu = time.perf_counter(), time.process_time()
+    play(2, cycles // problem.window_cycles)
+    took = {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu}
+    print(json.dumps(took))
+
+
+if __name__ == "__main__":
+    _run_alone(sys.argv[1])

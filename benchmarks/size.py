@@ -1,0 +1,61 @@
+"""Sizes of what is installed, and CPU time of building the kernel."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tempfile
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+
+from packaging.requirements import Requirement
+
+from benchmarks.figures import Figure, Goal, Section
+from benchmarks.timing import ROOT, run_timed
+
+MB = 1e6
+
+
+def measure(quick: bool) -> Section:
+    """Megabytes, and seconds."""
+    figures = [Figure("installed with [sim], Dwell aside", [_installed({"sim"}) / MB], "MB")]
+    notes = []
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder, "dwell")
+        left_out = shutil.ignore_patterns(".*", "build", "runs", "studies", "demo-out", "*.so")
+        shutil.copytree(ROOT, copy, ignore=left_out)
+        command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel"]
+        spent = []
+        for _ in range(1 if quick else 3):
+            shutil.rmtree(copy / "build", ignore_errors=True)
+            spent.append(run_timed(command, folder=copy)[1].cpu_s)
+        figures.append(
+            Figure("building the kernel and a wheel, CPU time", spent, "s", Goal(high=10))
+        )
+        (wheel,) = (copy / "dist").glob("*.whl")
+        figures.append(Figure("wheel", [wheel.stat().st_size / MB], "MB", Goal(high=1.2)))
+        notes.append(wheel.name)
+    return Section("Installing", figures, notes)
+
+
+def _installed(extras: set[str]) -> int:
+    """Bytes of the distributions that Dwell needs with these extras."""
+    sizes: dict[str, int] = {}
+    asked = [("dwell-placement", extras)]
+    while asked:
+        name, of = asked.pop()
+        for text in distribution(name).requires or ():
+            needed = Requirement(text)
+            marker = needed.marker
+            if marker and not any(marker.evaluate({"extra": extra}) for extra in (of or {""})):
+                continue
+            if needed.name in sizes:
+                continue
+            try:
+                files = distribution(needed.name).files or ()
+            except PackageNotFoundError:
+                continue
+            paths = [Path(str(file.locate())) for file in files]
+            sizes[needed.name] = sum(path.stat().st_size for path in paths if path.is_file())
+            asked.append((needed.name, needed.extras))
+    return sum(sizes.values())
