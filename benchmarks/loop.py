@@ -6,8 +6,8 @@ import json
 import shutil
 import sys
 import tempfile
-import time
 from collections.abc import Callable
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -61,14 +61,12 @@ def _run_alone(name: str) -> None:
     cell, policy, cycles, _ = WORK[name]
     problem = dwell.load(ROOT / cell)
 
-    def play(seed: int, windows: int) -> None:
-        simulate_in_parts(problem, "baseline", policy=policy, seed=seed, windows=windows)
+    def play(seed: int, windows: int) -> Took:
+        laps = simulate_in_parts(problem, "baseline", policy=policy, seed=seed, windows=windows)
+        return sum(laps, start=Took(0.0, 0.0))
 
     play(1, 20)
-    wall, cpu = time.perf_counter(), time.process_time()
-    play(2, cycles // problem.window_cycles)
-    took = {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu}
-    print(json.dumps(took))
+    print(json.dumps(asdict(play(2, cycles // problem.window_cycles))))
 
 
 if __name__ == "__main__":
