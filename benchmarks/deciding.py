@@ -18,7 +18,7 @@ from dwell.kernels.arrays import lay_out
 from dwell.model import Problem, QoS
 from dwell.policies import MinimalPolicy
 
-SCENARIO = "edge-cpu-stress"
+SCENARIO = "baseline"
 
 
 class Patient:
@@ -55,9 +55,11 @@ def measure(quick: bool) -> Section:
     problem = dwell.load(CELL)
     real = dwell.draw(problem, scenario=SCENARIO, seed=1, windows=windows)
     variants: dict[tuple[str, str], Callable[[], Took]] = {}
+    moves = []
     for name, (policy, _) in POLICIES.items():
         run = dwell.simulate_realisation(problem, real, policy=policy)
         placements = run.cycles["placement"].to_physical().to_numpy()
+        moves.append(f"{name} {int(run.decisions['migrated'].sum())}")
         variants[name, "run"] = partial(_run, problem, real, policy)
         variants[name, "kernel"] = partial(_play, problem, real, placements)
     runs = in_turns(variants, rounds)
@@ -73,7 +75,8 @@ def measure(quick: bool) -> Section:
         )
         for name, (_, goal) in POLICIES.items()
     ]
-    notes = shared_core(run for some in runs.values() for run in some)
+    notes = [f"moves, which are Python's: {', '.join(moves)}"]
+    notes += shared_core(run for some in runs.values() for run in some)
     return Section(f"Deciding in {windows} windows of the simulator", figures, notes)
 
 
