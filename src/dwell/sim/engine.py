@@ -245,7 +245,9 @@ class _Stamper:
         self.stamps, self.shares = tables.stamps, tables.shares
         self.closed = tables.cells["window"]
         self.seen = [tables.seen[name] for name in SEEN]
-        self.by_rule = False
+        self.first, self.close_cycle = tables.cells["window_first"], tables.cells["close_cycle"]
+        #: Incumbent and stamped cycles of the kernel's rule, where it decides.
+        self.decided = self.rule_stamped = np.zeros(0, np.int64)
         tables.clock[0]["pauses"] = 1
         self.watch = SimulatedGuard(problem, realisation, arrays) if guarded else None
         self.stamped = self._reach(self.window_cycles)
@@ -253,6 +255,8 @@ class _Stamper:
 
     def _stamp(self, start: int, stop: int) -> None:
         """Stamp cycles with the placement, and with what they are also sent through."""
+        if start >= stop:
+            return
         stamps, code = self.stamps, self.code[self.placement]
         stamps[0, start:stop] = code
         if self.plan is not None and start < self.cycles:
@@ -293,15 +297,16 @@ class _Stamper:
             switching=plain.switching,
             tiers=np.array(tiers, np.int8),
         )
-        self.by_rule = True
+        rule = self.arrays.tables.rule
+        self.decided, self.rule_stamped = rule["incumbent"], rule["stamped"]
 
     def close_window(self) -> None:
         """Carry out what was decided for the window that has just closed, or have it decided."""
         index = self.closed.item(0) - 1
         boundary = self.seen[0].item(0, index) + self.window_cycles
         close_ns = self._close_ns(boundary)
-        if self.by_rule:
-            order = self.names[self.arrays.tables.rule[0]["incumbent"]]
+        if len(self.decided):
+            order = self.names[self.decided.item(0)]
         elif self._host_down(close_ns):
             self.controller.miss()
             order = self.placement
@@ -348,12 +353,11 @@ class _Stamper:
         self.placement = order
         if self.watch is not None:
             self.watch.moved(following)
-        cells = self.arrays.tables.cells
-        cells["window_first"][0] = following
-        cells["close_cycle"][0] = following + self.window_cycles
+        self.first[0] = following
+        self.close_cycle[0] = following + self.window_cycles
         self.stamped = self._reach(following + self.window_cycles)
         self._stamp(following, self.stamped)
-        self.arrays.tables.rule["stamped"] = self.stamped
+        self.rule_stamped[:] = self.stamped
 
     def _begin(self, order: str, boundary: int, close_ns: int) -> bool:
         """Begin a cold migration, which ends with `step`; False if no task has to be waited for."""
@@ -414,8 +418,10 @@ class _Stamper:
 
     def _takes_effect(self, boundary: int, close_ns: int) -> int:
         """First cycle that an order given at a close stamps; those before are out already."""
-        arrived = self.release_ns[: self.cycles].searchsorted(close_ns + self.delay_ns)
-        return max(boundary + self.lead, int(arrived))
+        first, arrived_ns = boundary + self.lead, close_ns + self.delay_ns
+        if first >= self.cycles or arrived_ns <= self.release_ns.item(first):
+            return first
+        return int(self.release_ns[: self.cycles].searchsorted(arrived_ns))
 
     def _host_down(self, at_ns: int) -> bool:
         i = bisect.bisect_right(self.host_at_ns, at_ns) - 1
