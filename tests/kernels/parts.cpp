@@ -12,22 +12,22 @@ using namespace dwell;
 constexpr i64 kTake = -1;
 
 // Adds every step with its number as key, or takes the first event where it is kTake; returns how
-// many were taken, and how many are left.
-DWELL_EXPORT i64 part_events(const i64* steps, i64 n, Event* room, i64 size,
-                             Event* taken) noexcept {
+// many were taken. Days are of 2^bits.
+DWELL_EXPORT i64 part_events(const i64* steps, i64 n, Event* room, i32* following, i64 size,
+                             i32* days, i64 n_days, i64 bits, Event* taken) noexcept {
   Clock clock{};
-  Queue queue({room, size}, clock);
+  clock.day_bits = bits;
   i64 count = 0;
   for (i64 key = 0; key < n; ++key) {
+    // It outlives a call in its tables.
+    Queue queue({room, size}, {following, size}, {days, n_days}, clock);
     if (steps[key] != kTake) {
       queue.push(steps[key], key);
     } else if (!queue.is_empty()) {
       taken[count++] = queue.first();
       queue.pop();
     }
-    // It outlives a call in its table.
     queue.save(clock);
-    queue = Queue({room, size}, clock);
   }
   return count;
 }

@@ -1,8 +1,6 @@
-"""The queue of events and the heaps of jobs: entries come out in order, whatever came between."""
+"""The heaps of jobs: entries come out in order, whatever came between."""
 
 from __future__ import annotations
-
-import ctypes
 
 import numpy as np
 from hypothesis import given
@@ -15,27 +13,6 @@ TAKE = -1
 #: Few values, so that many are equal and keys have to tell them apart.
 VALUE = st.integers(0, 5)
 STEPS = st.lists(st.one_of(st.just(TAKE), VALUE), max_size=64)
-#: So many that the queue of events becomes a heap, and now and then is short again.
-LONG = st.lists(
-    st.one_of(st.lists(st.just(TAKE), max_size=60), st.lists(st.integers(0, 40), max_size=60)),
-    max_size=8,
-).map(lambda groups: [step for group in groups for step in group])
-
-
-@given(st.one_of(STEPS, LONG))
-def test_events_come_by_time_then_key(steps: list[int]) -> None:
-    room, taken = (np.zeros(len(steps) + 1, row_types()["events"]) for _ in range(2))
-    size = ctypes.c_int64(len(room))
-    count = parts().part_events(at(ints(steps)), len(steps), at(room), size, at(taken))
-    kept: list[tuple[int, int]] = []
-    expected = []
-    for key, step in enumerate(steps):
-        if step != TAKE:
-            kept.append((step, key))
-        elif kept:
-            expected.append(min(kept))
-            kept.remove(min(kept))
-    assert taken[:count].tolist() == expected
 
 
 @given(STEPS, st.lists(st.integers(0, 64), min_size=64, max_size=64))

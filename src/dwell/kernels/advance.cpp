@@ -31,7 +31,7 @@ DWELL_EXPORT i32 dwell_advance(const Tables* tables) noexcept {
 
 // Adds an event of the caller's; there must be room.
 DWELL_EXPORT void dwell_post_event(const Tables* tables, i64 at_ns, i64 key) noexcept {
-  Queue queue(tables->events, tables->clock[0]);
+  Queue queue(tables->events, tables->following, tables->days, tables->clock[0]);
   queue.push(at_ns, key);
   queue.save(tables->clock[0]);
 }

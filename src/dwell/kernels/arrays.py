@@ -95,8 +95,11 @@ class Arrays:
 
     def grow_events(self) -> None:
         """Double the room of the queue of events."""
-        events = self.tables.events
-        self._use(self.tables._replace(events=np.concatenate((events, np.zeros_like(events)))))
+        t = self.tables
+        room = 2 * len(t.events)
+        self._use(
+            t._replace(events=np.resize(t.events, room), following=np.resize(t.following, room))
+        )
 
     def grow_ring(self) -> None:
         """Double the number of cycles that may be in flight, and move those that are."""
@@ -536,7 +539,8 @@ class _Layout:
             "logs_all": self.logs_all,
             "end_ns": self.end_ns,
         }
-        rows["clock"].append(clock)
+        day_bits, n_days = self._calendar()
+        rows["clock"].append(clock | {"day_bits": day_bits})
         self._announce_first(changes)
         stamps = np.zeros((cells, cycles), np.int16)
         stamps[[row["parent"] >= 0 for row in rows["cells"]]] = -1
@@ -575,6 +579,8 @@ class _Layout:
             shadow_parts=np.array(self.shadow_parts, np.int8).reshape(-1, self.max_tasks),
             layers=layers,
             stamps=stamps,
+            following=np.zeros(len(structs["events"]), np.int32),
+            days=np.zeros(n_days, np.int32),
             dirty=np.zeros(len(rows["servers"]), np.int32),
             ready=np.zeros(margin, np.int64),
             attempts=np.zeros((cells * slots, max(self.max_flows, 1)), np.int64),
@@ -591,6 +597,17 @@ class _Layout:
             log_outcome=np.zeros(logged * self.max_tasks, np.int8),
             log_arrived=np.full((logged, self.max_flows), -1, np.int64),
         )
+
+    def _calendar(self) -> tuple[int, int]:
+        """Bits of a day, in which about one event happens, and days of a year: two periods."""
+        pipelines = [problem.pipeline for problem, _ in self.cells]
+        # Releases, completions, and messages.
+        rate_hz = sum(
+            (1 + len(one.tasks) + len(one.flows)) / one.period_ms * 1e3 for one in pipelines
+        )
+        day_bits = int(1e9 / rate_hz).bit_length()
+        year_ns = round(2e6 * max(one.period_ms for one in pipelines))
+        return day_bits, 1 << (year_ns >> day_bits).bit_length()
 
     def _slots(self) -> int:
         """Cycles that the ring has room for at first, a power of two: a window's, where logged."""

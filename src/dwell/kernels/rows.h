@@ -34,7 +34,8 @@ using Times = const i64*;
   field(i64, n_cycles) field(i64, n_windows) field(i64, n_priced) /* columns of the outputs */    \
   field(i64, margin) field(i64, budget)                                                          \
   field(i64, logs_all) /* whether logs are of all cycles, or of those in the ring */             \
-  field(i64, n_events) field(i64, is_heap) /* of the queue */                                    \
+  field(i64, n_events) field(i64, first_event) field(i64, used_events) field(i64, free_event)    \
+  field(i64, is_calendar) field(i64, day_bits) /* a day is 2^day_bits ns; see queue.h */         \
   field(i64, next_change)                                                                        \
   field(i64, pauses) /* whether a call ends when a window closes */                              \
   field(i64, closed_cell)                                                                        \
@@ -191,8 +192,8 @@ using Times = const i64*;
   row(Pace, DWELL_PACE) row(Node, DWELL_NODE) row(Change, DWELL_CHANGE) row(Hop, DWELL_HOP)      \
   row(Link, DWELL_LINK) row(Segment, DWELL_SEGMENT) row(Rate, DWELL_RATE)                        \
   row(Event, DWELL_EVENT) row(Running, DWELL_RUNNING) row(Waiting, DWELL_WAITING)                \
-  row(Job, DWELL_JOB) row(Slot, DWELL_SLOT) row(Log, DWELL_LOG) row(Seen, DWELL_SEEN) row(Rule, DWELL_RULE)          \
-  row(Option, DWELL_OPTION) row(Decided, DWELL_DECIDED)
+  row(Job, DWELL_JOB) row(Slot, DWELL_SLOT) row(Log, DWELL_LOG) row(Seen, DWELL_SEEN)            \
+  row(Rule, DWELL_RULE) row(Option, DWELL_OPTION) row(Decided, DWELL_DECIDED)
 
 // clang-format on
 
@@ -214,10 +215,11 @@ DWELL_ROWS(DWELL_STRUCT)
   table(i32, outputs) table(i32, cell_nodes) table(f64, capacity) table(Node, nodes)             \
   table(i32, site_of) table(i32, route) table(i64, back_ns) table(i8, shadow_parts)              \
   table(Hop, hops) table(Times, layers) table(Segment, segments) table(Rate, rates)              \
-  table(Change, changes) table(Pace, paces) table(f64, work) table(f64, switching) table(i8, tiers)                      \
-  table(i16, stamps)                                                                             \
+  table(Change, changes) table(Pace, paces) table(f64, work) table(f64, switching)               \
+  table(i8, tiers) table(i16, stamps)                                                            \
   table(Site, sites) table(Server, servers) table(Quota, quotas) table(Link, links)              \
-  table(Event, events) table(Running, running) table(Waiting, waiting)                           \
+  table(Event, events) table(i32, following) table(i32, days)                                    \
+  table(Running, running) table(Waiting, waiting)                                                \
   table(i32, dirty) table(i64, ready) table(Job, jobs) table(Slot, slots) table(i64, attempts)   \
   table(f64, own_ns) table(i64, ages) table(Rule, rule) table(Option, options) table(f64, shown) \
   table(i64, latency_ns) table(i64, compute_ns) table(i64, network_ns) table(i8, outcome)        \

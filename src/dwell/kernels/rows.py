@@ -108,7 +108,9 @@ class Tables(NamedTuple):
     servers: Rows  # (servers,)
     quotas: Rows  # (servers with a quota,)
     links: Rows  # (links,)
-    events: Rows  # the queue
+    events: Rows  # the queue, with the next event of the same day, and the first of every day
+    following: NDArray[np.int32]
+    days: NDArray[np.int32]
     running: Rows  # per server a heap of running jobs by virtual finish
     waiting: Rows  # per server a heap of jobs that wait for cores
     dirty: NDArray[np.int32]  # servers to look after at the end of the event

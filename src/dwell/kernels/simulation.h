@@ -23,7 +23,7 @@ struct Simulation : Tables {
 
   explicit Simulation(const Tables& tables)
       : Tables(tables),
-        queue(events, clock[0]),
+        queue(events, following, days, clock[0]),
         n_slots(clock[0].n_slots),
         n_tasks(clock[0].n_tasks),
         n_flows(clock[0].n_flows),

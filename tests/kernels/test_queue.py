@@ -1,0 +1,41 @@
+"""The queue of events: they come out in order, whatever came between."""
+
+from __future__ import annotations
+
+from ctypes import c_int64
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dwell.kernels.rows import row_types
+from tests.kernels.parts import at, ints, parts
+
+TAKE = -1
+#: Few times, so that many are equal and keys have to tell them apart; and some beyond many years.
+TIME = st.one_of(st.integers(0, 40), st.integers(0, 2**62))
+#: So many that the queue becomes a calendar, and now and then is short again.
+STEPS = st.lists(
+    st.one_of(st.lists(st.just(TAKE), max_size=60), st.lists(TIME, max_size=60)), max_size=8
+).map(lambda groups: [step for group in groups for step in group])
+
+
+@given(STEPS, st.integers(0, 6), st.integers(0, 5))
+def test_events_come_by_time_then_key(steps: list[int], day_bits: int, year_bits: int) -> None:
+    room, taken = (np.zeros(len(steps) + 1, row_types()["events"]) for _ in range(2))
+    following, days = np.zeros(len(room), np.int32), np.zeros(1 << year_bits, np.int32)
+    count = parts().part_events(
+        *(at(ints(steps)), c_int64(len(steps))),
+        *(at(room), at(following), c_int64(len(room))),
+        *(at(days), c_int64(len(days)), c_int64(day_bits)),
+        at(taken),
+    )
+    kept: list[tuple[int, int]] = []
+    expected = []
+    for key, step in enumerate(steps):
+        if step != TAKE:
+            kept.append((step, key))
+        elif kept:
+            expected.append(min(kept))
+            kept.remove(min(kept))
+    assert taken[:count].tolist() == expected
