@@ -9,6 +9,7 @@ import pickle
 import subprocess
 import sys
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -284,12 +285,46 @@ def test_what_is_no_decision_is_refused(canonical: Problem) -> None:
     placement = canonical.candidates["SO"]
     contradiction = Decision(placement=placement, name="LOC", migrated=False, reason="hold")
     silent = Decision(placement=placement, name="SO", migrated=False, reason="hold")
-    for answer in ("nowhere", None, 3, contradiction, silent):
+    for answer in ("nowhere", None, 3, float("nan"), contradiction, silent):
         with pytest.raises(PolicyError, match=r"Always\.decide"):
             dwell.simulate(canonical, policy=Always(answer), seed=1, windows=3)
     fine = Decision(placement=placement, name="SO", migrated=True, reason="migrate")
     with pytest.raises(PolicyError, match="window 1"):  # it has migrated already
         dwell.simulate(canonical, policy=Always(fine), seed=1, windows=3)
+
+
+class Failing:
+    """A policy that fails at its third close."""
+
+    closes = 0
+
+    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
+        """Stay where it is, twice."""
+        self.closes += 1
+        return ("LOC", "LOC")[self.closes - 1]
+
+
+def test_what_a_policy_raises_in_a_close_is_what_its_author_sees(canonical: Problem) -> None:
+    realisation = dwell.draw(canonical, scenario="baseline", seed=1, windows=4)
+    before = dwell.simulate_realisation(canonical, realisation, policy="dtp")
+    with pytest.raises(IndexError, match="tuple index out of range"):
+        dwell.simulate_realisation(canonical, realisation, policy=Failing())
+    # The realisation is as it was.
+    after = dwell.simulate_realisation(canonical, realisation, policy="dtp")
+    assert after.cycles.equals(before.cycles)
+
+
+def test_two_threads_may_play_one_realisation(canonical: Problem) -> None:
+    realisation = dwell.draw(canonical, scenario="baseline", seed=1, windows=20)
+    policies = ["dtp", "cusum", "dtp", "LOC"]
+
+    def play(policy: str) -> pl.DataFrame:
+        return dwell.simulate_realisation(canonical, realisation, policy=policy).cycles
+
+    alone = [play(policy) for policy in policies]
+    with ThreadPoolExecutor(2) as threads:
+        together = list(threads.map(play, policies))
+    assert all(one.equals(other) for one, other in zip(alone, together, strict=True))
 
 
 def test_what_is_unknown_is_refused(canonical: Problem) -> None:
