@@ -24,6 +24,7 @@ from dwell.control import (
     Guard,
     Presence,
     Probation,
+    ShadowPlan,
 )
 from dwell.display import Displayed, milliseconds
 from dwell.estimators import Evidence, Instants
@@ -145,7 +146,7 @@ def objects(
         *(policy_by_name(name, canonical) for name in policies),
         *(estimator_by_name(name, canonical) for name in ("profile", "shadow", "scaling")),
         *(controller, controller.estimator, controller.log, Presence.of(canonical)),
-        *(FallbackRound(["LOC"]), Failures.of(canonical)),
+        *(FallbackRound(["LOC"]), Failures.of(canonical), ShadowPlan(0, 9, 3, 0.05)),
         Guard(["LOC"], placement="SO", **guard),
         Probation(30, health_cycles=10, patience_ns=1),
         ClosedWindow(ints[:, 0], ints[:, 0], 1, 0, np.zeros((3, 3))),

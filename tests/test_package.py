@@ -134,12 +134,17 @@ def test_a_robot_runs_and_moves_a_cell_with_the_extra_live_alone(
     size = sum(path.stat().st_size for path in python.parents[1].rglob("*") if path.is_file())
     assert size / 1e6 <= int(told[1]) <= 150
 
-    # A cell runs without the kernel.
+    # A cell runs without the kernel, if nothing prices its placements.
     (library,) = python.parents[1].rglob(NAME)
     library.unlink()
 
     cell = RealCell(tmp_path / "cell", python)
     try:
+        words = ("--cell", cell.file, "--out", tmp_path / "none", "--policy", "dtp")
+        refused = run(python, "-m", "dwell", "controller", *words)
+        assert refused.returncode == 1
+        assert refused.stderr.startswith("error: the compiled kernel")
+        assert refused.stderr.count("\n") == 1
         cell.controller()
         for node in ("R1", "R2", "E"):
             cell.agent(node)
@@ -155,6 +160,7 @@ def test_a_robot_runs_and_moves_a_cell_with_the_extra_live_alone(
     assert not (folder / "run.json").exists()
     log = (cell.folder / "controller.log").read_text(encoding="utf-8")
     assert "stays a journal, for Polars is not installed here" in log
+    assert "placement LOC stays, and its record has the estimates of profile" in log
     # What the robot could not write, this environment reads of the journal.
     assert "SO" in dwell.open_run(folder).cycles["placement"].cast(str).to_list()
 

@@ -51,6 +51,10 @@ class ShadowPlan:
             np.minimum(turned, candidates - 1, out=turned)
             self._place[:] = turned
 
+    def __repr__(self) -> str:
+        first = self._first
+        return f"ShadowPlan(cycles {first} to {first + len(self._place)}, {len(self.sent)} sent)"
+
     @property
     def sent(self) -> NDArray[np.int64]:
         """The cycles that are sent through any, whatever they run under, ascending."""

@@ -76,9 +76,15 @@ class PartTimes:
     ----------
     parts : int
         Number of parts.
+
+    Raises
+    ------
+    KernelError
+        If the library cannot be loaded: before the first window, and not in it.
     """
 
     def __init__(self, parts: int) -> None:
+        self._meter = _meter()
         self._count, self._order = np.zeros((2, parts), np.int64)
         self._window = _Window()
         self._found = _Found(None, self._count.ctypes.data, self._order.ctypes.data)
@@ -121,7 +127,7 @@ class PartTimes:
 
     def add(self, active: int, layout: CyclesLayout) -> None:
         """Add the times of the cycles under one candidate, and then of their shadows."""
-        _meter()(layout.row, self._window, active, self._limit_ns, self._found)
+        self._meter(layout.row, self._window, active, self._limit_ns, self._found)
 
     def by_part(self) -> dict[int, Floats]:
         """Return the times by number of part, in the order in which they were found."""

@@ -12,7 +12,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from dwell.control import Controller
-from dwell.errors import LiveError
+from dwell.errors import KernelError, LiveError
 from dwell.live.agent import Agent, CpuCount, Gauge
 from dwell.live.control_group import own_group
 from dwell.live.controlled_cell import ControlledCell
@@ -168,6 +168,9 @@ def run_controller(
         nobody, or a cell leaves this computer without keys.
     TrustError
         If the keys are not the controller's.
+    KernelError
+        If a cell's estimator needs the compiled kernel, which cannot be loaded, and its policy may
+        move it.
     """
     names = [problem.name for problem in problems]
     if len(set(names)) < len(names):
@@ -187,7 +190,7 @@ def run_controller(
             transport = platform.transport(security, f"controller@{node}", node)
             stack.callback(transport.close)
             place = security.place(f"controller@{node}", node, transport, Log(say))
-            controller = Controller(problem, policy)
+            controller = _controller(problem, policy, say)
             recorder = RunRecorder(out, problem, controller, say, jobs=jobs)
             clock = platform.clock(problem, node)
             cell = ControlledCell(place, controller, recorder, name, time.time_ns())
@@ -206,6 +209,18 @@ def run_controller(
         finally:
             folders = [_finished(recorder, cell) for recorder, cell in recorders]
         return [folder for folder in folders if folder is not None]
+
+
+def _controller(problem: Problem, policy: str | None, say: Callable[[str], None]) -> Controller:
+    """Make a cell's controller; without the compiled kernel only one that prices nothing."""
+    try:
+        return Controller(problem, policy)
+    except KernelError as error:
+        name = problem.policy_and_estimator(policy or problem.controller.policy)[0]
+        if name not in problem.candidates:
+            raise
+        say(f"{error}; placement {name} stays, and its record has the estimates of profile")
+        return Controller(problem, name, "profile")
 
 
 def _require_runs(out: Path) -> None:
