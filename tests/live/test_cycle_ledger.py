@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
@@ -163,6 +163,8 @@ PROBLEM = dwell.load("examples/canonical.yaml")
     first=st.sampled_from(INSTANTS),
     set_ms=st.integers(-4_000, 4_000),
 )
+# Between two jobs of one node.
+@example(place=1, first="inputs", set_ms=-20)
 def test_a_clock_that_is_set_within_a_cycle_leaves_no_interval_that_cannot_be(
     place: int, first: str, set_ms: int
 ) -> None:

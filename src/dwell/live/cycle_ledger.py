@@ -284,7 +284,11 @@ class Ledger:
                     self._disbelieve(cycle, hop.node)
             for source, arrived_ns in hop.inputs:
                 sender = hops.get(source)
-                if sender is None or sender.node == hop.node or sender.ended_ns == UNKNOWN:
+                if sender is None or sender.ended_ns == UNKNOWN:
+                    continue
+                if sender.node == hop.node:
+                    if arrived_ns < sender.ended_ns:
+                        self._disbelieve(cycle, hop.node)
                     continue
                 sent, arrived = (
                     self._within(cycle, node, at_ns)
