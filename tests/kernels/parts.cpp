@@ -11,18 +11,18 @@ using namespace dwell;
 
 constexpr i64 kTake = -1;
 
-// Adds every step with its number as key, or takes the first event where it is kTake; returns how
-// many were taken. Days are of 2^bits.
-DWELL_EXPORT i64 part_events(const i64* steps, i64 n, Event* room, i32* following, i64 size,
-                             i32* days, i64 n_days, i64 bits, Event* taken) noexcept {
+// Adds every step with its key, or takes the first event where it is kTake; returns how many were
+// taken. Days are of 2^bits.
+DWELL_EXPORT i64 part_events(const i64* steps, const i64* keys, i64 n, Event* room, i32* following,
+                             i64 size, i32* days, i64 n_days, i64 bits, Event* taken) noexcept {
   Clock clock{};
   clock.day_bits = bits;
   i64 count = 0;
-  for (i64 key = 0; key < n; ++key) {
+  for (i64 i = 0; i < n; ++i) {
     // It outlives a call in its tables.
     Queue queue({room, size}, {following, size}, {days, n_days}, clock);
-    if (steps[key] != kTake) {
-      queue.push(steps[key], key);
+    if (steps[i] != kTake) {
+      queue.push(steps[i], keys[i]);
     } else if (!queue.is_empty()) {
       taken[count++] = queue.first();
       queue.pop();

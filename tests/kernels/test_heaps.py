@@ -18,7 +18,8 @@ STEPS = st.lists(st.one_of(st.just(TAKE), VALUE), max_size=64)
 @given(STEPS, st.lists(st.integers(0, 64), min_size=64, max_size=64))
 def test_running_jobs_may_leave_from_the_middle(steps: list[int], places: list[int]) -> None:
     heap = np.zeros(len(steps) + 1, row_types()["running"])
-    n = parts().part_running(at(ints(steps)), at(ints(places)), len(steps), at(heap))
+    added, where = ints(steps), ints(places)
+    n = parts().part_running(at(added), at(where), len(steps), at(heap))
     inside: list[tuple[float, int]] = heap[:n].tolist()
     # Every entry is after the one over it, so that the first is the first to finish.
     assert all(inside[(i - 1) // 2] < inside[i] for i in range(1, n))

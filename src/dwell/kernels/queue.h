@@ -69,10 +69,11 @@ class Queue {
   i64 day_of(i64 row) const { return events_[row].at_ns >> day_bits_; }
   i32& list_of(i64 day) const { return days_[day & (n_days_ - 1)]; }
 
-  // Enters the row of an event into the list of its day.
+  // Enters the row of an event into the list of its day, behind any that are its equals: the first
+  // event stays the first of its list.
   void link(i64 row) {
     i32* at = &list_of(day_of(row));
-    while (*at != kNone && events_[*at] < events_[row]) at = &following_[*at];
+    while (*at != kNone && !(events_[row] < events_[*at])) at = &following_[*at];
     following_[row] = *at;
     *at = static_cast<i32>(row);
   }
@@ -122,7 +123,7 @@ class Queue {
     used_ = size_;
     free_ = kNone;
     std::fill_n(days_, n_days_, kNone);
-    for (i64 row = 0; row < size_; ++row) link(row);
+    for (i64 row = first_; row >= 0; --row) link(row);
   }
 
   [[gnu::noinline]] void close_calendar() {
