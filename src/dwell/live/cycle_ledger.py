@@ -284,7 +284,8 @@ class Ledger:
                     self._disbelieve(cycle, hop.node)
             for source, arrived_ns in hop.inputs:
                 sender = hops.get(source)
-                if sender is None or sender.ended_ns == UNKNOWN:
+                is_flow = (source, hop.task) in self._flows
+                if sender is None or sender.ended_ns == UNKNOWN or not is_flow:
                     continue
                 if sender.node == hop.node:
                     if arrived_ns < sender.ended_ns:
