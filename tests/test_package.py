@@ -160,7 +160,7 @@ def test_a_robot_runs_and_moves_a_cell_with_the_extra_live_alone(
     assert not (folder / "run.json").exists()
     log = (cell.folder / "controller.log").read_text(encoding="utf-8")
     assert "stays a journal, for Polars is not installed here" in log
-    assert "placement LOC stays, and its record has the estimates of profile" in log
+    assert "placement LOC stays, and its record expects no other of any candidate" in log
     # What the robot could not write, this environment reads of the journal.
     assert "SO" in dwell.open_run(folder).cycles["placement"].cast(str).to_list()
 

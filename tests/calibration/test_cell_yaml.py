@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -72,24 +73,22 @@ def test_tasks_and_links_of_a_profile(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("share", [0.02, 0.10])
 def test_the_estimate_is_that_of_the_samples(tmp_path: Path, share: float) -> None:
-    """Two values, the larger one clearly above or below 5 %: the estimator draws rows."""
+    """Two values, the larger one above or below 5 %: a window that replays all rows has both."""
     rows = 500
     samples = [20.0 if row < share * rows else 10.0 for row in range(rows)]
     problem = pasted(tmp_path, "  LOC: {}\n", [task("see", "R1", samples)])
     expected = percentile(np.array(samples), 95)
     assert expected == (20 if share > 0.05 else 10)
-    assert Profile(problem).l95_ms["LOC"] == expected
+    assert Profile(replace(problem, window_cycles=rows)).l95_ms["LOC"] == expected
 
 
 def test_real_samples_end_up_in_the_estimate(tmp_path: Path) -> None:
     measured = measure_task("see", "R1", lambda: sum(range(500)), settings=Settings(400, 5))
     problem = pasted(tmp_path, "  LOC: {}\n", [measured])
     assert np.array_equal(trace(problem, "see", "R1").values, measured.samples)
-    l95_ms = Profile(problem).l95_ms["LOC"]
-    assert np.isclose(measured.samples, l95_ms, rtol=0, atol=1e-9).any()
-    # Drawn with replacement, on a fixed seed: within 1.5 % of the rank.
-    ordered = np.sort(measured.samples)
-    assert ordered[int(0.935 * 400) - 1] <= l95_ms <= ordered[int(0.965 * 400) - 1]
+    # Every window replays all of them.
+    l95_ms = Profile(replace(problem, window_cycles=400)).l95_ms["LOC"]
+    assert l95_ms == pytest.approx(percentile(measured.samples, 95), abs=1e-6)
 
 
 def test_a_run_replays_them_in_order(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ def test_check_as_json(cell: Path) -> None:
     assert found["valid"] is True
     assert found["warnings"] == []
     assert found["candidates"]["OFF"]["l95_ms"] == 4.0
-    assert found["candidates"]["OFF"]["own_work"] == {"R": 0.05, "E": 0.025}
+    assert found["candidates"]["OFF"]["own_work"] == pytest.approx({"R": 0.05, "E": 0.025})
 
 
 def test_check_prints_every_fault_with_its_line(cell: Path) -> None:

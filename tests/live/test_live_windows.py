@@ -106,7 +106,9 @@ def stressed(cell: Problem) -> Played:
 
 @pytest.fixture(scope="module")
 def impaired(cell: Problem) -> Played:
-    return simulate(cell, "network-impairment")
+    # It moves, since it begins where it should not stay.
+    controller = dataclasses.replace(cell.controller, initial="SO")
+    return simulate(dataclasses.replace(cell, controller=controller), "network-impairment")
 
 
 Event = tuple[int, int, Callable[[LiveWindows, int], None]]

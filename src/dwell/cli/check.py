@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
 import dwell
 from dwell.cli.exit_codes import ExitCode
-from dwell.cli.options import CellArgument, Insecure, Json, Keys, Traces
+from dwell.cli.options import CellArgument, Insecure, Json, Keys, Scenario, Traces
 from dwell.cli.output import aligned, print_json, warn
 from dwell.display import milliseconds
 from dwell.errors import Fault, PolicyError, ProblemError
@@ -17,6 +17,7 @@ from dwell.model.bounds import counted
 
 if TYPE_CHECKING:
     from dwell.estimators import Profile
+    from dwell.estimators.prices import Price
     from dwell.model import Problem
 
 
@@ -30,6 +31,7 @@ def check(
             "make its stages and actuators."
         ),
     ] = None,
+    scenario: Scenario = "baseline",
     keys: Keys = None,
     insecure: Insecure = False,
     as_json: Json = False,
@@ -52,14 +54,16 @@ def check(
     if faults := tuple(_class_faults(problem)):
         _refuse(faults, "\n".join(f"{cell}: {fault}" for fault in faults), as_json=as_json)
     from dwell.estimators import Profile
+    from dwell.estimators.prices import prices_of
 
-    profile = Profile(problem)
-    warnings = tuple(_warnings(problem, profile))
+    prices = prices_of(problem, scenario)
+    warnings = tuple(_warnings(problem, Profile(problem)))
     if as_json:
         rows = [_fault(warning) for warning in warnings]
-        print_json({"valid": True, **_contents(problem, profile), "warnings": rows})
+        contents = {"valid": True, **_contents(problem), "priced_under": scenario}
+        print_json(contents | {"candidates": _priced(problem, prices), "warnings": rows})
     else:
-        typer.echo(_summary(problem, profile))
+        typer.echo(_summary(problem, prices, scenario))
         warn(cell, warnings)
 
 
@@ -105,7 +109,7 @@ def _fault(fault: Fault) -> dict[str, Any]:
     return {"path": fault.path, "message": fault.message}
 
 
-def _contents(problem: Problem, profile: Profile) -> dict[str, Any]:
+def _contents(problem: Problem) -> dict[str, Any]:
     """Return the contents of the cell as plain values."""
     pipeline = problem.pipeline
     return {
@@ -117,19 +121,26 @@ def _contents(problem: Problem, profile: Profile) -> dict[str, Any]:
         "nodes": {name: node.tier for name, node in problem.fabric.nodes.items()},
         "links": list(problem.fabric.links),
         "scenarios": list(problem.scenarios),
-        "candidates": {
-            name: {
-                "placement": dict(placement),
-                "l95_ms": profile.uncut_l95_ms[name],
-                "violation_rate": profile.violation_rate[name],
-                "own_work": dict(profile.own[name]),
-            }
-            for name, placement in problem.candidates.items()
-        },
     }
 
 
-def _summary(problem: Problem, profile: Profile) -> str:
+def _priced(problem: Problem, prices: Mapping[str, Price]) -> dict[str, Any]:
+    """Return candidates and what they come to as plain values."""
+    return {
+        name: {
+            "placement": dict(placement),
+            "l95_ms": prices[name].uncut_l95_ms,
+            "l95_error_ms": prices[name].l95_error_ms,
+            "violation_rate": prices[name].violation_rate,
+            "violation_error": prices[name].violation_error,
+            "own_work": dict(prices[name].own),
+            "cycles": prices[name].cycles,
+        }
+        for name, placement in problem.candidates.items()
+    }
+
+
+def _summary(problem: Problem, prices: Mapping[str, Price], scenario: str) -> str:
     pipeline, nodes = problem.pipeline, problem.fabric.nodes
     movable = [
         f"{name} ({', '.join(task.on)})"
@@ -140,11 +151,11 @@ def _summary(problem: Problem, profile: Profile) -> str:
     rows = [
         [
             name,
-            milliseconds(profile.uncut_l95_ms[name]),
-            f"{profile.violation_rate[name] * 100:.1f}",
-            *(f"{profile.own[name][node] * 100:.0f}" for node in nodes),
+            _with_error(milliseconds(price.uncut_l95_ms), price.l95_error_ms),
+            _with_error(f"{price.violation_rate * 100:.1f}", price.violation_error * 100),
+            *(f"{price.own[node] * 100:.0f}" for node in nodes),
         ]
-        for name in problem.candidates
+        for name, price in prices.items()
     ]
     return "\n".join(
         (
@@ -156,7 +167,13 @@ def _summary(problem: Problem, profile: Profile) -> str:
             f"can move: {', '.join(movable) or 'nothing'}",
             f"scenarios: {', '.join(problem.scenarios)}",
             "",
-            "Undisturbed, without queues: L95, V_D, and the cell's own work on each node",
+            f"{scenario[0].upper()}{scenario[1:]}, each played alone: L95 and V_D of a window with "
+            "standard errors, and the cell's own work on each node",
             aligned(head, rows),
         )
     )
+
+
+def _with_error(mean: str, error: float) -> str:
+    """Return a mean with its standard error, where there is one, to the mean's last digit."""
+    return f"{mean} ± {error:.{len(mean.partition('.')[2])}f}" if error else mean

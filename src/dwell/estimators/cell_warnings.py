@@ -15,7 +15,7 @@ import numpy as np
 from dwell.cost import price, tier_utilisation
 from dwell.display import milliseconds
 from dwell.errors import Fault
-from dwell.estimators.profile import SEED, Profile, SampleCycles, mean_ms
+from dwell.estimators.profile import Profile, mean_ms
 from dwell.model.fabric import Node
 from dwell.model.objective import TIERS, Objective
 from dwell.model.pipeline import Execution, Task
@@ -41,7 +41,7 @@ def warnings_of(problem: Problem, profile: Profile | None = None) -> Iterator[Fa
     """
     profile = profile or Profile(problem)
     yield from _overloads(problem)
-    yield from _slow_stages(problem, profile)
+    yield from _slow_stages(problem)
     yield from _starved_stages(problem)
     yield from _full_links(problem)
     yield from _same_placements(problem)
@@ -51,7 +51,7 @@ def warnings_of(problem: Problem, profile: Profile | None = None) -> Iterator[Fa
     yield from _false_alarms(problem, profile)
     yield from _helpless_fallbacks(problem)
     yield from _late_releases(problem)
-    yield from _unstable_loops(problem)
+    yield from _unstable_loops(problem, profile)
     yield from _without_effect(problem)
 
 
@@ -110,7 +110,7 @@ def _limit(node: Node, left: float) -> str:
 
 def _remedy(node: Node, left: float) -> str:
     if left < 1:
-        return "place less there; the table leaves out queues, and so what comes of it"
+        return "place less there"
     if node.quota is not None and node.quota.cpu < node.cores:
         return f"place less there, or raise nodes.{node.name}.quota.cpu"
     return "place less there, or give the node more cores"
@@ -158,13 +158,13 @@ def _accelerator_ms(problem: Problem, placement: Placement) -> dict[tuple[str, s
     return work_ms
 
 
-def _slow_stages(problem: Problem, profile: Profile) -> Iterator[Fault]:
+def _slow_stages(problem: Problem) -> Iterator[Fault]:
     """Yield stages that take longer for a job than their workers have."""
     pipeline, nodes = problem.pipeline, problem.fabric.nodes
     for candidate, placement in problem.candidates.items():
         for task in pipeline.tasks.values():
             node, execution = nodes[placement[task.name]], task.on[placement[task.name]]
-            if profile.own[candidate][node.name] > 1:
+            if _own_share(problem, node, placement) > 1:
                 continue
             job_ms = mean_ms(pipeline, task, execution)
             if execution.accelerator is None:
@@ -381,7 +381,7 @@ def _late_releases(problem: Problem) -> Iterator[Fault]:
         )
 
 
-def _unstable_loops(problem: Problem) -> Iterator[Fault]:
+def _unstable_loops(problem: Problem, profile: Profile) -> Iterator[Fault]:
     """Yield candidates under which the servo loop swings ever farther.
 
     The delay of the loop is the mean latency and half a period, for which a command is held in the
@@ -389,10 +389,8 @@ def _unstable_loops(problem: Problem) -> Iterator[Fault]:
     """
     if problem.servo is None:
         return
-    cycles = SampleCycles(problem, DRAWS, SEED)
-    for name, placement in problem.candidates.items():
-        latency_ms = float(cycles.latency_ms(placement).mean())
-        delay_s = (latency_ms + problem.pipeline.period_ms / 2) / 1e3
+    for name, alone in profile.prices.items():
+        delay_s = (alone.latency_ms + problem.pipeline.period_ms / 2) / 1e3
         most_s = longest_delay_s(problem.servo)
         if delay_s > most_s:
             yield Fault(

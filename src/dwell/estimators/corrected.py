@@ -43,7 +43,8 @@ from dwell.estimators.evidence import Evidence
 from dwell.estimators.measured import Message, Meter, Part, Site, message_of
 from dwell.estimators.paths import longest_path, seen_windows, steps_of
 from dwell.estimators.pool import Pool, middle
-from dwell.estimators.profile import SEED, Profile, SampleCycles
+from dwell.estimators.prices import SEED
+from dwell.estimators.profile import Profile, SampleCycles
 from dwell.estimators.protocol import Support
 from dwell.estimators.slowdown import explaining_threads, slowdown
 from dwell.model.bounds import HALF_LIFE_WINDOWS

@@ -1,18 +1,8 @@
 """Profile: static profiling, the estimate from what is known before the run.
 
-A fixed set of sample cycles is drawn once from the problem's processes, on its own seed and
-without any disturbance, queue or contention. For each candidate the latency of a sample cycle is
-the longest path through the DAG::
-
-    finish(v) = max over inputs (finish(u) + message(u, v)) + exec(v, node)
-    latency   = max over sinks finish(v)
-
-and L95 and V_D are those of the samples. Percentiles of stages are never added: the 95th
-percentile of a sum is not the sum of the 95th percentiles.
-
-All candidates share the draws, and processes that replay columns of one trace share its rows, so
-that candidates differ by where their tasks run and not by luck. Every process has a stream of its
-own, keyed by its name: adding a node, a link or a task shifts nobody else's draws.
+Every candidate has the price that it comes to where the cell stays on it and no scenario disturbs
+it (`dwell.estimators.prices`): the means over windows of L95 and V_D as the controller sees them,
+and the work of the cell on every node.
 
 What a window adds is the foreign load: utilisation that was seen and is not the cell's own work.
 It is expected to stay where it is, whichever candidate runs. Latencies take no notice of it: a
@@ -28,15 +18,15 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from functools import lru_cache
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dwell.cost import SATURATED
 from dwell.errors import MetricError
-from dwell.estimators.paths import longest_path, order_statistic, steps_of
+from dwell.estimators.paths import longest_path, steps_of
+from dwell.estimators.prices import SEED, Price, prices_of
 from dwell.model.bounds import require
 from dwell.model.fabric import Link, Node
 from dwell.model.frozen import FrozenDict
@@ -48,51 +38,56 @@ from dwell.model.qos import QoS, unchecked_qos
 
 Floats: TypeAlias = NDArray[np.float64]
 
-SEED = 20_250_601
-
 
 class Profile:
-    """Estimates QoS from sample cycles drawn once from the problem's processes.
+    """Estimates QoS as that of every candidate alone, undisturbed, played once in the kernel.
 
     Parameters
     ----------
-    samples : int
-        Sample cycles.
+    samples : int, optional
+        Cycles of each candidate that count, rounded up to whole windows; as many as the means need
+        where None (see `dwell.estimators.prices`).
     seed : int
-        Seed of the sample cycles; the same for every run, so that an estimate is a fixed number.
+        Seed of what is played; the same for every run, so that an estimate is a fixed number.
 
     Attributes
     ----------
     l95_ms : mapping of str to float
         Estimated L95 of every candidate, milliseconds; never more than ``problem.censor_ms``.
     uncut_l95_ms : mapping of str to float
-        The same without that bound; infinite where it is lost.
+        The same without that bound; infinite where more than 5 % of the cycles are lost.
     violation_rate : mapping of str to float
         Estimated V_D of every candidate.
     own : mapping of str to mapping of str to float
         Share of each node's cores that the cell's own work takes, by candidate and node.
+    prices : mapping of str to Price
+        All of it, with the standard errors and the number of cycles played.
 
     Raises
     ------
     ProblemError
         If `samples` or `seed` is out of its range.
+    KernelError
+        If the compiled kernel cannot be loaded.
     """
 
-    def __init__(self, problem: Problem, samples: int = 4000, seed: int = SEED) -> None:
-        require(1 <= samples <= 10_000_000, "samples", samples, "from 1 to 10000000")
+    def __init__(self, problem: Problem, samples: int | None = None, seed: int = SEED) -> None:
+        if samples is not None:
+            require(1 <= samples <= 10_000_000, "samples", samples, "from 1 to 10000000")
         require(seed >= 0, "seed", seed, "a whole number of at least 0")
         self._samples, self._seed = samples, seed
-        uncut_l95_ms, violation_rate, own = _sampled(problem, samples, seed)
-        l95_ms = {name: min(uncut, problem.censor_ms) for name, uncut in uncut_l95_ms.items()}
-        self.l95_ms: Mapping[str, float] = FrozenDict(l95_ms)
-        self.uncut_l95_ms, self.violation_rate, self.own = uncut_l95_ms, violation_rate, own
+        self.prices = prices = prices_of(problem, seed=seed, cycles=samples)
+        self.l95_ms: Mapping[str, float] = _each(prices, "l95_ms")
+        self.uncut_l95_ms: Mapping[str, float] = _each(prices, "uncut_l95_ms")
+        self.violation_rate: Mapping[str, float] = _each(prices, "violation_rate")
+        self.own: Mapping[str, Mapping[str, float]] = _each(prices, "own")
         self._nodes = tuple(problem.fabric.nodes)
         table = []
-        for name in problem.candidates:
+        for name, price in prices.items():
             # Once through the checks: what differs from window to window is a share of the cores.
-            known = QoS(l95_ms[name], violation_rate[name], {}, uncut_l95_ms[name])
+            known = QoS(price.l95_ms, price.violation_rate, {}, price.uncut_l95_ms)
             metrics = known.l95_ms, known.violation_rate, known.cut_from_ms
-            table.append((name, *metrics, tuple(own[name].items())))
+            table.append((name, *metrics, tuple(price.own.items())))
         self._table = tuple(table)
         self.start(problem)
 
@@ -143,20 +138,8 @@ class Profile:
         return estimates
 
 
-@lru_cache(maxsize=8)
-def _sampled(
-    problem: Problem, samples: int, seed: int
-) -> tuple[Mapping[str, float], Mapping[str, float], Mapping[str, Mapping[str, float]]]:
-    """Return L95 (ms), V_D and own work of every candidate; a study asks once a run."""
-    cycles = SampleCycles(problem, samples, seed)
-    uncut_l95_ms, violation_rate, own = {}, {}, {}
-    for name, placement in problem.candidates.items():
-        latency_ms = cycles.latency_ms(placement)
-        uncut_l95_ms[name] = order_statistic(latency_ms)
-        late = np.count_nonzero(latency_ms > problem.pipeline.deadline_ms)
-        violation_rate[name] = int(late) / samples
-        own[name] = FrozenDict(cycles.own_work(placement))
-    return FrozenDict(uncut_l95_ms), FrozenDict(violation_rate), FrozenDict(own)
+def _each(prices: Mapping[str, Price], what: str) -> Mapping[str, Any]:
+    return FrozenDict({name: getattr(price, what) for name, price in prices.items()})
 
 
 class SampleCycles:

@@ -44,7 +44,8 @@ from numpy.typing import NDArray
 from dwell.errors import Fault, ProblemError
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.paths import longest_path, order_statistic, steps_of
-from dwell.estimators.profile import SEED, Profile, SampleCycles
+from dwell.estimators.prices import SEED
+from dwell.estimators.profile import Profile, SampleCycles
 from dwell.estimators.spans import Spans, patience_ns, spans_of
 from dwell.model.bounds import VALUE, shown
 from dwell.model.pipeline import Flow

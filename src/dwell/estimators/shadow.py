@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from dwell.estimators.evidence import UNKNOWN, Evidence, Instants
 from dwell.estimators.measured import groups
 from dwell.estimators.paths import Step, steps_of
-from dwell.estimators.profile import SEED, Profile, SampleCycles
+from dwell.estimators.prices import SEED
+from dwell.estimators.profile import Profile, SampleCycles
 from dwell.estimators.protocol import Support
 from dwell.model.bounds import HALF_LIFE_WINDOWS
 from dwell.model.instants import HORIZON_NS, NEVER_NS

@@ -183,6 +183,8 @@ class Drawing:
         Windows of the whole run.
     shadow : bool
         Whether what belongs to one job or message is drawn for shadow jobs.
+    wraps : bool
+        Whether every trace begins anew where it ends.
 
     Raises
     ------
@@ -191,10 +193,17 @@ class Drawing:
     """
 
     def __init__(
-        self, problem: Problem, scenario: str, *, seed: int, windows: int, shadow: bool = False
+        self,
+        problem: Problem,
+        scenario: str,
+        *,
+        seed: int,
+        windows: int,
+        shadow: bool = False,
+        wraps: bool = False,
     ) -> None:
         self.problem, self.name, self.scenario = problem, scenario, problem.scenario(scenario)
-        self.seed, self.windows, self.shadow = seed, windows, shadow
+        self.seed, self.windows, self.shadow, self.wraps = seed, windows, shadow, wraps
         self.cycles = problem.cycles_of(windows)
         self.drawn = 0
         #: The cycles that are drawn, where it is not every one (see `draw_shadows`).
@@ -368,7 +377,8 @@ class Drawing:
         if id(table) not in self.rows:
             rng = self._rng(f"trace/{table.stream}/{table.by}/{table.group}")
             # The last release only closes the last window; no cycle needs a row for it.
-            self.rows[id(table)] = table, table.replay(rng, self.release_ns[:-1] / NS_PER_MS)
+            release_ms = self.release_ns[:-1] / NS_PER_MS
+            self.rows[id(table)] = table, table.replay(rng, release_ms, wraps=self.wraps)
         return self.rows[id(table)][1]
 
     def _trace_starts(self) -> Iterator[TraceStart]:

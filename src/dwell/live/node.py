@@ -25,7 +25,7 @@ from dwell.live.state_files import make_folder
 from dwell.live.supervision import Supervisor
 from dwell.live.transport.orphans import remove_orphans
 from dwell.live.wiring import wire
-from dwell.model import Problem
+from dwell.model import Problem, QoS
 
 #: Why a folder cannot be made that somebody has to put right; anything else is tried again.
 MISTAKEN = frozenset({errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP})
@@ -219,8 +219,21 @@ def _controller(problem: Problem, policy: str | None, say: Callable[[str], None]
         name = problem.policy_and_estimator(policy or problem.controller.policy)[0]
         if name not in problem.candidates:
             raise
-        say(f"{error}; placement {name} stays, and its record has the estimates of profile")
-        return Controller(problem, name, "profile")
+        say(f"{error}; placement {name} stays, and its record expects no other of any candidate")
+        return Controller(problem, name, _AsSeen(problem))
+
+
+class _AsSeen:
+    """An estimator that expects of every candidate what the window showed."""
+
+    def __init__(self, problem: Problem) -> None:
+        self._names = tuple(problem.candidates)
+
+    def estimate(
+        self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
+    ) -> Mapping[str, QoS]:
+        """Expect the window of all (see `Estimator`)."""
+        return dict.fromkeys(self._names, observed)
 
 
 def _require_runs(out: Path) -> None:

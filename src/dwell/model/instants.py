@@ -44,3 +44,8 @@ def require_length(
         )
         raise ProblemError([Fault(asked, message)])
     return cycles
+
+
+def longest_run(period_ms: float) -> int:
+    """Return how many cycles a run has at most."""
+    return int(min(CYCLES.high, LENGTH_S.high / (period_ms / 1e3)))

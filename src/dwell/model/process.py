@@ -293,11 +293,13 @@ class TraceTable:
         """
         return self.file.rpartition("/")[2] if self.file.startswith("/") else self.file
 
-    def replay(self, rng: np.random.Generator, release_ms: Floats) -> NDArray[np.int64]:
+    def replay(
+        self, rng: np.random.Generator, release_ms: Floats, *, wraps: bool = False
+    ) -> NDArray[np.int64]:
         """Rows that cycles released at `release_ms` take, from a random start.
 
         Without ``wrap`` the start is drawn from those after which enough rows (or enough time)
-        remain in the same group.
+        remain in the same group; with `wraps` as if it had ``wrap``.
 
         Raises
         ------
@@ -308,15 +310,16 @@ class TraceTable:
 
         ends = np.append(self.starts[1:], self.rows)
         if self.by == "row" or self.time_ms is None:
-            return self._replay_rows(rng, len(release_ms), ends)
-        return self._replay_time(rng, release_ms - release_ms[0], self.time_ms, ends)
+            return self._replay_rows(rng, len(release_ms), ends, wraps or self.wrap)
+        elapsed_ms = release_ms - release_ms[0]
+        return self._replay_time(rng, elapsed_ms, self.time_ms, ends, wraps or self.wrap)
 
     def _replay_rows(
-        self, rng: np.random.Generator, cycles: int, ends: NDArray[np.int64]
+        self, rng: np.random.Generator, cycles: int, ends: NDArray[np.int64], wraps: bool
     ) -> NDArray[np.int64]:
         import numpy as np
 
-        if self.wrap:
+        if wraps:
             # The whole file is one loop, so that every row is used and groups keep their order.
             return (rng.integers(self.rows) + np.arange(cycles)) % self.rows
         slack = np.maximum(ends - self.starts - cycles + 1, 0)
@@ -335,11 +338,12 @@ class TraceTable:
         elapsed_ms: Floats,
         time_ms: Floats,
         ends: NDArray[np.int64],
+        wraps: bool,
     ) -> NDArray[np.int64]:
         import numpy as np
 
         spans = time_ms[ends - 1]
-        if self.wrap:
+        if wraps:
             return self._wrap_time(rng, elapsed_ms, time_ms, spans, ends - self.starts)
         needs = float(elapsed_ms[-1])
         # Releases are whole nanoseconds: a trace that ends within one of them is long enough.
@@ -375,7 +379,7 @@ class TraceTable:
         lengths = spans + np.where(gaps > 0, spans / np.maximum(gaps, 1), usual)
         total = float(lengths.sum())
         if total == 0:  # every row has the same instant: their order is all there is
-            return self._replay_rows(rng, len(elapsed_ms), np.array([self.rows]))
+            return self._replay_rows(rng, len(elapsed_ms), np.array([self.rows]), True)
         begin = np.concatenate(([0.0], np.cumsum(lengths)[:-1]))
         instants = np.repeat(begin, counts) + time_ms
         phase = (rng.uniform(0, total) + elapsed_ms) % total

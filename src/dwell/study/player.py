@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from dwell.cost import hamming, price
 from dwell.errors import SimulationError
+from dwell.estimators.prices import Price, Question, known_prices, take_over
 from dwell.model import Problem
 from dwell.model.bounds import counted
 from dwell.study.hindsight import Hindsight
@@ -71,11 +72,16 @@ class Player:
         That of the process that asks; a process with other software refuses to play.
     kept : tuple of int
         Seeds whose runs are kept whole.
+    prices : dict
+        What candidates come to, as the process that asks has played them (see `rehearse`).
     """
 
     study: Study
     software: Mapping[str, str] = field(default_factory=software)
     kept: tuple[int, ...] = ()
+    prices: dict[Question, Mapping[str, Price]] = field(
+        default_factory=dict, repr=False, compare=False
+    )
     # Problems as contenders see them, by point and contender: a study asks for each many times.
     _seen: dict[tuple[int, str], Problem] = field(default_factory=dict, repr=False, compare=False)
 
@@ -97,6 +103,7 @@ class Player:
             raise SimulationError(
                 f"a worker has other software than the process that asks it: {has}, not {needs}"
             )
+        take_over(self.prices)
         realisation = draw(
             self.study.points[item.points[0]].problem,
             scenario=item.scenario,
@@ -125,6 +132,7 @@ class Player:
             alone = play_alone(problem, realisation) if self._in_hindsight else None
             for contender in self.study.contenders:
                 self._simulate(contender, 0, realisation, alone)
+        self.prices.update(known_prices())
 
     def _play(
         self, point: int, item: Item, realisation: Realisation

@@ -1,0 +1,280 @@
+"""Prices: what windows of a candidate come to where the cell stays on it.
+
+The kernel plays every candidate alone, as `simulate` does with a policy that never moves: with
+contention, queues, links and cycles that overlap. All candidates meet the same draws, so that they
+differ by where their tasks run and not by luck. More is played until the means are known well
+enough (`L95_SHARE`, `RATE`), or `MOST_CYCLES` or `MOST_EVENTS` are reached; how much that is
+depends on counts and values alone, so that a price is a fixed number. Traces begin anew where they
+end.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.estimators.paths import l95_rank
+from dwell.kernels.advance import play
+from dwell.kernels.arrays import Arrays, lay_out
+from dwell.kernels.codes import CycleOutcome
+from dwell.kernels.random_draws import Drawing
+from dwell.kernels.realisation import Realisation
+from dwell.model.fabric import Fabric
+from dwell.model.frozen import FrozenDict
+from dwell.model.instants import NEVER_NS, longest_run
+from dwell.model.pipeline import Pipeline
+from dwell.model.placement import Placement
+from dwell.model.problem import Problem
+from dwell.model.scenario import Scenario
+
+Floats: TypeAlias = NDArray[np.float64]
+Ints: TypeAlias = NDArray[np.int64]
+
+SEED = 20_250_601
+#: Standard errors that are good enough: of L95 as a share of it, and of V_D.
+L95_SHARE, RATE = 0.01, 0.0025
+#: How much of a candidate is played at most.
+MOST_CYCLES, MOST_EVENTS = 100_000, 10_000_000
+#: Windows that are played first: those in which queues settle, which do not count, and others; of a
+#: scenario as many as a run has if nothing else is asked for.
+SETTLING, FIRST, DISTURBED = 5, 20, 300
+#: Means of so many stretches of windows, whose windows may depend on each other, have the error.
+STRETCHES = 20
+#: How much more is played than seems to be needed, since the error is itself an estimate.
+AMPLE = 1.2
+#: Of how many questions the answers are kept.
+KEPT = 64
+#: Longer windows are played as windows of so many cycles.
+LONGEST_WINDOW = 4_000
+
+
+@dataclass(frozen=True, slots=True)
+class Price:
+    """Means over the windows of a candidate that stays, with their standard errors.
+
+    Parameters
+    ----------
+    l95_ms, l95_error_ms : float
+        L95 as a controller sees it, never more than ``problem.censor_ms``.
+    uncut_l95_ms : float
+        The same without that bound, by what the cycles of a window took in the end; infinite where
+        more than 5 % of them are lost, or never come to an end.
+    violation_rate, violation_error : float
+        V_D.
+    latency_ms : float
+        Mean latency of the cycles that came to an end; NaN where none did.
+    own : mapping of str to float
+        Share of each node's cores that the cell's jobs take.
+    cycles : int
+        How many cycles were played, those at the begin that do not count included.
+    """
+
+    l95_ms: float
+    l95_error_ms: float
+    uncut_l95_ms: float
+    violation_rate: float
+    violation_error: float
+    latency_ms: float
+    own: Mapping[str, float]
+    cycles: int
+
+    @property
+    def is_good_enough(self) -> bool:
+        """Whether no more has to be played."""
+        return self.wanted <= 1.0
+
+    @property
+    def wanted(self) -> float:
+        """How many times as much must be played."""
+        l95 = self.l95_error_ms / (L95_SHARE * self.l95_ms) if self.l95_error_ms else 0.0
+        return max(l95, self.violation_error / RATE) ** 2
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """All of a problem that its prices depend on."""
+
+    pipeline: Pipeline
+    fabric: Fabric
+    candidates: Mapping[str, Placement]
+    window_cycles: int
+    censor_ms: float
+    close_grace_ms: float
+    scenario: Scenario
+    name: str
+    seed: int
+    cycles: int | None
+    problem: Problem = field(compare=False, repr=False)
+
+
+_known: dict[Question, Mapping[str, Price]] = {}
+
+
+def prices_of(
+    problem: Problem, scenario: str = "baseline", *, seed: int = SEED, cycles: int | None = None
+) -> Mapping[str, Price]:
+    """Return the price of every candidate; what was asked before is not played again.
+
+    Parameters
+    ----------
+    scenario : str
+        Whose disturbances the cell meets.
+    seed : int
+        Seed of the draws.
+    cycles : int, optional
+        How many cycles of each candidate count; as many as are needed where None.
+
+    Raises
+    ------
+    KernelError
+        If the compiled kernel cannot be loaded.
+    """
+    question = Question(
+        pipeline=problem.pipeline,
+        fabric=problem.fabric,
+        candidates=problem.candidates,
+        window_cycles=problem.window_cycles,
+        censor_ms=problem.censor_ms,
+        close_grace_ms=problem.controller.close_grace_ms,
+        scenario=problem.scenario(scenario),
+        name=scenario,
+        seed=seed,
+        cycles=cycles,
+        problem=problem,
+    )
+    if question not in _known:
+        take_over({question: _answer(question)})
+    return _known[question]
+
+
+def known_prices() -> dict[Question, Mapping[str, Price]]:
+    """Return what this process has been asked of late, for another one to `take_over`."""
+    return dict(_known)
+
+
+def take_over(known: Mapping[Question, Mapping[str, Price]]) -> None:
+    """Know prices that have been played already; those that were known longest are forgotten."""
+    _known.update(known)
+    for question in list(_known)[:-KEPT]:
+        del _known[question]
+
+
+def _answer(question: Question) -> Mapping[str, Price]:
+    problem = question.problem
+    if problem.window_cycles > LONGEST_WINDOW:
+        problem = replace(problem, window_cycles=LONGEST_WINDOW)
+    most = _most_windows(problem, question.cycles)
+    windows = min(DISTURBED if question.scenario else SETTLING + FIRST, most)
+    if question.cycles is not None:
+        windows = most
+    found: dict[str, Price] = {}
+    left = list(problem.candidates)
+    while True:
+        drawing = Drawing(problem, question.name, seed=question.seed, windows=windows, wraps=True)
+        realisation = drawing.take(windows)
+        found |= {name: price_of(problem, realisation, name) for name in left}
+        left = [name for name in left if not found[name].is_good_enough]
+        if not left or windows == most:
+            break
+        counted = windows - min(SETTLING, windows - 1)
+        wanted = AMPLE * max(found[name].wanted for name in left) * counted
+        windows = min(SETTLING + math.ceil(min(wanted, most)), most)
+    return FrozenDict({name: found[name] for name in problem.candidates})
+
+
+def _most_windows(problem: Problem, cycles: int | None) -> int:
+    """How many windows are played of a candidate: so that `cycles` count, or at most; one or more.
+
+    An event is a release, a completion or a message.
+    """
+    pipeline, width = problem.pipeline, problem.window_cycles
+    events = 1 + len(pipeline.tasks) + len(pipeline.flows)
+    most = min(MOST_CYCLES, MOST_EVENTS // events) // width
+    if cycles is not None:
+        most = SETTLING + -(-cycles // width)
+    return max(min(most, longest_run(pipeline.period_ms) // width), 1)
+
+
+def play_alone(problem: Problem, realisation: Realisation, name: str) -> Arrays:
+    """Play a candidate that stays, and return the tables of what it did."""
+    arrays = lay_out([(problem, realisation)])
+    arrays.tables.stamps[:] = list(problem.candidates).index(name)
+    play(arrays)
+    return arrays
+
+
+def price_of(problem: Problem, realisation: Realisation, name: str) -> Price:
+    """Price a candidate by its windows on one realisation."""
+    tables = play_alone(problem, realisation, name).tables
+    first = min(SETTLING, realisation.windows - 1)
+    seen = tables.seen[0, first:]
+    l95_ms, l95_error_ms = mean_and_error(seen["l95_ms"])
+    rates = seen["missed"] / problem.window_cycles
+    violation_rate, violation_error = mean_and_error(rates)
+    if l95_error_ms and not violation_error:
+        # It is random, and still every window misses as many: none, or all, as a rule.
+        violation_error = _unseen_error(violation_rate, len(seen) * problem.window_cycles)
+    since = first * problem.window_cycles
+    latency_ns, outcome = tables.latency_ns[0, since:], tables.outcome[0, since:]
+    done = outcome == CycleOutcome.DONE
+    finished_ms = latency_ns[done] / 1e6
+    usual_ms = float(np.median(finished_ms)) if len(finished_ms) else 0.0
+    # What is still under way, and no older than usual, may come to an end or not.
+    age_ms = (realisation.release_ns[-1] - realisation.release_ns[since:-1]) / 1e6
+    is_young = (outcome == CycleOutcome.IN_FLIGHT) & (age_ms <= max(problem.censor_ms, usual_ms))
+    lost = int(np.count_nonzero(~done & ~is_young))
+    uncut_ms = _known_later(latency_ns.reshape(len(seen), -1), seen["l95_ms"])
+    open_windows = is_young.reshape(len(seen), -1).any(axis=1)
+    if not open_windows.all():
+        uncut_ms = uncut_ms[~open_windows]
+    # Shares that are equal but for the rounding of sums are equal.
+    own = tables.shares[0, first:, 1].mean(axis=0).round(12)
+    return Price(
+        l95_ms=l95_ms,
+        l95_error_ms=l95_error_ms,
+        uncut_l95_ms=math.inf if lost > 0.05 * len(done) else max(float(uncut_ms.mean()), l95_ms),
+        violation_rate=violation_rate,
+        violation_error=violation_error,
+        latency_ms=float(finished_ms.mean()) if len(finished_ms) else math.nan,
+        own=FrozenDict(zip(problem.fabric.nodes, own.tolist(), strict=True)),
+        cycles=realisation.cycles,
+    )
+
+
+def mean_and_error(by_window: Floats) -> tuple[float, float]:
+    """Mean of windows, and its standard error by the means of stretches of them.
+
+    Windows that are all equal have no error; of a single one it is infinite.
+    """
+    mean = float(by_window.mean())
+    if len(by_window) < 2:
+        return mean, math.inf
+    if (by_window == by_window[0]).all():
+        return mean, 0.0
+    stretches = np.array_split(by_window, min(STRETCHES, len(by_window)))
+    means = np.array([stretch.mean() for stretch in stretches])
+    return mean, float(means.std(ddof=1) / math.sqrt(len(means)))
+
+
+def _unseen_error(rate: float, cycles: int) -> float:
+    """Standard error of a rate, had one cycle more been missed and one more not (Laplace)."""
+    rate = (rate * cycles + 1) / (cycles + 2)
+    return math.sqrt(rate * (1 - rate) / cycles)
+
+
+def _known_later(latency_ns: Ints, seen_ms: Floats) -> Floats:
+    """L95 of every window by what its cycles took in the end, milliseconds, or what was seen.
+
+    Parameters
+    ----------
+    latency_ns : int64 array, shape (windows, W)
+        `NEVER_NS` where a cycle did not come to an end.
+    """
+    rank = l95_rank(latency_ns.shape[1])
+    l95_ns = np.partition(latency_ns, rank - 1, axis=1)[:, rank - 1]
+    return np.where(l95_ns < NEVER_NS, np.maximum(l95_ns / 1e6, seen_ms), seen_ms)
