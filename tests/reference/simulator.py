@@ -34,6 +34,8 @@ NEAR_NS = 1000
 STATE_TIMEOUT_MS = 200
 DRAWN_MS = 5
 LEAST_TURN_MS = 1.4
+# Cycles beyond a window after which a shadow is given up.
+GIVEN_UP_AFTER = 64
 # Behind all that an event does one after another.
 LATE = 10**9
 
@@ -331,6 +333,9 @@ class NodeState:
         self.waiting: list[Thread] = []
         self.had = 0
         self.debt = self.touched = self.touched_by_change = False
+        # Shadow jobs there were at the last event, and accelerators where one may begin in this.
+        self.seen_shadows: list[Job] = []
+        self.looked_at: set[str] = set()
         self.period_ago = self.tick_ago = 0
         self.wakes = [0]
         self.wake_key = 0
@@ -416,8 +421,20 @@ class NodeState:
         threads = [*self.waiting, *([self.turn] if self.turn else [])]
         return sum(thread.received for thread in threads) // max(len(threads), 1)
 
+    @property
+    def own(self) -> list[Job]:
+        """Jobs of the CPU that are no shadow jobs."""
+        return [job for job in self.jobs if job.cell == ITSELF]
+
+    @property
+    def shadows(self) -> list[Job]:
+        """Shadow jobs of the CPU."""
+        return [job for job in self.jobs if job.cell == SHADOW]
+
     def line_up(self) -> None:
         """Let threads that are new wait for their turn, and take those that are gone away."""
+        if self.shadows != self.seen_shadows:
+            self.seen_shadows, self.touched = self.shadows, True
         new_foreign = self.touched_by_change
         average = self.average
         if self.turn and self.turn.job and self.turn.job not in self.jobs:
@@ -432,7 +449,7 @@ class NodeState:
             self.waiting += [Thread(None, average) for _ in range(self.foreign)]
             self.touched_by_change = False
         known = [thread.job for thread in (*self.waiting, self.turn) if thread]
-        for job in self.jobs:
+        for job in self.own:
             if job not in known:
                 self.waiting.append(Thread(job, self.beginning(job)))
                 self.touched = True
@@ -491,7 +508,7 @@ class NodeState:
 
     def next_look(self, now: int) -> int | None:
         """When the kernel looks next if nothing changes."""
-        if self.down or not (self.turn or self.waiting):
+        if self.down or not (self.turn or self.waiting or self.shadows):
             return None
         step, ago = self.tick, self.tick_ago
         if self.debt:
@@ -519,37 +536,58 @@ class NodeState:
     @property
     def running(self) -> list[Job]:
         if self.tick:
-            return [self.turn.job] if self.turn and self.turn.job else []
+            return [self.turn.job] if self.turn and self.turn.job else self.shadows
         if self.node.scheduler == "fair":
             return self.jobs
         return [job for job in self.jobs if job.cores > 0]
 
     @property
     def threads(self) -> int:
-        """K'."""
-        if self.node.scheduler == "fair":
-            return sum(job.execution.threads for job in self.jobs)
-        return sum(job.cores for job in self.jobs)
+        """K' + H'."""
+        return self.threads_of(self.jobs)
 
-    @property
-    def speed(self) -> Fraction:
+    def threads_of(self, jobs: Sequence[Job]) -> int:
+        """Threads of jobs, or the cores that they hold."""
+        if self.node.scheduler == "fair":
+            return sum(job.execution.threads for job in jobs)
+        return sum(job.cores for job in jobs)
+
+    def speed(self, cell: int) -> Fraction:
+        """Speed of own jobs, or of shadow jobs."""
         if self.stopped:
             return Fraction(0)
-        share = self.share * self.pace
+        share = (self.share if cell == ITSELF else self.share_of_shadows) * self.pace
         return share / (Fraction(self.node.interference) if self.foreign else 1)
 
     @property
-    def share(self) -> Fraction:
-        """Cores that a thread has of those that there are."""
-        c, s = self.node.cores, self.foreign
+    def free_of_background(self) -> Fraction:
+        """c'."""
         # Under a quota the background takes from the bucket, elsewhere from the cores.
-        left = c - (Fraction(0) if self.quota else Fraction(self.node.background))
+        return self.node.cores - (Fraction(0) if self.quota else Fraction(self.node.background))
+
+    @property
+    def share(self) -> Fraction:
+        """Cores that a thread of an own job has of those that there are."""
+        c, s = self.node.cores, self.foreign
+        left = self.free_of_background
         if self.tick:
             job = self.turn.job if self.turn else None
             return Fraction(1, job.execution.threads) if job else Fraction(0)
         if self.node.scheduler == "fair":
-            return min(Fraction(1), left / max(1, self.threads + s))
+            return min(Fraction(1), left / max(1, self.threads_of(self.own) + s))
         return left / (c + s)
+
+    @property
+    def share_of_shadows(self) -> Fraction:
+        """Cores that a thread of a shadow job has."""
+        if self.node.scheduler != "fair":
+            return self.share
+        own, left = self.threads_of(self.own), self.free_of_background
+        if self.tick:
+            left = Fraction(0 if self.turn and self.turn.job else 1)
+        else:
+            left -= own * self.share
+        return min(Fraction(1), left / max(1, self.foreign + self.threads_of(self.shadows)))
 
     def part(self, job: Job) -> Fraction:
         """Part of its speed at which a job runs on the cores that it holds."""
@@ -570,10 +608,10 @@ class NodeState:
         """Let the time since the last change pass."""
         elapsed = now - self.since
         self.since = now
-        speed, rate = self.speed, self.rate
+        speeds, rate = {cell: self.speed(cell) for cell in (ITSELF, SHADOW)}, self.rate
         for job in self.running:
             before = max(job.left, Fraction(0))
-            job.left -= speed * self.part(job) * elapsed
+            job.left -= speeds[job.cell] * self.part(job) * elapsed
             received = before - max(job.left, Fraction(0))
             self.work[job.cell] += job.execution.threads * received
         for jobs in self.served.values():
@@ -581,8 +619,8 @@ class NodeState:
                 job.left -= elapsed * (job.cores > 0)
         self.busy += (rate * self.pace + self.behind) * elapsed
         self.left -= rate * elapsed
-        self.had += rate * elapsed
         if self.turn:
+            self.had += rate * elapsed
             self.turn.received += rate * elapsed
         if (self.slack or self.tick) and (now + self.period_ago) // self.period > self.periods:
             self.periods, self.pool = (now + self.period_ago) // self.period, self.grant
@@ -596,32 +634,58 @@ class NodeState:
         kind = job.execution.accelerator
         return self.jobs if kind is None else self.served[kind]
 
-    def give_out(self) -> None:
-        """Give out the cores, and the places on the accelerators."""
+    def give_out(self, awaited: Callable[[str, Job], bool]) -> None:
+        """Give out the cores, and the places on the accelerators.
+
+        `awaited` says whether an own job is due on an accelerator before a shadow job would end.
+        """
         c = self.node.cores
         if self.tick:
             self.line_up()
             if self.touched:
                 self.notice()
             self.take_turns()
-            for job in self.jobs:
+            for job in self.own:
                 job.cores = int(self.turn is not None and job is self.turn.job)
+            for job in self.shadows:
+                job.cores = 1
         elif self.node.scheduler == "fair":
             for job in self.jobs:
                 job.cores = min(job.execution.threads, c)
         elif self.node.scheduler == "fifo":
-            hold_in_order(sorted(self.jobs, key=lambda job: job.readiness), c)
+            hold_in_order(sorted(self.own, key=lambda job: job.readiness), c, c)
+            shadows = sorted(self.shadows, key=lambda job: job.readiness)
+            left = c - self.threads_of(self.own)
+            put_back(shadows, left)
+            hold_in_order(shadows, left, c)
         else:
-            for job in self.jobs:
-                # Reading: one that has all its work keeps its cores until it completes.
-                if job.start is None or job.left > 0:
-                    job.cores = 0
-            # Reading: as under fifo, the first that does not fit ends the round.
-            by_priority = sorted(self.jobs, key=lambda job: (-job.task.priority, job.readiness))
-            hold_in_order(by_priority, c)
+            free = c
+            for jobs in (self.own, self.shadows):
+                for job in jobs:
+                    # Reading: one that has all its work keeps its cores until it completes.
+                    if job.start is None or job.left > 0:
+                        job.cores = 0
+                # Reading: as under fifo, the first that does not fit ends the round.
+                by_priority = sorted(jobs, key=lambda job: (-job.task.priority, job.readiness))
+                hold_in_order(by_priority, free, c)
+                free -= self.threads_of(jobs)
         for kind, jobs in self.served.items():
-            in_order = sorted(jobs, key=lambda job: job.readiness)
-            hold_in_order(in_order, self.node.accelerators[kind], width=1)
+            self.give_out_places(kind, sorted(jobs, key=lambda job: job.readiness), awaited)
+
+    def give_out_places(
+        self, kind: str, jobs: Sequence[Job], awaited: Callable[[str, Job], bool]
+    ) -> None:
+        """Give out the places of an accelerator."""
+        places = self.node.accelerators[kind]
+        own, shadows = ([job for job in jobs if job.cell == cell] for cell in (ITSELF, SHADOW))
+        hold_in_order(own, places - sum(job.cores for job in shadows), 1)
+        if kind not in self.looked_at or any(job.cores == 0 for job in own):
+            return
+        for job in shadows:
+            full = sum(other.cores for other in jobs) >= places
+            if job.cores == 0 and (full or awaited(kind, job)):
+                break
+            job.cores = 1
 
     def due(self, job: Job, now: int) -> int | None:
         """First whole nanosecond at which the job will have its execution time, as things are."""
@@ -629,19 +693,26 @@ class NodeState:
             return now
         if job.cores == 0:
             return None
-        speed = self.speed * self.part(job) if job.execution.accelerator is None else Fraction(1)
+        speed = self.speed(job.cell) * self.part(job) if job.execution.accelerator is None else Fraction(1)
         if speed == 0:
             return None
         return now + math.ceil(job.left / speed)
 
 
-def hold_in_order(jobs: Sequence[Job], cores: int, width: int | None = None) -> None:
-    """Give cores to those that hold none, in order, until one does not fit."""
+def put_back(jobs: Sequence[Job], cores: int) -> None:
+    """Take the cores of the last of some jobs, in order, until the rest fit."""
+    for job in reversed(jobs):
+        if sum(other.cores for other in jobs) > cores and job.left > 0:
+            job.cores = 0
+
+
+def hold_in_order(jobs: Sequence[Job], cores: int, width: int) -> None:
+    """Give cores, at most `width`, to those that hold none, in order, until one does not fit."""
     free = cores - sum(job.cores for job in jobs)
     for job in jobs:
         if job.cores > 0:
             continue
-        needed = width or min(job.execution.threads, cores)
+        needed = min(job.execution.threads, width)
         if needed > free:
             break
         job.cores = needed
@@ -727,6 +798,9 @@ class Simulation:
         self.lost_joins: set[tuple[int, int, str]] = set()
         self.jobs: dict[tuple[int, int, str], Job] = {}
         self.arrived: dict[tuple[int, int, str, str], int] = {}
+        self.given_up: set[int] = set()
+        # Least time from a release to readiness, by candidate and task.
+        self.soonest: dict[tuple[str, str], int] = {}
 
         self.log: list[LogEntry] = []
         self.current = -1
@@ -762,11 +836,12 @@ class Simulation:
             for node in self.nodes.values():
                 node.advance(time)
             action()
-            for node in self.nodes.values():
-                node.give_out()
+            for name, node in self.nodes.items():
+                node.give_out(self.awaiter(name))
                 node.give_back()
                 self.plan(node)
                 node.touched = False
+                node.looked_at.clear()
 
         order = (((kind * 10 + cell) * 10**9 + cycle + 1) * 10**6 + task + 1) * 10**6 + flow
         At(self.env, time - self.now, order, happen)
@@ -808,6 +883,34 @@ class Simulation:
                 # Nothing else happens then; every event looks anew at who runs, and how fast.
                 look = self.looker(node, empty_at)
                 self.at(empty_at, DISTURBANCE, -1, LAST_CHANGE, look, fixed=bool(node.tick))
+
+    def awaiter(self, node: str) -> Callable[[str, Job], bool]:
+        """Whether an own job is due on an accelerator of a node before a shadow job would end."""
+
+        def on_it(cycle: int, kind: str) -> list[str]:
+            placement = self.placed[ITSELF, cycle]
+            tasks = self.pipeline.tasks.values()
+            here = [task.name for task in tasks if placement[task.name] == node]
+            return [name for name in here if self.execution(name, node).accelerator == kind]
+
+        def awaited(kind: str, job: Job) -> bool:
+            end = self.now + nanoseconds(job.execution.exec_ms.expectation)
+            period = nanoseconds(self.pipeline.period_ms)
+            for cycle, (active, _) in enumerate(self.stamps):
+                for task in on_it(cycle, kind):
+                    due = self.release[cycle] + self.soonest.get((active, task), 0)
+                    if cycle == len(self.stamps) - 1 and due + period < end:
+                        return True
+                    missing = (ITSELF, cycle, task) not in self.jobs
+                    lost = (ITSELF, cycle) in self.losses
+                    if missing and not lost and due < end and self.now < due + period:
+                        return True
+            return False
+
+        return awaited
+
+    def execution(self, task: str, node: str) -> Execution:
+        return self.pipeline.tasks[task].on[node]
 
     def looker(self, node: NodeState, time: int) -> Callable[[], None]:
         def look() -> None:
@@ -1081,6 +1184,8 @@ class Simulation:
         """Let the guard hear of a cycle or a probe if it has completed, after the way back."""
         if self.guard is None or (cell, cycle) in self.heard_of or (cell, cycle) not in self.placed:
             return
+        if self.is_given_up(cell, cycle):
+            return
         if not all(self.reached(cell, cycle, sink) for sink in self.sinks):
             return
         self.heard_of.add((cell, cycle))
@@ -1132,6 +1237,9 @@ class Simulation:
     def releaser(self, cycle: int) -> Callable[[], None]:
         def release() -> None:
             self.opened[cycle] = self.usage
+            self.give_up(cycle - self.problem.window_cycles - GIVEN_UP_AFTER)
+            for node in self.nodes.values():
+                node.looked_at |= set(node.served)
             active, other = self.stamp(cycle)
             self.stamps.append((active, other))
             self.placed[ITSELF, cycle] = self.problem.candidates[active]
@@ -1165,6 +1273,31 @@ class Simulation:
                 self.start_later(SHADOW, cycle, name, offset)
         self.hear_back(SHADOW, cycle)
 
+    def give_up(self, cycle: int) -> None:
+        """Give up the shadow of a cycle."""
+        self.given_up.add(cycle)
+        for name in self.pipeline.tasks:
+            job = self.jobs.get((SHADOW, cycle, name))
+            if job is None or job.outcome != "in_flight":
+                continue
+            pool = self.pools[SHADOW, name, job.node]
+            job.due = None
+            if job in pool.waiting:
+                pool.waiting.remove(job)
+                continue
+            self.nodes[job.node].runnable(job).remove(job)
+            self.looked_at(job)
+            pool.idle += 1
+            self.take(pool, job.node)
+
+    def is_given_up(self, cell: int, cycle: int) -> bool:
+        return cell == SHADOW and cycle in self.given_up
+
+    def looked_at(self, job: Job) -> None:
+        """Note that something happened to jobs of an accelerator."""
+        if job.execution.accelerator is not None:
+            self.nodes[job.node].looked_at.add(job.execution.accelerator)
+
     def start_later(self, cell: int, cycle: int, task: str, offset: int) -> None:
         self.at(
             self.now + offset,
@@ -1179,6 +1312,8 @@ class Simulation:
     def start_source(self, cell: int, cycle: int, task: str) -> None:
         # Reading: a source with an offset is released when its offset is over. On a node that is
         # down its job is lost as soon as it is ready.
+        if self.is_given_up(cell, cycle):
+            return
         job = self.make_job(cell, cycle, task, ())
         if self.nodes[job.node].down:
             self.lose_job(job, "node_down")
@@ -1252,6 +1387,8 @@ class Simulation:
         """Bring one input to a task, by a message or by a hand-over on the same node."""
         task = flow.target
         key = (cell, cycle, task)
+        if self.is_given_up(cell, cycle):
+            return
         if self.nodes[self.placed[cell, cycle][task]].down:
             self.lost_joins.add(key)
             self.lose(cell, cycle, "node_down")
@@ -1287,6 +1424,11 @@ class Simulation:
             senders=senders,
         )
         self.jobs[cell, cycle, name] = job
+        if cell == ITSELF:
+            since, under = self.now - self.release[cycle], self.stamps[cycle][0]
+            self.soonest[under, name] = min(since, self.soonest.get((under, name), since))
+        elif self.nodes[node].tick:
+            return job
         if self.nodes[node].tick and job.execution.accelerator is None:
             work, before = int(job.left), nanoseconds(job.execution.before_ms)
             if 0 < before < work:
@@ -1312,6 +1454,7 @@ class Simulation:
             pool.idle -= 1
             job = pool.waiting.pop(0)
             self.nodes[node].runnable(job).append(job)
+            self.looked_at(job)
 
     def complete(self, job: Job) -> None:
         if job.rest:
@@ -1320,6 +1463,7 @@ class Simulation:
         job.end = self.now
         job.outcome = "done"
         self.nodes[job.node].runnable(job).remove(job)
+        self.looked_at(job)
         pool = self.pools[job.cell, job.task.name, job.node]
         pool.idle += 1
         self.take(pool, job.node)
@@ -1338,6 +1482,8 @@ class Simulation:
     def send_output(self, cell: int, flow: Flow, job: Job) -> None:
         """Hand an output over, or send it, to where a cell has its target."""
         cycle = job.cycle
+        if self.is_given_up(cell, cycle):
+            return
         target = self.placed[cell, cycle][flow.target]
         if target == job.node:
             self.deliver(cell, cycle, flow, job)
@@ -1367,6 +1513,7 @@ class Simulation:
             node.touched_by_change = gone or node.foreign != change.threads
             node.foreign = change.threads
             node.touched = True
+            node.looked_at |= set(node.served)
             if change.down and not node.down:
                 self.hear()
                 node.down = True
@@ -1513,6 +1660,8 @@ class Simulation:
         """Send a message once more at `again`."""
 
         def happen() -> None:
+            if not message.is_state and self.is_given_up(message.cell, message.cycle):
+                return
             message.attempt = attempt
             message.sent_at, message.sent_by = self.now, self.current
             self.send(link, message)

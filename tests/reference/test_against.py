@@ -48,6 +48,7 @@ from tests.cells.generated import (
     random_stamps,
 )
 from tests.kernels.parts import attempt_uniform as kernel_uniform
+from tests.reference import simulator as reference_simulator
 from tests.reference.simulator import (
     ITSELF,
     NEAR_NS,
@@ -595,6 +596,15 @@ def test_equal_to_the_microsecond_with_processor_sharing(schedulers: Sequence[Sc
 
 @pytest.mark.parametrize("whole_ms", [False, True], ids=["continuous", "whole-ms"])
 def test_shadows_equal_to_the_nanosecond_without_processor_sharing(whole_ms: bool) -> None:
+    compare(("fifo", "priority"), whole_ms=whole_ms, orders=True, stamped=True)
+
+
+@pytest.mark.parametrize("whole_ms", [False, True], ids=["continuous", "whole-ms"])
+def test_shadows_given_up_early_equal_to_the_nanosecond_without_processor_sharing(
+    whole_ms: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sim_arrays, "GIVEN_UP_AFTER", 0)
+    monkeypatch.setattr(reference_simulator, "GIVEN_UP_AFTER", 0)
     compare(("fifo", "priority"), whole_ms=whole_ms, orders=True, stamped=True)
 
 

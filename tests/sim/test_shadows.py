@@ -20,6 +20,9 @@ from numpy.typing import NDArray
 import dwell
 from dwell.control import shadow_stamps
 from dwell.estimators import Evidence
+from dwell.kernels.advance import play as advance_to_end
+from dwell.kernels.arrays import lay_out
+from dwell.kernels.codes import Status
 from dwell.kernels.random_draws import draw_shadows
 from dwell.kernels.realisation import NodeChange
 from dwell.model import (
@@ -40,9 +43,10 @@ from dwell.model import (
     Task,
     Uniform,
 )
-from tests.cells.generated import MS, make_problem, make_realisation
+from tests.cells.generated import MS, Scheduler, make_problem, make_realisation
 from tests.reference.simulator import ITSELF, SHADOW, shadow_stamp, simulate
 from tests.reference.test_against import (
+    EXAMPLES,
     Case,
     Played,
     Probe,
@@ -50,6 +54,7 @@ from tests.reference.test_against import (
     differences,
     make_case,
     play_stamped,
+    random_shadow_stamps,
 )
 
 CANONICAL = Path(__file__).parents[2] / "examples" / "canonical.yaml"
@@ -67,13 +72,14 @@ def cell(
     *,
     moves: Mapping[str, Mapping[str, str]] = MOVES,
     cores: int = 1,
+    edge: Node = E,
     period_ms: float = 100,
     window_cycles: int = 1,
     **link: Any,
 ) -> Problem:
     """Return a problem on R and E with links of 1 ms in both directions."""
     return make_problem(
-        [replace(R, cores=cores), E],
+        [replace(R, cores=cores), edge],
         tasks,
         flows,
         links=[Link("R", "E", Constant(1), **link), Link("E", "R", Constant(1), **link)],
@@ -136,32 +142,127 @@ SIDE_BY_SIDE = cell(
 )
 
 
-def test_a_shadow_job_takes_the_cpu_from_the_cycle_itself() -> None:
-    # B' reaches E at 3, when D has 7 ms left: both run at half speed until B' has its 4 at 11.
+def test_a_shadow_job_has_what_the_cycle_itself_leaves_of_the_cpu() -> None:
+    # B' reaches E at 3 and stands still until D has its 10 ms.
     found = play(SIDE_BY_SIDE)
-    assert jobs(found, shadow=True) == {"B": ("E", 3, 11)}
+    assert jobs(found, shadow=True) == {"B": ("E", 3, 14)}
     assert jobs(found, shadow=False) == {
         "S": ("R", 0, 2),
         "B": ("R", 2, 6),
-        "D": ("E", 0, 14),
-        "K": ("R", 15, 16),
+        "D": ("E", 0, 10),
+        "K": ("R", 11, 12),
     }
-    assert latencies(found) == [16]
-    assert latencies(play(SIDE_BY_SIDE, others=[None])) == [12]
+    assert latencies(found) == latencies(play(SIDE_BY_SIDE, others=[None])) == [12]
+
+
+def test_two_tasks_on_one_core_with_a_shadow() -> None:
+    # R has 40 ms of every cycle for itself: B' goes on where it was when K has run.
+    problem = cell(
+        [task("A", 30), task("B", 30, "R", "E"), task("K", 1)],
+        [Flow("A", "K"), Flow("B", "K")],
+        period_ms=70,
+    )
+    found = play(problem, active="OFF", others=["LOC"])
+    assert jobs(found, shadow=False) == {
+        "A": ("R", 0, 30),
+        "B": ("E", 0, 30),
+        "K": ("R", 31, 32),
+    }
+    assert jobs(found, shadow=True) == {"B": ("R", 0, 61)}
+    assert latencies(found) == [32]
+    # As a placement, both run at half speed.
+    assert latencies(play(problem, others=[None])) == [61]
+
+
+STRESS = [NodeChange(0, "E", 1, False)]
+
+
+def test_a_shadow_job_beside_a_stress_thread_is_as_slow_as_a_real_one() -> None:
+    problem = cell(
+        [task("S", 2), task("B", 4, "R", "E"), task("K", 1)], [Flow("S", "B"), Flow("B", "K")]
+    )
+    found = play(problem, changes=STRESS)
+    assert jobs(found, shadow=True) == {"B": ("E", 3, 11)}
+    assert jobs(play(problem, active="OFF", changes=STRESS), shadow=False)["B"] == ("E", 3, 11)
+
+
+def test_a_shadow_job_shares_with_a_stress_thread_what_own_jobs_leave() -> None:
+    # D has half of E until 20, as without B', which has a quarter: 4 ms from 3 to 19.
+    found = play(SIDE_BY_SIDE, changes=STRESS)
+    assert jobs(found, shadow=False)["D"] == ("E", 0, 20)
+    assert jobs(found, shadow=True) == {"B": ("E", 3, 19)}
+
+
+@pytest.mark.parametrize("scheduler", ["fifo", "priority"])
+def test_an_own_job_takes_its_core_from_a_shadow_job_at_once(scheduler: Any) -> None:
+    # B' runs from 3 on; D takes E from 6 to 10, whatever priority B' has, and B' keeps its 3 ms.
+    problem = cell(
+        [
+            task("S", 2),
+            task("B", 8, "R", "E", priority=9),
+            task("D", 4, "E", offset_ms=6),
+            task("K", 1),
+        ],
+        [Flow("S", "B"), Flow("B", "K"), Flow("D", "K")],
+        edge=replace(E, scheduler=scheduler),
+    )
+    found = play(problem)
+    assert jobs(found, shadow=False)["D"] == ("E", 6, 10)
+    assert jobs(found, shadow=True) == {"B": ("E", 3, 15)}
+
+
+def on_accelerator(ms: float, *, offset_ms: float = 0.0) -> Problem:
+    """Five tasks of 10 ms on one accelerator of E, of which B would be another, of `ms` there."""
+    gpu = {"E": Execution(Constant(10), accelerator="gpu")}
+    five = [Task(f"G{i}", gpu, offset_ms=offset_ms) for i in range(5)]
+    on = {"R": Execution(Constant(4)), "E": Execution(Constant(ms), accelerator="gpu")}
+    return cell(
+        [task("S", 2), Task("B", on), task("K", 1), *five],
+        [Flow("S", "B"), Flow("B", "K")],
+        edge=replace(E, accelerators={"gpu": 1}),
+        window_cycles=2,
+    )
+
+
+@pytest.mark.parametrize(
+    ("ms", "offset_ms", "expected"),
+    [
+        # G0 to G4 run from 0 to 50 and again from 100: B' fits between them, or never begins.
+        (50, 0, [(50, 100), (150, 200)]),
+        (51, 0, [None, None]),
+        # Until it is known that they come 30 ms after the release they count as due at once; from
+        # then on B', which is there at 103, may end before they come.
+        (20, 30, [(80, 100), (103, 123)]),
+        (28, 30, [(80, 108), (180, 208)]),
+    ],
+)
+def test_a_shadow_job_begins_on_an_accelerator_where_no_own_job_is_due(
+    ms: float, offset_ms: float, expected: list[tuple[float, float] | None]
+) -> None:
+    found = play(on_accelerator(ms, offset_ms=offset_ms), windows=2)
+    shadow = found.jobs.filter(pl.col("shadow") & (pl.col("cycle") < 2))
+    times = [
+        None if start is None or end is None else (start / MS, end / MS)
+        for start, end in shadow.select("start_ns", "end_ns").rows()
+    ]
+    assert times == expected
+    own = found.jobs.filter(~pl.col("shadow") & pl.col("task").cast(str).str.starts_with("G"))
+    first = [offset_ms * MS + 100 * MS * k for k in range(4)]
+    assert own["start_ns"].to_list() == [at + 10 * MS * i for at in first for i in range(5)]
 
 
 def test_a_shadow_has_execution_times_of_its_own() -> None:
-    # 6 ms instead of 4: at half speed beside D from 3 to 15.
+    # 6 ms instead of 4, from when D has ended.
     found = play(SIDE_BY_SIDE, exec_ms={("B", "E"): [6], ("B", "R"): [50], ("S", "R"): [50]})
-    assert jobs(found, shadow=True) == {"B": ("E", 3, 15)}
-    assert latencies(found) == [18]
+    assert jobs(found, shadow=True) == {"B": ("E", 3, 16)}
+    assert latencies(found) == [12]
 
 
 def test_what_reaches_the_sink_of_a_shadow_is_discarded() -> None:
     # D is shared, and K is behind B: its input from D is sent a second time, too.
     found = play(SIDE_BY_SIDE)
-    assert arrivals(found, cell=SHADOW) == {"S->B": 3, "B->K": 12, "D->K": 15}
-    assert arrivals(found, cell=ITSELF) == {"S->B": 2, "B->K": 6, "D->K": 15}
+    assert arrivals(found, cell=SHADOW) == {"S->B": 3, "B->K": 15, "D->K": 11}
+    assert arrivals(found, cell=ITSELF) == {"S->B": 2, "B->K": 6, "D->K": 11}
     assert found.jobs.filter(pl.col("task") == "K")["shadow"].to_list() == [False]
 
 
@@ -175,12 +276,12 @@ ONE_LINK = cell(
 
 def test_a_shadow_message_shares_the_rate_of_the_link() -> None:
     # 8000 bytes take 8 ms. S sends D its input first (2 to 10), then the shadow's (10 to 18); the
-    # output of B waits behind it from 6 to 18. K and B' then share E until K ends at 21.
+    # output of B waits behind it from 6 to 18. K goes before B' on E.
     found = play(ONE_LINK)
     assert arrivals(found, cell=ITSELF) == {"S->B": 2, "S->D": 11, "B->K": 19, "D->K": 12}
     assert arrivals(found, cell=SHADOW) == {"S->B": 19, "B->K": 24, "D->K": 12}
     assert jobs(found, shadow=True) == {"B": ("E", 19, 24)}
-    assert latencies(found)[0] == 21
+    assert latencies(found)[0] == 20
     assert latencies(play(ONE_LINK, others=[None]))[0] == 13
 
 
@@ -311,6 +412,82 @@ def test_more_shadows_than_cycles_may_be_in_flight() -> None:
     outcomes = found.jobs.filter("shadow")["outcome"].value_counts()
     assert dict(outcomes.iter_rows()) == {"done": 99, "in_flight": 201}
     assert set(latencies(found)) == {3.0}
+
+
+def test_a_shadow_is_given_up_after_a_window_and_64_cycles() -> None:
+    # B' takes 30 ms every 10: of the first cycles 3 k + 3 periods have passed when it ends, so that
+    # from cycle 36 on it is given up after 74.
+    problem = cell(
+        [task("S", 1), task("B", 1, "R", "E"), task("K", 1)],
+        [Flow("S", "B"), Flow("B", "K")],
+        period_ms=10,
+        window_cycles=10,
+    )
+    found = play(problem, windows=20, exec_ms={("B", "E"): [30] * 200})
+    shadow = found.jobs.filter("shadow")
+    assert shadow.filter(pl.col("outcome") == "done")["cycle"].to_list() == list(range(36))
+    assert set(shadow["outcome"]) == {"done", "in_flight"}
+    assert set(latencies(found)) == {3.0}
+
+
+def test_shadows_that_never_end_take_bounded_room() -> None:
+    problem = cell(
+        [task("S", 1), task("D", 10, "E"), task("B", 1, "R", "E"), task("K", 1)],
+        [Flow("S", "B"), Flow("B", "K")],
+        period_ms=10,
+        window_cycles=10,
+    )
+    real = make_realisation(problem, windows=100)
+    arrays = lay_out([(problem, real)], shadows=real)
+    arrays.tables.stamps[1] = 1
+    assert advance_to_end(arrays) == Status.FINISHED
+    assert arrays.tables.clock["n_slots"].tolist() == [128]
+
+
+@pytest.mark.parametrize("schedulers", [("fair",), ("fifo",), ("priority",)], ids=str)
+def test_own_jobs_run_as_without_shadows(schedulers: Sequence[Scheduler]) -> None:
+    sent = 0
+    for seed in range(EXAMPLES):
+        case = without_shared_means(make_case(seed, schedulers, orders=True))
+        shadows = draw_shadows(case.problem, case.real)
+        stamps, others = random_shadow_stamps(Random(seed), case)
+        with_shadows = play_stamped(case, shadows, stamps, others)
+        without = play_stamped(case, shadows, stamps, [None] * len(others))
+        own = with_shadows.jobs.filter(~pl.col("shadow"))
+        sent += len(with_shadows.jobs) - len(own)
+        assert own.equals(without.jobs), f"make_case({seed}, {schedulers}, orders=True)"
+        assert with_shadows.cycles.equals(without.cycles)
+        assert with_shadows.core_ns is not None
+        assert without.core_ns is not None
+        # Own work, and what is busy without it and the shadows': stress and background.
+        assert np.array_equal(with_shadows.core_ns[:, :, 1], without.core_ns[:, :, 1])
+    assert sent > EXAMPLES
+
+
+def without_shared_means(case: Case) -> Case:
+    """Draw a case again without quotas, accelerators, bytes and order on links."""
+    fabric, pipeline = case.problem.fabric, case.problem.pipeline
+    alone: dict[str, Any] = {"background_beside": None, "contention_stressed": {}}
+    nodes = {
+        name: replace(node, quota=None, contention=0.0, **alone)
+        for name, node in fabric.nodes.items()
+    }
+    tasks = {
+        name: replace(
+            task, on={at: replace(on, accelerator=None) for at, on in task.on.items()}
+        )
+        for name, task in pipeline.tasks.items()
+    }
+    links = {name: replace(link, in_order=False) for name, link in fabric.links.items()}
+    flows = tuple(replace(flow, payload_bytes=0) for flow in pipeline.flows)
+    problem = replace(
+        case.problem,
+        fabric=replace(fabric, nodes=nodes, links=links),
+        pipeline=replace(pipeline, tasks=tasks, flows=flows),
+    )
+    seed, windows = case.real.seed or 0, case.real.windows
+    real = dwell.draw(problem, scenario="disturbed", seed=seed, windows=windows)
+    return replace(case, problem=problem, real=real)
 
 
 # ------------------------------------------------------------------------------ what it costs

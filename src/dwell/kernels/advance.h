@@ -25,13 +25,13 @@ void handle(S& s, i64 key, i64 now) {
       complete(s, key, now);
       break;
     case kArrival:
-      arrive(s, cell, cycle, item, now);
+      if (!is_given_up(s, cell, cycle)) arrive(s, cell, cycle, item, now);
       break;
     case kStart:
-      note_ready(s, job_key(cell, cycle, item));
+      if (!is_given_up(s, cell, cycle)) note_ready(s, job_key(cell, cycle, item));
       break;
     case kRetry:
-      retry(s, cell, cycle, item, now);
+      if (!is_given_up(s, cell, cycle)) retry(s, cell, cycle, item, now);
       break;
     case kChange:
       if (item == 0) {

@@ -21,6 +21,8 @@ from dwell.model.window_close import close_after_ns, window_close_ns
 
 SCHEDULERS = {"fair": Scheduler.FAIR, "fifo": Scheduler.FIFO, "priority": Scheduler.PRIORITY}
 RING_START = 64
+#: A shadow is given up where a window and so many cycles have been released since.
+GIVEN_UP_AFTER = 64
 #: Events after which a call of the kernel ends for a moment: some 20 ms.
 BUDGET = 200_000
 #: What a core draws on the pool of a quota at a time (sched_cfs_bandwidth_slice_us), and the least
@@ -292,6 +294,8 @@ class _Layout:
             "is_cpu": not kind,
             "next_key": -1,
             "quota": -1,
+            "above": -1,
+            "below": -1,
             "beside": 1.0,
             "pace": 1.0,
             "speed": 1.0,
@@ -322,6 +326,8 @@ class _Layout:
             "candidate_0": len(self.site_of),
             "n_candidates": len(problem.candidates),
             "n_sinks": sum(not pipeline.outputs(name) for name in names),
+            "period_ns": round(pipeline.period_ms * 1e6),
+            "given_up_after": problem.window_cycles + GIVEN_UP_AFTER,
             "pair_0": len(self.shadow_parts),
             "node_0": len(self.cell_nodes),
             "n_nodes": len(problem.fabric.nodes),
@@ -380,9 +386,23 @@ class _Layout:
         shadow = {"candidate_0": len(self.site_of), "close_cycle": real.cycles + 1}
         self.rows["cells"].append(parent | shadow | {"shadow": -1, "parent": 0})
         self.reals.append(real)
+        for node, kind in list(self.server_row):
+            self._add_below(node, kind)
         hop_0 = len(self.rows["hops"])
         self._add_hops(problem, real, {name: i for i, name in enumerate(problem.fabric.links)})
         self._add_candidates(1, 0, problem, real, hop_0)
+
+    def _add_below(self, node: int, kind: str | None) -> None:
+        """Add what own jobs leave of a server."""
+        row = self.server_row[node, kind]
+        above = self.rows["servers"][row]
+        turns = above["scheduler"] == Scheduler.TURNS
+        above["below"] = len(self.rows["servers"])
+        below = {"above": row, "below": -1, "quota": -1, "background": 0.0}
+        self.rows["servers"].append(
+            above | below | {"scheduler": Scheduler.FAIR if turns else above["scheduler"]}
+        )
+        self.server_workers.append(0)
 
     def _add_changes(self, index: int, changes: NodeChanges) -> None:
         """Add the changes of a cell's nodes; those of a shared node are the first cell's."""
@@ -419,6 +439,8 @@ class _Layout:
             node = self.node_row[index, node_name]
             server = self.server_row[node, execution.accelerator]
             on = self.rows["servers"][server]
+            if cell != index:
+                server = on["below"]
             fair, cores = on["scheduler"] in (Scheduler.FAIR, Scheduler.TURNS), on["cores"]
             threads = execution.threads if execution.accelerator is None else 1
             self.server_workers[server] += execution.workers
@@ -440,6 +462,7 @@ class _Layout:
                     "start_ns": round(task.start_ms * 1e6),
                     "before_ns": round(execution.before_ms * 1e6),
                     "after_ns": round(execution.after_ms * 1e6),
+                    "mean_ns": round(min(execution.exec_ms.expectation * 1e6, LAST_NS)),
                 }
             )
         return rows
@@ -585,6 +608,7 @@ class _Layout:
             ready=np.zeros(margin, np.int64),
             attempts=np.zeros((cells * slots, max(self.max_flows, 1)), np.int64),
             own_ns=np.zeros((cells, self.max_nodes)),
+            soonest_ns=np.full((len(self.site_of), self.max_tasks), -1, np.int64),
             ages=np.zeros(max(problem.window_cycles for problem, _ in self.cells), np.int64),
             latency_ns=np.full((cells, cycles), NEVER_NS),
             compute_ns=np.zeros((cells, cycles), np.int64),

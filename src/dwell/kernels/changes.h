@@ -109,6 +109,12 @@ void change_server(S& s, Server& server, const Change& change, bool turns, i64 n
   tick(s, server, now);
   if (turns && change.is_down) crash(s, server, now);
   server.is_down = change.is_down != 0;
+  if (has_below(s, server)) {
+    Server& below = s.servers[server.below];
+    tick(s, below, now);
+    if (turns && change.is_down) crash(s, below, now);
+    below.is_down = server.is_down;
+  }
   if (server.is_cpu) {
     renew_before_stress(s, server, now);
     const bool anew = change.stress != server.stress || (turns && change.is_down);

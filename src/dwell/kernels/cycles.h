@@ -2,7 +2,7 @@
 #pragma once
 
 #include "links.h"
-#include "turns.h"
+#include "remainders.h"
 
 namespace dwell {
 
@@ -64,6 +64,7 @@ template <class S>
 bool become_ready(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
   Job& job = s.job(cell, cycle, task);
   job.ready_ns = now;
+  note_soonest(s, cell, cycle, task, now);
   log_job(s, cell, cycle, task, job, kInFlight, -1);
   Site& site = s.site(job);
   if (s.server(site).is_down) {
@@ -116,6 +117,7 @@ i64 shared_by(const S& s, i64 cell, i64 cycle, i64 task) {
   const i64 shadow = s.cell(cell).shadow;
   if (shadow < 0 || s.stamp(shadow, cycle) < 0) return -1;
   const i64 pair = s.slot(shadow, cycle).pair;
+  if (pair < 0) return -1;
   return s.shadow_parts[pair * s.n_tasks + task] == kShared ? shadow : -1;
 }
 
@@ -240,6 +242,69 @@ void retry(S& s, i64 cell, i64 cycle, i64 flow, i64 now) {
   send(s, cell, cycle, flow, s.hop(cell, cycle, flow), attempt, now);
 }
 
+// Takes a job of a shadow from where it runs or waits; its worker takes what waits next.
+template <class S>
+void withdraw(S& s, i64 key, Job& job, i64 now) {
+  Site& site = s.site(job);
+  Server& server = s.server(site);
+  if (take_off(s, server, site, key, now)) {
+    log_job(s, site.cell, cycle_of(key), site.task, job, kInFlight, -1);
+    free_worker(s, site);
+    return;
+  }
+  i64 before = -1, waits = site.head;
+  for (i64 i = 0; i < site.waiting; ++i) {
+    if (waits == cycle_of(key)) {
+      if (before < 0) {
+        site.head = job.next;
+      } else {
+        s.job(site.cell, before, site.task).next = job.next;
+      }
+      if (site.tail == waits) site.tail = before;
+      site.waiting -= 1;
+      return;
+    }
+    before = waits;
+    waits = s.job(site.cell, waits, site.task).next;
+  }
+}
+
+// Gives up the shadow that has been under way for too many cycles when this one is released.
+template <class S>
+void give_up_before(S& s, i64 cell, i64 released, i64 now) {
+  const Cell& of = s.cell(cell);
+  const i64 shadow = of.shadow, cycle = released - of.given_up_after;
+  if (shadow < 0 || cycle < 0 || s.stamp(shadow, cycle) < 0) return;
+  Slot& slot = s.slot(shadow, cycle);
+  if (slot.cycle != cycle) return;
+  // What is still sent to it is the work of its parent, or of messages under way.
+  slot.pair = -1;
+  if (slot.live == 0) return;
+  slot.live = 0;
+  for (i64 task = 0; task < of.n_tasks; ++task) {
+    Job& job = s.job(shadow, cycle, task);
+    if (job.ready_ns < 0 || s.site(job).cell != shadow) continue;
+    withdraw(s, job_key(shadow, cycle, task), job, now);
+  }
+}
+
+// Whether a message or a source is of a shadow that has been given up.
+template <class S>
+bool is_given_up(const S& s, i64 cell, i64 cycle) {
+  if (S::kPlain || s.cell(cell).parent < 0) return false;
+  const Slot& slot = s.slot(cell, cycle);
+  return slot.cycle != cycle || slot.pair < 0;
+}
+
+// Has every server with accelerators look whether a shadow job may begin there.
+template <class S>
+void mark_accelerators(S& s) {
+  for (i64 row = 0; row < s.servers.size; ++row) {
+    Server& server = s.servers[row];
+    if (is_below(s, server) && !server.is_cpu && server.n_wait > 0) mark(s, server);
+  }
+}
+
 // Begins a cycle, or the shadow of one: its sources become ready.
 //
 // Of a shadow only sources that it does not share start, as those do that start later.
@@ -254,6 +319,7 @@ void begin_cycle(S& s, i64 cell, i64 cycle, i64 active, bool is_shadow, i64 now)
     const Task& fixed = s.task(cell, task);
     Job& job = s.job(cell, cycle, task);
     job.missing = fixed.n_in;
+    if (!S::kPlain) job.ready_ns = -1;
     job.started_ns = -1;
     job.site = s.site_of[candidate * s.n_tasks + task];
     job.compute_ns = 0;
@@ -280,11 +346,16 @@ void begin_cycle(S& s, i64 cell, i64 cycle, i64 active, bool is_shadow, i64 now)
 template <class S>
 void release(S& s, i64 cell, i64 cycle, i64 now) {
   const i64 active = s.stamp(cell, cycle);
+  if (!S::kPlain) {
+    s.cell(cell).released = cycle + 1;
+    give_up_before(s, cell, cycle, now);
+  }
   clear_log(s, cell, cycle);
   begin_cycle(s, cell, cycle, active, false, now);
   if (!S::kPlain) {
     const i64 shadow = s.cell(cell).shadow;
     if (shadow >= 0) {
+      mark_accelerators(s);
       clear_log(s, shadow, cycle);
       s.slot(shadow, cycle).cycle = cycle;  // its place in the logs, also without a shadow
       if (s.stamp(shadow, cycle) >= 0) begin_cycle(s, shadow, cycle, active, true, now);
@@ -314,9 +385,14 @@ template <class S>
 void flush(S& s, i64 now) {
   for (i64 i = 0; i < s.n_dirty; ++i) {
     Server& server = s.servers[s.dirty[i]];
+    const bool has_pair = has_below(s, server);
+    // What is below matters to own jobs where it draws on their quota, or holds places.
+    const bool is_itself = !has_pair || (server.is_dirty & kIsDirty) != 0 ||
+                           has_quota(s, server) || !server.is_cpu;
     server.is_dirty = 0;
-    if (server.scheduler != kFair) dispatch(s, server, now);
-    schedule(s, server, now);
+    if (is_itself && server.scheduler != kFair) dispatch(s, server, now);
+    if (has_pair) leave_rest(s, server, now);
+    if (is_itself) schedule(s, server, now);
   }
   s.n_dirty = 0;
 }

@@ -72,7 +72,8 @@ void draw_quota(S& s, Server& server, i64 now) {
     return;
   }
   refill(s, server, now);
-  if (quota.left_ns <= 0 && server.used + server.stress > 0 && !server.is_down) {
+  const bool is_busy = server.used + server.stress + lent(s, server) > 0;
+  if (quota.left_ns <= 0 && is_busy && !server.is_down) {
     quota.left_ns += quota.pool_ns;
     quota.pool_ns = 0;
     refill(s, server, now);
@@ -90,7 +91,7 @@ void announce_quota(S& s, Server& server, i64 now) {
     refill(s, server, now);
   }
   const i64 busy = server.used + server.stress;
-  if (busy == 0 || server.is_down) {
+  if (busy + lent(s, server) == 0 || server.is_down) {
     quota.looks_ns = -1;
     // Beyond the slack, what was drawn goes back.
     if (is_pooled(s, server, quota) && quota.left_ns > quota.slack_ns) {
@@ -104,7 +105,7 @@ void announce_quota(S& s, Server& server, i64 now) {
   if (turns) {
     at_ns = next_look(s, server, quota, now);
   } else if (!server.is_stopped) {
-    const i64 rate = std::min(busy, server.cores);
+    const i64 rate = std::min(busy, server.cores) + lent(s, server);
     at_ns = std::min(at_ns, now + (quota.left_ns + rate - 1) / rate);
   } else if (quota.pool_ns > 0) {
     at_ns = now;

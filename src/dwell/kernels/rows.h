@@ -54,6 +54,8 @@ using Times = const i64*;
   field(i64, deadline_ns) field(f64, longest_ms) /* with which latencies beyond it count */       \
   field(i64, looks_ns) field(i64, patience_ns) field(i64, waited) field(i64, moved)              \
   field(i64, rested)                                                                             \
+  field(i64, period_ns) field(i64, released) /* cycles */                                        \
+  field(i64, given_up_after) /* cycles released since, of a shadow under way */                  \
   field(i32, task_0) field(i32, n_tasks) field(i32, flow_0) field(i32, candidate_0)              \
   field(i32, n_candidates) field(i32, n_sinks) field(i32, pair_0)                                \
   field(i32, node_0) field(i32, n_nodes) /* in `cell_nodes` */                                   \
@@ -75,14 +77,19 @@ using Times = const i64*;
   field(i64, ready_at_ns)                                                                        \
   field(i32, cell) field(i32, task) field(i32, server) field(i32, node) field(i32, own)          \
   field(i32, rank)                                                                               \
-  field(i64, workers) field(i64, start_ns) field(i64, before_ns) field(i64, after_ns)
+  field(i64, workers) field(i64, start_ns) field(i64, before_ns) field(i64, after_ns)            \
+  field(i64, mean_ns) /* of `exec_ns`, as the file states it */
 
 // `busy_ns` is in core-nanoseconds, of which 64 bits may not hold those of all cores. `quota` is a
-// row of `quotas`, -1 for none.
+// row of `quotas`, -1 for none. Shadow jobs run on a server of their own, `below` that of the own
+// jobs, which is `above` it; -1 for none. To it `stress`, `is_down` and `is_stopped` are copied,
+// `cores` and `spare` are what is left to it, and it adds `lent` busy cores and `background` to
+// those above.
 #define DWELL_SERVER(field)                                                                      \
   field(f64, virtual_ns) field(f64, speed)                                                       \
   field(i64, last_ns) field(i64, next_ns) field(i64, next_key)                                   \
-  field(i64, used) field(i64, stress) field(i64, cores)                                          \
+  field(i64, used) field(i64, stress) field(i64, cores) field(i64, lent)                         \
+  field(i32, above) field(i32, below)                                                            \
   field(i32, base) field(i32, n_run) field(i32, n_wait) field(i32, quota) field(i32, node)       \
   field(i8, scheduler) field(i8, is_down) field(i8, is_dirty) field(i8, is_cpu)                  \
   field(i8, is_stopped) /* by its quota */                                                       \
@@ -221,7 +228,8 @@ DWELL_ROWS(DWELL_STRUCT)
   table(Event, events) table(i32, following) table(i32, days)                                    \
   table(Running, running) table(Waiting, waiting)                                                \
   table(i32, dirty) table(i64, ready) table(Job, jobs) table(Slot, slots) table(i64, attempts)   \
-  table(f64, own_ns) table(i64, ages) table(Rule, rule) table(Option, options) table(f64, shown) \
+  table(f64, own_ns) table(i64, soonest_ns) table(i64, ages)                                     \
+  table(Rule, rule) table(Option, options) table(f64, shown)                                     \
   table(i64, latency_ns) table(i64, compute_ns) table(i64, network_ns) table(i8, outcome)        \
   table(f64, opened) table(f64, closed) table(Seen, seen) table(f64, shares)                     \
   table(Decided, decided) table(f64, priced)                                                     \

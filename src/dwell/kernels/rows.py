@@ -119,6 +119,7 @@ class Tables(NamedTuple):
     slots: Rows  # (cells * slots,)
     attempts: Ints  # (cells * slots, flows) attempts lost so far, less one
     own_ns: Floats  # (cells, nodes of a cell) core-nanoseconds of completed own work
+    soonest_ns: Ints  # (candidates, tasks) least time from release to readiness; -1 before one
     ages: Ints  # (W,) of one window
     rule: Rows  # (1,), or empty where Python decides
     options: Rows  # (candidates,)

@@ -15,6 +15,9 @@
 
 namespace dwell {
 
+// Why a server has to be looked after: its own jobs, or only those of the server below it.
+enum Dirty : i8 { kIsDirty = 1, kBelowIsDirty = 2 };
+
 // Work left below this many nanoseconds is rounding, not work.
 constexpr f64 kSlackNs = 1e-3;
 
@@ -28,6 +31,10 @@ void take_turn(S& s, Server& server, i64 now);
 template <class S>
 void admit_threads(S& s, Server& server, const Site& site, Job& job, i64 key, i64 now);
 inline void end_turn(Quota& quota);
+
+// What is due on an accelerator (remainders.h).
+template <class S>
+bool is_awaited(const S& s, const Server& server, const Site& site, i64 now);
 
 template <class S>
 bool takes_turns(const S&, const Server& server) {
@@ -56,12 +63,30 @@ inline f64 time_alone(const Site& site, i64 work_ns) {
   return work * static_cast<f64>(site.threads) / static_cast<f64>(site.need);
 }
 
-// Remembers that a server must give out cores at the end of the event.
+// Whether a server is what own jobs leave of another to shadow jobs.
+template <class S>
+bool is_below(const S&, const Server& server) {
+  return !S::kPlain && server.above >= 0;
+}
+
+template <class S>
+bool has_below(const S&, const Server& server) {
+  return !S::kPlain && server.below >= 0;
+}
+
+// Cores that shadow jobs add to those that draw on a server's quota.
+template <class S>
+i64 lent(const S&, const Server& server) {
+  return S::kPlain ? 0 : server.lent;
+}
+
+// Remembers that a server must give out cores at the end of the event; one that is below another
+// does so after it.
 template <class S>
 void mark(S& s, Server& server) {
-  if (server.is_dirty) return;
-  server.is_dirty = 1;
-  s.dirty[s.n_dirty++] = static_cast<i32>(&server - s.servers.rows);
+  Server& first = is_below(s, server) ? s.servers[server.above] : server;
+  if (!first.is_dirty) s.dirty[s.n_dirty++] = static_cast<i32>(&first - s.servers.rows);
+  first.is_dirty |= is_below(s, server) ? kBelowIsDirty : kIsDirty;
 }
 
 // Brings a server's busy time up to now; returns the time since it last was.
@@ -71,6 +96,12 @@ i64 account(S& s, Server& server, i64 now) {
   const i64 busy = server.used + server.stress;
   server.last_ns = now;
   if (elapsed <= 0 || server.is_down) return elapsed;
+  if (is_below(s, server)) {
+    if (server.is_stopped) return elapsed;
+    server.busy_ns += static_cast<f64>(elapsed) * static_cast<f64>(server.lent);
+    server.behind_ns += static_cast<f64>(elapsed) * server.background;
+    return elapsed;
+  }
   if (server.background > 0.0) {
     f64 background = server.background;
     if (!has_quota(s, server)) {
@@ -86,6 +117,9 @@ i64 account(S& s, Server& server, i64 now) {
       quota.left_ns -= elapsed * taken;
       quota.turn_ns += elapsed * taken;
     }
+  }
+  if (has_quota(s, server) && !server.is_stopped) {
+    s.quotas[server.quota].left_ns -= elapsed * lent(s, server);
   }
   return elapsed;
 }
@@ -156,23 +190,27 @@ void start(S& s, Server& server, const Site& site, i64 key, Job& job, f64 left, 
   server.used += site.need;
 }
 
+// Place of a job among others before its readiness counts; a smaller one goes first.
+inline i64 rank_of(const Server& server, const Site& site) {
+  return server.scheduler == kFifo ? 0 : site.rank;
+}
+
 // Adds a job to those that wait for cores, or a thread to those that wait for their turn.
 template <class S>
 void queue_up(S& s, Server& server, const Waiting& row) {
   push(waiting_of(s, server), server.n_wait++, row);
 }
 
-// Takes the cores of the last running job behind the first waiting one, if there is any.
+// Takes the cores of the last running job behind another one, if there is any.
 template <class S>
-[[gnu::noinline]] bool preempt(S& s, Server& server) {
+[[gnu::noinline]] bool preempt(S& s, Server& server, Waiting last) {
   Running* running = running_of(s, server);
-  Waiting last = *waiting_of(s, server);
   i64 worst = -1;
   for (i64 i = 0; i < server.n_run; ++i) {
     const f64 left = running[i].finish_ns - server.virtual_ns;
     if (left <= kSlackNs) continue;  // it has all its work and completes at this very instant
     const Job& job = s.job(running[i].key);
-    const Waiting other{s.site(job).rank, job.ready_ns, running[i].key, left};
+    const Waiting other{rank_of(server, s.site(job)), job.ready_ns, running[i].key, left};
     if (last < other) {
       last = other;
       worst = i;
@@ -183,6 +221,19 @@ template <class S>
   server.used -= s.site(s.job(last.key)).need;
   queue_up(s, server, last);
   return true;
+}
+
+// Cores or places that cannot be given out: those of an accelerator also where shadow jobs run.
+template <class S>
+i64 taken(const S& s, const Server& server) {
+  const bool shares = !server.is_cpu && has_below(s, server);
+  return server.used + (shares ? s.servers[server.below].used : 0);
+}
+
+// Whether a job may begin that fits: a shadow job on an accelerator waits for what is due there.
+template <class S>
+bool may_begin(const S& s, const Server& server, const Site& site, i64 now) {
+  return !is_below(s, server) || server.is_cpu || !is_awaited(s, server, site, now);
 }
 
 // Gives out the cores of a server that is not fair.
@@ -198,10 +249,11 @@ void dispatch(S& s, Server& server, i64 now) {
     const Waiting first = *waiting_of(s, server);
     Job& job = s.job(first.key);
     const Site& site = s.site(job);
-    if (server.used + site.need <= server.cores) {
+    if (taken(s, server) + site.need <= server.cores) {
+      if (!may_begin(s, server, site, now)) break;
       pop(waiting_of(s, server), server.n_wait--);
       start(s, server, site, first.key, job, first.left_ns, now);
-    } else if (server.scheduler != kPriority || !preempt(s, server)) {
+    } else if (server.scheduler != kPriority || !preempt(s, server, first)) {
       break;
     }
   }
@@ -223,7 +275,8 @@ void leave(S& s, Server& server, const Site& site, i64 now) {
     server.used -= site.need;
   }
   server.next_key = -1;
-  if (n > 1 || server.n_wait > 0 || has_quota(s, server)) mark(s, server);
+  const bool is_pair = is_below(s, server) || has_below(s, server);
+  if (n > 1 || server.n_wait > 0 || has_quota(s, server) || is_pair) mark(s, server);
   if (server.scheduler == kFair) set_speed(s, server);
 }
 
@@ -242,19 +295,22 @@ void admit(S& s, i64 key, i64 now) {
   const f64 left = time_alone(site, work_ns);
   // Where nobody else can want the cores now, the job needs no queue.
   const bool alone = server.n_wait == 0 && s.n_ready == 1;
-  const bool fits = alone && server.used + site.need <= server.cores;
+  const bool fits = alone && !is_below(s, server) && taken(s, server) + site.need <= server.cores;
   if (has_quota(s, server)) {
     tick(s, server, now);
     refill(s, server, now);
   }
   if (server.scheduler != kFair && !fits) {
     mark(s, server);
-    const i64 rank = server.scheduler == kFifo ? 0 : site.rank;
-    queue_up(s, server, Waiting{rank, job.ready_ns, key, left});
+    queue_up(s, server, Waiting{rank_of(server, site), job.ready_ns, key, left});
     return;
   }
   tick(s, server, now);
   start(s, server, site, key, job, left, now);
+  if (is_below(s, server) || has_below(s, server)) {
+    mark(s, server);
+    if (is_below(s, server)) return;
+  }
   if (server.scheduler == kFair) set_speed(s, server);
   if (server.is_dirty) return;
   const bool lone = server.n_run == 1 && !has_quota(s, server);

@@ -14,19 +14,20 @@ template <class S>
     Server& server = s.servers[s.nodes[s.cell_nodes[of.node_0 + i]].server_0];
     tick(s, server, now);
     f64 own = s.own_ns[cell * n_nodes + i];
-    f64 extra = !S::kPlain && of.shadow >= 0 ? s.own_ns[of.shadow * n_nodes + i] : 0.0;
     for (i64 at = 0; at < server.n_run + server.n_wait; ++at) {
       const Progress found = progress(s, server, at);
-      if (found.key == kForeign) continue;
-      const i64 whose = cell_of(found.key);
-      if (whose == cell) {
-        own += found.received_ns;
-      } else if (whose == of.shadow) {
-        extra += found.received_ns;
-      }
+      if (found.key != kForeign && cell_of(found.key) == cell) own += found.received_ns;
     }
     out[i] = server.busy_ns * server.pace + server.behind_ns;
     out[n_nodes + i] = own;
+    if (!has_below(s, server)) continue;
+    Server& below = s.servers[server.below];
+    tick(s, below, now);
+    f64 extra = s.own_ns[of.shadow * n_nodes + i];
+    for (i64 at = 0; at < below.n_run + below.n_wait; ++at) {
+      extra += progress(s, below, at).received_ns;
+    }
+    out[i] += below.busy_ns * below.pace + below.behind_ns;
     out[2 * n_nodes + i] = extra;
   }
 }

@@ -1,0 +1,122 @@
+// What own jobs leave: the servers below others, on which shadow jobs run.
+//
+// Own jobs know nothing of them, so that their instants are those of a run without shadows; after
+// every event that a server has had a part in, what is left of it is counted anew.
+#pragma once
+
+#include "turns.h"
+
+namespace dwell {
+
+// Cores of a server, fair or in turns, that own jobs leave to shadow jobs and foreign threads.
+template <class S>
+f64 rest_of(const S& s, const Server& server) {
+  if (takes_turns(s, server)) return server.n_run > 0 ? 0.0 : 1.0;
+  const f64 own = static_cast<f64>(server.used), foreign = static_cast<f64>(server.stress);
+  const f64 load = own + foreign;
+  return load <= server.spare ? server.spare - own : server.spare * foreign / load;
+}
+
+// Counts what the jobs of a server below another add to its busy cores, and take of its background.
+template <class S>
+void count_added(const S& s, const Server& server, Server& below) {
+  const i64 busy = server.used + server.stress, cores = server.cores;
+  const i64 used = busy + (below.is_cpu ? below.used : 0);
+  below.lent = std::min(used, cores) - std::min(busy, cores);
+  below.background = 0.0;
+  if (server.background > 0.0 && !has_quota(s, server)) {
+    const auto behind = [&](i64 taken) {
+      return std::min(server.background, static_cast<f64>(std::max<i64>(cores - taken, 0)));
+    };
+    below.background = behind(used) - behind(busy);
+  }
+}
+
+// Gives shadow jobs what own jobs leave of a server, which have been given their cores.
+template <class S>
+[[gnu::noinline]] void leave_rest(S& s, Server& server, i64 now) {
+  Server& below = s.servers[server.below];
+  tick(s, below, now);
+  // Where shadow jobs matter to own jobs, these are announced again after any change.
+  if (has_quota(s, server) || !server.is_cpu) tick(s, server, now);
+  if (has_quota(s, server) && !takes_turns(s, server)) refill(s, server, now);
+  below.stress = server.stress;
+  below.is_stopped = server.is_stopped;
+  if (below.pace != server.pace) {
+    below.behind_ns += below.busy_ns * below.pace;
+    below.busy_ns = 0.0;
+    below.pace = server.pace;
+  }
+  if (below.scheduler == kFair) {
+    below.spare = rest_of(s, server);
+    set_speed(s, below);
+  } else {
+    below.cores = server.cores - server.used;
+    // Before all others, so that any job is behind it.
+    const Waiting own{std::numeric_limits<i64>::min(), 0, 0, 0.0};
+    while (below.used > below.cores && preempt(s, below, own)) {
+    }
+    dispatch(s, below, now);
+    below.speed = server.speed;
+  }
+  count_added(s, server, below);
+  server.lent = has_quota(s, server) ? below.lent : 0;
+  schedule(s, below, now);
+}
+
+// Whether an own job may want a place of an accelerator before a shadow job ends that begins now.
+template <class S>
+bool is_awaited(const S& s, const Server& below, const Site& site, i64 now) {
+  const Server& server = s.servers[below.above];
+  if (server.n_wait > 0) return true;
+  const i64 cell = s.cell(site.cell).parent, end_ns = later(now, site.mean_ns);
+  const Cell& of = s.cell(cell);
+  const i64 last = of.released - 1;
+  for (i64 cycle = last; cycle >= 0 && cycle > last - s.n_slots; --cycle) {
+    const Slot& slot = s.slot(cell, cycle);
+    for (i64 task = 0; task < of.n_tasks; ++task) {
+      const Job& job = s.job(cell, cycle, task);
+      if (s.site(job).server != below.above) continue;
+      const i64 soonest_ns = std::max<i64>(s.soonest_ns[slot.candidate * s.n_tasks + task], 0);
+      const i64 due_ns = later(of.release_ns[cycle], soonest_ns);
+      const i64 next_ns = later(due_ns, of.period_ns);
+      if (cycle == last && next_ns < end_ns) return true;
+      const bool is_due = due_ns < end_ns && now < next_ns;
+      if (is_due && job.ready_ns < 0 && !slot.is_lost) return true;
+    }
+  }
+  return false;
+}
+
+// Remembers the least time from a release to the readiness of an own job.
+template <class S>
+void note_soonest(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
+  if (S::kPlain || s.cell(cell).shadow < 0) return;
+  i64& soonest_ns = s.soonest_ns[s.slot(cell, cycle).candidate * s.n_tasks + task];
+  const i64 since_ns = now - s.cell(cell).release_ns[cycle];
+  if (soonest_ns < 0 || since_ns < soonest_ns) soonest_ns = since_ns;
+}
+
+// Takes a job off a server below another, wherever it is there; false if it is not.
+template <class S>
+bool take_off(S& s, Server& server, const Site& site, i64 key, i64 now) {
+  for (i64 at = 0; at < server.n_run + server.n_wait; ++at) {
+    const bool runs = at < server.n_run;
+    const i64 row = runs ? at : at - server.n_run;
+    if ((runs ? running_of(s, server)[row].key : waiting_of(s, server)[row].key) != key) continue;
+    tick(s, server, now);
+    if (server.is_cpu) s.own_ns[site.own] += progress(s, server, at).received_ns;
+    if (runs) {
+      pop(running_of(s, server), server.n_run--, row);
+      server.used -= site.need;
+      server.next_key = -1;
+    } else {
+      pop(waiting_of(s, server), server.n_wait--, row);
+    }
+    mark(s, server);
+    return true;
+  }
+  return false;
+}
+
+}  // namespace dwell
