@@ -110,14 +110,22 @@ bool is_discarded(const S& s, i64 cell, i64 cycle, i64 task) {
   return s.shadow_parts[s.slot(cell, cycle).pair * s.n_tasks + task] == kDiscarded;
 }
 
+// Whether a cycle is that of a shadow that has been given up.
+template <class S>
+bool is_given_up(const S& s, i64 cell, i64 cycle) {
+  if (S::kPlain || s.cell(cell).parent < 0) return false;
+  const Cell& parent = s.cell(s.cell(cell).parent);
+  return cycle + parent.given_up_after < parent.released;
+}
+
 // Shadow that shares a task with a cycle, -1 for none.
 template <class S>
 i64 shared_by(const S& s, i64 cell, i64 cycle, i64 task) {
   if (S::kPlain) return -1;
   const i64 shadow = s.cell(cell).shadow;
   if (shadow < 0 || s.stamp(shadow, cycle) < 0) return -1;
+  if (is_given_up(s, shadow, cycle)) return -1;
   const i64 pair = s.slot(shadow, cycle).pair;
-  if (pair < 0) return -1;
   return s.shadow_parts[pair * s.n_tasks + task] == kShared ? shadow : -1;
 }
 
@@ -276,24 +284,13 @@ void give_up_before(S& s, i64 cell, i64 released, i64 now) {
   const i64 shadow = of.shadow, cycle = released - of.given_up_after;
   if (shadow < 0 || cycle < 0 || s.stamp(shadow, cycle) < 0) return;
   Slot& slot = s.slot(shadow, cycle);
-  if (slot.cycle != cycle) return;
-  // What is still sent to it is the work of its parent, or of messages under way.
-  slot.pair = -1;
-  if (slot.live == 0) return;
+  if (slot.cycle != cycle || slot.live == 0) return;
   slot.live = 0;
   for (i64 task = 0; task < of.n_tasks; ++task) {
     Job& job = s.job(shadow, cycle, task);
     if (job.ready_ns < 0 || s.site(job).cell != shadow) continue;
     withdraw(s, job_key(shadow, cycle, task), job, now);
   }
-}
-
-// Whether a message or a source is of a shadow that has been given up.
-template <class S>
-bool is_given_up(const S& s, i64 cell, i64 cycle) {
-  if (S::kPlain || s.cell(cell).parent < 0) return false;
-  const Slot& slot = s.slot(cell, cycle);
-  return slot.cycle != cycle || slot.pair < 0;
 }
 
 // Has every server with accelerators look whether a shadow job may begin there.
