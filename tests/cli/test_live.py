@@ -77,6 +77,18 @@ def test_processes_are_placed_one_by_one(cell: RealCell) -> None:
     assert real or "real-time priority 1" in cell.log("R1", "camera@R1")
 
 
+@pytest.mark.skipif(not hasattr(os, "SCHED_IDLE"), reason="needs SCHED_IDLE")
+def test_only_shadow_workers_run_on_what_is_left(cell: RealCell) -> None:
+    def scheduler(who: str) -> int:
+        written = json.loads((cell.state("E") / f"{who}.pid").read_text())
+        return os.sched_getscheduler(int(written["pid"]))
+
+    assert scheduler("perception@E") == os.SCHED_OTHER
+    idle = scheduler("perception@E.shadow") == os.SCHED_IDLE
+    # Who may not have the class goes on without, and says so.
+    assert idle or "no low scheduling class" in cell.log("E", "perception@E.shadow")
+
+
 def test_the_busier_of_cpu_and_accelerator_counts(cell: RealCell) -> None:
     status = cell.until(lambda status: status["window"]["utilisation"]["E"] >= 0.87)
     assert status["processes"]["agent@E"]["note"] == ""

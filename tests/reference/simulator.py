@@ -693,7 +693,11 @@ class NodeState:
             return now
         if job.cores == 0:
             return None
-        speed = self.speed(job.cell) * self.part(job) if job.execution.accelerator is None else Fraction(1)
+        speed = (
+            self.speed(job.cell) * self.part(job)
+            if job.execution.accelerator is None
+            else Fraction(1)
+        )
         if speed == 0:
             return None
         return now + math.ceil(job.left / speed)

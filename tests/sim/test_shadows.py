@@ -473,9 +473,7 @@ def without_shared_means(case: Case) -> Case:
         for name, node in fabric.nodes.items()
     }
     tasks = {
-        name: replace(
-            task, on={at: replace(on, accelerator=None) for at, on in task.on.items()}
-        )
+        name: replace(task, on={at: replace(on, accelerator=None) for at, on in task.on.items()})
         for name, task in pipeline.tasks.items()
     }
     links = {name: replace(link, in_order=False) for name, link in fabric.links.items()}

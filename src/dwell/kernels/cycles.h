@@ -382,13 +382,10 @@ template <class S>
 void flush(S& s, i64 now) {
   for (i64 i = 0; i < s.n_dirty; ++i) {
     Server& server = s.servers[s.dirty[i]];
-    const bool has_pair = has_below(s, server);
-    // What is below matters to own jobs where it draws on their quota, or holds places.
-    const bool is_itself = !has_pair || (server.is_dirty & kIsDirty) != 0 ||
-                           has_quota(s, server) || !server.is_cpu;
+    const bool is_itself = !has_below(s, server) || is_concerned(s, server);
     server.is_dirty = 0;
     if (is_itself && server.scheduler != kFair) dispatch(s, server, now);
-    if (has_pair) leave_rest(s, server, now);
+    if (has_below(s, server)) leave_rest(s, server, now);
     if (is_itself) schedule(s, server, now);
   }
   s.n_dirty = 0;

@@ -64,6 +64,13 @@ template <class S>
   schedule(s, below, now);
 }
 
+// Whether what an event did to a server matters to own jobs: of what is below only what draws on
+// their quota, or holds places.
+template <class S>
+bool is_concerned(const S& s, const Server& server) {
+  return (server.is_dirty & kIsDirty) != 0 || has_quota(s, server) || !server.is_cpu;
+}
+
 // Whether an own job may want a place of an accelerator before a shadow job ends that begins now.
 template <class S>
 bool is_awaited(const S& s, const Server& below, const Site& site, i64 now) {

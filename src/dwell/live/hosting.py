@@ -187,6 +187,7 @@ def work(
     stopped: threading.Event,
     note: Callable[[Job | None], None] | None = None,
     clock: Clock = time.monotonic_ns,
+    begin: Callable[[], None] | None = None,
     ready: Callable[[], None] | None = None,
 ) -> None:
     """Run a worker's jobs in this thread until it is told to stop.
@@ -195,6 +196,8 @@ def work(
     ----------
     note : callable, optional
         Told what job begins, and None when it is over.
+    begin : callable, optional
+        Called before the stage is started, when the thread of the beats runs.
     ready : callable, optional
         Called when the stage has started.
     """
@@ -202,6 +205,8 @@ def work(
     hosted = Hosted(worker, transport, clock, heard=lambda: worker.has_work, complain=complain)
     start_thread("beats", hosted.run)
     stage = worker.stage
+    if begin is not None:
+        begin()
     start = getattr(stage, "start", None)
     if start is not None:
         start()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -13,6 +14,7 @@ from dwell.errors import LiveError
 from dwell.live.control_group import ControlGroup, own_group
 from dwell.live.hosting import Clock, Hosted, Platform, keep_collections_short, work
 from dwell.live.log import Log
+from dwell.live.lowest_class import take_lowest_class
 from dwell.live.messages import Header
 from dwell.live.role import Pulse, RoleLogic, RolePlace
 from dwell.live.security import Security
@@ -174,6 +176,7 @@ def _work(
         stopped=stopped,
         note=note,
         clock=clock,
+        begin=partial(take_lowest_class, role.who, _print) if worker.shadow else None,
         ready=keep_collections_short,
     )
 
