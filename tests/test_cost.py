@@ -101,6 +101,21 @@ def test_nodes_of_no_tier_are_ignored() -> None:
     assert cost(more, LOC, LOC, OBJECTIVE) == cost(QOS, LOC, LOC, OBJECTIVE)
 
 
+def test_accelerators_count_in_their_tier_where_the_objective_takes_them() -> None:
+    busy = replace(QOS, utilisation={**QOS.utilisation, "E.gpu": 0.84})
+    assert cost(busy, LOC, LOC, OBJECTIVE) == cost(QOS, LOC, LOC, OBJECTIVE)
+    taken = replace(OBJECTIVE, accelerators={"E.gpu": "edge", "R1.npu": "robot"})
+    more = 0.3 * (0.84 - 0.14) / 0.7
+    assert cost(busy, LOC, LOC, taken) == pytest.approx(cost(QOS, LOC, LOC, OBJECTIVE) + more)
+    # Of what nobody measured J does without.
+    assert cost(QOS, LOC, LOC, taken) == cost(QOS, LOC, LOC, OBJECTIVE)
+
+
+def test_the_cap_holds_for_accelerators_whatever_j_takes() -> None:
+    busy = replace(QOS, utilisation={**QOS.utilisation, "E.gpu": 0.996})
+    assert excess(busy, OBJECTIVE) == 1 / 0.98 - 1
+
+
 @pytest.mark.parametrize("node", ["R1", "E", "R2", "C"])
 def test_a_missing_node_is_named(node: str) -> None:
     used = {name: share for name, share in QOS.utilisation.items() if name != node}

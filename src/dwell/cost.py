@@ -6,9 +6,9 @@ that moved::
     J = a_L * L95 / L_target + a_V * V_D + a_r * U_r / U_r_target + a_e * U_e / U_e_target
         [+ a_c * U_c / U_c_target] + a_S * S
 
-U_r and U_e are maxima over the tier's nodes, because a mean hides the one saturated robot. The
-bracketed term exists only where the objective weighs cloud nodes apart; otherwise they count as
-edge nodes.
+U_r and U_e are maxima over the tier's nodes, because a mean hides the one saturated robot, and over
+their accelerators, too, where the objective counts these. The bracketed term exists only where the
+objective weighs cloud nodes apart; otherwise they count as edge nodes.
 
 All arithmetic is in `price`, which takes floats and arrays alike: a window priced alone and a
 window priced among thousands give the same bits.
@@ -45,12 +45,12 @@ __all__ = [
 
 Metric = TypeVar("Metric", float, "NDArray[np.float64]")
 
-#: Utilisation from which a node is full: what more is asked of it cannot be seen any more.
+#: Utilisation from which a resource is full: what more is asked of it cannot be seen any more.
 SATURATED = 0.995
 
 
 class TierNodes(NamedTuple):
-    """Nodes whose maximum is U_r, U_e and U_c; a tier without nodes counts as 0."""
+    """Nodes and accelerators whose maximum is U_r, U_e and U_c; a tier without any counts as 0."""
 
     robot: tuple[str, ...]
     edge: tuple[str, ...]
@@ -93,25 +93,26 @@ def hamming(current: Placement, previous: Placement) -> float:
 
 
 def tier_nodes(objective: Objective) -> TierNodes:
-    """Nodes behind each utilisation term of J, in the objective's order.
+    """Nodes, then accelerators, behind each utilisation term of J, in the objective's order.
 
     Cloud nodes stand under `edge` unless ``weights.cloud`` is given.
     """
     apart = objective.weights.cloud is not None
     counted = {"robot": "robot", "edge": "edge", "cloud": "cloud" if apart else "edge"}
     tiers: dict[str, list[str]] = {"robot": [], "edge": [], "cloud": []}
-    for node, tier in objective.tiers.items():
-        tiers[counted[tier]].append(node)
+    for name, tier in (*objective.tiers.items(), *objective.accelerators.items()):
+        tiers[counted[tier]].append(name)
     return TierNodes(tuple(tiers["robot"]), tuple(tiers["edge"]), tuple(tiers["cloud"]))
 
 
 def tier_utilisation(utilisation: Mapping[str, float], objective: Objective) -> TierUtilisation:
-    """U_r, U_e and U_c of a window: the maximum over each tier's nodes.
+    """U_r, U_e and U_c of a window: the maximum over each tier's nodes and accelerators.
 
     Parameters
     ----------
     utilisation : mapping of str to float
-        Busy share of each node's cores; every node of ``objective.tiers``, others are ignored.
+        Busy share of each resource: of every node of ``objective.tiers``, and of those of
+        ``objective.accelerators`` that are known; others are ignored.
 
     Raises
     ------
@@ -126,7 +127,8 @@ def tier_utilisation(utilisation: Mapping[str, float], objective: Objective) -> 
                 "J needs it for every node of objective.tiers"
             )
     robot, edge, cloud = (
-        max((utilisation[node] for node in nodes), default=0.0) for nodes in tier_nodes(objective)
+        max((utilisation[name] for name in names if name in utilisation), default=0.0)
+        for names in tier_nodes(objective)
     )
     return TierUtilisation(robot, edge, cloud)
 
@@ -203,20 +205,20 @@ def cost(qos: QoS, current: Placement, previous: Placement, objective: Objective
 
 
 def censored(used: Metric, own: Metric) -> bool | NDArray[np.bool_]:
-    """Whether a node is saturated and others have a part of it, so that their load is hidden.
+    """Whether a resource is saturated and others have a part of it, so that theirs is hidden.
 
     Parameters
     ----------
-    used, own : float, or array of shape (windows, nodes)
-        Busy share of the cores, and the cell's own share with its shadow jobs.
+    used, own : float, or array of shape (windows, resources)
+        Busy share of it, and the cell's own share with its shadow jobs.
     """
     return (used >= SATURATED) & (own < SATURATED)
 
 
 def busiest(qos: QoS) -> float:
-    """Utilisation of the busiest node, as caps are compared with it; 0 where there is no node.
+    """Utilisation of the busiest resource, as caps are compared with it; 0 where there is none.
 
-    A saturated node counts as full, observed or estimated: an observation of 0.997 is no less than
+    A saturated one counts as full, observed or estimated: an observation of 0.997 is no less than
     an estimate of 1.
     """
     used = qos.utilisation
@@ -231,7 +233,7 @@ def excess(qos: QoS, objective: Objective) -> float:
     -------
     float
         Maximum of ``value / cap - 1`` over L95 (uncut: a lost one exceeds every cap) and the
-        utilisation of every node in `qos` (see `busiest`); above 0 if and only if a cap is
+        utilisation of every resource in `qos` (see `busiest`); above 0 if and only if a cap is
         exceeded, -1 where there are no caps.
     """
     caps = objective.caps

@@ -232,6 +232,7 @@ def test_every_key_reaches_the_model() -> None:
                 "weights": {"cloud": 0.1},
                 "targets": {"cloud": 0.5},
                 "tiers": {"n": "edge"},
+                "accelerators": True,
             },
             "controller": {
                 "policy": "cusum",
@@ -259,6 +260,7 @@ def test_every_key_reaches_the_model() -> None:
     assert isinstance(task.state_bytes, int)
     assert problem.objective.weights.cloud == 0.1
     assert problem.objective.tiers == {"n": "edge"}
+    assert problem.objective.accelerators == {"n.gpu": "edge"}
     assert problem.controller == ControllerSettings(
         policy="cusum",
         escape=True,

@@ -48,6 +48,8 @@ VALUES: list[tuple[tuple[str | int, ...], object, str, tuple[str, ...]]] = [
     (("nodes", "R1", "zzz"), 4, "nodes.R1.zzz", ("unknown key 'zzz'", "tier, cores, scheduler")),
     (("nodes", "R1", "scheduler"), "rr", "nodes.R1.scheduler", ("'rr'", "fair, fifo, priority")),
     (("nodes", "R1", "accelerators"), {"gpu": 0}, "nodes.R1.accelerators.gpu", ("0", "from 1")),
+    (("nodes", "R1", "accelerators"), {"a/b": 1}, "nodes.R1.accelerators.a/b", ("not a name",)),
+    (("objective", "accelerators"), "yes", "objective.accelerators", ("'yes'", "true")),
     (("nodes", "R1", "quota"), {"cpu": 0, "period_ms": 4}, "nodes.R1.quota.cpu", ("0", "0.001")),
     (
         ("nodes", "R1", "quota"),

@@ -40,7 +40,7 @@ from dwell.model import (
     Uniform,
     Weights,
 )
-from dwell.model.fabric import Scheduler
+from dwell.model.fabric import Scheduler, accelerator_tiers
 from dwell.model.objective import TIERS
 from dwell.model.problem import MIGRATIONS
 from dwell.model.servo import PLANTS
@@ -212,6 +212,7 @@ def _objective(draw: st.DrawFn, nodes: dict[str, Node]) -> Objective:
     tiers = {name: node.tier for name, node in nodes.items()}
     if draw(st.booleans()):
         tiers = draw(st.dictionaries(st.sampled_from(sorted(nodes)), st.sampled_from(TIERS)))
+    accelerators = accelerator_tiers(nodes, tiers) if draw(st.booleans()) else {}
     return Objective(
         Weights(
             draw(_reals(1e-9, 1e9)),
@@ -224,6 +225,7 @@ def _objective(draw: st.DrawFn, nodes: dict[str, Node]) -> Objective:
         Targets(draw(target), draw(target), draw(target), draw(target) if cloud else None),
         Caps(draw(cap), draw(cap)),
         tiers,
+        accelerators,
     )
 
 

@@ -92,6 +92,7 @@ class RealCell:
         self.module.write_text(MOODY)
         document = to_document(dwell.load(self.file))
         document["tasks"]["perception"]["run"] = "moody:Perception"
+        document["nodes"]["E"]["accelerators"] = {"gpu": 1}
         document["live"] |= {"release": "frames", "max_age_ms": 400}
         # Other work on this machine shall not look like a fault.
         document["controller"] |= {"guard_cycles": 20, "policy": "LOC"}

@@ -89,8 +89,9 @@ def test_only_shadow_workers_run_on_what_is_left(cell: RealCell) -> None:
     assert idle or "no low scheduling class" in cell.log("E", "perception@E.shadow")
 
 
-def test_the_busier_of_cpu_and_accelerator_counts(cell: RealCell) -> None:
-    status = cell.until(lambda status: status["window"]["utilisation"]["E"] >= 0.87)
+def test_an_accelerator_counts_beside_the_cpu(cell: RealCell) -> None:
+    status = cell.until(lambda status: status["window"]["utilisation"]["E.gpu"] == 0.875)
+    assert status["window"]["utilisation"].keys() == {"R1", "E", "R2", "E.gpu"}
     assert status["processes"]["agent@E"]["note"] == ""
 
 

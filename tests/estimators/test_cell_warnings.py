@@ -72,6 +72,12 @@ def gpu(exec_ms: float, count: int = 1) -> dict[str, Any]:
     return on_one({"accelerators": {"gpu": count}}, {"a": both, "b": both})
 
 
+def five_on_a_gpu() -> dict[str, Any]:
+    """Return five stages of 30 ms at P = 100 ms."""
+    tasks = {name: stage(30, accelerator="gpu") for name in "abcde"}
+    return {**on_one({"accelerators": {"gpu": 1}}, tasks), "period_ms": 100}
+
+
 def by_priority(timer_ms: float) -> dict[str, Any]:
     tasks = {"timer": stage(timer_ms, 1), "rest": stage(0.5)}
     return on_one({"scheduler": "priority"}, tasks)
@@ -107,6 +113,14 @@ LINK = {"link": "R->E"}
     ("document", "path", "words"),
     [
         (gpu(8), "candidates.SO", ("160% of gpu of E", "raise nodes.E.accelerators.gpu")),
+        (gpu(12), "candidates.SO", ("240% of gpu of E: it can never keep pace",)),
+        (gpu(4.6), "candidates.SO", ("92% of gpu of E: its jobs wait for each other",)),
+        (five_on_a_gpu(), "candidates.SO", ("150% of gpu of E: it can never keep pace",)),
+        (
+            {**gpu(4), "objective": {"caps": {"utilisation": 0.7}}},
+            "candidates.SO",
+            ("80% of gpu of E, over the cap of 70%",),
+        ),
         (quota(6, 0.5), "candidates.SO", ("120% of the quota of E", "nodes.E.quota.cpu")),
         (bursts(9.1), "candidates.SO", ("91% of the cores of E, of which bursts leave 84%",)),
         (
@@ -174,7 +188,7 @@ def test_what_is_never_meant_is_said(
     [
         cell(),
         gpu(8, count=2),
-        gpu(5),
+        gpu(4.4),
         quota(5, 0.5),
         quota(6, 4),
         bursts(8),

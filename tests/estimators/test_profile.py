@@ -313,6 +313,38 @@ def test_jobs_wider_than_their_node(
     assert profile.own["LOC"]["R1"] == pytest.approx(own)
 
 
+def on_gpu(count: int = 1) -> Problem:
+    """Return a task of 30 ms that may run on the gpu of E, beside one that always does."""
+    nodes = [R1, Node("E", "edge", accelerators={"gpu": count})]
+    gpu = fixed(30.0, 4, "gpu")
+    tasks = [Task("A", {"R1": fixed(10.0), "E": gpu}), Task("B", {"E": gpu})]
+    return make_problem(nodes, tasks, candidates={"LOC": {"A": "R1"}, "OFF": {"A": "E"}})
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_own_work_on_an_accelerator_is_by_its_places(count: int) -> None:
+    own = Profile(on_gpu(count), samples=10).own
+    assert [own[name]["E.gpu"] for name in ("LOC", "OFF")] == [0.3 / count, 0.6 / count]
+    assert [own[name]["E"] for name in ("LOC", "OFF")] == [0.0, 0.0]
+
+
+def test_foreign_load_of_an_accelerator_is_what_is_not_own() -> None:
+    profile = Profile(on_gpu(), samples=10)
+    seen = QoS(50.0, 0.0, {"R1": 0.1, "E": 0.0, "E.gpu": 0.5})
+    own = {"R1": 0.1, "E": 0.0, "E.gpu": 0.3}
+    estimates = profile.estimate(observed=seen, incumbent="LOC", own=own)
+    assert estimates["OFF"].utilisation["E.gpu"] == pytest.approx(0.2 + 0.6)
+
+
+@pytest.mark.parametrize("known", [("used",), ("own",), ()])
+def test_an_accelerator_that_was_not_measured_is_in_no_estimate(known: tuple[str, ...]) -> None:
+    profile = Profile(on_gpu(), samples=10)
+    nodes = {"R1": 0.1, "E": 0.0}
+    used, own = ({**nodes, "E.gpu": 0.3} if one in known else nodes for one in ("used", "own"))
+    estimates = profile.estimate(observed=QoS(50.0, 0.0, used), incumbent="LOC", own=own)
+    assert all(tuple(one.utilisation) == ("R1", "E") for one in estimates.values())
+
+
 @pytest.mark.parametrize(
     ("exec_ms", "threads", "expected_ms"),
     [

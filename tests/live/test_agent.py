@@ -31,3 +31,5 @@ def test_an_accelerator_counts_as_long_as_it_was_busy() -> None:
         load.report(Load("E", 1, at_ns, 0, 0, 0, busy))
     assert load.at(400)[3] - load.at(0)[3] == 250
     assert load.at(200)[3] - load.at(0)[3] == 150
+    # Of the last 100 the hook said nothing.
+    assert load.at(400)[4] - load.at(0)[4] == 300

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 import random
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,7 +28,8 @@ from dwell.live.live_windows import LiveWindows
 from dwell.live.messages import Completion, Hop, Load, Stamp
 from dwell.live.offsets import Offsets
 from dwell.live.run_rows import Resume, Rows, columns_of
-from dwell.model import Execution, Flow, FrozenDict, Link, Node, Problem, QoS, Task
+from dwell.model import Caps, Execution, Flow, FrozenDict, Link, Node, Problem, QoS, Task
+from dwell.model.fabric import accelerator_tiers
 from dwell.model.instants import NEVER_NS
 from dwell.model.process import Constant
 from dwell.record import Journal, Run, seal_run
@@ -1008,10 +1010,90 @@ def test_a_candidate_on_the_same_jobs_is_as_busy_as_the_incumbent() -> None:
         done = Completion(hand.stamp(cycle), "act0", P, "actuated", (job("see", job_ms),), "A")
         hand.windows.completed(done, P)
     used, own, _ = hand.controller.utilisation(busy_window(hand))
-    seen = QoS(10.0, 0.0, FrozenDict(zip(hand.controller.nodes, used.tolist(), strict=True)))
-    mine = dict(zip(hand.controller.nodes, own.tolist(), strict=True))
+    seen = QoS(10.0, 0.0, FrozenDict(zip(hand.controller.resources, used.tolist(), strict=True)))
+    mine = dict(zip(hand.controller.resources, own.tolist(), strict=True))
     estimates = profile.estimate(observed=seen, incumbent="NEAR", own=mine)
     assert estimates["NEAR"].utilisation["A"] == pytest.approx(used[0])
+
+
+def accelerated(**kinds: int) -> Problem:
+    """The small cell, whose source needs an accelerator of A there."""
+    problem = small()
+    nodes = dict(problem.fabric.nodes)
+    nodes["A"] = dataclasses.replace(nodes["A"], accelerators=kinds)
+    tasks, see = dict(problem.pipeline.tasks), problem.pipeline.tasks["see"]
+    on = {**see.on, "A": dataclasses.replace(see.on["A"], accelerator=next(iter(kinds)))}
+    tasks["see"] = dataclasses.replace(see, on=on)
+    return dataclasses.replace(
+        problem,
+        fabric=dataclasses.replace(problem.fabric, nodes=nodes),
+        pipeline=dataclasses.replace(problem.pipeline, tasks=tasks),
+    )
+
+
+def accelerated_window(
+    hand: Hand, *, hook: float = -1.0, told: int = 3, term: int = 1
+) -> dict[str, list[float | None]]:
+    """Busy, own and shadow ms of every resource, of jobs of 15 ms on A; None for not measured."""
+    hand.release(range(W + 1), term)
+    for at_ms in (-100, 400):
+        hand.windows.loaded(Load("A", 1, at_ms * MS, (100 + at_ms) * MS, 0, 0, hook))
+    for cycle in range(told):
+        hops = (Hop("see", "A", 0, 1 * MS, 16 * MS), Hop("act0", "A", 0, 0, 1, cpu_ns=7 * MS))
+        done = Completion(hand.stamp(cycle, term), "act0", P, "actuated", hops, "A")
+        hand.windows.completed(done, P)
+    core_ms = (hand.windows.close().core_ns / MS).T.tolist()
+    return {
+        name: [None if math.isnan(ms) else round(ms, 6) for ms in each]
+        for name, each in zip(hand.controller.resources, core_ms, strict=True)
+    }
+
+
+def test_the_hook_of_a_node_is_that_of_its_only_kind_of_accelerators() -> None:
+    hand = Hand(accelerated(gpu=2))
+    used = accelerated_window(hand, hook=0.6)
+    # Of both places; what the CPU does is apart.
+    assert used["A.gpu"] == [0.6 * 2 * W * P / MS, 3 * 15, 0]
+    assert used["A"] == [W * P / MS, 3 * 7, 0]
+    assert used["B"] == [0, 0, 0]
+
+
+@pytest.mark.parametrize(("kinds", "hook"), [({"gpu": 1}, -1.0), ({"gpu": 1, "npu": 1}, 0.6)])
+def test_without_a_hook_of_its_own_an_accelerator_is_as_busy_as_its_jobs_keep_it(
+    kinds: dict[str, int], hook: float
+) -> None:
+    used = accelerated_window(Hand(accelerated(**kinds)), hook=hook)
+    assert used["A.gpu"] == [3 * 15, 3 * 15, 0]
+    if "npu" in kinds:
+        # Nothing of the placement runs there.
+        assert used["A.npu"] == [0, 0, 0]
+
+
+def test_an_accelerator_that_no_job_tells_of_is_not_measured() -> None:
+    hand = Hand(accelerated(gpu=1))
+    assert accelerated_window(hand, told=0)["A.gpu"] == [None, None, 0]
+    elsewhere = Hand(accelerated(gpu=1))
+    assert accelerated_window(elsewhere, told=0, term=2)["A.gpu"] == [0, 0, 0]
+
+
+def test_caps_and_j_do_without_an_accelerator_that_was_not_measured() -> None:
+    problem = accelerated(gpu=1)
+    objective = dataclasses.replace(
+        problem.objective,
+        caps=Caps(utilisation=0.9),
+        accelerators=accelerator_tiers(problem.fabric.nodes, problem.objective.tiers),
+    )
+    hand = Hand(dataclasses.replace(problem, objective=objective))
+    hand.controller = Controller(hand.problem, "dtp")
+    hand.windows = LiveWindows(hand.problem, hand.offsets, hand.controller)
+    hand.release(range(W + 1))
+    assert len(hand.close()) == W
+    (row,) = hand.controller.log.decisions
+    decision = dict(zip(hand.controller.decision_columns, row, strict=True))
+    hand.record()
+    assert hand.column("windows", "u_A.gpu") == [None]
+    assert decision["est_u_A.gpu_NEAR"] is None
+    assert decision["eligible_FAR"] is True
 
 
 def test_a_node_nobody_reports_of_is_idle() -> None:

@@ -23,11 +23,11 @@ def load(at_ns: int, busy_ns: int, *, life: int = 1, accelerator: float = 0.0) -
 
 def test_a_node_counts_in_proportion_between_two_reports() -> None:
     node = NodeLoad()
-    assert node.at(50).tolist() == [0, 0, 0, 0]
+    assert node.at(50).tolist() == [0, 0, 0, 0, 0]
     for at_ns, busy_ns in ((100, 1_000), (200, 1_080), (300, 1_080)):
         node.report(load(at_ns, busy_ns, accelerator=0.5))
     used = node.at(250) - node.at(150)
-    assert used.tolist() == [40.0, 20.0, 0.0, 50.0]
+    assert used.tolist() == [40.0, 20.0, 0.0, 50.0, 100.0]
 
 
 def test_a_node_that_falls_silent_counts_as_idle() -> None:

@@ -77,6 +77,7 @@ def test_what_is_not_there_is_left_out() -> None:
     assert "scale" not in document["tasks"]["t"]
     assert document["objective"]["caps"] == {}
     assert "tiers" not in document["objective"]
+    assert "accelerators" not in document["objective"]
     assert document["dwell"] == 1
 
 

@@ -35,3 +35,5 @@ def test_cloud_nodes_that_weigh_apart_need_a_target() -> None:
     assert apart.tiers["C"] == "cloud"
     with pytest.raises(ProblemError, match="one of robot, edge, cloud"):
         Objective(Weights(), Targets(30.0), tiers={"R1": "moon"})  # type: ignore[dict-item]
+    counted = Objective(Weights(), Targets(30.0), accelerators={"E.gpu": "edge"})
+    assert counted.accelerators == {"E.gpu": "edge"}

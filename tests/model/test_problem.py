@@ -160,6 +160,14 @@ PLACED = {"a": "R", "b": "R"}
             "objective.tiers.X",
             "unknown node 'X'",
         ),
+        (
+            lambda: replace(
+                _problem(),
+                objective=replace(_problem().objective, accelerators={"E.gpu": "edge"}),
+            ),
+            "objective.accelerators",
+            "those of all nodes of tiers, nothing",
+        ),
         (lambda: _problem().scenario("baselin"), "", "did you mean 'baseline'?"),
     ],
 )

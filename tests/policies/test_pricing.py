@@ -2,9 +2,9 @@ from __future__ import annotations
 
 import pytest
 
-from dwell.cost import cost
+from dwell.cost import cost, tier_utilisation
 from dwell.errors import MetricError, PolicyError
-from dwell.model import Caps, Objective, Placement, QoS, Targets, Weights
+from dwell.model import Caps, Objective, Placement, QoS, Targets, Tier, Weights
 from dwell.policies.pricing import Pricing
 
 CANDIDATES = {
@@ -31,6 +31,27 @@ def test_prices_are_those_of_the_formulas() -> None:
     assert pricing().observed(qos(), "SO", "LOC") == cost(
         qos(), CANDIDATES["SO"], CANDIDATES["LOC"], OBJECTIVE
     )
+
+
+@pytest.mark.parametrize("used", [{}, {"E.gpu": 0.8}, {"E.gpu": 0.2, "R1.npu": 0.9}])
+@pytest.mark.parametrize("apart", [False, True])
+def test_prices_with_accelerators_are_those_of_the_formulas(
+    used: dict[str, float], apart: bool
+) -> None:
+    accelerators: dict[str, Tier] = {"E.gpu": "cloud" if apart else "edge", "R1.npu": "robot"}
+    objective = Objective(
+        Weights(cloud=0.2 if apart else None),
+        Targets(30.0, cloud=0.5 if apart else None),
+        tiers={**OBJECTIVE.tiers, "E": "cloud"} if apart else OBJECTIVE.tiers,
+        accelerators=accelerators,
+    )
+    window = QoS(20.0, 0.1, {**dict.fromkeys(TIERS, 0.5), **used})
+    found = pricing(objective)
+    estimates = dict.fromkeys(CANDIDATES, window)
+    for name, placement in CANDIDATES.items():
+        expected = cost(window, placement, CANDIDATES["LOC"], objective)
+        assert found.estimated(estimates, "LOC")[name] == expected
+    assert found.used(window) == tier_utilisation(window.utilisation, objective)
 
 
 def test_candidates_within_the_caps_are_eligible() -> None:

@@ -35,7 +35,9 @@ def price(q: QoS, now: Nodes, before: Nodes, objective: Objective) -> float:
     """Equation 7."""
 
     def used(*tiers: str) -> float:
-        return max([q.utilisation[n] for n, t in objective.tiers.items() if t in tiers] + [0.0])
+        of_nodes = [q.utilisation[n] for n, t in objective.tiers.items() if t in tiers]
+        counted = [n for n, t in objective.accelerators.items() if t in tiers]
+        return max([*of_nodes, *[q.utilisation[n] for n in counted if n in q.utilisation], 0.0])
 
     a, bar = objective.weights, objective.targets
     total = a.latency * (q.l95_ms / bar.latency_ms)

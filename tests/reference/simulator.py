@@ -81,10 +81,10 @@ class JobResult:
 
 @dataclass(frozen=True)
 class Usage:
-    """What a node's CPU has done since time 0, core-nanoseconds.
+    """What a resource has done since time 0, core-nanoseconds, or those of places.
 
-    `busy` is the integral of min(c, K' + s + b); `own` and `shadow` are the work that the jobs of
-    the cycles, and those of their shadows, have received.
+    `busy` is the integral of min(c, K' + s + b), or of the places taken; `own` and `shadow` are the
+    work that the jobs of the cycles, and those of their shadows, have received.
     """
 
     busy: Fraction
@@ -94,7 +94,7 @@ class Usage:
 
 @dataclass(frozen=True)
 class WindowResult:
-    """A window: its first cycle, what nodes had done when it opened and closed, what was known.
+    """A window: its first cycle, what resources had done when it opened and closed, what was known.
 
     `known` holds the jobs and `arrived` the messages of its cycles, and of their shadows, that the
     events before the close have brought about.
@@ -131,7 +131,7 @@ class Result:
 
     @property
     def busy(self) -> Mapping[str, tuple[Fraction, ...]]:
-        """Busy time of every node at the first release and at the close of every window."""
+        """Busy time of every resource at the first release and at the close of every window."""
         times = (self.windows[0].opened, *(window.closed for window in self.windows))
         return {name: tuple(usage[name].busy for usage in times) for name in times[0]}
 
@@ -317,6 +317,7 @@ class NodeState:
         self.served: dict[str, list[Job]] = {kind: [] for kind in node.accelerators}
         self.busy = Fraction(0)
         self.work = {ITSELF: Fraction(0), SHADOW: Fraction(0)}
+        self.places = {kind: [Fraction(0)] * 3 for kind in node.accelerators}
         self.since = 0
         self.stressed = 0
         self.period = self.quota = self.left = self.pool = self.slack = self.periods = 0
@@ -614,9 +615,15 @@ class NodeState:
             job.left -= speeds[job.cell] * self.part(job) * elapsed
             received = before - max(job.left, Fraction(0))
             self.work[job.cell] += job.execution.threads * received
-        for jobs in self.served.values():
+        for kind, jobs in self.served.items():
+            places = self.places[kind]
             for job in jobs:
-                job.left -= elapsed * (job.cores > 0)
+                if job.cores == 0:
+                    continue
+                received = min(Fraction(elapsed), max(job.left, Fraction(0)))
+                job.left -= elapsed
+                places[1 + job.cell] += received
+                places[0] += elapsed
         self.busy += (rate * self.pace + self.behind) * elapsed
         self.left -= rate * elapsed
         if self.turn:
@@ -626,8 +633,12 @@ class NodeState:
             self.periods, self.pool = (now + self.period_ago) // self.period, self.grant
 
     @property
-    def usage(self) -> Usage:
-        return Usage(self.busy, self.work[ITSELF], self.work[SHADOW])
+    def usage(self) -> dict[str, Usage]:
+        """What the CPU has done, and each kind of the accelerators, by the resource's name."""
+        name = self.node.name
+        of_cpu = Usage(self.busy, self.work[ITSELF], self.work[SHADOW])
+        of_kinds = {f"{name}.{kind}": Usage(*places) for kind, places in self.places.items()}
+        return {name: of_cpu, **of_kinds}
 
     def runnable(self, job: Job) -> list[Job]:
         """Jobs among which this one runs: the CPU's, or those of its accelerator."""
@@ -981,7 +992,7 @@ class Simulation:
 
     @property
     def usage(self) -> dict[str, Usage]:
-        return {name: node.usage for name, node in self.nodes.items()}
+        return {name: of for node in self.nodes.values() for name, of in node.usage.items()}
 
     def open_window(self, first: int) -> None:
         """Let the next window begin with this cycle; without a whole one left, the run is over."""

@@ -336,7 +336,7 @@ def window_differences(case: Case, windows: pl.DataFrame, result: Result) -> Ite
         sent = sum(other is not None for _, other in result.stamps[first:last])
         if row.get("shadow_cycles", 0) != sent:
             yield f"{where}: shadow_cycles {row['shadow_cycles']}, expected {sent}"
-        for name in case.problem.fabric.nodes:
+        for name in case.problem.fabric.resources:
             busy, _, shadow = shares(case, expected, name)
             for column, value in ((f"u_{name}", busy), (f"shadow_{name}", shadow)):
                 if abs(row.get(column, 0.0) - value) > 1e-6:
@@ -354,22 +354,22 @@ def guard_differences(decisions: pl.DataFrame, result: Result) -> Iterator[str]:
         yield f"the guard moved {found}, expected {expected}"
 
 
-def shares(case: Case, window: WindowResult, node: str) -> tuple[float, float, float]:
-    """Shares of a node's cores in a window: busy, own and shadow."""
-    opened, closed = window.opened[node], window.closed[node]
+def shares(case: Case, window: WindowResult, resource: str) -> tuple[float, float, float]:
+    """Shares of a node's cores, or of its accelerators, in a window: busy, own and shadow."""
+    opened, closed = window.opened[resource], window.closed[resource]
     span_ns = window.close_ns - int(case.real.release_ns[window.first_cycle])
-    cores = case.problem.fabric.nodes[node].capacity
+    capacity = case.problem.fabric.resources[resource].capacity
     busy, own, shadow = (
-        min(1.0, float(after - before) / (cores * span_ns))
+        min(1.0, float(after - before) / (capacity * span_ns))
         for before, after in zip(astuple(opened), astuple(closed), strict=True)
     )
     return busy, own, shadow
 
 
 def core_differences(case: Case, core_ns: NDArray[np.float64], result: Result) -> Iterator[str]:
-    """Compare what nodes had done at the begin and end of windows, shape (2, windows, 3, nodes)."""
+    """Compare what resources had done when windows began and ended: (2, windows, 3, resources)."""
     for k, window in enumerate(result.windows):
-        for i, name in enumerate(case.problem.fabric.nodes):
+        for i, name in enumerate(case.problem.fabric.resources):
             for when, usage in enumerate((window.opened[name], window.closed[name])):
                 found = core_ns[when, k, :, i].tolist()
                 expected = [float(value) for value in astuple(usage)]
@@ -386,7 +386,7 @@ def probe_differences(case: Case, probe: Probe, result: Result, tolerance_ns: in
     rows = zip(probe.evidence, probe.observed, probe.own, seen, strict=False)
     for evidence, observed, own, window in rows:
         where = f"window of cycle {window.first_cycle}"
-        for name in case.problem.fabric.nodes:
+        for name in case.problem.fabric.resources:
             _, *expected = shares(case, window, name)
             if abs(own[name] - sum(expected)) > 1e-6:
                 yield f"{where}: own work on {name} {own[name]}, expected {expected}"

@@ -193,6 +193,8 @@ def test_accelerator_serves_one_after_another_untouched_by_stress() -> None:
     assert times(result, "B") == (0, 5, 8)
     assert times(result, "C") == (0, 0, 8)
     assert result.busy["R"][-1] == 100 * MS
+    assert result.busy["R.gpu"][-1] == (5 + 3) * MS
+    assert result.windows[-1].closed["R.gpu"].own == (5 + 3) * MS
 
 
 # --------------------------------------------------------------------------- workers and inputs

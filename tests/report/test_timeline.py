@@ -27,7 +27,7 @@ def timeline(run: dwell.Run, **more: object) -> Figure:
         begins_by_number(run.windows, PROBLEM.pipeline.period_ms),
         slug="time",
         palette=Palette.of(tuple(PROBLEM.candidates)),
-        nodes=tuple(PROBLEM.fabric.nodes),
+        resources=tuple(PROBLEM.fabric.resources),
         deadline_ms=PROBLEM.pipeline.deadline_ms,
         **more,  # type: ignore[arg-type]
     )

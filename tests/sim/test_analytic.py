@@ -321,3 +321,50 @@ def test_priority_under_stress_preempts_as_many_as_needed() -> None:
     stress = [NodeChange(0, "R", 2, False)]
     tasks = [job("A", 10), job("B", 12), job("wide", 3, threads=2, offset=4, priority=1)]
     assert ends_ms(node, tasks, stress) == [26, 30, 10]
+
+
+def on_accelerator(name: str, ms: float, kind: str, offset: float = 0.0) -> Task:
+    execution = Execution(Constant(ms), accelerator=kind)
+    return Task(name, {"R": execution}, offset_ms=offset)
+
+
+def test_five_tasks_of_30_ms_on_one_accelerator_fall_behind_by_50_ms_a_cycle() -> None:
+    node = Node("R", "robot", cores=4, accelerators={"gpu": 1})
+    problem = make_problem([node], [on_accelerator(name, 30, "gpu") for name in "ABCDE"])
+    real = make_realisation(problem, windows=6)
+    run = dwell.simulate_realisation(problem, real, policy="LOC")
+    assert latencies_ms(run).tolist()[:4] == [150, 200, 250, 300]
+    assert run.windows["u_R.gpu"].to_list() == [1.0] * 6
+    assert run.windows["u_R"].to_list() == [0.0] * 6
+    # All of it is the cell's own.
+    assert run.decisions["est_u_R.gpu_LOC"].to_list() == [1.0] * 6
+
+
+def test_two_kinds_of_accelerators_are_busy_on_their_own() -> None:
+    # Of two places of the gpu A and B take 30 and 20 ms each; C of one of the npu takes 45.
+    node = Node("R", "robot", accelerators={"gpu": 2, "npu": 1})
+    tasks = [
+        on_accelerator("A", 30, "gpu"),
+        on_accelerator("B", 20, "gpu"),
+        on_accelerator("C", 45, "npu"),
+        job("D", 10),
+    ]
+    problem = make_problem([node], tasks, window_cycles=2)
+    changes = [NodeChange(0, "R", 1, False)]
+    real = make_realisation(problem, windows=3, node_changes=changes)
+    run = dwell.simulate_realisation(problem, real, policy="LOC")
+    assert latencies_ms(run).tolist() == [45] * 6
+    assert run.windows["u_R.gpu"].to_list() == pytest.approx([0.25] * 3)
+    assert run.windows["u_R.npu"].to_list() == pytest.approx([0.45] * 3)
+    # Stress keeps the CPU busy, and no accelerator.
+    assert run.windows["u_R"].to_list() == [1.0] * 3
+
+
+def test_a_job_that_an_accelerator_loses_was_work_until_then() -> None:
+    node = Node("R", "robot", accelerators={"gpu": 1})
+    problem = make_problem([node], [on_accelerator("A", 60, "gpu")])
+    changes = [NodeChange(15 * MS, "R", 0, True), NodeChange(80 * MS, "R", 0, False)]
+    real = make_realisation(problem, windows=2, node_changes=changes)
+    run = dwell.simulate_realisation(problem, real, policy="LOC")
+    assert run.windows["u_R.gpu"].to_list() == pytest.approx([0.15, 0.6])
+    assert run.cycles["outcome"].to_list() == ["node_down", "done"]

@@ -15,6 +15,7 @@ import dwell
 from dwell.control import Controller, plain_rule
 from dwell.errors import PolicyError
 from dwell.model import Caps, Objective, Problem, Targets, Weights
+from dwell.model.fabric import accelerator_tiers
 from dwell.policies import ATP, DTP, Cusum, LatencyFirst, Static
 from dwell.sim.engine import simulate_realisation
 from tests.cells.generated import random_problem
@@ -51,7 +52,8 @@ def objective_of(rng: Random, problem: Problem) -> Objective:
             Caps(rng.uniform(0.2, 2.0) * problem.pipeline.period_ms, rng.uniform(0.05, 1.0)),
         ]
     )
-    return replace(problem.objective, weights=weights, targets=targets, caps=caps, tiers=tiers)
+    accelerators = accelerator_tiers(problem.fabric.nodes, tiers) if rng.random() < 0.5 else {}
+    return Objective(weights, targets, caps, tiers, accelerators)
 
 
 def policy_of(rng: Random, problem: Problem) -> Any:

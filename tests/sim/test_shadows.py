@@ -524,6 +524,33 @@ def test_the_columns_of_a_window_say_what_shadows_cost(estimator: Probe | Quiet)
         assert estimator.own[0] == pytest.approx({"R": 0.06, "E": 0.02 + 0.04})
 
 
+def test_a_shadow_on_an_accelerator_is_neither_own_work_nor_foreign_load() -> None:
+    # B moves to the gpu of E, which D has for 30 ms of every 100.
+    gpu = Execution(Constant(30), accelerator="gpu")
+    tasks = [
+        task("S", 2),
+        Task("B", {"R": Execution(Constant(4)), "E": gpu}),
+        task("K", 1),
+        Task("D", {"E": gpu}),
+    ]
+    problem = make_problem(
+        [R, replace(E, accelerators={"gpu": 1})],
+        tasks,
+        [Flow("S", "B"), Flow("B", "K")],
+        links=[Link("R", "E", Constant(1)), Link("E", "R", Constant(1))],
+        candidates={"LOC": {"B": "R"}, "OFF": {"B": "E"}},
+        window_cycles=2,
+        controller=ControllerSettings(on="R"),
+    )
+    probe = Probe(1.0)
+    real = make_realisation(problem, windows=3)
+    run = dwell.simulate_realisation(problem, real, policy="LOC", estimator=probe)
+    assert run.windows["u_E.gpu"].to_list() == pytest.approx([0.6] * 3)
+    assert run.windows["shadow_E.gpu"].to_list() == pytest.approx([0.3] * 3)
+    assert run.windows["shadow_E"].to_list() == [0.0] * 3
+    assert probe.own[0] == pytest.approx({"R": 0.07, "E": 0.0, "E.gpu": 0.6})
+
+
 def test_what_is_no_foreign_load_is_told_apart_from_what_is() -> None:
     probe = Probe(1.0)
     disturbed = replace(

@@ -56,6 +56,7 @@ from dwell.model import (
     Weights,
 )
 from dwell.model.bounds import require
+from dwell.model.fabric import accelerator_tiers
 from dwell.model.frozen import FrozenDict
 from dwell.model.process import DRAWN, UnreadTrace
 from dwell.model.semantics import CellParts, find_faults
@@ -144,7 +145,7 @@ class Assembly:
             broken_candidates=[name for name, moves in entry.candidates.items() if moves is None],
             scenarios=scenarios,
             controller=controller,
-            tiers=objective.tiers if objective is not None else (),
+            tiers=objective.tiers if objective is not None else {},
             policies=policies.names() if self.judged else None,
             estimators=estimators.names() if self.judged else None,
             shadowing=estimators.shadowing() if self.judged else (),
@@ -352,7 +353,9 @@ class Assembly:
         self, entry: ObjectiveEntry, nodes: Mapping[str, Node | None]
     ) -> Objective | None:
         deadline_ms = self.entry.deadline_ms or self.entry.period_ms
-        tiers = {name: node.tier for name, node in nodes.items() if node is not None}
+        tiers = entry.tiers
+        if tiers is None:
+            tiers = {name: node.tier for name, node in nodes.items() if node is not None}
         values = {"latency_ms": deadline_ms, **self._given("objective", entry.targets)}
         weights = self.faults.attempt(
             "objective", Weights, **self._given("objective", entry.weights)
@@ -367,7 +370,8 @@ class Assembly:
             weights=weights or Weights(),
             targets=targets,
             caps=caps or Caps(),
-            tiers=tiers if entry.tiers is None else entry.tiers,
+            tiers=tiers,
+            accelerators=accelerator_tiers(nodes, tiers) if entry.accelerators else {},
         )
 
     def _controller(self, entry: ControllerEntry) -> ControllerSettings | None:

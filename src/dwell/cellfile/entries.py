@@ -563,7 +563,7 @@ class CapsEntry(Entry):
 
     latency_ms: Cap | None = optional("On L95, ms; none by default.")
     utilisation: Cap | None = optional(
-        "On the utilisation of every node, as 0.98; none by default."
+        "On the utilisation of every node and accelerator, as 0.98; none by default."
     )
 
 
@@ -575,6 +575,9 @@ class ObjectiveEntry(Entry):
     caps: CapsEntry | None = optional("Hard caps.")
     tiers: dict[str, Literal["robot", "edge", "cloud"]] | None = optional(
         "Nodes whose utilisation counts, and as which tier; default: all, as their own tier."
+    )
+    accelerators: bool | None = optional(
+        "Whether accelerators of these nodes count in their tiers, too; default false."
     )
 
 

@@ -142,18 +142,19 @@ def _priced(problem: Problem, prices: Mapping[str, Price]) -> dict[str, Any]:
 
 def _summary(problem: Problem, prices: Mapping[str, Price], scenario: str) -> str:
     pipeline, nodes = problem.pipeline, problem.fabric.nodes
+    resources = problem.fabric.resources
     movable = [
         f"{name} ({', '.join(task.on)})"
         for name, task in pipeline.tasks.items()
         if not task.anchored
     ]
-    head = ["candidate", "L95 (ms)", "V_D (%)", *(f"{node} (%)" for node in nodes)]
+    head = ["candidate", "L95 (ms)", "V_D (%)", *(f"{one} (%)" for one in resources)]
     rows = [
         [
             name,
             _with_error(milliseconds(price.uncut_l95_ms), price.l95_error_ms),
             _with_error(f"{price.violation_rate * 100:.1f}", price.violation_error * 100),
-            *(f"{price.own[node] * 100:.0f}" for node in nodes),
+            *(f"{price.own[one] * 100:.0f}" for one in resources),
         ]
         for name, price in prices.items()
     ]

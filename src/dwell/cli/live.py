@@ -502,7 +502,10 @@ def status_lines(status: dict[str, Any]) -> list[str]:
         f"of the guard {status['guard_moves']}"
     )
     if window := status["window"]:
-        used = ", ".join(f"{node} {share:.0%}" for node, share in window["utilisation"].items())
+        used = ", ".join(
+            f"{name} {'not measured' if share is None else f'{share:.0%}'}"
+            for name, share in window["utilisation"].items()
+        )
         lines.append(
             f"window {window['number']}, {window['age_ms'] / 1e3:.1f} s ago: L95 "
             f"{milliseconds(window['l95_ms'])} ms, V_D {window['violation_rate']:.1%}, J "

@@ -310,12 +310,13 @@ class Screen:
     def _load(self, state: CellState) -> Table:
         load = Table.grid(padding=(0, 1))
         used = state.window.get("utilisation") or {}
-        for node in self.problem.fabric.nodes:
-            share = used.get(node)
+        for name, one in self.problem.fabric.resources.items():
+            share = used.get(name)
             filled = round(BAR * min(max(_float(share), 0.0), 1.0)) if share is not None else 0
             bar = Text("█" * filled).append("·" * (BAR - filled), style=GREY)
             percent = _number(_hundred(share), "%", 0).rjust(5)
-            load.add_row(Text("CPU", style=GREY), Text(node, no_wrap=True), bar, percent)
+            kind = Text(one.kind or "CPU", style=GREY, no_wrap=True)
+            load.add_row(kind, Text(one.node, no_wrap=True), bar, percent)
         return load
 
     def _foot(self, state: CellState) -> Iterator[Text]:

@@ -159,7 +159,7 @@ def _summary(
     if row is None:
         return f"{title}, none after the {warmup} of warm-up: nothing to sum up; ask for more"
     shares = (f"{name} {row[f'share_{name}']:.0%}" for name in problem.candidates)
-    used = (f"{node} {row[f'node_{node}']:.0%}" for node in problem.fabric.nodes)
+    used = (f"{name} {row[f'node_{name}']:.0%}" for name in problem.fabric.resources)
     lines = (
         ("missed deadlines (V_D)", f"{float(row['violation_rate']) * 100:.2f} %"),
         ("L95, mean of windows", f"{milliseconds(float(str(row['l95_ms'])), 2)} ms"),

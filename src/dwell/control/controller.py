@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from operator import add
@@ -41,8 +42,9 @@ class ClosedWindow:
         Instant of the close.
     open_ns : int
         Release of its first cycle.
-    core_ns : float64 array, shape (3, nodes)
-        Core-nanoseconds in the window: of all work, of the cell's own jobs, of its shadow jobs.
+    core_ns : float64 array, shape (3, resources)
+        Core-nanoseconds in the window: of all work, of the cell's own jobs, of its shadow jobs;
+        of an accelerator, of its places. NaN where they were not measured.
     evidence : callable, optional
         Makes the window's `Evidence`, for estimators that learn from it.
     """
@@ -141,12 +143,15 @@ class Controller:
         self.on_fallback = False
         #: What the policy would leave the fallback for, had it been proven by probes; else None.
         self.wanted: str | None = None
-        self.nodes = tuple(problem.fabric.nodes)
+        resources = problem.fabric.resources.values()
+        #: Names of the cell's resources: its nodes, then their accelerators.
+        self.resources = tuple(one.name for one in resources)
+        self._has_accelerators = any(one.kind for one in resources)
         self._names = tuple(problem.candidates)
         #: What the log has where nothing is known of the candidates.
         self._none: list[float | bool | None] = [None] * len(self._names)
         self.log = DecisionLog()
-        self._cores = np.array([node.capacity for node in problem.fabric.nodes.values()], float)
+        self._capacity = np.array([one.capacity for one in resources], float)
         self._pricing = Pricing(problem.candidates, problem.objective)
         self._deadline_ns = round(problem.pipeline.deadline_ms * 1e6)
         self._censor_ms = problem.censor_ms
@@ -167,15 +172,16 @@ class Controller:
         """Names of the columns of `Log.decisions`.
 
         J of every candidate (null where the policy prices none), what was estimated of it (L95 in
-        ms, violation rate, utilisation of every node), whether it is within the caps, by how much
-        it is over them at most (null without caps), and where the estimator says it, how many
+        ms, violation rate, utilisation of every resource), whether it is within the caps, by how
+        much it is over them at most (null without caps), and where the estimator says it, how many
         samples stand behind the estimate and how old (windows) the newest is.
         """
         features: tuple[Feature, ...] = ("support",) if self.supports else ()
+        resources = self.problem.fabric.resources.values()
         return tuple(
             column.name
             for one in those_with(features, DECISIONS)
-            for column in columns_of(one.name, self.nodes, self._names)
+            for column in columns_of(one.name, resources, self._names)
         )
 
     def described(self) -> dict[str, object]:
@@ -247,13 +253,16 @@ class Controller:
         ----------
         l95_ms, violation_rate, uncut_ms : float
             L95 as it could be known, V_D, and L95 as caps are compared with it.
-        shares : float64 array, shape (3, nodes)
-            Busy, own and shadow share of every node's cores.
+        shares : float64 array, shape (3, resources)
+            Busy, own and shadow share of every resource; NaN where they were not measured.
         """
         used, own, shadow = shares.tolist()
-        utilisation = FrozenDict(zip(self.nodes, used, strict=True))
+        seen = dict(zip(self.resources, used, strict=True))
         # Neither the cell's jobs nor its shadow jobs are foreign.
-        mine = dict(zip(self.nodes, map(add, own, shadow), strict=True))
+        mine = dict(zip(self.resources, map(add, own, shadow), strict=True))
+        if self._has_accelerators:
+            seen, mine = _measured(seen), _measured(mine)
+        utilisation = FrozenDict(seen)
         observed = QoS(l95_ms, violation_rate, utilisation, uncut_ms)
         return self.decide(observed, mine, proven=proven)
 
@@ -263,8 +272,8 @@ class Controller:
             self._learner.learn(evidence())
 
     def utilisation(self, window: ClosedWindow) -> Floats:
-        """Busy, own and shadow share of every node's cores, shape (3, nodes)."""
-        return utilisation(window.core_ns, self._cores, window.close_ns - window.open_ns)
+        """Busy, own and shadow share of every resource, shape (3, resources)."""
+        return utilisation(window.core_ns, self._capacity, window.close_ns - window.open_ns)
 
     def decide(self, observed: QoS, own: Mapping[str, float], *, proven: str | None = None) -> str:
         """Decide on metrics that are already aggregated (see `close`)."""
@@ -397,7 +406,7 @@ class Controller:
                 *(map(costs.get, names) if costs else self._none),
                 *[estimate.l95_ms for estimate in known],
                 *[estimate.violation_rate for estimate in known],
-                *[shares.get(node) for node in self.nodes for shares in used],
+                *[shares.get(name) for name in self.resources for shares in used],
                 *self._capped(known),
                 *self._supported(),
             )
@@ -462,6 +471,11 @@ class Controller:
             reason="migrate" if migrated else "hold",
             dwell=0 if migrated else self.dwell + 1,
         )
+
+
+def _measured(shares: Mapping[str, float]) -> dict[str, float]:
+    """Leave out what is NaN."""
+    return {name: share for name, share in shares.items() if not math.isnan(share)}
 
 
 def _without_estimator(

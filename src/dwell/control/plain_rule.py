@@ -22,7 +22,7 @@ Floats: TypeAlias = NDArray[np.float64]
 
 
 class PlainRule(NamedTuple):
-    """A policy and an estimator in numbers; candidates and nodes in the problem's order.
+    """A policy and an estimator in numbers; candidates and resources in the problem's order.
 
     Parameters
     ----------
@@ -32,12 +32,12 @@ class PlainRule(NamedTuple):
         Numbers of the policy, weights, targets and caps of its objective.
     options : mapping of str to float64 array, shape (candidates,)
         What is expected of each candidate, and whether its toggled task is on a robot.
-    work : float64 array, shape (candidates, nodes)
-        Share of each node's cores that the cell's own work takes.
+    work : float64 array, shape (candidates, resources)
+        Share of each resource that the cell's own work takes.
     switching : float64 array, shape (candidates, candidates)
         S of a candidate (column) after another (row).
     tiers : tuple of str
-        Tier of each node in J, ``robot``, ``edge`` or ``cloud``; empty where J has none of it.
+        Tier of each resource in J, ``robot``, ``edge`` or ``cloud``; empty where J has none of it.
     """
 
     policy: str
@@ -64,6 +64,7 @@ def plain_rule(controller: Controller) -> PlainRule | None:
     if own.objective not in (None, problem.objective):
         return None
     names, nodes = list(problem.candidates), list(problem.fabric.nodes)
+    resources = list(problem.fabric.resources)
     known = {
         "l95_ms": profile.l95_ms,
         "uncut_ms": profile.uncut_l95_ms,
@@ -72,9 +73,9 @@ def plain_rule(controller: Controller) -> PlainRule | None:
     }
     on = np.array([[nodes.index(node) for node in one.values()] for one in own.candidates.values()])
     tier_of = {
-        node: tier
+        name: tier
         for tier, members in tier_nodes(problem.objective)._asdict().items()
-        for node in members
+        for name in members
     }
     return PlainRule(
         policy=called,
@@ -87,9 +88,9 @@ def plain_rule(controller: Controller) -> PlainRule | None:
             "dwell": controller.dwell,
         },
         options={name: np.array([by[one] for one in names]) for name, by in known.items()},
-        work=np.array([[profile.own[name][node] for node in nodes] for name in names]),
+        work=np.array([[profile.own[name][one] for one in resources] for name in names]),
         switching=(on[:, None] != on).sum(axis=2) / on.shape[1],
-        tiers=tuple(tier_of.get(node, "") for node in nodes),
+        tiers=tuple(tier_of.get(one, "") for one in resources),
     )
 
 

@@ -85,15 +85,16 @@ def final_l95_ms(latency_ns: Ints) -> Floats:
     return ms
 
 
-def utilisation(core_ns: Floats, cores: Floats, span_ns: Ints | int) -> Floats:
-    """Share of the cores that was busy, as the operating system of each node would show it.
+def utilisation(core_ns: Floats, capacity: Floats, span_ns: Ints | int) -> Floats:
+    """Share of each resource that was busy: of a node's cores, as its system would show it.
 
     Parameters
     ----------
-    core_ns : float64 array, shape (..., nodes)
-        Busy core-nanoseconds in the window.
-    cores : float64 array, shape (nodes,)
+    core_ns : float64 array, shape (..., resources)
+        Busy core-nanoseconds in the window; of an accelerator, those of its places.
+    capacity : float64 array, shape (resources,)
+        Cores, or places.
     span_ns : int, or int64 array of shape (..., 1)
         Length of the window.
     """
-    return np.minimum(core_ns / (cores * span_ns), 1.0)
+    return np.minimum(core_ns / (capacity * span_ns), 1.0)

@@ -27,6 +27,8 @@ from dwell.model.servo import Servo
 
 #: Draws of a process that a percentile, or a mean of latencies, is taken of.
 DRAWS = 10_000
+#: Share of an accelerator from which on its jobs wait for each other often.
+NEARLY_FULL = 0.9
 #: Share of J from which on one term leaves nothing to the others.
 DOMINANT = 0.95
 
@@ -75,7 +77,7 @@ def unplayed(problem: Problem, scenario: str, windows: int) -> Iterator[Fault]:
 
 
 def _overloads(problem: Problem) -> Iterator[Fault]:
-    """Yield candidates whose own work is more than a node, or an accelerator, can do."""
+    """Yield candidates whose own work is more than a node can do, or than an accelerator nearly."""
     nodes = problem.fabric.nodes
     for name, placement in problem.candidates.items():
         for node in nodes.values():
@@ -87,13 +89,13 @@ def _overloads(problem: Problem) -> Iterator[Fault]:
                     f"its own work takes {share:.0%} of {_limit(node, left)}: it can never keep "
                     f"pace; {_remedy(node, left)}",
                 )
-        for (where, kind), work_ms in _accelerator_ms(problem, placement).items():
-            share = work_ms / (problem.pipeline.period_ms * nodes[where].accelerators[kind])
-            if share > 1:
+        for (where, kind), share in _accelerator_shares(problem, placement).items():
+            if share > NEARLY_FULL:
+                what = "it can never keep pace" if share > 1 else "its jobs wait for each other"
                 yield Fault(
                     f"candidates.{name}",
-                    f"its own work takes {share:.0%} of {kind} of {where}: it can never keep pace; "
-                    f"place less there, or raise nodes.{where}.accelerators.{kind}",
+                    f"its own work takes {share:.0%} of {kind} of {where}: {what}; place less "
+                    f"there, or raise nodes.{where}.accelerators.{kind}",
                 )
 
 
@@ -146,8 +148,8 @@ def _left_share(problem: Problem, node: Node, placement: Placement) -> float:
     return left * (1 - on / (on + off) * (1 - beside / node.interference))
 
 
-def _accelerator_ms(problem: Problem, placement: Placement) -> dict[tuple[str, str], float]:
-    """Mean work of a cycle by node and kind of accelerator."""
+def _accelerator_shares(problem: Problem, placement: Placement) -> dict[tuple[str, str], float]:
+    """Share of each accelerator that own work asks for, by node and kind."""
     work_ms: dict[tuple[str, str], float] = {}
     for task in problem.pipeline.tasks.values():
         node = placement[task.name]
@@ -155,7 +157,11 @@ def _accelerator_ms(problem: Problem, placement: Placement) -> dict[tuple[str, s
         if execution.accelerator is not None:
             place = node, execution.accelerator
             work_ms[place] = work_ms.get(place, 0.0) + mean_ms(problem.pipeline, task, execution)
-    return work_ms
+    period_ms, nodes = problem.pipeline.period_ms, problem.fabric.nodes
+    return {
+        (node, kind): work / (period_ms * nodes[node].accelerators[kind])
+        for (node, kind), work in work_ms.items()
+    }
 
 
 def _slow_stages(problem: Problem) -> Iterator[Fault]:
@@ -239,8 +245,8 @@ def _same_placements(problem: Problem) -> Iterator[Fault]:
 
 
 def _over_caps(problem: Problem, profile: Profile) -> Iterator[Fault]:
-    """Yield candidates that are over the latency cap before anything disturbs them."""
-    cap_ms = problem.objective.caps.latency_ms
+    """Yield candidates that are over a cap before anything disturbs them."""
+    cap_ms, cap = problem.objective.caps.latency_ms, problem.objective.caps.utilisation
     for name, l95_ms in profile.uncut_l95_ms.items():
         if l95_ms > cap_ms:
             yield Fault(
@@ -248,6 +254,14 @@ def _over_caps(problem: Problem, profile: Profile) -> Iterator[Fault]:
                 f"L95 is {milliseconds(l95_ms)} ms undisturbed, over the cap of {cap_ms:g} ms: it "
                 "is never eligible while another one is",
             )
+    for name, placement in problem.candidates.items():
+        for (node, kind), share in _accelerator_shares(problem, placement).items():
+            if cap < share <= 1:
+                yield Fault(
+                    f"candidates.{name}",
+                    f"its own work takes {share:.0%} of {kind} of {node}, over the cap of "
+                    f"{cap:.0%}: it is never eligible while another one is",
+                )
 
 
 def _percentages(problem: Problem) -> Iterator[Fault]:

@@ -69,7 +69,7 @@ class Price:
     latency_ms : float
         Mean latency of the cycles that came to an end; NaN where none did.
     own : mapping of str to float
-        Share of each node's cores that the cell's jobs take.
+        Share of each resource that the cell's jobs take: a node, or a kind of accelerator.
     cycles : int
         How many cycles were played, those at the begin that do not count included.
     """
@@ -241,7 +241,7 @@ def price_of(problem: Problem, realisation: Realisation, name: str) -> Price:
         violation_rate=violation_rate,
         violation_error=violation_error,
         latency_ms=float(finished_ms.mean()) if len(finished_ms) else math.nan,
-        own=FrozenDict(zip(problem.fabric.nodes, own.tolist(), strict=True)),
+        own=FrozenDict(zip(problem.fabric.resources, own.tolist(), strict=True)),
         cycles=realisation.cycles,
     )
 

@@ -11,7 +11,9 @@ stressed robot looks busy here, not slow.
 Of a saturated node that others have a part of, the foreign load cannot be seen: what others got is
 only the least that they ask for, and where the cell leaves they may take all of it. Such a node is
 expected to be full under every candidate, but under one that was active before and showed less, if
-the node has been saturated at every close since: then it was the cell that filled it.
+the node has been saturated at every close since: then it was the cell that filled it. A kind of a
+node's accelerators is as a node in all this; where a window shows nothing of it, neither do the
+estimates.
 """
 
 from __future__ import annotations
@@ -59,7 +61,8 @@ class Profile:
     violation_rate : mapping of str to float
         Estimated V_D of every candidate.
     own : mapping of str to mapping of str to float
-        Share of each node's cores that the cell's own work takes, by candidate and node.
+        Share of each resource that the cell's own work takes, by candidate and resource: a node, or
+        a kind of its accelerators, as ``E.gpu``.
     prices : mapping of str to Price
         All of it, with the standard errors and the number of cycles played.
 
@@ -81,10 +84,12 @@ class Profile:
         self.uncut_l95_ms: Mapping[str, float] = _each(prices, "uncut_l95_ms")
         self.violation_rate: Mapping[str, float] = _each(prices, "violation_rate")
         self.own: Mapping[str, Mapping[str, float]] = _each(prices, "own")
-        self._nodes = tuple(problem.fabric.nodes)
+        resources = problem.fabric.resources
+        self._resources = tuple(resources)
+        self._accelerators = frozenset(name for name, one in resources.items() if one.kind)
         table = []
         for name, price in prices.items():
-            # Once through the checks: what differs from window to window is a share of the cores.
+            # Once through the checks: what differs from window to window are shares of resources.
             known = QoS(price.l95_ms, price.violation_rate, {}, price.uncut_l95_ms)
             metrics = known.l95_ms, known.violation_rate, known.cut_from_ms
             table.append((name, *metrics, tuple(price.own.items())))
@@ -96,9 +101,9 @@ class Profile:
 
     def start(self, problem: Problem) -> None:
         """Forget every window."""
-        #: What each node showed, by the candidate it was last seen under, at its last close without
-        #: saturation and at all after it.
-        self._shown: dict[str, dict[str, float]] = {node: {} for node in self._nodes}
+        #: What each resource showed, by the candidate it was last seen under, at its last close
+        #: without saturation and at all after it.
+        self._shown: dict[str, dict[str, float]] = {name: {} for name in self._resources}
 
     def estimate(
         self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
@@ -107,8 +112,11 @@ class Profile:
         # Conditions and not min() and max(): this runs at the close of every window.
         used = observed.utilisation
         foreign, full = {}, {}
+        unmeasured = {one for one in self._accelerators if one not in used or one not in own}
         try:
             for node, shown in self._shown.items():
+                if node in unmeasured:
+                    continue
                 busy, mine = used[node], own[node]
                 load = busy - mine
                 foreign[node] = load if load > 0.0 else 0.0
@@ -122,13 +130,15 @@ class Profile:
         except KeyError as error:
             what = "own" if error.args[0] in used else "observed.utilisation"
             raise MetricError(
-                f"{what} has nothing for node {error.args[0]}; "
-                f"it must hold each of {', '.join(self._nodes)}"
+                f"{what} has nothing for node {error.args[0]}; it must hold each of "
+                f"{', '.join(one for one in self._resources if one not in self._accelerators)}"
             ) from None
         estimates = {}
         for name, l95_ms, violation_rate, cut_from_ms, work in self._table:
             utilisation = {}
             for node, share in work:
+                if node in unmeasured:
+                    continue
                 busy = foreign[node] + share
                 utilisation[node] = busy if busy < 1.0 else 1.0
             for node, shown in full.items():
@@ -166,19 +176,19 @@ class SampleCycles:
         return np.round(latency, 6)
 
     def own_work(self, placement: Placement) -> dict[str, float]:
-        """Share of each node's cores that one job of every task placed there takes a period."""
+        """Share of each resource that one job of every task placed there takes a period."""
         pipeline, nodes = self.problem.pipeline, self.problem.fabric.nodes
-        work_ms = dict.fromkeys(nodes, 0.0)
+        resources = self.problem.fabric.resources
+        work_ms = dict.fromkeys(resources, 0.0)
         for name, task in pipeline.tasks.items():
             node = nodes[placement[name]]
             execution = task.on[node.name]
+            job_ms = mean_ms(pipeline, task, execution)
             if execution.accelerator is None:
-                held = min(execution.threads, node.cores)
-                work_ms[node.name] += (
-                    mean_ms(pipeline, task, execution) * _stretch(execution, node) * held
-                )
+                job_ms = job_ms * _stretch(execution, node) * min(execution.threads, node.cores)
+            work_ms[execution.resource(node.name)] += job_ms
         return {
-            name: work / (pipeline.period_ms * nodes[name].capacity)
+            name: work / (pipeline.period_ms * resources[name].capacity)
             for name, work in work_ms.items()
         }
 

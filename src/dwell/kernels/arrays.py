@@ -39,8 +39,8 @@ class Arrays:
     ----------
     tables : Tables
         What the kernel works on; replaced as a whole when a part of it grows.
-    nodes : tuple of tuple of str
-        By cell: its nodes, in the order of the snapshots' columns.
+    resources : tuple of tuple of str
+        By cell: its resources, in the order of the snapshots' columns.
     address : int
         What the kernel is handed.
     """
@@ -48,10 +48,10 @@ class Arrays:
     def __init__(
         self,
         tables: Tables,
-        nodes: tuple[tuple[str, ...], ...],
+        resources: tuple[tuple[str, ...], ...],
         behind: Sequence[Ints],
     ) -> None:
-        self.nodes = nodes
+        self.resources = resources
         # Rows have addresses in these.
         self._behind = behind
         self._use(tables)
@@ -76,19 +76,19 @@ class Arrays:
         **tables : array
             `work`, `switching` and `tiers`.
         """
-        candidates, nodes = tables["work"].shape
+        candidates, resources = tables["work"].shape
         windows = self.tables.seen.shape[1]
         rule = _table("rule", [numbers], 0)
         rows = np.zeros(candidates, row_types()["options"])
         for name, values in options.items():
             rows[name] = values
-        columns = (5 + nodes) * candidates
+        columns = (5 + resources) * candidates
         self.tables.clock[0]["n_priced"] = columns
         self._use(
             self.tables._replace(
                 rule=rule,
                 options=rows,
-                shown=np.ones((nodes, candidates)),
+                shown=np.ones((resources, candidates)),
                 decided=np.zeros(windows, row_types()["decided"]),
                 priced=np.zeros((windows, columns)),
                 **tables,
@@ -174,7 +174,7 @@ class _Layout:
         self.cycles = max(real.cycles for _, real in cells)
         self.max_tasks = max(len(problem.pipeline.tasks) for problem, _ in cells)
         self.max_flows = max(len(problem.pipeline.flows) for problem, _ in cells)
-        self.max_nodes = max(len(problem.fabric.nodes) for problem, _ in cells)
+        self.max_resources = max(len(problem.fabric.resources) for problem, _ in cells)
         self.node_row: dict[tuple[int, str], int] = {}
         self.server_row: dict[tuple[int, str | None], int] = {}
         self.server_workers: list[int] = []
@@ -184,7 +184,7 @@ class _Layout:
         self.behind: list[Ints] = []
         self.end_ns = 0
         self.outputs: list[int] = []
-        self.cell_nodes: list[int] = []
+        self.cell_servers: list[int] = []
         self.capacity: list[float] = []
         self.layers: list[dict[int, int]] = []
         self.segments: list[Rows] = []
@@ -204,8 +204,8 @@ class _Layout:
             ((problem, _),) = self.cells
             self._add_shadow(problem, self.shadows)
         self._check_keys()
-        nodes = tuple(tuple(problem.fabric.nodes) for problem, _ in self.cells)
-        return Arrays(self._tables(), nodes, self.behind)
+        resources = tuple(tuple(problem.fabric.resources) for problem, _ in self.cells)
+        return Arrays(self._tables(), resources, self.behind)
 
     def _addresses(self, table: Ints) -> list[int]:
         """Return the address of every row of a realisation's table."""
@@ -308,6 +308,7 @@ class _Layout:
 
     def _add_cell(self, index: int, problem: Problem, real: Realisation) -> None:
         pipeline, release_ns = problem.pipeline, real.release_ns
+        resources = problem.fabric.resources.values()
         names, hop_0 = list(pipeline.tasks), len(self.rows["hops"])
         due_ns, grace_ns = close_after_ns(problem)
         self.end_ns = max(self.end_ns, int(release_ns[-1]) + grace_ns, int(release_ns[-2]) + due_ns)
@@ -329,14 +330,16 @@ class _Layout:
             "period_ns": round(pipeline.period_ms * 1e6),
             "given_up_after": problem.window_cycles + GIVEN_UP_AFTER,
             "pair_0": len(self.shadow_parts),
-            "node_0": len(self.cell_nodes),
-            "n_nodes": len(problem.fabric.nodes),
+            "resource_0": len(self.cell_servers),
+            "n_resources": len(resources),
             "shadow": -1,
             "parent": -1,
         }
         self.rows["cells"].append(cell)
-        self.cell_nodes += [self.node_row[index, name] for name in problem.fabric.nodes]
-        self.capacity += [float(node.capacity) for node in problem.fabric.nodes.values()]
+        self.cell_servers += [
+            self.server_row[self.node_row[index, one.node], one.kind or None] for one in resources
+        ]
+        self.capacity += [one.capacity for one in resources]
         flows = ordered_flows(pipeline)
         flow_row = {(flow.source, flow.target): i for i, flow in enumerate(flows)}
         self.rows["flows"] += [
@@ -430,7 +433,7 @@ class _Layout:
     ) -> dict[tuple[str, str], int]:
         """Add the sites of a cell, or of its shadow, on the nodes of the cell `index`."""
         rows: dict[tuple[str, str], int] = {}
-        columns = list(problem.fabric.nodes)
+        columns = list(problem.fabric.resources)
         for (task_name, node_name), exec_ns in zip(
             real.sites, self._addresses(real.exec_ns), strict=True
         ):
@@ -451,7 +454,7 @@ class _Layout:
                     "task": names.index(task_name),
                     "server": server,
                     "node": node,
-                    "own": cell * self.max_nodes + columns.index(node_name),
+                    "own": cell * self.max_resources + columns.index(execution.resource(node_name)),
                     "exec_ns": exec_ns,
                     "depth": task.depth,
                     "rank": -task.priority,  # a smaller one goes first
@@ -554,7 +557,7 @@ class _Layout:
             "n_tasks": self.max_tasks,
             "n_flows": self.max_flows,
             "n_layers": n_layers,
-            "n_nodes": self.max_nodes,
+            "n_resources": self.max_resources,
             "n_cycles": cycles,
             "n_windows": windows,
             "margin": margin,
@@ -589,8 +592,8 @@ class _Layout:
         return Tables(
             **structs,
             outputs=np.array(self.outputs, np.int32),
-            cell_nodes=np.array(self.cell_nodes, np.int32),
-            capacity=np.array(self.capacity),
+            cell_servers=np.array(self.cell_servers, np.int32),
+            capacity=np.array(self.capacity, np.float64),
             work=np.zeros(0),
             switching=np.zeros(0),
             shown=np.zeros(0),
@@ -607,16 +610,16 @@ class _Layout:
             dirty=np.zeros(len(rows["servers"]), np.int32),
             ready=np.zeros(margin, np.int64),
             attempts=np.zeros((cells * slots, max(self.max_flows, 1)), np.int64),
-            own_ns=np.zeros((cells, self.max_nodes)),
+            own_ns=np.zeros((cells, self.max_resources)),
             soonest_ns=np.full((len(self.site_of), self.max_tasks), -1, np.int64),
             ages=np.zeros(max(problem.window_cycles for problem, _ in self.cells), np.int64),
             latency_ns=np.full((cells, cycles), NEVER_NS),
             compute_ns=np.zeros((cells, cycles), np.int64),
             network_ns=np.zeros((cells, cycles), np.int64),
             outcome=np.zeros((cells, cycles), np.int8),
-            opened=np.zeros((cells, windows, 3, self.max_nodes)),
-            closed=np.zeros((cells, windows, 3, self.max_nodes)),
-            shares=np.zeros((cells, windows, 3, self.max_nodes)),
+            opened=np.zeros((cells, windows, 3, self.max_resources)),
+            closed=np.zeros((cells, windows, 3, self.max_resources)),
+            shares=np.zeros((cells, windows, 3, self.max_resources)),
             shadow_bytes=np.zeros(cycles if self.shadows is not None else 0, np.int64),
             log_outcome=np.zeros(logged * self.max_tasks, np.int8),
             log_arrived=np.full((logged, self.max_flows), -1, np.int64),

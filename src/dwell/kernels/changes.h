@@ -42,7 +42,7 @@ template <class S>
   for (i64 i = 0; i < server.n_run + server.n_wait; ++i) {
     const Progress found = progress(s, server, i);
     if (found.key == kForeign) continue;
-    if (server.is_cpu) s.own_ns[s.site(s.job(found.key)).own] += found.received_ns;
+    s.own_ns[s.site(s.job(found.key)).own] += found.received_ns;
     drop_job(s, cell_of(found.key), cycle_of(found.key), item_of(found.key), kNodeDown, now);
   }
   while (server.n_run > 0) {

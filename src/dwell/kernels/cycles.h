@@ -229,9 +229,7 @@ void complete(S& s, i64 key, i64 now) {
   if (server.next_key != key || server.next_ns != now) return;
   if (next_thread(s, server, site, job, key, now)) return;
   leave(s, server, site, now);
-  if (server.is_cpu) {
-    s.own_ns[site.own] += static_cast<f64>(site.threads) * static_cast<f64>(site.exec_ns[cycle]);
-  }
+  s.own_ns[site.own] += static_cast<f64>(site.threads) * static_cast<f64>(site.exec_ns[cycle]);
   job.compute_ns += now - job.started_ns;
   log_job(s, cell, cycle, task, job, kDone, now);
   free_worker(s, site);

@@ -1,4 +1,4 @@
-// The metrics of a window as it could be known when it closed: misses, L95, shares of the cores.
+// The metrics of a window as it could be known when it closed: misses, L95, shares of the resources.
 #pragma once
 
 #include <limits>
@@ -45,13 +45,13 @@ void measure(S& s, i64 cell, i64 window, i64 first, i64 now) {
       Seen{first, missed, std::min(l95_ms, of.longest_ms),
            lost ? std::numeric_limits<f64>::infinity() : l95_ms};
 
-  const i64 at = snapshot_row(s, cell, window), n_nodes = s.clock[0].n_nodes;
+  const i64 at = snapshot_row(s, cell, window), n_resources = s.clock[0].n_resources;
   const f64 span_ns = static_cast<f64>(now - of.release_ns[first]);
   for (i64 part = 0; part < 3; ++part) {
-    for (i64 i = 0; i < of.n_nodes; ++i) {
-      const i64 place = at + part * n_nodes + i;
+    for (i64 i = 0; i < of.n_resources; ++i) {
+      const i64 place = at + part * n_resources + i;
       const f64 used_ns = s.closed[place] - s.opened[place];
-      s.shares[place] = std::min(used_ns / (s.capacity[of.node_0 + i] * span_ns), 1.0);
+      s.shares[place] = std::min(used_ns / (s.capacity[of.resource_0 + i] * span_ns), 1.0);
     }
   }
 }

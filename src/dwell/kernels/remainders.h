@@ -112,7 +112,7 @@ bool take_off(S& s, Server& server, const Site& site, i64 key, i64 now) {
     const i64 row = runs ? at : at - server.n_run;
     if ((runs ? running_of(s, server)[row].key : waiting_of(s, server)[row].key) != key) continue;
     tick(s, server, now);
-    if (server.is_cpu) s.own_ns[site.own] += progress(s, server, at).received_ns;
+    s.own_ns[site.own] += progress(s, server, at).received_ns;
     if (runs) {
       pop(running_of(s, server), server.n_run--, row);
       server.used -= site.need;

@@ -30,7 +30,7 @@ using Times = const i64*;
 // most. A call ends after `budget` events.
 #define DWELL_CLOCK(field)                                                                       \
   field(i64, n_slots) field(i64, n_tasks) field(i64, n_flows) field(i64, n_layers)               \
-  field(i64, n_nodes) /* of a cell */                                                            \
+  field(i64, n_resources) /* of a cell */                                                        \
   field(i64, n_cycles) field(i64, n_windows) field(i64, n_priced) /* columns of the outputs */    \
   field(i64, margin) field(i64, budget)                                                          \
   field(i64, logs_all) /* whether logs are of all cycles, or of those in the ring */             \
@@ -58,7 +58,7 @@ using Times = const i64*;
   field(i64, given_up_after) /* cycles released since, of a shadow under way */                  \
   field(i32, task_0) field(i32, n_tasks) field(i32, flow_0) field(i32, candidate_0)              \
   field(i32, n_candidates) field(i32, n_sinks) field(i32, pair_0)                                \
-  field(i32, node_0) field(i32, n_nodes) /* in `cell_nodes` */                                   \
+  field(i32, resource_0) field(i32, n_resources) /* in `cell_servers` */                         \
   field(i32, shadow) field(i32, parent)
 
 #define DWELL_TASK(field)                                                                        \
@@ -69,7 +69,7 @@ using Times = const i64*;
 
 // What a job uses of its server, `need`, is the cores that it holds, the threads that share them
 // where the server is fair, or a place. Its work is done by `threads` threads. `own` is the row of
-// its node in `own_ns`.
+// its server in `own_ns`.
 #define DWELL_SITE(field)                                                                        \
   field(Times, exec_ns)                                                                          \
   field(i64, need) field(i64, threads)                                                           \
@@ -219,7 +219,7 @@ DWELL_ROWS(DWELL_STRUCT)
 // in rows.py.
 #define DWELL_TABLES(table)                                                                      \
   table(Clock, clock) table(Cell, cells) table(Task, tasks) table(Flow, flows)                   \
-  table(i32, outputs) table(i32, cell_nodes) table(f64, capacity) table(Node, nodes)             \
+  table(i32, outputs) table(i32, cell_servers) table(f64, capacity) table(Node, nodes)           \
   table(i32, site_of) table(i32, route) table(i64, back_ns) table(i8, shadow_parts)              \
   table(Hop, hops) table(Times, layers) table(Segment, segments) table(Rate, rates)              \
   table(Change, changes) table(Pace, paces) table(f64, work) table(f64, switching)               \

@@ -86,8 +86,8 @@ class Tables(NamedTuple):
     tasks: Rows  # (tasks,)
     flows: Rows  # (flows,)
     outputs: NDArray[np.int32]  # flows out of each task, in the order of the file
-    cell_nodes: NDArray[np.int32]  # nodes of each cell
-    capacity: Floats  # cores of each of them
+    cell_servers: NDArray[np.int32]  # servers of each cell's resources
+    capacity: Floats  # cores, or places, of each of them
     nodes: Rows  # (nodes,)
     site_of: NDArray[np.int32]  # (candidates, tasks) -> site
     route: NDArray[np.int32]  # (candidates, flows) -> hop, or -1 on the same node
@@ -99,9 +99,9 @@ class Tables(NamedTuple):
     rates: Rows  # (segments,)
     changes: Rows  # (changes,)
     paces: Rows  # (paces,)
-    work: Floats  # (candidates, nodes) own work, or empty; as all below that a rule needs
+    work: Floats  # (candidates, resources) own work, or empty; as all below that a rule needs
     switching: Floats  # (candidates, candidates) share of tasks moved
-    tiers: NDArray[np.int8]  # (nodes,)
+    tiers: NDArray[np.int8]  # (resources,)
     stamps: NDArray[np.int16]  # (cells, N) candidate of each cycle; -1 where a shadow has none
     # state
     sites: Rows  # (sites,)
@@ -118,21 +118,21 @@ class Tables(NamedTuple):
     jobs: Rows  # (cells * slots * tasks,)
     slots: Rows  # (cells * slots,)
     attempts: Ints  # (cells * slots, flows) attempts lost so far, less one
-    own_ns: Floats  # (cells, nodes of a cell) core-nanoseconds of completed own work
+    own_ns: Floats  # (cells, resources of a cell) core-nanoseconds of completed own work
     soonest_ns: Ints  # (candidates, tasks) least time from release to readiness; -1 before one
     ages: Ints  # (W,) of one window
     rule: Rows  # (1,), or empty where Python decides
     options: Rows  # (candidates,)
-    shown: Floats  # (nodes, candidates) what a node showed under each since it is full; else 1
+    shown: Floats  # (resources, candidates) what one showed under each since it is full; else 1
     # outputs
     latency_ns: Ints  # (cells, N), NEVER_NS until done
     compute_ns: Ints
     network_ns: Ints
     outcome: NDArray[np.int8]
-    opened: Floats  # (cells, windows, 3, nodes of a cell) busy, own and shadow at first releases
-    closed: Floats  # (cells, windows, 3, nodes of a cell) busy, own and shadow at closes
+    opened: Floats  # (cells, windows, 3, resources) busy, own and shadow at first releases
+    closed: Floats  # (cells, windows, 3, resources) busy, own and shadow at closes
     seen: Rows  # (cells, windows) metrics as they could be known at closes
-    shares: Floats  # (cells, windows, 3, nodes of a cell) of the cores: busy, own and shadow
+    shares: Floats  # (cells, windows, 3, resources) of the cores or places: busy, own and shadow
     decided: Rows  # (windows,)
     priced: (
         Floats  # (windows, columns) by candidate: J, L95, V_D, U of each node, is within, excess

@@ -11,7 +11,7 @@
 
 namespace dwell {
 
-// From this share on a node is full: what more is asked of it cannot be seen any more.
+// From this share on a resource is full: what more is asked of it cannot be seen any more.
 constexpr f64 kSaturated = 0.995;
 // Candidates this close to the least relative excess are told apart by J instead.
 constexpr f64 kExcessTolerance = 1e-6;
@@ -27,29 +27,29 @@ struct Priced {
   S& s;
   const Seen& seen;
   f64* row;
-  const i64 n, n_nodes;
+  const i64 n, n_resources;
 
   Priced(S& simulation, i64 window)
       : s(simulation),
         seen(s.seen[window]),
         row(&s.priced[window * s.clock[0].n_priced]),
         n(s.options.size),
-        n_nodes(s.cell(0).n_nodes) {}
+        n_resources(s.cell(0).n_resources) {}
 
   f64& j(i64 c) { return row[c]; }
   f64& l95_ms(i64 c) { return row[n + c]; }
   f64& violation_rate(i64 c) { return row[2 * n + c]; }
-  f64& used(i64 node, i64 c) { return row[(3 + node) * n + c]; }
-  f64& is_within(i64 c) { return row[(3 + n_nodes) * n + c]; }
-  f64& excess(i64 c) { return row[(4 + n_nodes) * n + c]; }
+  f64& used(i64 resource, i64 c) { return row[(3 + resource) * n + c]; }
+  f64& is_within(i64 c) { return row[(3 + n_resources) * n + c]; }
+  f64& excess(i64 c) { return row[(4 + n_resources) * n + c]; }
 
   f64 uncut_ms(i64 c) const {
     return c == s.rule[0].incumbent ? seen.uncut_ms : s.options[c].uncut_ms;
   }
-  // Utilisation of the busiest node, a saturated one counting as full.
+  // Utilisation of the busiest resource, a saturated one counting as full.
   f64 busiest(i64 c) {
     f64 largest = 0.0;
-    for (i64 node = 0; node < n_nodes; ++node) largest = std::max(largest, used(node, c));
+    for (i64 i = 0; i < n_resources; ++i) largest = std::max(largest, used(i, c));
     return largest < kSaturated ? largest : std::max(largest, 1.0);
   }
 };
@@ -67,10 +67,10 @@ f64 price(const S& s, f64 l95_ms, f64 violation_rate, const Used& used, f64 swit
 template <class S>
 Used used_by_tiers(Priced<S>& priced, i64 candidate) {
   Used used{};
-  for (i64 node = 0; node < priced.n_nodes; ++node) {
-    const i8 tier = priced.s.tiers[node];
+  for (i64 i = 0; i < priced.n_resources; ++i) {
+    const i8 tier = priced.s.tiers[i];
     if (tier == kNoTier) continue;
-    used.tier[tier] = std::max(used.tier[tier], priced.used(node, candidate));
+    used.tier[tier] = std::max(used.tier[tier], priced.used(i, candidate));
   }
   return used;
 }
@@ -84,9 +84,9 @@ void estimate(Priced<S>& priced, const f64* used, const f64* own, const f64* sha
     priced.l95_ms(c) = s.options[c].l95_ms;
     priced.violation_rate(c) = s.options[c].violation_rate;
   }
-  for (i64 node = 0; node < priced.n_nodes; ++node) {
-    const f64 busy = used[node], mine = own[node] + shadow[node];
-    f64* shown = &s.shown[node * n];
+  for (i64 i = 0; i < priced.n_resources; ++i) {
+    const f64 busy = used[i], mine = own[i] + shadow[i];
+    f64* shown = &s.shown[i * n];
     if (busy < kSaturated) {
       std::fill(shown, shown + n, 1.0);
       shown[incumbent] = busy;
@@ -96,10 +96,10 @@ void estimate(Priced<S>& priced, const f64* used, const f64* own, const f64* sha
     const bool hides = busy >= kSaturated && mine < kSaturated;
     const f64 foreign = busy - mine > 0.0 ? busy - mine : 0.0;
     for (i64 c = 0; c < n; ++c) {
-      const f64 expected = std::min(foreign + s.work[c * priced.n_nodes + node], 1.0);
-      priced.used(node, c) = hides ? shown[c] : expected;
+      const f64 expected = std::min(foreign + s.work[c * priced.n_resources + i], 1.0);
+      priced.used(i, c) = hides ? shown[c] : expected;
     }
-    priced.used(node, incumbent) = busy;
+    priced.used(i, incumbent) = busy;
   }
 }
 
@@ -278,10 +278,10 @@ Choice choose(Priced<S>& priced, f64 measured, f64 alone) {
 template <class S>
 bool decide(S& s, i64 window) {
   Rule& rule = s.rule[0];
-  const i64 incumbent = rule.incumbent, n = s.options.size, n_nodes = s.clock[0].n_nodes;
+  const i64 incumbent = rule.incumbent, n = s.options.size, n_resources = s.clock[0].n_resources;
   const f64* shares = &s.shares[snapshot_row(s, 0, window)];
   Priced<S> priced(s, window);
-  estimate(priced, shares, shares + n_nodes, shares + 2 * n_nodes);
+  estimate(priced, shares, shares + n_resources, shares + 2 * n_resources);
   const f64 n_cycles = static_cast<f64>(s.cell(0).window_cycles);
   priced.l95_ms(incumbent) = priced.seen.l95_ms;
   priced.violation_rate(incumbent) = static_cast<f64>(priced.seen.missed) / n_cycles;

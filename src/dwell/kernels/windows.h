@@ -1,41 +1,42 @@
-// Windows: what nodes had done when each opened and closed; and when the guard looks.
+// Windows: what resources had done when each opened and closed; and when the guard looks.
 #pragma once
 
 #include "changes.h"
 
 namespace dwell {
 
-// Writes the core-nanoseconds of a cell's nodes up to now: busy, the cell's own, its shadow's.
+// Writes the core-nanoseconds of a cell's resources up to now: busy, the cell's own, its shadow's.
+// Of an accelerator they are those of its places.
 template <class S>
 [[gnu::noinline]] void snapshot(S& s, f64* out, i64 cell, i64 now) {
   const Cell& of = s.cell(cell);
-  const i64 n_nodes = s.clock[0].n_nodes;
-  for (i64 i = 0; i < of.n_nodes; ++i) {
-    Server& server = s.servers[s.nodes[s.cell_nodes[of.node_0 + i]].server_0];
+  const i64 n_resources = s.clock[0].n_resources;
+  for (i64 i = 0; i < of.n_resources; ++i) {
+    Server& server = s.servers[s.cell_servers[of.resource_0 + i]];
     tick(s, server, now);
-    f64 own = s.own_ns[cell * n_nodes + i];
+    f64 own = s.own_ns[cell * n_resources + i];
     for (i64 at = 0; at < server.n_run + server.n_wait; ++at) {
       const Progress found = progress(s, server, at);
       if (found.key != kForeign && cell_of(found.key) == cell) own += found.received_ns;
     }
     out[i] = server.busy_ns * server.pace + server.behind_ns;
-    out[n_nodes + i] = own;
+    out[n_resources + i] = own;
     if (!has_below(s, server)) continue;
     Server& below = s.servers[server.below];
     tick(s, below, now);
-    f64 extra = s.own_ns[of.shadow * n_nodes + i];
+    f64 extra = s.own_ns[of.shadow * n_resources + i];
     for (i64 at = 0; at < below.n_run + below.n_wait; ++at) {
       extra += progress(s, below, at).received_ns;
     }
     out[i] += below.busy_ns * below.pace + below.behind_ns;
-    out[2 * n_nodes + i] = extra;
+    out[2 * n_resources + i] = extra;
   }
 }
 
 // Place of a snapshot in `opened` and `closed`.
 template <class S>
 i64 snapshot_row(const S& s, i64 cell, i64 window) {
-  return (cell * s.clock[0].n_windows + window) * 3 * s.clock[0].n_nodes;
+  return (cell * s.clock[0].n_windows + window) * 3 * s.clock[0].n_resources;
 }
 
 // Window that a cycle is the first of, as far as is known; -1 for none.

@@ -5,6 +5,7 @@ The decisions are those of `dwell.control.Controller`, the object that the simul
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -601,7 +602,10 @@ class ControlledCell:
             "cost": cost,
             "reason": decision["reason"],
             "estimates": {name: decision[f"j_{name}"] for name in problem.candidates},
-            "utilisation": dict(zip(self.controller.nodes, used, strict=True)),
+            "utilisation": {
+                name: None if math.isnan(share) else share
+                for name, share in zip(self.controller.resources, used, strict=True)
+            },
         }
 
     # -------------------------------------------------------------------------- people

@@ -7,6 +7,7 @@ another node of which nothing is known is taken to have been lost.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TypeAlias
@@ -19,7 +20,7 @@ from dwell.control import Evidence, Instants
 from dwell.live.messages import ACTUATED, NOT_APPLIED, STALE, Completion, Hop, Stamp
 from dwell.live.offsets import UNBOUNDED_NS, Offsets
 from dwell.live.wiring import lane_of
-from dwell.model import Problem
+from dwell.model import Execution, Problem
 from dwell.model.instants import NEVER_NS
 from dwell.record import Values
 
@@ -208,6 +209,7 @@ class Ledger:
         order = pipeline.topological()
         self._forward = sorted(pipeline.flows, key=lambda flow: order.index(flow.source))
         self._apart: dict[tuple[str, str], frozenset[str]] = {}
+        self._accelerated: dict[str, frozenset[str]] = {}
 
     def tells(self, completion: Completion) -> bool:
         """Whether a completion is about a task that can say so."""
@@ -364,13 +366,62 @@ class Ledger:
                     spent[hop.node] += hop.cpu_ns
         return spent
 
+    def accelerator_ns(self, cycles: Iterable[LiveCycle]) -> dict[str, tuple[float, float]]:
+        """Time that the jobs of some cycles, and of their shadows, had accelerators.
+
+        It is that from their start to their end, waiting for the accelerator included. By resource,
+        of those that they can have used; of the cycles' own NaN where none of them told it.
+        """
+        own, shadow, placed = Counter[str](), Counter[str](), set[str]()
+        for cycle in cycles:
+            placed |= self._accelerators_of(cycle.placement)
+            for (is_shadow, *_), hop in self._jobs(cycle).items():
+                execution = self._execution(hop)
+                if execution is None or execution.accelerator is None or hop.ended_ns == UNKNOWN:
+                    continue
+                spent = shadow if is_shadow else own
+                spent[execution.resource(hop.node)] += max(hop.ended_ns - hop.started_ns, 0)
+        return {
+            name: (
+                float(own[name]) if name in own or name not in placed else math.nan,
+                shadow[name],
+            )
+            for name in {*own, *shadow, *placed}
+        }
+
+    def _accelerators_of(self, candidate: str) -> frozenset[str]:
+        """Names of the kinds of accelerators that a candidate's tasks run on."""
+        known = self._accelerated.get(candidate)
+        if known is None:
+            placed = self._candidates[candidate].items()
+            executions = ((self._pipeline.tasks[task].on[node], node) for task, node in placed)
+            names = (one.resource(node) for one, node in executions if one.accelerator is not None)
+            known = self._accelerated[candidate] = frozenset(names)
+        return known
+
     def _on_cpu(self, hop: Hop) -> bool:
-        task = self._pipeline.tasks.get(hop.task)
-        execution = None if task is None else task.on.get(hop.node)
+        execution = self._execution(hop)
         return execution is not None and execution.accelerator is None
+
+    def _execution(self, hop: Hop) -> Execution | None:
+        """Execution of a job; None where its task does not run there."""
+        task = self._pipeline.tasks.get(hop.task)
+        return None if task is None else task.on.get(hop.node)
 
     def jobs(self, cycle: LiveCycle) -> list[Values]:
         """Return rows of ``jobs``: all known to have become ready for a cycle or its shadow."""
+        jobs = self._jobs(cycle)
+        order = sorted(jobs, key=lambda key: (key[0], self._tasks[key[1]]))
+        rows = []
+        for key in order:
+            hop = jobs[key]
+            handover_ns = self._handover_ns(cycle, hop, jobs, shadow=key[0])
+            ending_ns = UNKNOWN if key[0] else self._ending_ns(cycle, hop)
+            rows.append(self._job_values(cycle, hop, (handover_ns, ending_ns), shadow=key[0]))
+        return [row for row in rows if row is not None]
+
+    def _jobs(self, cycle: LiveCycle) -> dict[tuple[bool, str, str], Hop]:
+        """Jobs of a cycle and its shadow: by whether they are the shadow's, task and node."""
         jobs: dict[tuple[bool, str, str], Hop] = {}
         apart = self._diverging(cycle) if cycle.shadow in self._codes else frozenset[str]()
         hops = [(hop, False) for hop in cycle.hops]
@@ -381,14 +432,7 @@ class Ledger:
             known = jobs.get((shadow, hop.task, hop.node))
             if known is None or known.ended_ns == UNKNOWN:
                 jobs[shadow, hop.task, hop.node] = hop
-        order = sorted(jobs, key=lambda key: (key[0], self._tasks[key[1]]))
-        rows = []
-        for key in order:
-            hop = jobs[key]
-            handover_ns = self._handover_ns(cycle, hop, jobs, shadow=key[0])
-            ending_ns = UNKNOWN if key[0] else self._ending_ns(cycle, hop)
-            rows.append(self._job_values(cycle, hop, (handover_ns, ending_ns), shadow=key[0]))
-        return [row for row in rows if row is not None]
+        return jobs
 
     def _handover_ns(
         self,

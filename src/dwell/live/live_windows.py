@@ -32,10 +32,13 @@ from dwell.live.offsets import UNBOUNDED_NS, Offsets
 from dwell.live.run_rows import LiveWindow, Resume, RunRows, sends_shadows, told
 from dwell.live.symptoms import Symptoms
 from dwell.model import Problem
+from dwell.model.fabric import accelerator_name
 from dwell.model.window_close import window_close_ns
 
 #: A window whose latencies may be off by more than this share of D is marked unproven.
 PROVEN_SHARE = 0.2
+#: Share of a window for which a hook has to have said how busy an accelerator was.
+HOOKED_SHARE = 0.5
 #: Numbers between two cycles were cycles if they had this share of a period each.
 NEAR_PERIOD = (0.75, 1.25)
 #: Where the stamper's clock and the controller's disagree by this much on the time since the last
@@ -407,22 +410,35 @@ class LiveWindows:
         self._beginning = None
 
     def _core_ns(self, cycles: list[LiveCycle], close_ns: int) -> NDArray[np.float64]:
-        """Core-nanoseconds of every node in a window, shape (3, nodes).
+        """Core-nanoseconds of every resource in a window, shape (3, resources).
 
-        A node is as busy as the busier of its CPU and its accelerator. Its own work is what its
-        jobs took, where any tell: what their processes take beside that, messages and beats, is in
-        no candidate's own work, and would be missing from the estimates of all.
+        A node's own work is what its jobs took, where any tell: what their processes take beside
+        that, messages and beats, is in no candidate's own work, and would be missing from the
+        estimates of all. Accelerators are as busy as a hook says, where their node has one kind of
+        them; elsewhere as busy as the cell's jobs keep them. NaN where none of these is known.
         """
         jobs_ns = self._ledger.spent_ns(cycles)
-        used = np.zeros((3, len(self._loads)))
+        used = np.zeros((3, len(self._controller.resources)))
+        hooked: dict[str, float] = {}
         for column, (node, load) in enumerate(self._loads.items()):
             begin_ns, end_ns = self._ledger.span_ns(node, cycles[0], close_ns)
-            busy_ns, own_ns, shadow_ns, accelerator_ns = load.at(end_ns) - load.at(begin_ns)
+            *counted_ns, busy_ns, told_ns = load.at(end_ns) - load.at(begin_ns)
+            used[:, column] = counted_ns
             if jobs_ns:
-                own_ns = jobs_ns[node]
-            capacity = self.problem.fabric.nodes[node].capacity
-            used[:, column] = max(busy_ns, capacity * accelerator_ns), own_ns, shadow_ns
+                used[1, column] = jobs_ns[node]
             load.forget(begin_ns)
+            kinds = self.problem.fabric.nodes[node].accelerators.items()
+            if len(kinds) == 1 and told_ns >= HOOKED_SHARE * (end_ns - begin_ns):
+                ((kind, count),) = kinds
+                busy = count * (close_ns - cycles[0].at_ns) * busy_ns / told_ns
+                hooked[accelerator_name(node, kind)] = busy
+        if len(used[0]) > len(self._loads):
+            by_jobs = self._ledger.accelerator_ns(cycles)
+            for column, name in enumerate(self._controller.resources):
+                if column >= len(self._loads):
+                    own_ns, shadow_ns = by_jobs.get(name, (0.0, 0.0))
+                    busy_ns = hooked.get(name, own_ns + shadow_ns)
+                    used[:, column] = busy_ns, own_ns, shadow_ns
         return used
 
     def symptoms(self, now_ns: int) -> dict[str, object]:

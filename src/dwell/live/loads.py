@@ -24,8 +24,8 @@ MOST_PROCESSES = 256
 class NodeLoad:
     """Work of a node over its own time.
 
-    Core-nanoseconds of all work, of the cell's jobs and of its shadows; and the nanoseconds that
-    its accelerator was busy.
+    Core-nanoseconds of all work, of the cell's jobs and of its shadows; the nanoseconds that its
+    accelerator was busy, and those in which a hook said so.
     """
 
     def __init__(self) -> None:
@@ -44,10 +44,11 @@ class NodeLoad:
             self._life = -1
         self._overshoot.advanced()
         read = np.array((load.busy_ns, load.own_ns, load.shadow_ns), np.float64)
-        total = self._total[-1] if self._total else np.zeros(4)
+        total = self._total[-1] if self._total else np.zeros(5)
         if load.life == self._life:
-            busy_ns = max(load.accelerator, 0.0) * (load.at_ns - self._at_ns[-1])
-            total = total + np.append(np.maximum(read - self._read, 0.0), busy_ns)
+            told_ns = load.at_ns - self._at_ns[-1] if load.accelerator >= 0.0 else 0
+            grown = np.maximum(read - self._read, 0.0)
+            total = total + np.append(grown, (load.accelerator * told_ns, told_ns))
         elif load.at_ns <= last_ns:
             # Not only the agent began anew, but its node's clock; or that instant was false.
             self._at_ns.clear()
@@ -57,14 +58,14 @@ class NodeLoad:
         self._total.append(total)
 
     def at(self, instant_ns: int) -> Floats:
-        """Core-nanoseconds, and those of the accelerator, at an instant; shape (4,).
+        """Core-nanoseconds, and those of the accelerator, at an instant; shape (5,).
 
         In proportion between two reports; beyond the first or last one for no longer than from one
         report to the next, so that a node that falls silent counts as idle.
         """
         at_ns, total = self._at_ns, self._total
         if len(at_ns) < 2:
-            return np.zeros(4)
+            return np.zeros(5)
         place = min(max(bisect.bisect(at_ns, instant_ns), 1), len(at_ns) - 1)
         begin_ns, end_ns = at_ns[place - 1], at_ns[place]
         share = min(max((instant_ns - begin_ns) / (end_ns - begin_ns), -1.0), 2.0)

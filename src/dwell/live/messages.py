@@ -320,7 +320,7 @@ class Load(_Array, frozen=True):
     busy_ns, own_ns, shadow_ns : int
         Core-nanoseconds of everything, of the cell's own processes, and of its shadow workers.
     accelerator : float
-        Utilisation of the node's accelerator where a hook measures it; -1 otherwise.
+        Utilisation of the node's accelerators where a hook measures it; -1 otherwise.
     processes : tuple of (str, int)
         CPU time of each of the cell's processes there, the agent's included, since it was started.
     """

@@ -57,7 +57,8 @@ def run_agent(
     hurried : Event, optional
         Has its processes end at once, and not in order, once it is told to stop.
     accelerator : callable, optional
-        Returns the utilisation of the node's accelerator, a share from 0 to 1.
+        Returns the utilisation of the node's accelerators, a share from 0 to 1. It counts where the
+        cell says that the node has one kind of them.
     environment : mapping of str to str, optional
         Environment of the node's processes, with the variables of `dwell.live.security`; this
         process's own if left out.
@@ -77,6 +78,8 @@ def run_agent(
         raise LiveError(f"no node {node!r} in cell {problem.name!r}; there are {known}")
     if cpus is not None:
         _use_cpus(cpus)
+    if accelerator is not None and (unused := _unused_hook(problem, node)):
+        say(unused)
     wiring = wire(problem)
     who = f"agent@{node}"
     security = Security.of(problem, wiring.entry(who).role, environment)
@@ -105,6 +108,15 @@ def run_agent(
     moving = [f"{who} {why}" for who, why in failed.items() if who.startswith("sink.")]
     if moving:
         raise LiveError(f"{'; '.join(moving)}: its actuator may not have stopped")
+
+
+def _unused_hook(problem: Problem, node: str) -> str:
+    """Say why the utilisation that a hook returns counts for nothing; empty where it counts."""
+    kinds = problem.fabric.nodes[node].accelerators
+    if len(kinds) == 1:
+        return ""
+    has = f"several kinds of accelerators ({', '.join(kinds)})" if kinds else "no accelerators"
+    return f"node {node} has {has} in the cell: what --accelerator returns counts for nothing"
 
 
 def _cpu_count(problem: Problem, node: str, say: Callable[[str], None]) -> CpuCount:

@@ -275,7 +275,7 @@ class RunRows:
         }
 
     def _window_values(self, window: LiveWindow) -> Values:
-        cycles, nodes, log = window.cycles, self._controller.nodes, self._controller.log
+        cycles, names, log = window.cycles, self._controller.resources, self._controller.log
         busy, _, by_shadows = window.used.tolist()
         place = window.number - self._first_window
         seen = log.seen[place] if place < len(log.seen) else (None, None, None)
@@ -291,7 +291,7 @@ class RunRows:
             "violation_rate": window.violation_rate(self._deadline_ns),
             "seen_l95_ms": seen_l95_ms,
             "seen_violation_rate": seen_violation_rate,
-            **{f"u_{node}": share for node, share in zip(nodes, busy, strict=True)},
+            **{f"u_{name}": _known(share) for name, share in zip(names, busy, strict=True)},
             "cost": cost,
             "term": cycles[-1].term,
             "lead": window.lead,
@@ -304,7 +304,8 @@ class RunRows:
             sent, sent_bytes = self._ledger.shadow_bytes(cycles)
             values |= {"shadow_cycles": sent, "shadow_bytes": sent_bytes}
             values |= {
-                f"shadow_{node}": share for node, share in zip(nodes, by_shadows, strict=True)
+                f"shadow_{name}": _known(share)
+                for name, share in zip(names, by_shadows, strict=True)
             }
         return values
 

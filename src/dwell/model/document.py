@@ -227,7 +227,11 @@ def _disturbance(path: str, item: Disturbance) -> Document:
 
 def objective_document(objective: Objective) -> Document:
     """Return an objective as a cell file's ``objective`` says it, every tier named."""
-    return _part("objective", objective)
+    document = _part("objective", objective)
+    # Which accelerators count follows from the tiers.
+    if not document.pop("accelerators", None):
+        return document
+    return {**document, "accelerators": True}
 
 
 def _objective(problem: Problem) -> Document:

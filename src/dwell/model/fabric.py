@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 from dwell.model.bounds import (
     ACCELERATORS,
@@ -202,6 +202,60 @@ class Node:
         return cpu * self.quota.period_ms
 
 
+class Resource(NamedTuple):
+    """What works in a cell, and may be busy: a node's CPU, or the accelerators of one of its kinds.
+
+    Parameters
+    ----------
+    name : str
+        The node's, or ``<node>.<kind>``: ``E.gpu``.
+    node : str
+        Name of the node.
+    kind : str
+        Kind of the accelerators; empty for the CPU.
+    capacity : float
+        What its utilisation is relative to: cores' worth of work, or number of accelerators.
+    """
+
+    name: str
+    node: str
+    kind: str
+    capacity: float
+
+    @property
+    def path(self) -> str:
+        """Where a cell file declares it."""
+        return f"nodes.{self.node}.accelerators.{self.kind}" if self.kind else f"nodes.{self.node}"
+
+    @property
+    def described(self) -> str:
+        """What it is, as messages have it."""
+        return f"accelerator {self.kind} of node {self.node}" if self.kind else f"node {self.node}"
+
+
+def resources_of(nodes: Mapping[str, Node | None]) -> Iterator[Resource]:
+    """Yield the CPUs of nodes, in their order, then their accelerators; None is an unknown node."""
+    for name, node in nodes.items():
+        yield Resource(name, name, "", math.nan if node is None else node.capacity)
+    for name, node in nodes.items():
+        for kind, count in ({} if node is None else node.accelerators).items():
+            yield Resource(accelerator_name(name, kind), name, kind, float(count))
+
+
+def accelerator_tiers(
+    nodes: Mapping[str, Node | None], tiers: Mapping[str, Tier]
+) -> dict[str, Tier]:
+    """Return the tier of every kind of accelerators of the nodes that have one in J."""
+    return {
+        one.name: tiers[one.node] for one in resources_of(nodes) if one.kind and one.node in tiers
+    }
+
+
+def accelerator_name(node: str, kind: str) -> str:
+    """Return the name of a kind of a node's accelerators as a resource."""
+    return f"{node}.{kind}"
+
+
 @dataclass(frozen=True, slots=True)
 class Link:
     """A directed connection.
@@ -268,6 +322,11 @@ class Fabric:
             f"{one.name} ({one.tier}, {counted(one.cores, 'core')})" for one in self.nodes.values()
         ]
         return f"<Fabric: {shortened(nodes)}; {counted(len(self.links), 'link')}>"
+
+    @property
+    def resources(self) -> Mapping[str, Resource]:
+        """The nodes' CPUs, then their accelerators, by name."""
+        return {one.name: one for one in resources_of(self.nodes)}
 
     def tier(self, tier: Tier) -> tuple[str, ...]:
         """Names of a tier's nodes, in the file's order."""

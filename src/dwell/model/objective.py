@@ -65,7 +65,7 @@ class Targets:
 
 @dataclass(frozen=True, slots=True)
 class Caps:
-    """Hard caps on L95 (ms) and on the utilisation of every node; infinite where there is none."""
+    """Hard caps on L95 (ms) and on the utilisation of every resource; infinite for none."""
 
     latency_ms: float = math.inf
     utilisation: float = math.inf
@@ -85,17 +85,24 @@ class Objective:
         See the classes.
     tiers : mapping of str to {"robot", "edge", "cloud"}
         Tier of every node whose utilisation counts.
+    accelerators : mapping of str to {"robot", "edge", "cloud"}
+        Tier of every kind of accelerators that counts in J beside the nodes, by the name of the
+        resource (``E.gpu``): those of all nodes of `tiers`, or none, as in the paper. J does
+        without those that a QoS does not have.
     """
 
     weights: Weights
     targets: Targets
     caps: Caps = field(default_factory=Caps)
     tiers: Mapping[str, Tier] = field(default_factory=FrozenDict)
+    accelerators: Mapping[str, Tier] = field(default_factory=FrozenDict)
 
     def __post_init__(self) -> None:
-        for node, tier in self.tiers.items():
-            require(tier in TIERS, f"tiers.{node}", tier, f"one of {', '.join(TIERS)}")
-        object.__setattr__(self, "tiers", FrozenDict(self.tiers))
+        for key in ("tiers", "accelerators"):
+            of = getattr(self, key)
+            for name, tier in of.items():
+                require(tier in TIERS, f"{key}.{name}", tier, f"one of {', '.join(TIERS)}")
+            object.__setattr__(self, key, FrozenDict(of))
         if self.weights.cloud is not None and self.targets.cloud is None:
             raise ProblemError(
                 [Fault("targets.cloud", "missing; weights.cloud weighs cloud nodes apart")]

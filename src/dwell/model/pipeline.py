@@ -19,6 +19,7 @@ from dwell.model.bounds import (
     WORKERS,
     require,
 )
+from dwell.model.fabric import accelerator_name
 from dwell.model.frozen import FrozenDict, require_names, shortened
 from dwell.model.live import require_callable_name
 from dwell.model.process import Constant, Process
@@ -60,6 +61,10 @@ class Execution:
         STANDBY.check("standby", self.standby)
         THREADS.check("threads", self.threads)
         WORKERS.check("workers", self.workers)
+
+    def resource(self, node: str) -> str:
+        """Name of what it works on, on a node: the node's, for its CPU, or that of a kind."""
+        return node if self.accelerator is None else accelerator_name(node, self.accelerator)
 
 
 @dataclass(frozen=True, slots=True)

@@ -213,6 +213,7 @@ class Problem(Displayed):
             },
             controller=self.controller,
             tiers=self.objective.tiers,
+            accelerators=self.objective.accelerators,
             live=self.live,
         )
 

@@ -28,7 +28,8 @@ class QoS:
     violation_rate : float
         Share of the window's cycles that missed the deadline, in [0, 1].
     utilisation : mapping of str to float
-        Busy share of each node's cores; finite, at least 0.
+        Busy share of each resource: a node's cores, by its name, or a kind of its accelerators,
+        as ``E.gpu``; finite, at least 0. Of what is not named nothing is known.
     cut_from_ms : float, optional
         L95 that `l95_ms` stands for in J where it is larger than that; infinite where it is lost.
         Caps are compared with it.

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING
 from dwell.errors import Fault
 from dwell.model import table_columns
 from dwell.model.bounds import shown
-from dwell.model.fabric import Link, Node
+from dwell.model.fabric import Link, Node, accelerator_tiers, resources_of
 from dwell.model.live import LiveSettings
+from dwell.model.objective import Tier
 from dwell.model.pipeline import Flow, Task
 from dwell.model.scenario import (
     MAX_LAYERS,
@@ -63,7 +64,8 @@ class CellParts:
     broken_candidates: Iterable[str] = ()
     scenarios: Mapping[str, Sequence[tuple[str, Disturbance]]] = field(default_factory=dict)
     controller: ControllerSettings | None = None
-    tiers: Iterable[str] = ()
+    tiers: Mapping[str, Tier] = field(default_factory=dict)
+    accelerators: Mapping[str, Tier] = field(default_factory=dict)
     policies: Sequence[str] | None = None
     estimators: Sequence[str] | None = None
     shadowing: Collection[str] = ()
@@ -160,6 +162,9 @@ def _nodes(parts: CellParts) -> Iterator[Fault]:
     if not parts.nodes:
         yield Fault("nodes", "none is declared; a cell needs at least one node")
     for name, node in parts.nodes.items():
+        for kind in node.accelerators if node is not None else ():
+            if message := bad_name(kind):
+                yield Fault(f"nodes.{name}.accelerators.{kind or repr(kind)}", message)
         for other in node.contention_stressed if node is not None else ():
             here = f"nodes.{name}.contention_stressed.{other}"
             yield from _unknown(here, "node", other, parts.nodes)
@@ -370,6 +375,14 @@ def _layers(parts: CellParts, items: Sequence[tuple[str, Disturbance]]) -> Itera
 def _objective(parts: CellParts) -> Iterator[Fault]:
     for name in parts.tiers:
         yield from _unknown(f"objective.tiers.{name}", "node", name, parts.nodes)
+    counted = accelerator_tiers(parts.nodes, parts.tiers)
+    if parts.accelerators and parts.accelerators != counted:
+        names = ", ".join(f"{name}: {tier}" for name, tier in counted.items()) or "nothing"
+        yield Fault(
+            "objective.accelerators",
+            f"{shown(dict(parts.accelerators))} is not allowed; it must be empty, or those of all "
+            f"nodes of tiers, {names}",
+        )
 
 
 def _controller(parts: CellParts) -> Iterator[Fault]:
@@ -421,7 +434,7 @@ def _live(parts: CellParts) -> Iterator[Fault]:
 def _columns(parts: CellParts) -> Iterator[Fault]:
     """Names of which two columns of a table would be called the same."""
     if parts.policies is not None:
-        yield from table_columns.clash_faults(list(parts.nodes), list(parts.candidates))
+        yield from table_columns.clash_faults(resources_of(parts.nodes), list(parts.candidates))
 
 
 def _shadow_budget(settings: ControllerSettings, candidates: int) -> Iterator[Fault]:

@@ -1,8 +1,8 @@
 """Columns of the tables that are made of a cell: each declared once, with the names in them.
 
 A `Column` says what a column is called, what it holds, in which unit, and when it is null. A table
-may have one for each node, each candidate, or each pair of them; `find_clashes` says where two of
-a cell's are called the same.
+may have one for each resource, each candidate, or each pair of them; `find_clashes` says where two
+of a cell's are called the same.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from functools import cache
 from typing import Literal, NamedTuple, TypeAlias
 
 from dwell.errors import Fault, ProblemError
+from dwell.model.fabric import Resource
 
 #: What a column holds: a number, a truth value, a text, or a name of the cell's.
 Kind: TypeAlias = Literal[
@@ -27,12 +28,12 @@ Feature: TypeAlias = Literal["live", "shadows", "support"]
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column of a table, or one for each node or candidate.
+    """A column of a table, or one for each resource or candidate.
 
     Parameters
     ----------
     name : str
-        With ``{node}`` and ``{candidate}`` where there is one for each.
+        With ``{resource}`` and ``{candidate}`` where there is one for each.
     kind : str
         A type of Polars', or what its names are names of.
     sentence : str
@@ -62,7 +63,8 @@ class TableSchema:
     sentence : str
         Meaning of a row.
     columns : tuple of tuple of Column
-        In their order; one for each node and candidate goes through the candidates of a node first.
+        In their order; one for each resource and candidate goes through a resource's candidates
+        first.
     numbered : bool
         Whether its first column numbers the rows; a row that comes again replaces the one before.
     on_request : bool
@@ -80,6 +82,7 @@ UNCOMPARED = "the clocks were not compared"
 APART = f"{LOST}, or {UNCOMPARED}"
 UNSEEN = "the controller did not see the close"
 GUARD = "a move of the guard's own"
+UNMEASURED = "an accelerator of a live cell that was not measured"
 UNTOLD = "not counted"
 LIVE: tuple[Feature, ...] = ("live",)
 SHADOWS: tuple[Feature, ...] = ("shadows",)
@@ -144,11 +147,22 @@ WINDOWS = (
     Column("violation_rate", "Float64", "V_D: share of its cycles that missed."),
     Column("seen_l95_ms", "Float64", "L95 as seen at the close.", "ms", UNSEEN),
     Column("seen_violation_rate", "Float64", "V_D as seen at the close.", null=UNSEEN),
-    Column("u_{node}", "Float64", "Utilisation of a node, foreign work included."),
+    Column(
+        "u_{resource}",
+        "Float64",
+        "Utilisation of a resource, foreign work included.",
+        null=UNMEASURED,
+    ),
     Column("cost", "Float64", "J of what was seen.", null=UNSEEN),
     Column("shadow_cycles", "Int64", "Cycles that were sent twice.", of=SHADOWS),
     Column("shadow_bytes", "Int64", "What their shadows put on links.", "bytes", of=SHADOWS),
-    Column("shadow_{node}", "Float64", "Share of a node's cores for shadows.", of=SHADOWS),
+    Column(
+        "shadow_{resource}",
+        "Float64",
+        "Share of its cores, or accelerators, for shadows.",
+        null=UNMEASURED,
+        of=SHADOWS,
+    ),
     Column("term", "Int64", "Term of its last cycle.", of=LIVE),
     Column("lead", "Int64", "Cycles before it that belong to no window.", of=LIVE),
     Column("heard", "Int64", "Cycles of which anything was heard.", of=LIVE),
@@ -183,7 +197,10 @@ DECISIONS = (
     Column("est_l95_ms_{candidate}", "Float64", "Its estimated L95.", "ms", GUARD),
     Column("est_violation_rate_{candidate}", "Float64", "Its estimated V_D.", null=GUARD),
     Column(
-        "est_u_{node}_{candidate}", "Float64", "Its estimated utilisation of a node.", null=GUARD
+        "est_u_{resource}_{candidate}",
+        "Float64",
+        "Its estimated utilisation of a resource.",
+        null=f"{GUARD}, or {UNMEASURED}",
     ),
     Column("eligible_{candidate}", "Boolean", "Whether it is within the caps.", null=GUARD),
     Column(
@@ -291,31 +308,39 @@ TABLES: Mapping[str, TableSchema] = {
 }
 
 #: Columns of a study's tables that are made of names: share of the windows that began under a
-#: candidate, and mean utilisation of a node.
-SHARE_OF, NODE_OF = "share_{candidate}", "node_{node}"
+#: candidate, and mean utilisation of a resource.
+SHARE_OF, USE_OF = "share_{candidate}", "node_{resource}"
 #: What follows the name of a column over seeds: its mean, and the ends of its interval.
 ENDS = ("", "_low", "_high")
 
 #: By table, how its columns are called.
 TEMPLATES: Mapping[str, Sequence[str]] = {
     **{name: [column.name for column in table.columns] for name, table in TABLES.items()},
-    "runs": [of + end for of in (SHARE_OF, NODE_OF) for end in ENDS],
+    "runs": [of + end for of in (SHARE_OF, USE_OF) for end in ENDS],
 }
 
 
 class NamedColumn(NamedTuple):
-    """A column of one cell: its name, and the node and the candidate in it; empty for none."""
+    """A column of one cell: its name, and the resource and the candidate in it, if any."""
 
     name: str
-    node: str
+    resource: Resource | None
     candidate: str
 
     @property
     def of(self) -> str:
         """The names that it is made of, as messages have them."""
-        made_of = {"node": self.node, "candidate": self.candidate}
-        names = [f"{kind} {name}" for kind, name in made_of.items() if name]
+        names = [] if self.resource is None else [self.resource.described]
+        if self.candidate:
+            names.append(f"candidate {self.candidate}")
         return ", ".join(names) or "every cell"
+
+    @property
+    def path(self) -> str:
+        """Where a cell file has the last of these names."""
+        if self.candidate or self.resource is None:
+            return f"candidates.{self.candidate}"
+        return self.resource.path
 
 
 class Clash(NamedTuple):
@@ -334,41 +359,49 @@ def those_with(features: Collection[Feature], columns: Iterable[Column]) -> Iter
 
 
 def columns_of(
-    template: str, nodes: Iterable[str], candidates: Iterable[str]
+    template: str, resources: Iterable[Resource], candidates: Iterable[str]
 ) -> Iterator[NamedColumn]:
-    """Yield the columns that one declaration is for a cell: all candidates of a node, then on."""
-    of_nodes = nodes if "{node}" in template else [""]
+    """Yield the columns that a declaration is for a cell: all candidates of a resource, then on."""
+    of_resources = list(resources) if "{resource}" in template else [None]
     of_candidates = list(candidates) if "{candidate}" in template else [""]
-    for node, candidate in itertools.product(of_nodes, of_candidates):
-        name = template.format(node=node, candidate=candidate)
-        yield NamedColumn(name, node, candidate)
+    for resource, candidate in itertools.product(of_resources, of_candidates):
+        name = template.format(resource=resource and resource.name, candidate=candidate)
+        yield NamedColumn(name, resource, candidate)
 
 
-def clash_faults(nodes: Sequence[str], candidates: Sequence[str]) -> Iterator[Fault]:
-    """Yield a fault for every two columns of a table that would have one name."""
-    for table, first, second in find_clashes(nodes, candidates):
-        path = f"candidates.{second.candidate}" if second.candidate else f"nodes.{second.node}"
+def clash_faults(resources: Iterable[Resource], candidates: Sequence[str]) -> Iterator[Fault]:
+    """Yield a fault for every two resources, or columns of a table, that would have one name."""
+    known: dict[str, Resource] = {}
+    for resource in resources:
+        first = known.setdefault(resource.name, resource)
+        if first is not resource:
+            yield Fault(
+                resource.path,
+                f"{first.described} and {resource.described} would both be called "
+                f"{resource.name!r} where a resource is named; rename one of them",
+            )
+    for table, one, other in find_clashes(tuple(known.values()), candidates):
         yield Fault(
-            path,
-            f"a table of {table} would have two columns {second.name!r}: of {first.of} and of "
-            f"{second.of}; rename one of them",
+            other.path,
+            f"a table of {table} would have two columns {other.name!r}: of {one.of} and of "
+            f"{other.of}; rename one of them",
         )
 
 
-def find_clashes(nodes: Sequence[str], candidates: Sequence[str]) -> Iterator[Clash]:
+def find_clashes(resources: Sequence[Resource], candidates: Sequence[str]) -> Iterator[Clash]:
     """Yield where two columns of a table would have one name."""
     for table, templates in TEMPLATES.items():
         known: dict[str, NamedColumn] = {}
         # The table's own come first, so that a clash with one is that of the cell's name.
         for template in sorted(templates, key=lambda one: "{" in one):
-            for column in columns_of(template, nodes, candidates):
+            for column in columns_of(template, resources, candidates):
                 first = known.setdefault(column.name, column)
                 if first is not column:
                     yield Clash(table, first, column)
 
 
 @cache
-def require_apart(nodes: tuple[str, ...], candidates: tuple[str, ...]) -> None:
+def require_apart(resources: tuple[Resource, ...], candidates: tuple[str, ...]) -> None:
     """Refuse names of a cell of which two columns of a table would be called the same.
 
     Raises
@@ -376,5 +409,5 @@ def require_apart(nodes: tuple[str, ...], candidates: tuple[str, ...]) -> None:
     ProblemError
         With every pair of them.
     """
-    if faults := list(clash_faults(nodes, candidates)):
+    if faults := list(clash_faults(resources, candidates)):
         raise ProblemError(faults)

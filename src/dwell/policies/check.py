@@ -267,14 +267,14 @@ def _bounded(lines: int) -> Iterator[None]:
 
 
 def _situations(problem: Problem) -> Iterator[Situation]:
-    """Yield the awkward windows for a problem's candidates and nodes."""
+    """Yield the awkward windows for a problem's candidates and resources."""
     names = list(problem.candidates)
-    nodes = list(problem.fabric.nodes)
+    resources = list(problem.fabric.resources)
     deadline, bound = problem.pipeline.deadline_ms, problem.censor_ms
     caps = problem.objective.caps
 
     def qos(l95_ms: float, violation_rate: float, used: float) -> QoS:
-        return QoS(l95_ms, violation_rate, dict.fromkeys(nodes, used))
+        return QoS(l95_ms, violation_rate, dict.fromkeys(resources, used))
 
     def alike(l95_ms: float, violation_rate: float, used: float) -> Window:
         return dict.fromkeys(names, qos(l95_ms, violation_rate, used))
@@ -300,15 +300,15 @@ def _situations(problem: Problem) -> Iterator[Situation]:
 def _walk(problem: Problem, windows: int) -> Iterator[Window]:
     """Yield windows whose metrics drift, each candidate's on its own."""
     rng = random.Random(WALK_SEED)  # noqa: S311 - a fixed sequence is the point
-    names, nodes = list(problem.candidates), list(problem.fabric.nodes)
+    names, resources = list(problem.candidates), list(problem.fabric.resources)
     logs = dict.fromkeys(names, 0.0)
-    used = {name: dict.fromkeys(nodes, 0.5) for name in names}
+    used = {name: dict.fromkeys(resources, 0.5) for name in names}
     for _ in range(windows):
         window = {}
         for name in names:
             logs[name] = 0.95 * logs[name] + rng.gauss(0, 0.2)
-            for node in nodes:
-                used[name][node] = min(1.0, max(0.0, used[name][node] + rng.gauss(0, 0.1)))
+            for one in resources:
+                used[name][one] = min(1.0, max(0.0, used[name][one] + rng.gauss(0, 0.1)))
             l95_ms = min(problem.pipeline.deadline_ms * math.exp(logs[name]), problem.censor_ms)
             rate = min(1.0, max(0.0, rng.gauss(0.3 * logs[name], 0.1)))
             window[name] = QoS(l95_ms, rate, used[name])

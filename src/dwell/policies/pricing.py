@@ -7,7 +7,7 @@ nodes and comparing placements again in every window.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from operator import itemgetter
 from typing import NoReturn
 
@@ -44,8 +44,19 @@ def explain_estimate(estimates: object, name: str, candidates: Mapping[str, Plac
     check_metrics(estimates[name], f"the estimate of {name}")
 
 
-def _shares(nodes: tuple[str, ...]) -> Callable[[Mapping[str, float]], tuple[float, ...]]:
-    """Return the function that looks up the utilisation of `nodes`: a tuple, never empty."""
+def _shares(
+    names: tuple[str, ...], accelerators: Collection[str]
+) -> Callable[[Mapping[str, float]], tuple[float, ...]]:
+    """Return the function that looks up the utilisation of a tier: a tuple, never empty."""
+    nodes = tuple(name for name in names if name not in accelerators)
+    if len(nodes) < len(names):
+        # Of accelerators a window need not show anything.
+        rest = names[len(nodes) :]
+        return lambda used: (
+            0.0,
+            *[used[name] for name in nodes],
+            *[used[name] for name in rest if name in used],
+        )
     if not nodes:
         return lambda utilisation: (0.0,)
     # Given one key alone, itemgetter would return a bare value.
@@ -63,8 +74,9 @@ class Pricing:
         self.candidates = candidates
         self.objective = objective
         nodes = tier_nodes(objective)
-        self._robot, self._edge = _shares(nodes.robot), _shares(nodes.edge)
-        self._cloud = _shares(nodes.cloud) if nodes.cloud else None
+        of = objective.accelerators
+        self._robot, self._edge = _shares(nodes.robot, of), _shares(nodes.edge, of)
+        self._cloud = _shares(nodes.cloud, of) if nodes.cloud else None
         # One row of Hamming distances an incumbent, made when it first is one: n candidates of
         # which few are ever active do not cost n * n comparisons.
         self._rows: dict[str, dict[str, float]] = {}

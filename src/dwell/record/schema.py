@@ -67,7 +67,7 @@ def column_types(table: str, problem: Problem, features: Collection[Feature] = (
 def _columns(
     table: str, problem: Problem, features: Collection[Feature]
 ) -> Iterator[tuple[str, Column, str | list[str]]]:
-    """Yield name, declaration and type of every column, in the order of nodes, then candidates."""
+    """Yield name, declaration and type of every column: by resources, then by candidates."""
     names: dict[str, list[str]] = {
         "candidate": list(problem.candidates),
         "node": list(problem.fabric.nodes),
@@ -75,9 +75,10 @@ def _columns(
         "outcome": list(OUTCOMES),
         "reason": list(REASONS),
     }
+    resources = problem.fabric.resources.values()
     for column in those_with(features, TABLES[table].columns):
         kind: str | list[str] = names.get(column.kind) or column.kind
-        for one in columns_of(column.name, names["node"], names["candidate"]):
+        for one in columns_of(column.name, resources, names["candidate"]):
             yield one.name, column, kind
 
 

@@ -16,7 +16,7 @@ from dwell.report.palette import Palette
 from dwell.report.phases import disturbed
 from dwell.report.policy_blocks import COST, RATE, THE_AIM, PolicyBlocks, named, scaled
 from dwell.report.table import Columns, Table, Text, table_text, wrapped
-from dwell.report.timeline import begins_by_number, run_timeline
+from dwell.report.timeline import begins_by_number, resources_in, run_timeline
 from dwell.study import Comparison, StudyResult, paper_predictions
 from dwell.study.drawn_disturbances import drawn_disturbances
 
@@ -163,7 +163,7 @@ def _timeline(comparison: Comparison, blocks: PolicyBlocks, scenario: str, polic
         begins_by_number(example.windows, problem.pipeline.period_ms),
         slug=f"{blocks.prefix}time-{scenario}",
         palette=Palette.of(problem.candidates),
-        nodes=tuple(problem.fabric.nodes),
+        resources=resources_in(example.windows, problem),
         deadline_ms=problem.pipeline.deadline_ms,
         disturbed=disturbed(
             drawn_disturbances(problem, scenario, comparison.seeds[0], comparison.windows),

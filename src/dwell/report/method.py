@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 
 from dwell.display import decimals_for
 from dwell.estimators.registry import REGISTRY as ESTIMATORS
-from dwell.model import LinkDisturbance, NodeDisturbance, Problem, Process, Trace
+from dwell.model import LinkDisturbance, Node, NodeDisturbance, Problem, Process, Trace
 from dwell.model.bounds import counted
 from dwell.report.formatting import OURS, Measure, percent, shown_contender, write_ms, write_number
 from dwell.report.page import Block, Definitions
@@ -53,7 +53,8 @@ def cell_definitions(problem: Problem) -> dict[str, str]:
         "period": write_ms(pipeline.period_ms),
         "deadline": write_ms(pipeline.deadline_ms),
         "nodes": ", ".join(
-            f"{one.name} ({one.tier}, {counted(one.cores, 'core')})" for one in nodes
+            f"{one.name} ({one.tier}, {counted(one.cores, 'core')}{_accelerators(one)})"
+            for one in nodes
         ),
         "window": f"{counted(problem.window_cycles, 'cycle')}, "
         f"{write_number(span_s, decimals_for(span_s, 1))} s",
@@ -141,6 +142,10 @@ def _process(process: Process) -> str:
     return f"{type(process).__name__.lower()} ({numbers}) ms"
 
 
+def _accelerators(node: Node) -> str:
+    return "".join(f", {count} × {kind}" for kind, count in node.accelerators.items())
+
+
 def _cost(problem: Problem) -> str:
     """Return J with the numbers of this cell."""
     weights, targets = problem.objective.weights, problem.objective.targets
@@ -153,7 +158,8 @@ def _cost(problem: Problem) -> str:
     if weights.cloud is not None and targets.cloud is not None:
         terms.append(f"{weights.cloud:g} · U of the cloud / {targets.cloud:g}")
     terms.append(f"{weights.switching:g} · share of the tasks moved")
-    return "J = " + " + ".join(terms)
+    of = "; U of accelerators, too" if problem.objective.accelerators else ""
+    return f"J = {' + '.join(terms)}{of}"
 
 
 def _caps(problem: Problem) -> str:

@@ -327,11 +327,11 @@ class PolicyBlocks:
 
     def more(self) -> Table:
         """Return further numbers of every policy in every scenario."""
-        nodes = [
-            Measure(f"node_{node}", f"U of {node}", "%", 100.0)
-            for node in self.problem.fabric.nodes
+        used = [
+            Measure(f"node_{name}", f"U of {name}", "%", 100.0)
+            for name in self.problem.fabric.resources
         ]
-        measures = [one for one in (*MORE, *nodes) if one.column in self.runs.columns]
+        measures = [one for one in (*MORE, *used) if one.column in self.runs.columns]
         return Table(
             f"{self.prefix}more",
             "More numbers",

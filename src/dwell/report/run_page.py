@@ -44,7 +44,7 @@ from dwell.report.phases import phase_rows
 from dwell.report.policy_blocks import COST, L95, RATE
 from dwell.report.run_header import RunHeader
 from dwell.report.table import Columns, Table, Text
-from dwell.report.timeline import begins_by_number, run_timeline
+from dwell.report.timeline import begins_by_number, resources_in, run_timeline
 from dwell.study.summary import Counted, count_in, latency_ms, longest_streak, order_statistic
 
 if TYPE_CHECKING:
@@ -169,7 +169,7 @@ class _RunPage:
             self.begin_s,
             slug="time",
             palette=self.palette,
-            nodes=self.header.nodes,
+            resources=resources_in(self.run.windows, self.header.problem),
             deadline_ms=self.header.deadline_ms,
             disturbed=self.header.disturbed,
             tracking=self.header.tracking,
@@ -227,6 +227,7 @@ class _RunPage:
             {**window, "begin_s": self.begin_of[window["window"]]}
             for window in self.worst.iter_rows(named=True)
         ]
+        resources = resources_in(self.run.windows, self.header.problem)
         columns: Columns = [
             Text("window", "window", link="#window-{window}"),
             Measure("begin_s", "at", "s"),
@@ -234,7 +235,7 @@ class _RunPage:
             RATE,
             FINAL_L95,
             COST,
-            *(Measure(f"u_{node}", node, "%", 100.0, 0) for node in self.header.nodes),
+            *(Measure(f"u_{name}", name, "%", 100.0, 0) for name in resources),
         ]
         caption = (
             "The windows with the most misses. L95 final: of the latencies that cycles had in the "
@@ -406,7 +407,8 @@ class _RunPage:
         cycles = windows.height * self.header.window_cycles
         seconds = cycles * self.header.period_ms / 1e3
         sent = float(windows["shadow_bytes"].sum())
-        used = {f"shadow_{node}": windows[f"shadow_{node}"].mean() for node in self.header.nodes}
+        resources = resources_in(windows, self.header.problem)
+        used = {f"shadow_{name}": windows[f"shadow_{name}"].mean() for name in resources}
         row = {
             "cycles": float(windows["shadow_cycles"].sum()) / cycles,
             "rate_mbps": sent * 8e-6 / seconds,

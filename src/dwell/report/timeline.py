@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import polars as pl
     from numpy.typing import NDArray
 
+    from dwell.model import Problem
     from dwell.report.phases import Disturbed
     from dwell.report.run_header import Tracking
 
@@ -63,7 +64,7 @@ def run_timeline(
     *,
     slug: str,
     palette: Palette,
-    nodes: Sequence[str],
+    resources: Sequence[str],
     deadline_ms: float,
     disturbed: Iterable[Disturbed] = (),
     tracking: Tracking | None = None,
@@ -80,6 +81,8 @@ def run_timeline(
     ----------
     begin_s : float64 array, shape (windows,)
         When each window began, seconds.
+    resources : sequence of str
+        Whose utilisation is drawn (see `resources_in`).
     palette : Palette
         Colours of the candidates.
     disturbed : iterable of Disturbed
@@ -115,7 +118,7 @@ def run_timeline(
         "estimates": _estimates(windows, decisions, begin_s + length_s, candidates, each),
         "moves": _moves(windows, decisions, begin_s, length_s),
         "spans": _spans(windows, disturbed, begin_s, length_s, end_s),
-        "nodes": _used(windows, begin_s + length_s / 2, nodes, each),
+        "nodes": _used(windows, begin_s + length_s / 2, resources, each),
     }
     wide = is_wide([*frame["l95"].drop_nulls().drop_nans(), deadline_ms])
     aim, due = limit_rule("y", 100 * AIM, "5 %"), limit_rule("y", deadline_ms, "deadline")
@@ -125,7 +128,7 @@ def run_timeline(
         (PANEL_PX, [*aim, *_marks("v_d", "V_D (%)", colours, each)]),
         (PANEL_PX, [*due, *_marks("l95", L95, colours, each, log=wide)]),
         (PANEL_PX, [_others(palette), *_marks("j", "J", colours, each)]),
-        (USE_PX, _use(nodes, each)),
+        (USE_PX, _use(resources, each)),
     ]
     if tracking is not None:
         panels.append((PANEL_PX, [*_marks("error", "tracking error (mm)", colours, each)]))
@@ -187,21 +190,35 @@ def _binned(frame: pl.DataFrame, each: int, by: Sequence[str] = ()) -> pl.DataFr
     return bins.group_by("bin", *by, maintain_order=True).agg(*firsts, *quantiles).drop("bin")
 
 
+def resources_in(windows: pl.DataFrame, problem: Problem) -> tuple[str, ...]:
+    """Return the resources of which windows say how busy they were.
+
+    They say so of every node; of accelerators not where nobody measured them, nor in runs that were
+    made before they were counted.
+    """
+    return tuple(
+        name
+        for name, one in problem.fabric.resources.items()
+        if not one.kind
+        or (f"u_{name}" in windows.columns and windows[f"u_{name}"].null_count() < windows.height)
+    )
+
+
 def _used(
-    windows: pl.DataFrame, middle_s: NDArray[np.float64], nodes: Sequence[str], each: int
+    windows: pl.DataFrame, middle_s: NDArray[np.float64], resources: Sequence[str], each: int
 ) -> pl.DataFrame:
-    """Return the utilisation of every node, a row a node and mark."""
+    """Return the utilisation of resources, a row a resource and mark."""
     import polars as pl
 
     frame = pl.DataFrame(
         {
             "window": windows["window"],
             "time": middle_s,
-            **{node: windows[f"u_{node}"].cast(pl.Float64) * 100 for node in nodes},
+            **{name: windows[f"u_{name}"].cast(pl.Float64) * 100 for name in resources},
         }
     )
     long = frame.unpivot(
-        list(nodes), index=["time", "window"], variable_name="node", value_name="used"
+        list(resources), index=["time", "window"], variable_name="node", value_name="used"
     )
     return _binned(long, each, ["node"])
 
@@ -368,10 +385,10 @@ def _others(palette: Palette) -> Spec:
     return layer("line", encoding, rows="estimates", strokeWidth=1, opacity=0.75)
 
 
-def _use(nodes: Sequence[str], each: int) -> list[Spec]:
-    """Return a line a node; of several windows in a mark, with bands of quartiles and extremes."""
-    shades = {node: (INK, MUTED)[place % 2] for place, node in enumerate(nodes)}
-    dashes = [DASHES[place % len(DASHES)] for place in range(len(nodes))]
+def _use(resources: Sequence[str], each: int) -> list[Spec]:
+    """Return a line a resource; of several windows a mark, with bands of quartiles and extremes."""
+    shades = {name: (INK, MUTED)[place % 2] for place, name in enumerate(resources)}
+    dashes = [DASHES[place % len(DASHES)] for place in range(len(resources))]
     axis, scale = {"values": [0, 50, 100]}, {"domain": [0, 104]}
 
     def up(end: str) -> Spec:
@@ -382,7 +399,7 @@ def _use(nodes: Sequence[str], each: int) -> list[Spec]:
     line = {
         "y": up("" if each == 1 else "_median"),
         "color": colour,
-        "strokeDash": name_of("node", scale={"domain": list(nodes), "range": dashes}),
+        "strokeDash": name_of("node", scale={"domain": list(resources), "range": dashes}),
     }
     lines = layer("line", line, rows="nodes", strokeWidth=1.1)
     if each == 1:

@@ -94,10 +94,10 @@ def _sections(validation: Validation) -> Iterator[Section]:
     yield Section("Where the time goes", [_split(validation), _parts(validation)])
     if not validation.jobs.is_empty():
         yield Section("Jobs", [_jobs(validation)], folded=True)
-    nodes = [f"u_{node}" for node in validation.problem.fabric.nodes]
+    used = [f"u_{name}" for name in validation.problem.fabric.resources]
     others = [
         _compared(validation, "windows", ["window_l95_ms", "migrations"], "Windows and migrations"),
-        _compared(validation, "use", nodes, "Utilisation of the nodes"),
+        _compared(validation, "use", used, "Utilisation of the nodes"),
         _compared(validation, "shares", _shares(validation), "Windows under each placement"),
     ]
     yield Section("More figures", [one for one in others if one.rows])
@@ -438,7 +438,8 @@ def _jobs(validation: Validation) -> Table:
 
 
 def _compared(validation: Validation, slug: str, names: Sequence[str], title: str) -> Table:
-    """Return figures, measured and predicted."""
+    """Return figures that some group has, measured and predicted."""
+    names = [name for name in names if any(name in one.figures for one in validation.groups)]
     rows = []
     for group in validation.groups:
         row = _named(group)

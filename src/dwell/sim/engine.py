@@ -27,6 +27,7 @@ from dwell.kernels.random_draws import draw, draw_shadows
 from dwell.kernels.realisation import NodeChanges, Realisation
 from dwell.model import Problem
 from dwell.model.document import to_document
+from dwell.model.fabric import resources_of
 from dwell.model.table_columns import require_apart
 from dwell.model.window_close import close_after_ns
 from dwell.record import Run
@@ -100,7 +101,7 @@ def simulate_realisation(
         Stop at every window even where nothing that is decided could matter; the Run is the same.
     """
     _check_fit(problem, realisation)
-    require_apart(tuple(problem.fabric.nodes), tuple(problem.candidates))
+    require_apart(tuple(resources_of(problem.fabric.nodes)), tuple(problem.candidates))
     try:
         played = _play(problem, realisation, policy, estimator, jobs, guard, by_window)
     except _ProbesWantedError:

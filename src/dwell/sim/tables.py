@@ -56,7 +56,7 @@ class PlayedRealisation:
 
     @property
     def shares(self) -> Floats:
-        """Busy, own and shadow share of every node's cores, shape (windows, 3, nodes)."""
+        """Busy, own and shadow share of every resource, shape (windows, 3, resources)."""
         return self.arrays.tables.shares[0, : len(self.seen)]
 
     @property
@@ -201,7 +201,7 @@ def _windows(played: PlayedRealisation, seen: dict[str, Floats]) -> TableArrays:
 
 
 def _shadow_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray[np.generic]]]:
-    """Cost of shadow jobs in each window: cycles sent twice, bytes, and share of the cores."""
+    """Cost of shadow jobs in each window: cycles sent twice, bytes, share of resources."""
     if not played.features:
         return {}
 
@@ -217,8 +217,8 @@ def _shadow_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray
         ),
         "shadow_bytes": sent_bytes,
         **{
-            f"shadow_{node}": partial(lambda i: played.shares[:, 2, i], i)
-            for i, node in enumerate(played.problem.fabric.nodes)
+            f"shadow_{name}": partial(lambda i: played.shares[:, 2, i], i)
+            for i, name in enumerate(played.controller.resources)
         },
     }
 
@@ -236,7 +236,7 @@ def _seen(played: PlayedRealisation) -> dict[str, Floats]:
         log = np.array(played.controller.log.seen, np.float64).reshape(-1, 3)
         seen = dict(zip(("l95_ms", "violation_rate", "cost"), log.T, strict=True))
     used = played.shares[:, 0]
-    return seen | {f"u_{node}": used[:, i] for i, node in enumerate(played.controller.nodes)}
+    return seen | {f"u_{name}": used[:, i] for i, name in enumerate(played.controller.resources)}
 
 
 def _decisions(controller: Controller) -> TableArrays:

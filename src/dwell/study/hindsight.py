@@ -44,11 +44,11 @@ class _Alone:
     first : int64 array, shape (windows,)
         First cycle of every window.
     used : dict of str to float64 array, shape (windows,)
-        Utilisation of each node in every window.
+        Utilisation of each resource in every window.
     open_ns : int64 array, shape (windows + 1,)
         Begin of every window, and the end of the last.
     busy_ns : dict of str to float64 array, shape (windows + 1,)
-        Time for which each node was busy until then, as if all of it were one core.
+        Time for which each resource was busy until then, as if all of it were one core.
     """
 
     release_ns: Ints
@@ -59,7 +59,7 @@ class _Alone:
     busy_ns: dict[str, Floats]
 
     def utilisation(self, first: int, open_ns: int, close_ns: int) -> dict[str, float]:
-        """Utilisation of each node in the window of a first cycle, between two instants."""
+        """Utilisation of each resource in the window of a first cycle, between two instants."""
         window = int(np.searchsorted(self.first, first))
         if window < len(self.first) and self.first[window] == first:
             return {node: float(used[window]) for node, used in self.used.items()}

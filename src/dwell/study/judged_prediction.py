@@ -151,7 +151,11 @@ class GroupJudge:
             l95,
             self._difference("window_l95_ms"),
             self._violations(l95.verdict),
-            *(self._use(f"u_{node}") for node in self.problem.fabric.nodes),
+            *(
+                self._use(f"u_{name}")
+                for name in self.problem.fabric.resources
+                if self._shows(name)
+            ),
             self._placed(),
             self._better(),
             *(self._difference(f"share_{name}") for name in self.problem.candidates),
@@ -203,6 +207,11 @@ class GroupJudge:
             measured=judged.measured._replace(**open_ends),
             error=judged.error._replace(**open_ends),
         )
+
+    def _shows(self, resource: str) -> bool:
+        """Whether it was measured how busy a resource was; of accelerators it need not be."""
+        name = f"u_{resource}"
+        return name in self.measured.sums and not math.isnan(self.measured.figure(name))
 
     def _use(self, name: str) -> Judged:
         judged = self._difference(name)

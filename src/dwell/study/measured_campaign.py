@@ -16,13 +16,13 @@ import numpy as np
 from dwell.cellfile import from_document
 from dwell.errors import RunError
 from dwell.model import Problem
-from dwell.record import Run, open_run
+from dwell.record import Run, arrays_of, open_run
 from dwell.record.campaign_folder import CampaignFolder, read_campaign
 from dwell.study.comparison import Comparison
 from dwell.study.job_times import jobs_of, links_of, profiles_of
 from dwell.study.measured_run import excluded_windows
 from dwell.study.player import Example
-from dwell.study.summary import Row, busiest, latency_grid_ms, summarise
+from dwell.study.summary import Row, busiest, latency_grid_ms, summarise, used_in
 
 if TYPE_CHECKING:
     import polars as pl
@@ -244,12 +244,11 @@ def _latencies(
 
 
 def _windows(run: Run, problem: Problem, scenario: str, policy: str) -> pl.DataFrame:
-    """Return the windows that count, with the busiest node of each tier."""
+    """Return the windows that count, with the busiest of each tier."""
     import polars as pl
 
     windows = run.windows.filter(~pl.col("warmup"))
-    used = {node: windows[f"u_{node}"].to_numpy() for node in problem.fabric.nodes}
-    robot, edge, _ = busiest(used, problem)
+    robot, edge, _ = busiest(used_in(arrays_of(windows), problem), problem)
     return windows.select(
         scenario=pl.lit(scenario),
         policy=pl.lit(policy),

@@ -282,7 +282,11 @@ def _window_sums(
     placed = windows["placement"].cast(str).to_numpy()
     return {
         "window_l95_ms": _sums(column("seen_l95_ms"), unit, units),
-        **{f"u_{node}": _sums(column(f"u_{node}"), unit, units) for node in problem.fabric.nodes},
+        **{
+            f"u_{name}": _sums(column(f"u_{name}"), unit, units)
+            for name in problem.fabric.resources
+            if f"u_{name}" in windows.columns
+        },
         **{
             f"share_{name}": _sums((placed == name).astype(np.float64), unit, units)
             for name in problem.candidates

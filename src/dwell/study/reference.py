@@ -35,7 +35,7 @@ from dwell.model import FrozenDict, Problem
 from dwell.model.window_close import window_close_ns
 from dwell.study.clairvoyant import Sequence, clairvoyant, priced
 from dwell.study.script import Script
-from dwell.study.summary import busiest, mean_of
+from dwell.study.summary import busiest, mean_of, used_in
 
 if TYPE_CHECKING:
     from dwell.record import Run, TableArrays
@@ -273,8 +273,8 @@ def _unseen_costs(
 
 
 def tier_use(windows: TableArrays, problem: Problem) -> tuple[Floats, Floats, Floats]:
-    """Utilisation of the busiest node of each tier, robot, edge and cloud, in every window."""
-    return busiest({node: windows[f"u_{node}"] for node in problem.fabric.nodes}, problem)
+    """Utilisation of the busiest of each tier, robot, edge and cloud, in every window."""
+    return busiest(used_in(windows, problem), problem)
 
 
 def _in_time(problem: Problem) -> Problem:

@@ -32,7 +32,7 @@ from dwell.cost import tier_nodes
 from dwell.errors import SimulationError
 from dwell.model import Problem
 from dwell.model.instants import NEVER_NS
-from dwell.model.table_columns import NODE_OF, SHARE_OF
+from dwell.model.table_columns import SHARE_OF, USE_OF
 from dwell.study.quality import actuations, age_of_information, misses_in, track
 
 if TYPE_CHECKING:
@@ -184,7 +184,7 @@ def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Su
     latencies = Latencies.of(final_ns, problem.pipeline.deadline_ms)
     placed = windows.names("placement")[counts]
     active = {name: placed.equal(name) for name in problem.candidates}
-    used = {node: windows[f"u_{node}"][counts] for node in problem.fabric.nodes}
+    used = {name: share[counts] for name, share in used_in(windows, problem).items()}
     row: Row = {
         **labels,
         "windows": int(counts.sum()),
@@ -226,7 +226,7 @@ def _unfinished(outcomes: Names) -> dict[str, int]:
 def _played(latency_ns: Ints, placed: Names, used: Mapping[str, Floats], problem: Problem) -> str:
     """Digest of what was played: of runs on one realisation, equal ones are the same run.
 
-    It is that of every cycle's placement and latency, and of the nodes' utilisation, to which
+    It is that of every cycle's placement and latency, and of the resources' utilisation, to which
     shadow jobs add where they delay nobody.
     """
     digest = hashlib.blake2b(latency_ns.data, digest_size=8)
@@ -331,29 +331,39 @@ def _percentiles(latencies: Latencies) -> dict[str, float]:
     return {"p95_ms": p95, "p50_ms": p50, "spread_ms": p95 - p50 if p50 < np.inf else np.inf}
 
 
+def used_in(windows: TableArrays, problem: Problem) -> dict[str, Floats]:
+    """Utilisation of every resource in every window.
+
+    Runs that were made before accelerators were counted say nothing of those.
+    """
+    names = {name: f"u_{name}" for name in problem.fabric.resources}
+    return {name: windows[column] for name, column in names.items() if column in windows}
+
+
 def busiest(used: Mapping[str, Floats], problem: Problem) -> tuple[Floats, Floats, Floats]:
-    """Utilisation of the busiest node of each tier, robot, edge and cloud, in every window.
+    """Utilisation of the busiest of each tier, robot, edge and cloud, in every window.
 
     Parameters
     ----------
     used : mapping of str to float64 array, shape (windows,)
-        Utilisation of every node. A tier without nodes has 0.
+        Utilisation of every node, and of the accelerators that are known; NaN where one was not
+        measured. A tier without nodes has 0.
     """
     none = np.zeros(len(next(iter(used.values()))))
     robot, edge, cloud = (
-        np.fmax.reduce([used[node] for node in nodes]) if nodes else none
-        for nodes in tier_nodes(problem.objective)
+        np.fmax.reduce([used[name] for name in names if name in used]) if names else none
+        for names in tier_nodes(problem.objective)
     )
     return robot, edge, cloud
 
 
 def _utilisation(used: Mapping[str, Floats], problem: Problem) -> dict[str, float]:
-    """Mean over windows of the busiest node of a tier, and of every node."""
+    """Mean over windows of the busiest of a tier, and of every resource."""
     robot, edge, _ = busiest(used, problem)
     return {
         "u_robot": mean_of(robot),
         "u_edge": mean_of(edge),
-        **{NODE_OF.format(node=node): mean_of(share) for node, share in used.items()},
+        **{USE_OF.format(resource=name): mean_of(share) for name, share in used.items()},
     }
 
 

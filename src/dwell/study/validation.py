@@ -102,7 +102,7 @@ class Group:
 
     @property
     def uses(self) -> dict[str, Judged]:
-        """Utilisation by node."""
+        """Utilisation by resource."""
         return {name[2:]: one for name, one in self.figures.items() if name.startswith("u_")}
 
 
