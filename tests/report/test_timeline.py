@@ -13,7 +13,14 @@ import dwell
 from dwell.report.figure import Figure, printed_svg, svg
 from dwell.report.palette import Palette
 from dwell.report.phases import Disturbed
-from dwell.report.timeline import MOST_BINS, MOST_MARKS, begins_by_number, run_timeline
+from dwell.report.timeline import (
+    MOST_BINS,
+    MOST_MARKS,
+    begins_by_number,
+    resources_in,
+    run_timeline,
+)
+from tests.cells.examples import EXAMPLES
 from tests.cells.small import make_problem
 
 PROBLEM = make_problem()
@@ -51,6 +58,16 @@ def test_every_window_has_a_mark_with_what_it_showed(run: dwell.Run) -> None:
     moved = run.decisions["migrated"].sum()
     assert moved
     assert frames["moves"].height == moved
+
+
+def test_resources_are_those_that_windows_tell_of() -> None:
+    problem = dwell.load(EXAMPLES / "fan-in.yaml")
+    windows = dwell.simulate(problem, policy="EDGE", seed=1, windows=2).windows
+    assert resources_in(windows, problem) == ("R1", "R2", "E", "E.gpu")
+    # A run of before accelerators were counted, and one in which nobody measured them.
+    unmeasured = windows.with_columns(pl.lit(None, pl.Float64).alias("u_E.gpu"))
+    for table in (windows.drop("u_E.gpu"), unmeasured):
+        assert resources_in(table, problem) == ("R1", "R2", "E")
 
 
 def test_what_goes_on_beyond_the_run_is_shaded_to_its_end(run: dwell.Run) -> None:

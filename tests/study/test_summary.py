@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -13,8 +14,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import dwell
 from dwell.errors import SimulationError
-from dwell.model import MovingTarget, Servo
+from dwell.model import MovingTarget, Problem, Servo
 from dwell.model.instants import NEVER_NS
 from dwell.record import OUTCOMES, Run
 from dwell.study.quality import actuations, track
@@ -27,6 +29,7 @@ from dwell.study.summary import (
     order_statistic,
     summarise,
 )
+from tests.cells.examples import EXAMPLES
 from tests.cells.small import make_problem
 
 W = 4
@@ -166,6 +169,47 @@ def test_a_row_holds_what_the_tables_show() -> None:
         "network_ms": pytest.approx(0.4),
     }
     assert row == expected
+
+
+def on_gpu(**objective: Any) -> Problem:
+    """The fan-in example with another objective."""
+    problem = dwell.load(EXAMPLES / "fan-in.yaml")
+    return replace(problem, objective=replace(problem.objective, **objective))
+
+
+def test_accelerators_are_in_a_row_and_in_u_e_where_j_takes_them() -> None:
+    labels: dict[str, str | int] = {"scenario": "baseline", "policy": "EDGE", "seed": 1}
+    problem = on_gpu()
+    run = dwell.simulate(problem, policy="EDGE", seed=1, windows=problem.warmup_windows + 3)
+    row = summarise(run, problem, labels).row
+    # Two tasks of 5 and 3 ms at P = 50 ms.
+    assert row["node_E.gpu"] == pytest.approx(0.16, rel=0.05)
+    assert row["u_edge"] == row["node_E"] != row["node_E.gpu"]
+    taken = on_gpu(accelerators={"E.gpu": "edge"})
+    assert summarise(run, taken, labels).row["u_edge"] == row["node_E.gpu"]
+    # Of a run that was made before they were counted nothing is known of them.
+    before = dwell.Run(
+        run.meta,
+        {
+            "cycles": run.cycles,
+            "windows": run.windows.drop("u_E.gpu"),
+            "decisions": run.decisions,
+        },
+    )
+    old = summarise(before, taken, labels).row
+    assert "node_E.gpu" not in old
+    assert old["u_edge"] == row["node_E"]
+
+
+def test_j_of_a_run_takes_accelerators_where_the_cell_says_so() -> None:
+    runs = [
+        dwell.simulate(on_gpu(**more), policy="EDGE", seed=1, windows=3)
+        for more in ({}, {"accelerators": {"E.gpu": "edge"}})
+    ]
+    weights, targets = on_gpu().objective.weights, on_gpu().objective.targets
+    more = weights.edge * (runs[0].windows["u_E.gpu"] - runs[0].windows["u_E"]) / targets.edge
+    expected = (runs[0].windows["cost"] + more).to_list()
+    assert runs[1].windows["cost"].to_list() == pytest.approx(expected)
 
 
 def test_runs_are_told_apart_by_what_was_played_and_by_nothing_else() -> None:

@@ -1,4 +1,4 @@
-// The metrics of a window as it could be known when it closed: misses, L95, shares of the resources.
+// The metrics of a window as it could be known when it closed: misses, L95, shares of resources.
 #pragma once
 
 #include <limits>

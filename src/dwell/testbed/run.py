@@ -223,6 +223,10 @@ def summary(run: Run) -> dict[str, Any]:
         "excluded": len(excluded),
         "l95_ms": means["l95_ms"],
         "violation_rate": means["violation_rate"],
-        "utilisation": {node: means[f"u_{node}"] for node in run.problem.fabric.nodes},
+        "utilisation": {
+            name: means[f"u_{name}"]
+            for name, one in run.problem.fabric.resources.items()
+            if not one.kind or means.get(f"u_{name}") is not None
+        },
         "migrations": int(run.decisions["migrated"].sum()),
     }
