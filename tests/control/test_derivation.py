@@ -52,6 +52,11 @@ class Record:
         self.places = {name: {**first, **moves} for name, moves in document["candidates"].items()}
         self.names = list(self.places)
         self.nodes = {name: node["tier"] for name, node in document["nodes"].items()}
+        self.accelerators = {
+            f"{name}.{kind}": node["tier"]
+            for name, node in document["nodes"].items()
+            for kind in node.get("accelerators", {})
+        }
         self.objective = self.parameters.get("objective", document["objective"])
 
     def moved(self, one: str, other: str) -> float:
@@ -62,9 +67,12 @@ class Record:
     def cost(self, row: Row, name: str, before: str) -> float:
         """J of a candidate's estimate, equation 7 of the paper."""
         weights, targets = self.objective["weights"], self.objective["targets"]
+        counted = dict(self.nodes)
+        if self.objective.get("accelerators", False):
+            counted |= self.accelerators
         busiest = {
             tier: max(
-                (row[f"est_u_{node}_{name}"] for node, of in self.nodes.items() if of == tier),
+                (row[f"est_u_{one}_{name}"] for one, of in counted.items() if of == tier),
                 default=0.0,
             )
             for tier in ("robot", "edge")
@@ -82,7 +90,7 @@ class Record:
         caps = self.objective.get("caps", {})
         if not caps:
             return None
-        used = max(row[f"est_u_{node}_{name}"] for node in self.nodes)
+        used = max(row[f"est_u_{one}_{name}"] for one in (*self.nodes, *self.accelerators))
         full = max(used, 1.0) if used >= 0.995 else used
         over = row[f"est_l95_ms_{name}"] / caps.get("latency_ms", math.inf) - 1
         return max(float(over), float(full / caps.get("utilisation", math.inf) - 1))
@@ -351,6 +359,34 @@ def test_every_decision_follows_from_its_row(
         rule = RULES[policy](record, "SO" if policy == "SO" else "LOC")
         for row, name, reason in derive(record, rule):
             assert (row["placement"], row["reason"]) == (name, reason), row["window"]
+
+
+@pytest.mark.parametrize("policy", ["dtp", "cusum", "work-function"])
+@pytest.mark.parametrize("taken", [False, True])
+@pytest.mark.parametrize("estimator", ["profile", "corrected"])
+def test_every_decision_follows_from_its_row_where_there_are_accelerators(
+    policy: str, taken: bool, estimator: str, tmp_path: Path
+) -> None:
+    problem = dwell.load("examples/fan-in.yaml")
+    objective = replace(
+        problem.objective,
+        # Parts of the placements have more on the gpu than that.
+        caps=Caps(utilisation=0.12),
+        accelerators={"E.gpu": "edge"} if taken else {},
+    )
+    problem = replace(problem, objective=objective)
+    run = dwell.simulate(
+        problem,
+        scenario="overview-robot-stress",
+        policy=policy,
+        estimator=estimator,
+        seed=1,
+        windows=25,
+    )
+    run.save(tmp_path / "run")
+    record = Record(tmp_path / "run")
+    for row, name, reason in derive(record, RULES[policy](record, problem.initial)):
+        assert (row["placement"], row["reason"]) == (name, reason), row["window"]
 
 
 def test_caps_that_leave_out_a_cheaper_candidate_are_the_reason(canonical: Problem) -> None:

@@ -148,6 +148,7 @@ def _summary(problem: Problem, prices: Mapping[str, Price], scenario: str) -> st
         for name, task in pipeline.tasks.items()
         if not task.anchored
     ]
+    what = "node" if len(resources) == len(nodes) else "node and accelerator"
     head = ["candidate", "L95 (ms)", "V_D (%)", *(f"{one} (%)" for one in resources)]
     rows = [
         [
@@ -169,7 +170,7 @@ def _summary(problem: Problem, prices: Mapping[str, Price], scenario: str) -> st
             f"scenarios: {', '.join(problem.scenarios)}",
             "",
             f"{scenario[0].upper()}{scenario[1:]}, each played alone: L95 and V_D of a window with "
-            "standard errors, and the cell's own work on each node",
+            f"standard errors, and the cell's own work on each {what}",
             aligned(head, rows),
         )
     )

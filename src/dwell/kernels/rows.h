@@ -69,7 +69,7 @@ using Times = const i64*;
 
 // What a job uses of its server, `need`, is the cores that it holds, the threads that share them
 // where the server is fair, or a place. Its work is done by `threads` threads. `own` is the row of
-// its server in `own_ns`.
+// its cell and server in `own_ns`.
 #define DWELL_SITE(field)                                                                        \
   field(Times, exec_ns)                                                                          \
   field(i64, need) field(i64, threads)                                                           \

@@ -162,9 +162,6 @@ def _nodes(parts: CellParts) -> Iterator[Fault]:
     if not parts.nodes:
         yield Fault("nodes", "none is declared; a cell needs at least one node")
     for name, node in parts.nodes.items():
-        for kind in node.accelerators if node is not None else ():
-            if message := bad_name(kind):
-                yield Fault(f"nodes.{name}.accelerators.{kind or repr(kind)}", message)
         for other in node.contention_stressed if node is not None else ():
             here = f"nodes.{name}.contention_stressed.{other}"
             yield from _unknown(here, "node", other, parts.nodes)
@@ -432,8 +429,12 @@ def _live(parts: CellParts) -> Iterator[Fault]:
 
 
 def _columns(parts: CellParts) -> Iterator[Fault]:
-    """Names of which two columns of a table would be called the same."""
+    """Names of accelerators, and names of which two columns would be called the same."""
     if parts.policies is not None:
+        for name, node in parts.nodes.items():
+            for kind in node.accelerators if node is not None else ():
+                if message := bad_name(kind):
+                    yield Fault(f"nodes.{name}.accelerators.{kind or repr(kind)}", message)
         yield from table_columns.clash_faults(resources_of(parts.nodes), list(parts.candidates))
 
 

@@ -159,7 +159,7 @@ WINDOWS = (
     Column(
         "shadow_{resource}",
         "Float64",
-        "Share of its cores, or accelerators, for shadows.",
+        "Share of a resource for shadows.",
         null=UNMEASURED,
         of=SHADOWS,
     ),
