@@ -21,7 +21,7 @@ f64 rest_of(const S& s, const Server& server) {
 template <class S>
 void count_added(const S& s, const Server& server, Server& below) {
   const i64 busy = server.used + server.stress, cores = server.cores;
-  const i64 used = busy + (below.is_cpu ? below.used : 0);
+  const i64 used = busy + below.used;
   below.lent = std::min(used, cores) - std::min(busy, cores);
   below.background = 0.0;
   if (server.background > 0.0 && !has_quota(s, server)) {
