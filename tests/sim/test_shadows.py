@@ -40,6 +40,7 @@ from dwell.model import (
     Problem,
     Process,
     QoS,
+    Quota,
     Task,
     Uniform,
 )
@@ -209,6 +210,20 @@ def test_an_own_job_takes_its_core_from_a_shadow_job_at_once(scheduler: Any) -> 
     found = play(problem)
     assert jobs(found, shadow=False)["D"] == ("E", 6, 10)
     assert jobs(found, shadow=True) == {"B": ("E", 3, 15)}
+
+
+@pytest.mark.parametrize(("ms", "ended"), [(4, 16), (6, 16), (8, 22)])
+def test_a_shadow_job_uses_up_the_quota_of_own_jobs(ms: float, ended: float) -> None:
+    # E has 10 ms of core time in every 20. B' is there from 3 on, D from 12 on for 4 ms: with 8 ms
+    # of B' before, D is stopped at 14, until the next period.
+    problem = cell(
+        [task("S", 2), task("B", ms, "R", "E"), task("D", 4, "E", offset_ms=12), task("K", 1)],
+        [Flow("S", "B"), Flow("B", "K"), Flow("D", "K")],
+        edge=replace(E, quota=Quota(0.5, 20.0)),
+    )
+    found = play(problem)
+    assert jobs(found, shadow=True) == {"B": ("E", 3, 3 + ms)}
+    assert jobs(found, shadow=False)["D"] == ("E", 12, ended)
 
 
 def on_accelerator(ms: float, *, offset_ms: float = 0.0) -> Problem:

@@ -381,9 +381,10 @@ void flush(S& s, i64 now) {
   for (i64 i = 0; i < s.n_dirty; ++i) {
     Server& server = s.servers[s.dirty[i]];
     const bool is_itself = !has_below(s, server) || is_concerned(s, server);
+    const bool leaves = is_shared(s, server) || (server.is_dirty & kBelowIsDirty) != 0;
     server.is_dirty = 0;
     if (is_itself && server.scheduler != kFair) dispatch(s, server, now);
-    if (has_below(s, server)) leave_rest(s, server, now);
+    if (leaves) leave_rest(s, server, now);
     if (is_itself) schedule(s, server, now);
   }
   s.n_dirty = 0;

@@ -74,6 +74,14 @@ bool has_below(const S&, const Server& server) {
   return !S::kPlain && server.below >= 0;
 }
 
+// Whether there are shadow jobs to which a server leaves anything.
+template <class S>
+bool is_shared(const S& s, const Server& server) {
+  if (!has_below(s, server)) return false;
+  const Server& below = s.servers[server.below];
+  return below.n_run + below.n_wait > 0;
+}
+
 // Cores that shadow jobs add to those that draw on a server's quota.
 template <class S>
 i64 lent(const S&, const Server& server) {
@@ -275,7 +283,7 @@ void leave(S& s, Server& server, const Site& site, i64 now) {
     server.used -= site.need;
   }
   server.next_key = -1;
-  const bool is_pair = is_below(s, server) || has_below(s, server);
+  const bool is_pair = is_below(s, server) || is_shared(s, server);
   if (n > 1 || server.n_wait > 0 || has_quota(s, server) || is_pair) mark(s, server);
   if (server.scheduler == kFair) set_speed(s, server);
 }
@@ -307,7 +315,7 @@ void admit(S& s, i64 key, i64 now) {
   }
   tick(s, server, now);
   start(s, server, site, key, job, left, now);
-  if (is_below(s, server) || has_below(s, server)) {
+  if (is_below(s, server) || is_shared(s, server)) {
     mark(s, server);
     if (is_below(s, server)) return;
   }
