@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from dwell.estimators.paths import l95_rank
 from dwell.kernels.advance import play
-from dwell.kernels.arrays import Arrays, lay_out
+from dwell.kernels.arrays import lay_out
 from dwell.kernels.codes import CycleOutcome
 from dwell.kernels.random_draws import Drawing
 from dwell.kernels.realisation import Realisation
@@ -147,9 +147,11 @@ def prices_of(
         cycles=cycles,
         problem=problem,
     )
-    if question not in _known:
-        take_over({question: _answer(question)})
-    return _known[question]
+    known = _known.get(question)
+    if known is None:
+        known = _answer(question)
+        take_over({question: known})
+    return known
 
 
 def known_prices() -> dict[Question, Mapping[str, Price]]:
@@ -200,17 +202,12 @@ def _most_windows(problem: Problem, cycles: int | None) -> int:
     return max(min(most, longest_run(pipeline.period_ms) // width), 1)
 
 
-def play_alone(problem: Problem, realisation: Realisation, name: str) -> Arrays:
-    """Play a candidate that stays, and return the tables of what it did."""
+def price_of(problem: Problem, realisation: Realisation, name: str) -> Price:
+    """Price a candidate by its windows on one realisation."""
     arrays = lay_out([(problem, realisation)])
     arrays.tables.stamps[:] = list(problem.candidates).index(name)
     play(arrays)
-    return arrays
-
-
-def price_of(problem: Problem, realisation: Realisation, name: str) -> Price:
-    """Price a candidate by its windows on one realisation."""
-    tables = play_alone(problem, realisation, name).tables
+    tables = arrays.tables  # those that had to grow are others
     first = min(SETTLING, realisation.windows - 1)
     seen = tables.seen[0, first:]
     l95_ms, l95_error_ms = mean_and_error(seen["l95_ms"])

@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 
 from dwell.cost import SATURATED
 from dwell.errors import MetricError
-from dwell.estimators.paths import longest_path, steps_of
 from dwell.estimators.prices import SEED, Price, prices_of
 from dwell.model.bounds import require
 from dwell.model.fabric import Link, Node
@@ -159,38 +158,9 @@ class SampleCycles:
         self.problem = problem
         self.samples = samples
         self.seed = seed
-        self._steps = steps_of(problem.pipeline)
         self._rows: dict[str, NDArray[np.int64]] = {}
         self._exec: dict[tuple[str, str], Floats] = {}
         self._message: dict[tuple[Flow, str], Floats] = {}
-
-    def latency_ms(self, placement: Placement) -> Floats:
-        """Latency of every sample cycle; infinite where it is lost; shape (samples,), ms."""
-        pipeline = self.problem.pipeline
-        latency = longest_path(
-            self._steps,
-            [self.executed(task, placement[task]) for task in pipeline.tasks],
-            [self.sent(flow, placement) for flow in pipeline.flows],
-        )
-        # To whole nanoseconds, as everything is timed: 0.1 + 0.2 must not miss a deadline of 0.3.
-        return np.round(latency, 6)
-
-    def own_work(self, placement: Placement) -> dict[str, float]:
-        """Share of each resource that one job of every task placed there takes a period."""
-        pipeline, nodes = self.problem.pipeline, self.problem.fabric.nodes
-        resources = self.problem.fabric.resources
-        work_ms = dict.fromkeys(resources, 0.0)
-        for name, task in pipeline.tasks.items():
-            node = nodes[placement[name]]
-            execution = task.on[node.name]
-            job_ms = mean_ms(pipeline, task, execution)
-            if execution.accelerator is None:
-                job_ms = job_ms * _stretch(execution, node) * min(execution.threads, node.cores)
-            work_ms[execution.resource(node.name)] += job_ms
-        return {
-            name: work / (pipeline.period_ms * resources[name].capacity)
-            for name, work in work_ms.items()
-        }
 
     def executed(self, task_name: str, node_name: str) -> Floats:
         """Execution times of a task on a node that runs nothing else."""
