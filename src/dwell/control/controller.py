@@ -281,7 +281,8 @@ class Controller:
         # With the switching term of the decision that led to it.
         measured = self._pricing.observed(observed, incumbent, self.previous)
         estimates = dict(self.estimator.estimate(observed=observed, incumbent=incumbent, own=own))
-        estimates[incumbent] = observed
+        if self._learner is None:
+            estimates[incumbent] = observed
         before = copy.deepcopy(self.policy) if self.on_fallback else self.policy
         decision = self._checked(self.policy.decide(observed=observed, estimates=estimates))
         self.wanted = None

@@ -36,13 +36,18 @@ class Instants:
     ready_ns: Ints
     end_ns: Ints
     arrived_ns: Ints
+    start_ns: Ints | None = None
+    work_ns: Ints | None = None
 
     def __repr__(self) -> str:
         return f"<Instants of {len(self.end_ns)} cycles>"
 
     def at(self, rows: Rows) -> Instants:
         """Instants of some of the cycles."""
-        return Instants(self.ready_ns[rows], self.end_ns[rows], self.arrived_ns[rows])
+        start_ns = None if self.start_ns is None else self.start_ns[rows]
+        work_ns = None if self.work_ns is None else self.work_ns[rows]
+        known = self.ready_ns[rows], self.end_ns[rows], self.arrived_ns[rows]
+        return Instants(*known, start_ns, work_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +72,7 @@ class Evidence:
     cycles: Instants
     shadow_placement: NDArray[np.integer]
     shadows: Instants | None
+    shadows_share: bool = True
 
     def __repr__(self) -> str:
         shadows = int((self.shadow_placement >= 0).sum())

@@ -1,24 +1,30 @@
-"""Times that a window measured of each part: a task on a node, or a flow on a link."""
+"""What a window showed of each part: a task on a node, or a flow on a link."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import replace
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.estimators.evidence import Evidence
+from dwell.estimators.evidence import UNKNOWN, Evidence, Instants
+from dwell.estimators.slowdown import slowdown
 from dwell.estimators.spans import patience_ns
 from dwell.kernels.meter import CyclesLayout, PartTimes
-from dwell.model.pipeline import Pipeline
+from dwell.model.fabric import Node
+from dwell.model.pipeline import Execution, Pipeline
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 
 Floats: TypeAlias = NDArray[np.float64]
-Rows: TypeAlias = slice | NDArray[np.int64]
+Ints: TypeAlias = NDArray[np.int64]
+Rows: TypeAlias = slice | Ints
 
 EVERY = slice(None)
+#: So many foreign threads are some.
+BESIDE = 0.5
 
 
 class Site(NamedTuple):
@@ -56,10 +62,10 @@ def parts_of(pipeline: Pipeline, placement: Placement) -> Iterator[Part]:
 
 
 class Meter:
-    """Takes windows apart into the times of the parts that their jobs and messages went through."""
+    """Takes windows apart into what they show of the parts that jobs and messages went through."""
 
     def __init__(self, problem: Problem) -> None:
-        self._pipeline = problem.pipeline
+        self._problem, self._pipeline = problem, problem.pipeline
         self._patience_ns = patience_ns(problem)
         names = list(problem.pipeline.tasks)
         self._sources = np.array([names.index(f.source) for f in problem.pipeline.flows], np.int64)
@@ -67,6 +73,9 @@ class Meter:
         every = (parts_of(problem.pipeline, placed) for placed in self._placements)
         self._parts = tuple(dict.fromkeys(part for parts in every for part in parts))
         self._times = PartTimes(len(self._parts))
+        costs = [_cost(problem, part) for part in self._parts]
+        self._cost, self._usual_cost = np.array(costs), np.array(costs)
+        self._demands = PartTimes(len(self._parts), self._cost, self._links())
         self._layouts: dict[int, CyclesLayout] = {}
 
     def times(self, evidence: Evidence) -> dict[Part, Floats]:
@@ -74,17 +83,100 @@ class Meter:
 
         They are overwritten by those of the next window.
         """
-        limit_ns = evidence.close_ns - self._patience_ns
+        return self._take_apart(self._times, evidence)
+
+    def demands(
+        self, evidence: Evidence, foreign: Mapping[str, float] | None = None
+    ) -> dict[Part, Floats]:
+        """Demands of every part that the window has any of, milliseconds, infinite where lost.
+
+        The demand of a job is its work: how long it takes alone on its node; of a message its
+        delay: the time on the way less waiting behind others of the cell, and less their
+        transmission at the rate of the link. They are overwritten by those of the next window.
+
+        Parameters
+        ----------
+        foreign : mapping of str to float, optional
+            Foreign threads beside which jobs ran, by node; 0 for what is not in it. What core time
+            a job received is divided by the node's `interference` where there are some. Where it
+            is not known, it is told from how long the job took beside them.
+        """
+        foreign = foreign or {}
+        self._cost[:] = self._usual_cost
+        for number, part in enumerate(self._parts):
+            if isinstance(part, Site) and foreign.get(part.node, 0.0) >= BESIDE:
+                self._cost[number] /= self._problem.fabric.nodes[part.node].interference
+        placement, through = evidence.placement, evidence.shadow_placement
         cycles, shadows = evidence.cycles, evidence.shadows
-        own = evidence.placement, cycles.ready_ns, cycles.end_ns, cycles.arrived_ns
+        told = replace(
+            evidence,
+            cycles=self.with_work(cycles, placement, foreign),
+            shadows=None if shadows is None else self.with_work(shadows, through, foreign),
+        )
+        return self._take_apart(self._demands, told)
+
+    def _take_apart(self, found: PartTimes, evidence: Evidence) -> dict[Part, Floats]:
+        limit_ns = evidence.close_ns - self._patience_ns
+        own = _columns_of(evidence.placement, evidence.cycles)
         sent = None
-        if shadows is not None:
-            through = evidence.shadow_placement
-            sent = through, shadows.ready_ns, shadows.end_ns, shadows.arrived_ns
-        self._times.begin(own, sent, limit_ns)
+        if evidence.shadows is not None:
+            sent = _columns_of(evidence.shadow_placement, evidence.shadows)
+        found.begin(own, sent, limit_ns)
         for active, _ in groups(evidence.placement):
-            self._times.add(active, self._layout(active))
-        return {self._parts[part]: found for part, found in self._times.by_part().items()}
+            found.add(active, self._layout(active))
+        return {self._parts[part]: values for part, values in found.by_part().items()}
+
+    def with_work(
+        self, instants: Instants, placement: NDArray[np.integer], foreign: Mapping[str, float]
+    ) -> Instants:
+        """Tell the core time of jobs of which it is not known by how long they took.
+
+        Parameters
+        ----------
+        placement : int array, shape (n,)
+            Candidate that each cycle, or shadow, went through; -1 for none.
+        foreign : mapping of str to float
+            As in `demands`.
+        """
+        ended = instants.end_ns >= 0
+        if instants.work_ns is not None and not (ended & (instants.work_ns < 0)).any():
+            return instants
+        begun_ns = instants.ready_ns if instants.start_ns is None else instants.start_ns
+        begun_ns = np.where(begun_ns >= 0, begun_ns, instants.ready_ns)
+        work_ns = np.full_like(instants.end_ns, UNKNOWN)
+        for code, rows in groups(placement):
+            if code >= 0:
+                cores = self._cores_received(self._placements[code], foreign)
+                taken_ns = instants.end_ns[rows] - begun_ns[rows]
+                work_ns[rows] = np.rint(taken_ns * cores)
+        work_ns[~ended | (begun_ns < 0)] = UNKNOWN
+        if instants.work_ns is not None:
+            work_ns = np.where(instants.work_ns >= 0, instants.work_ns, work_ns)
+        return replace(instants, work_ns=work_ns)
+
+    def _cores_received(self, placement: Placement, foreign: Mapping[str, float]) -> Floats:
+        """Cores that the job of each task has in the mean beside foreign threads."""
+        received = []
+        for name, task in self._pipeline.tasks.items():
+            node, execution = self._problem.fabric.nodes[placement[name]], task.on[placement[name]]
+            cores = cores_of(node, execution)
+            if execution.accelerator is None:
+                cores /= slowdown(node, execution.threads, foreign.get(node.name, 0.0))
+            received.append(cores)
+        return np.array(received)
+
+    def sending_ms(self, message: Message) -> float:
+        """Time that the link of a message takes to send it."""
+        return float(self._usual_cost[self._parts.index(message)]) / 1e6
+
+    def _links(self) -> Ints:
+        """Number of each part's link, if it is a message on one that has a rate; else -1."""
+        rated = [link.name for link in self._problem.fabric.links.values() if link.rate_mbps < np.inf]
+        links = [
+            rated.index(part.link) if isinstance(part, Message) and part.link in rated else -1
+            for part in self._parts
+        ]
+        return np.array(links, np.int64)
 
     def _layout(self, active: int) -> CyclesLayout:
         """Return what cycles under a candidate, and their shadows, have for themselves."""
@@ -110,6 +202,28 @@ class Meter:
             for flow in self._pipeline.flows
         ]
         return [-1 if part is None else self._parts.index(part) for part in parts]
+
+
+def _columns_of(
+    placement: NDArray[np.integer], instants: Instants
+) -> tuple[NDArray[np.integer], ...]:
+    work_ns = instants.ready_ns if instants.work_ns is None else instants.work_ns
+    return placement, instants.ready_ns, instants.end_ns, instants.arrived_ns, work_ns
+
+
+def cores_of(node: Node, execution: Execution) -> float:
+    """Cores that a job has while nothing is in its way; of an accelerator one place."""
+    return float(min(execution.threads, node.cores)) if execution.accelerator is None else 1.0
+
+
+def _cost(problem: Problem, part: Part) -> float:
+    """Time of a job alone over its core time; of a message, nanoseconds to send it."""
+    if isinstance(part, Message):
+        bytes_of = {(flow.source, flow.target): flow.payload_bytes for flow in problem.pipeline.flows}
+        rate_mbps = problem.fabric.links[part.link].rate_mbps
+        return float(round(8e3 * bytes_of[part.source, part.target] / rate_mbps))
+    node = problem.fabric.nodes[part.node]
+    return 1.0 / cores_of(node, problem.pipeline.tasks[part.task].on[part.node])
 
 
 def groups(codes: NDArray[np.integer]) -> Iterator[tuple[int, Rows]]:

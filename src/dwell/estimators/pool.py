@@ -1,201 +1,333 @@
-"""Pool: the times of one part of a cycle in its present regime."""
+"""Pool: what is known of one part of a cycle, as declared or as it was measured.
+
+The demands of a part are those that the cell file declares until windows show otherwise. What a
+window brings is compared with what is known by Fisher's method of combining tests: of every value
+its place among the known ones, all places together (R. A. Fisher, Statistical Methods for Research
+Workers, 1925). Values of one window are often alike, as those of a scene that changes slowly are;
+how much alike is measured in the undisturbed cell, and the test knows of it.
+"""
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from typing import TypeAlias
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.kernels.meter import places
+
 Floats: TypeAlias = NDArray[np.float64]
 
-#: Most times that a pool holds, and fewest that it keeps however old they are.
+#: Most values that a pool holds, and fewest that it keeps however old they are.
 LARGEST = 400
 ENOUGH = 12
-#: P(new > old) outside [1 - SHIFT, SHIFT] is another regime, if there are LEAST new times and that
-#: is more than so many standard deviations away from chance.
-SHIFT = 0.85
-LEAST = 2
-LEAST_DEVIATIONS = 2.2
-#: More times than these are looked up faster in order.
-FEW = 24
-
-NOTHING: Floats = np.empty(0)
+#: Deviations from chance that are another regime; that are none, where what is declared is taken
+#: back; and that tell new values from measured ones there.
+SHIFTED, ALIKE, APART = 4.0, 2.0, 2.0
+#: Mean place of a window's values that is another regime; of all that is held, any is.
+MOVED = 0.75
+#: Deviations that are a change within a window, of at least so many values.
+CHANGED, LEAST = 5.0, 16
 
 
-class Pool:
-    """Times of one part: the profile's to begin with, then the newest measured ones.
+class Reference:
+    """Values of a part in the undisturbed cell.
 
     Parameters
     ----------
-    prior : float64 array, shape (n,)
-        The profile's times, in no particular order; infinite where it is lost.
-    additive : bool
-        Whether what disturbs the part adds to its times (a message) or multiplies them (a job).
-    places : float64 array, shape (m,)
-        Quantile of every draw, in [0, 1), by which it is paired with those of other pools.
-    normals : float64 array, shape (m,)
-        Standard normal numbers that widen the draws.
+    blocks : float64 array, shape (n,)
+        In the order of cycles, `block` of them from each stretch; infinite where lost.
+    block : int
+        Cycles of a stretch, whose values may be alike.
 
     Attributes
     ----------
     ordered : float64 array
-        All times, ascending.
+        Ascending.
     usual : float
-        Median of the profile's times that are not lost; infinite where all are.
+        Median of those that are not lost; infinite where all are.
+    likeness : float
+        Mean correlation of two values of a stretch, by their places.
+    """
+
+    __slots__ = ("likeness", "ordered", "usual", "values")
+
+    def __init__(self, values: Floats, block: int) -> None:
+        self.values = values
+        self.ordered = np.sort(values)
+        self.usual = middle(values)
+        self.likeness = _likeness(self.ordered, values, block)
+
+    def __repr__(self) -> str:
+        return f"<Reference of {len(self.values)} values, usually {self.usual:g} ms>"
+
+
+class Pool:
+    """What is known of one part.
+
+    Parameters
+    ----------
+    reference : Reference
+        What it is as declared.
+    additive : bool
+        Whether what disturbs the part adds to its values (a message) or multiplies them (a job).
+
+    Attributes
+    ----------
+    held : float64 array
+        Values that were measured, in the order in which they came; those of the present regime.
+    is_declared : bool
+        Whether it is as declared, whatever is held.
     measured : int
-        How many of the times were measured.
+        How many of `held` were measured; others have the declared shape.
     last : int
         The window that the newest measured one is from; 0 before there is any.
     touched : int
-        The window in which the times last changed; 0 while they are the profile's.
-    drawn : float64 array, shape (m,)
-        The times that cycles are composed of (see `draw`).
+        The window in which it last ceased to be as declared, or got another value since; 0 while it
+        is as declared.
     """
 
     __slots__ = (
         "_chunks",
-        "_held",
-        "_normals",
-        "_places",
-        "_rows",
-        "_rows_of",
-        "_untested",
-        "_widened",
+        "_shift",
         "additive",
-        "drawn",
+        "held",
+        "is_declared",
         "last",
         "measured",
-        "ordered",
-        "prior",
+        "reference",
         "touched",
-        "usual",
     )
 
-    def __init__(self, prior: Floats, additive: bool, places: Floats, normals: Floats) -> None:
-        self.prior, self.additive = prior, additive
-        self.usual = middle(prior)
+    def __init__(self, reference: Reference, additive: bool) -> None:
+        self.reference, self.additive = reference, additive
         self.last = 0
-        self._untested = NOTHING
-        self._places, self._normals = places, normals
-        self._rows, self._rows_of = np.empty(0, np.int64), 0
-        self.drawn, self._widened = NOTHING, math.nan
         self.reset()
 
+    def __repr__(self) -> str:
+        what = "as declared" if self.is_declared else f"{self.measured} values, {self.usual:g} ms"
+        return f"<Pool: {what}>"
+
+    @property
+    def usual(self) -> float:
+        """Median of the values that are not lost; infinite where all are."""
+        return self.reference.usual if self.is_declared else middle(self.held)
+
+    @property
+    def lost(self) -> float:
+        """Share of the values that are lost."""
+        held = self.reference.values if self.is_declared else self.held
+        return float(np.isinf(held).mean()) if len(held) else 0.0
+
+    @property
+    def error_ms(self) -> float:
+        """Standard error of what the values take in the mean."""
+        known = self.held[np.isfinite(self.held)]
+        if len(known) < 2:
+            return 0.0
+        return float(known.std()) / math.sqrt(max(self.measured, 1))
+
     def reset(self) -> None:
-        """Return to the profile's times."""
-        self.replace(self.prior, 0)
+        """Return to what is declared."""
+        self.is_declared = True
+        self._begin(np.empty(0), 0)
+        self.touched = 0
 
-    def replace(self, times: Floats, window: int) -> None:
-        """Begin again with times that nobody measured."""
-        #: The times in the order in which they came, and how many of them each window brought.
-        self._held = times
-        self._chunks = deque([(window, len(times))])
-        self.measured = 0
-        self._change(window)
+    def replace(self, values: Floats, window: int) -> None:
+        """Begin another regime with values that nobody measured."""
+        self.is_declared = False
+        self._begin(values, window)
 
-    def learn(self, times: Floats, window: int, memory: float) -> bool | None:
-        """Take in the times that a window measured.
+    def learn(self, values: Floats, window: int, memory: float) -> bool:
+        """Take in the values that a window measured; returns whether another regime has begun.
 
         Parameters
         ----------
-        times : float64 array, shape (n,)
+        values : float64 array, shape (n,)
             At least one, infinite where it was lost.
         memory : float
-            Windows after which a time is forgotten.
-
-        Returns
-        -------
-        bool or None
-            Whether they are of another regime: then everything older is gone. None where there are
-            too few to tell; they are looked at again with the next.
+            Windows after which a value is forgotten.
         """
         self.last = window
-        # A copy: a column of a window's table must not keep the table alive.
-        times = times[:: -(-len(times) // LARGEST)].copy()
-        tested = np.concatenate((self._untested, times)) if len(self._untested) else times
-        enough = len(tested) >= LEAST
-        self._untested = NOTHING if enough else tested
-        if enough and self._shifted(tested):
-            self._begin(tested, window)
+        # A copy: they are overwritten by the next window's.
+        values = values[:: -(-len(values) // LARGEST)].copy()
+        reference = self.reference
+        if not len(reference.values):
+            # Never came to an end where it is as declared, so that nothing can be told from it.
+            self.is_declared = False
+            self._add(values, Shift.among(values, values), window, memory)
+            return False
+        declared = Shift.among(values, reference.ordered)
+        off = declared.deviations(reference.likeness)
+        if self.is_declared:
+            if off >= SHIFTED and declared.is_large:
+                self._begin_anew(values, window)
+                return True
+            self._add(values, declared, window, memory)
+            self.is_declared = self._off_declared() < SHIFTED
+            return not self.is_declared
+        apart = Shift.among(values, np.sort(self.held))
+        if off < ALIKE and (
+            apart.deviations(reference.likeness) >= APART or self._off_declared() < ALIKE
+        ):
+            self.reset()
             return True
-        self._add(times, window, memory)
-        return False if enough else None
+        is_another = apart.is_large and apart.deviations(reference.likeness) >= SHIFTED
+        if is_another and len(self.held) >= ENOUGH:
+            self._begin_anew(values, window)
+            return True
+        self._add(values, declared, window, memory)
+        return False
 
-    def draw(self, deviation: float) -> None:
-        """Set `drawn`: times of the pool, each multiplied by a lognormal factor.
+    def moved(self, to: float) -> Floats:
+        """The declared values, stretched or shifted so that their median is another."""
+        values, usual = self.reference.values, self.reference.usual
+        if self.additive or usual <= 0:
+            return np.maximum(values + (to - usual), 0.0)
+        return values * (to / usual)
+
+    def _off_declared(self) -> float:
+        """Deviations by which all that is held is not as declared."""
+        together = max(chunk.shift.size for chunk in self._chunks)
+        return self._shift.deviations(self.reference.likeness, together)
+
+    def _begin_anew(self, values: Floats, window: int) -> None:
+        """Begin another regime; where its values are few, with the declared shape."""
+        values = newest(values)
+        new = middle(values)
+        few = len(values) < ENOUGH and max(new, self.reference.usual) < math.inf
+        shape = self.moved(new) if few else np.empty(0)
+        self.replace(shape[:: max(len(shape) // ENOUGH, 1)][:ENOUGH], window)
+        self._add(values, Shift.among(values, self.reference.ordered), window, math.inf)
+
+    def _begin(self, values: Floats, window: int) -> None:
+        self.held = values
+        self._shift = Shift.among(values, self.reference.ordered)
+        self._chunks = deque([_Chunk(window, self._shift)])
+        self.measured, self.touched = 0, window
+
+    def _add(self, values: Floats, shift: Shift, window: int, memory: float) -> None:
+        """Add values, and drop the oldest: what is forgotten, and what is beyond `LARGEST`."""
+        chunks = self._chunks
+        chunks.append(_Chunk(window, shift))
+        total = self._shift + shift
+        while (
+            chunks[0].window <= window - memory and total.size - chunks[0].shift.size >= ENOUGH
+        ) or total.size > LARGEST:
+            total = total - chunks.popleft().shift
+        self._shift = total
+        self.held = np.concatenate((self.held, values))[-total.size :]
+        self.measured = min(self.measured + len(values), total.size)
+        if not self.is_declared:
+            self.touched = window
+
+
+@dataclass(frozen=True, slots=True)
+class Shift:
+    """How values lie among known ones.
+
+    Parameters
+    ----------
+    size : int
+        How many they are.
+    larger, smaller, places : float
+        Sums of -log(1 - p), of -log(p), and of p, their places among the known ones.
+    """
+
+    size: int
+    larger: float
+    smaller: float
+    places: float
+
+    @classmethod
+    def among(cls, values: Floats, known: Floats) -> Shift:
+        """Compare values with known ones, which ascend."""
+        return cls(len(values), *places(known, values))
+
+    def __add__(self, other: Shift) -> Shift:
+        return self._with(other, 1)
+
+    def __sub__(self, other: Shift) -> Shift:
+        return self._with(other, -1)
+
+    def _with(self, other: Shift, sign: int) -> Shift:
+        return Shift(
+            self.size + sign * other.size,
+            self.larger + sign * other.larger,
+            self.smaller + sign * other.smaller,
+            self.places + sign * other.places,
+        )
+
+    @property
+    def is_large(self) -> bool:
+        """Whether most of the values are larger, or smaller, than most known ones."""
+        return not 1 - MOVED <= self.places / self.size <= MOVED
+
+    def deviations(self, likeness: float, together: int | None = None) -> float:
+        """Deviations from chance by which the values are larger, or smaller, than the known ones.
 
         Parameters
         ----------
-        deviation : float
-            Standard deviation of the factor's logarithm; 0 draws the times as they are.
+        likeness : float
+            Mean correlation of two values of a window.
+        together : int, optional
+            How many of them are of one window at most; all where None.
         """
-        if deviation == self._widened:
-            return
-        size = len(self.ordered)
-        if size != self._rows_of:
-            self._rows, self._rows_of = (self._places * size).astype(np.int64), size
-        self.drawn = self.ordered.take(self._rows)
-        if deviation > 0:
-            self.drawn *= np.exp(deviation * self._normals)
-        self._widened = deviation
-
-    def moved(self, to: float) -> Floats:
-        """The profile's times, stretched or shifted so that their median is another."""
-        if self.additive or self.usual <= 0:
-            return np.maximum(self.prior + (to - self.usual), 0.0)
-        return self.prior * (to / self.usual)
-
-    def _shifted(self, times: Floats) -> bool:
-        """Whether times are of another regime than the pool's (Mann-Whitney statistic)."""
-        old, count = self.ordered, len(times)
-        if count > FEW:
-            times = times.copy()
-            times.sort()
-        ranks = old.searchsorted(times, "left")
-        ranks += old.searchsorted(times, "right")
-        exceeds = int(np.add.reduce(ranks)) / (2 * count * len(old))
-        if 1 - SHIFT <= exceeds <= SHIFT:
-            return False
-        deviation: float = ((1 / count + 1 / len(old)) / 12) ** 0.5
-        return abs(exceeds - 0.5) > LEAST_DEVIATIONS * deviation
-
-    def _begin(self, times: Floats, window: int) -> None:
-        """Begin another regime; where its times are few, with the shape of the profile's."""
-        new = middle(times)
-        few = len(times) < ENOUGH and max(new, self.usual) < math.inf
-        shape = np.sort(self.moved(new)) if few else NOTHING
-        self.replace(shape[:: max(len(shape) // ENOUGH, 1)], window)
-        self._add(times, window, math.inf)
-
-    def _add(self, times: Floats, window: int, memory: float) -> None:
-        """Add times, and drop the oldest: what is forgotten, and what is beyond `LARGEST`."""
-        chunks, held = self._chunks, len(self._held)
-        chunks.append((window, len(times)))
-        size = held + len(times)
-        while chunks[0][0] <= window - memory and size - chunks[0][1] >= ENOUGH:
-            size -= chunks.popleft()[1]
-        while size > LARGEST:
-            since, count = chunks.popleft()
-            left = max(count - (size - LARGEST), 0)
-            size -= count - left
-            if left:
-                chunks.appendleft((since, left))
-        # At most `LARGEST` times come at once, so that none of the new ones is dropped.
-        self._held = np.concatenate((self._held[held + len(times) - size :], times))
-        self.measured = min(self.measured + len(times), size)
-        self._change(window)
-
-    def _change(self, window: int) -> None:
-        self.touched = window
-        self.ordered = self._held.copy()
-        self.ordered.sort()
-        self._widened = math.nan  # nothing is drawn from these times yet
+        size = self.size
+        if not size:
+            return 0.0
+        # Of a sum of exponential values, by the cube root of its mean (Wilson and Hilferty).
+        part = 1.0 / (9.0 * size)
+        largest = max(self.larger, self.smaller, 0.0) / size
+        off: float = (largest ** (1.0 / 3.0) - (1.0 - part)) / math.sqrt(part)
+        return off / math.sqrt(1.0 + ((together or size) - 1) * likeness)
 
 
-def middle(times: Floats) -> float:
-    """Median of the times that are not lost; infinite where all are."""
-    finite = times[np.isfinite(times)]
+class _Chunk(NamedTuple):
+    """What a window has brought."""
+
+    window: int
+    shift: Shift
+
+
+def newest(values: Floats) -> Floats:
+    """Return the values since the last change in a window, if there was one.
+
+    The quarters before and after a change differ in their ranks; infinite values are the largest.
+    """
+    count = len(values)
+    if count < LEAST:
+        return values
+    ordered = np.sort(values)
+    ranks = ordered.searchsorted(values, "left") + ordered.searchsorted(values, "right")
+    ends = np.array([count // 4, count // 2, 3 * count // 4])
+    before = np.cumsum(ranks)[ends - 1]
+    gap = before / ends - (ranks.sum() - before) / (count - ends)
+    # Twice the ranks have four times the variance of a uniform distribution over them.
+    off = np.abs(gap) / (count * np.sqrt((1 / ends + 1 / (count - ends)) / 3))
+    at = int(off.argmax())
+    return values[ends[at] :] if off[at] >= CHANGED else values
+
+
+def _likeness(ordered: Floats, values: Floats, block: int) -> float:
+    """Mean correlation of two values of a stretch: by how much their mean place varies more."""
+    stretches = len(values) // block
+    if stretches < 2 or block < 2:
+        return 0.0
+    left, right = ordered.searchsorted(values, "left"), ordered.searchsorted(values, "right")
+    logs = -np.log1p(-(left + right + 1) / (2 * len(ordered) + 2))
+    variance = float(logs.var())
+    if variance == 0.0:
+        return 0.0
+    means = logs[: stretches * block].reshape(stretches, block).mean(axis=1)
+    inflated = float(means.var(ddof=1)) * block / variance
+    return max((inflated - 1.0) / (block - 1), 0.0)
+
+
+def middle(values: Floats) -> float:
+    """Median of the values that are not lost; infinite where all are."""
+    finite = values[np.isfinite(values)]
     return float(np.median(finite)) if len(finite) else math.inf

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TypeAlias
 
 import numpy as np
@@ -70,6 +71,8 @@ class Price:
         Mean latency of the cycles that came to an end; NaN where none did.
     own : mapping of str to float
         Share of each resource that the cell's jobs take: a node, or a kind of accelerator.
+    foreign, foreign_deviation : mapping of str to float
+        Share of each resource that others take, with the standard deviation from window to window.
     cycles : int
         How many cycles were played, those at the begin that do not count included.
     """
@@ -81,6 +84,8 @@ class Price:
     violation_error: float
     latency_ms: float
     own: Mapping[str, float]
+    foreign: Mapping[str, float]
+    foreign_deviation: Mapping[str, float]
     cycles: int
 
     @property
@@ -111,6 +116,23 @@ class Question:
     cycles: int | None
     problem: Problem = field(compare=False, repr=False)
 
+    @classmethod
+    def of(cls, problem: Problem, scenario: str, seed: int, cycles: int | None) -> Question:
+        """Ask for the prices of a problem (see `prices_of`)."""
+        return cls(
+            pipeline=problem.pipeline,
+            fabric=problem.fabric,
+            candidates=problem.candidates,
+            window_cycles=problem.window_cycles,
+            censor_ms=problem.censor_ms,
+            close_grace_ms=problem.controller.close_grace_ms,
+            scenario=problem.scenario(scenario),
+            name=scenario,
+            seed=seed,
+            cycles=cycles,
+            problem=problem,
+        )
+
 
 _known: dict[Question, Mapping[str, Price]] = {}
 
@@ -134,19 +156,7 @@ def prices_of(
     KernelError
         If the compiled kernel cannot be loaded.
     """
-    question = Question(
-        pipeline=problem.pipeline,
-        fabric=problem.fabric,
-        candidates=problem.candidates,
-        window_cycles=problem.window_cycles,
-        censor_ms=problem.censor_ms,
-        close_grace_ms=problem.controller.close_grace_ms,
-        scenario=problem.scenario(scenario),
-        name=scenario,
-        seed=seed,
-        cycles=cycles,
-        problem=problem,
-    )
+    question = Question.of(problem, scenario, seed, cycles)
     known = _known.get(question)
     if known is None:
         known = _answer(question)
@@ -215,7 +225,7 @@ def price_of(problem: Problem, realisation: Realisation, name: str) -> Price:
     violation_rate, violation_error = mean_and_error(rates)
     if l95_error_ms and not violation_error:
         # It is random, and still every window misses as many: none, or all, as a rule.
-        violation_error = _unseen_error(violation_rate, len(seen) * problem.window_cycles)
+        violation_error = unseen_error(violation_rate, len(seen) * problem.window_cycles)
     since = first * problem.window_cycles
     latency_ns, outcome = tables.latency_ns[0, since:], tables.outcome[0, since:]
     done = outcome == CycleOutcome.DONE
@@ -229,8 +239,9 @@ def price_of(problem: Problem, realisation: Realisation, name: str) -> Price:
     open_windows = is_young.reshape(len(seen), -1).any(axis=1)
     if not open_windows.all():
         uncut_ms = uncut_ms[~open_windows]
-    # Shares that are equal but for the rounding of sums are equal.
-    own = tables.shares[0, first:, 1].mean(axis=0).round(12)
+    busy, own = tables.shares[0, first:, 0], tables.shares[0, first:, 1]
+    foreign = np.maximum(busy - own, 0.0)
+    by_resource = partial(_by_resource, problem)
     return Price(
         l95_ms=l95_ms,
         l95_error_ms=l95_error_ms,
@@ -238,9 +249,16 @@ def price_of(problem: Problem, realisation: Realisation, name: str) -> Price:
         violation_rate=violation_rate,
         violation_error=violation_error,
         latency_ms=float(finished_ms.mean()) if len(finished_ms) else math.nan,
-        own=FrozenDict(zip(problem.fabric.resources, own.tolist(), strict=True)),
+        own=by_resource(own.mean(axis=0)),
+        foreign=by_resource(foreign.mean(axis=0)),
+        foreign_deviation=by_resource(foreign.std(axis=0)),
         cycles=realisation.cycles,
     )
+
+
+def _by_resource(problem: Problem, shares: Floats) -> Mapping[str, float]:
+    # Shares that are equal but for the rounding of sums are equal.
+    return FrozenDict(zip(problem.fabric.resources, shares.round(12).tolist(), strict=True))
 
 
 def mean_and_error(by_window: Floats) -> tuple[float, float]:
@@ -258,7 +276,7 @@ def mean_and_error(by_window: Floats) -> tuple[float, float]:
     return mean, float(means.std(ddof=1) / math.sqrt(len(means)))
 
 
-def _unseen_error(rate: float, cycles: int) -> float:
+def unseen_error(rate: float, cycles: int) -> float:
     """Standard error of a rate, had one cycle more been missed and one more not (Laplace)."""
     rate = (rate * cycles + 1) / (cycles + 2)
     return math.sqrt(rate * (1 - rate) / cycles)

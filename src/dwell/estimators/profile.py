@@ -19,7 +19,7 @@ estimates.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -86,13 +86,14 @@ class Profile:
         resources = problem.fabric.resources
         self._resources = tuple(resources)
         self._accelerators = frozenset(name for name, one in resources.items() if one.kind)
-        table = []
+        table, work = [], []
         for name, price in prices.items():
             # Once through the checks: what differs from window to window are shares of resources.
             known = QoS(price.l95_ms, price.violation_rate, {}, price.uncut_l95_ms)
             metrics = known.l95_ms, known.violation_rate, known.cut_from_ms
-            table.append((name, *metrics, tuple(price.own.items())))
-        self._table = tuple(table)
+            table.append((name, *metrics))
+            work.append((name, tuple(price.own.items())))
+        self._table, self._work = tuple(table), tuple(work)
         self.start(problem)
 
     def __repr__(self) -> str:
@@ -108,6 +109,33 @@ class Profile:
         self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
     ) -> dict[str, QoS]:
         """Estimate every candidate's metrics, the incumbent's too (see `Estimator`)."""
+        shares = self.utilisation(observed, incumbent, own, self._work)
+        return {
+            name: unchecked_qos(l95_ms, violation_rate, shares[name], cut_from_ms)
+            for name, l95_ms, violation_rate, cut_from_ms in self._table
+        }
+
+    def utilisation(
+        self,
+        observed: QoS,
+        incumbent: str,
+        own: Mapping[str, float],
+        work: Iterable[tuple[str, Iterable[tuple[str, float]]]],
+    ) -> dict[str, FrozenDict[str, float]]:
+        """Estimate the share of every resource that is busy under each candidate.
+
+        Parameters
+        ----------
+        observed, incumbent, own
+            As in `estimate`.
+        work : iterable of (candidate, iterable of (resource, share))
+            What the cell itself takes under each candidate, shadow jobs included.
+
+        Raises
+        ------
+        MetricError
+            If a node's utilisation is missing.
+        """
         # Conditions and not min() and max(): this runs at the close of every window.
         used = observed.utilisation
         foreign, full = {}, {}
@@ -132,19 +160,18 @@ class Profile:
                 f"{what} has nothing for node {error.args[0]}; it must hold each of "
                 f"{', '.join(one for one in self._resources if one not in self._accelerators)}"
             ) from None
-        estimates = {}
-        for name, l95_ms, violation_rate, cut_from_ms, work in self._table:
+        estimated = {}
+        for name, takes in work:
             utilisation = {}
-            for node, share in work:
+            for node, share in takes:
                 if node in unmeasured:
                     continue
                 busy = foreign[node] + share
                 utilisation[node] = busy if busy < 1.0 else 1.0
             for node, shown in full.items():
                 utilisation[node] = shown.get(name, 1.0)
-            shares = FrozenDict(utilisation)
-            estimates[name] = unchecked_qos(l95_ms, violation_rate, shares, cut_from_ms)
-        return estimates
+            estimated[name] = FrozenDict(utilisation)
+        return estimated
 
 
 def _each(prices: Mapping[str, Price], what: str) -> Mapping[str, Any]:

@@ -43,12 +43,23 @@ DWELL_EXPORT void dwell_logged_instants(const Tables* tables, i64 first, i64 n, 
                                         i64 n_flows, i64* out) noexcept {
   const Simulation<false, false> s(*tables);
   for (i64 cell = 0; cell < s.cells.size; ++cell) {
-    i64 *ready_ns = out, *end_ns = ready_ns + n * s.n_tasks, *arrived_ns = end_ns + n * s.n_tasks;
+    i64 *ready_ns = out, *end_ns = ready_ns + n * s.n_tasks, *start_ns = end_ns + n * s.n_tasks;
+    i64 *work_ns = start_ns + n * s.n_tasks, *arrived_ns = work_ns + n * s.n_tasks;
     for (i64 cycle = first; cycle < first + n; ++cycle) {
       const i64 row = s.log_row(cell, cycle);
-      for (i64 at = row * s.n_tasks; at < (row + 1) * s.n_tasks; ++at) {
+      for (i64 task = 0; task < s.n_tasks; ++task) {
+        const i64 at = row * s.n_tasks + task;
         *ready_ns++ = s.log[at].ready_ns;
-        *end_ns++ = s.log_outcome[at] == kDone ? s.log[at].end_ns : -1;
+        const bool done = s.log_outcome[at] == kDone;
+        *end_ns++ = done ? s.log[at].end_ns : -1;
+        *start_ns++ = s.log[at].start_ns;
+        const i16 stamp = s.stamp(cell, cycle);
+        i64 work = -1;
+        if (done && stamp >= 0) {
+          const Site& site = s.sites[s.site_of[(s.cells[cell].candidate_0 + stamp) * s.n_tasks + task]];
+          work = site.threads * site.exec_ns[cycle];
+        }
+        *work_ns++ = work;
       }
       for (i64 i = 0; i < n_flows; ++i) *arrived_ns++ = s.log_arrived[row * s.n_flows + flows[i]];
     }

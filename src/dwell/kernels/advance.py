@@ -58,7 +58,7 @@ def post_event(arrays: Arrays, at_ns: int, key: int) -> None:
 
 def logged_instants(
     arrays: Arrays, first: int, last: int, flows: Ints
-) -> list[tuple[Ints, Ints, Ints]]:
+) -> list[tuple[Ints, ...]]:
     """Return instants of cycles that the logs still have, nanoseconds; -1 for never.
 
     Parameters
@@ -76,7 +76,7 @@ def logged_instants(
     """
     tables, count = arrays.tables, last - first
     jobs = count * (tables.jobs.size // tables.slots.size)
-    found = np.empty((len(tables.cells), 2 * jobs + count * len(flows)), np.int64)
+    found = np.empty((len(tables.cells), 4 * jobs + count * len(flows)), np.int64)
     _functions()[3](
         *(arrays.address, first, count),
         *(flows.ctypes.data, len(flows), found.ctypes.data),
@@ -85,7 +85,9 @@ def logged_instants(
         (
             of[:jobs].reshape(count, -1),
             of[jobs : 2 * jobs].reshape(count, -1),
-            of[2 * jobs :].reshape(count, len(flows)),
+            of[4 * jobs :].reshape(count, len(flows)),
+            of[2 * jobs : 3 * jobs].reshape(count, -1),
+            of[3 * jobs : 4 * jobs].reshape(count, -1),
         )
         for of in found
     ]

@@ -95,6 +95,18 @@ class Arrays:
             )
         )
 
+    def copy(self) -> Arrays:
+        """Return tables that share what is fixed with these, and have a state of their own."""
+        return Arrays(_with_own_state(self.tables, self.tables), self.resources, self._behind)
+
+    def restart(self, first: Arrays) -> None:
+        """Go back to the state of tables that have not been played."""
+        self._use(_with_own_state(self.tables, first.tables))
+
+    def replace(self, **tables: NDArray[Any]) -> None:
+        """Use other tables in the place of some."""
+        self._use(self.tables._replace(**tables))
+
     def grow_events(self) -> None:
         """Double the room of the queue of events."""
         t = self.tables
@@ -713,6 +725,12 @@ def _counted_ns(node: Node, quota: Quota) -> list[int]:
     """Quota without and with foreign threads, slack, least turn, and what is drawn at a time."""
     budgets = (max(node.wall_ns(ms), 1) for ms in (node.budget_ms, node.stressed_budget_ms))
     return [*budgets, *(node.wall_ns(ms) for ms in (quota.slack_ms, LEAST_MS, DRAWN_MS))]
+
+
+def _with_own_state(tables: Tables, state: Tables) -> Tables:
+    """Return tables with a copy of the state of others."""
+    changing = ("clock", "cells", "sites", *Tables._fields[Tables._fields.index("sites") + 1 :])
+    return tables._replace(**{name: getattr(state, name).copy() for name in changing})
 
 
 def _table(name: str, rows: Sequence[Mapping[str, Any]], room: int) -> Rows:

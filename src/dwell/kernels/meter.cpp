@@ -1,8 +1,11 @@
 // The times of jobs and messages that the instants of a window's cycles show, by part: a task on a
 // node, or a flow on a link.
 
+#include <algorithm>
 #include <limits>
+#include <vector>
 
+#include "elementary.h"
 #include "export.h"
 #include "rows.h"
 
@@ -10,8 +13,9 @@ namespace dwell {
 namespace {
 
 // A row a cycle of a window: the candidate that it went through, when its jobs became ready, when
-// they completed, and when its messages arrived, -1 for what had not come; then, where there are
-// shadows, the same of its shadow, the candidate being -1 where it has none.
+// they completed, when its messages arrived, and the core time of its jobs, -1 for what had not come
+// or is not known; then, where there are shadows, the same of its shadow, the candidate being -1
+// where it has none.
 struct Window {
   const i64* rows;
   i64 n, width;
@@ -28,11 +32,17 @@ struct Layout {
 };
 
 // The times found: up to `most` of each part, and the parts in the order in which they were found.
+//
+// Where demands are asked for, and not times, there is a `cost` of each part: of a job its time alone
+// over its core time, of a message the nanoseconds that its link takes to send it; and a `link` that
+// has a rate, -1 for none.
 struct Found {
   f64* ms;
   i64* count;
   i64* order;
   i64 most, n_parts;
+  const f64* cost;
+  const i64* link;
 };
 
 void add(Found& found, i64 part, f64 ms) {
@@ -41,12 +51,41 @@ void add(Found& found, i64 part, f64 ms) {
 }
 
 // Adds what lies between two instants. What has not come is lost if it began before the limit; if
-// it began later, or never, nothing is known of it.
-void add_span(Found& found, i64 part, i64 begin_ns, i64 end_ns, i64 limit_ns) {
+// it began later, or never, nothing is known of it. Returns whether it has come.
+bool add_span(Found& found, i64 part, i64 begin_ns, i64 end_ns, i64 limit_ns) {
   if (begin_ns >= 0 && end_ns >= 0) {
     add(found, part, static_cast<f64>(end_ns - begin_ns) / 1e6);
-  } else if (begin_ns >= 0 && begin_ns < limit_ns) {
+    return true;
+  }
+  if (begin_ns >= 0 && begin_ns < limit_ns) {
     add(found, part, std::numeric_limits<f64>::infinity());
+  }
+  return false;
+}
+
+// A message on a link with a rate: when it was sent, how long that takes, and its time so far.
+struct Crossing {
+  i64 link, sent_ns;
+  f64 cost_ns;
+  f64* ms;
+
+  bool operator<(const Crossing& other) const {
+    return link != other.link ? link < other.link : sent_ns < other.sent_ns;
+  }
+};
+
+// Takes off the time that messages waited behind others of the cell, and that they were sent for.
+void take_off_waits(std::vector<Crossing>& crossings) {
+  std::stable_sort(crossings.begin(), crossings.end());
+  i64 link = -1;
+  f64 free_ns = 0.0;
+  for (const Crossing& crossing : crossings) {
+    const f64 sent_ns = static_cast<f64>(crossing.sent_ns);
+    if (crossing.link != link) free_ns = sent_ns;
+    link = crossing.link;
+    free_ns = std::max(free_ns, sent_ns) + crossing.cost_ns;
+    // What arrived earlier than that went over a link that is better than is known.
+    *crossing.ms = std::max(*crossing.ms - (free_ns - sent_ns) / 1e6, 0.0);
   }
 }
 
@@ -66,18 +105,19 @@ i64 next_other(const Window& window, i64 shadow, i64 active, i64 after) {
 
 using namespace dwell;
 
-// Adds the times of the cycles under one candidate, part after part, then those of their shadows by
-// candidate.
+// Adds the times, or demands, of the cycles under one candidate, part after part, then those of
+// their shadows by candidate.
 DWELL_EXPORT void dwell_meter(const Layout* layout, const Window* window, i64 active, i64 limit_ns,
                               Found* found) noexcept {
-  const i64 n_tasks = layout->n_tasks, n_flows = layout->n_flows;
-  const i64 shadow = 1 + 2 * n_tasks + n_flows;  // where its columns begin
+  const i64 n_tasks = layout->n_tasks, n_flows = layout->n_flows, n_parts = n_tasks + n_flows;
+  const i64 shadow = 1 + 3 * n_tasks + n_flows;  // where its columns begin
+  std::vector<Crossing> crossings;
   i64 other = -1;
   do {
     const i64 begin = other < 0 ? 0 : shadow;
-    const i64* parts = layout->parts + (other + 1) * (n_tasks + n_flows);
+    const i64* parts = layout->parts + (other + 1) * n_parts;
     const i8* shared = layout->shared + (other + 1) * n_flows;
-    for (i64 column = 0; column < n_tasks + n_flows; ++column) {
+    for (i64 column = 0; column < n_parts; ++column) {
       const i64 part = parts[column], flow = column - n_tasks;
       if (part < 0) continue;
       const i64 source = flow < 0 ? 0 : layout->sources[flow];
@@ -85,14 +125,40 @@ DWELL_EXPORT void dwell_meter(const Layout* layout, const Window* window, i64 ac
         const i64* cycle = window->rows + i * window->width;
         if (cycle[0] != active || (begin > 0 && cycle[begin] != other)) continue;
         const i64 *ready_ns = cycle + begin + 1, *end_ns = ready_ns + n_tasks;
-        if (flow < 0) {
+        const i64 *arrived_ns = end_ns + n_tasks, *work_ns = arrived_ns + n_flows;
+        if (flow < 0 && found->cost == nullptr) {
           add_span(*found, part, ready_ns[column], end_ns[column], limit_ns);
+        } else if (flow < 0) {
+          const bool is_known = end_ns[column] >= 0 && work_ns[column] >= 0;
+          const f64 cost = found->cost[part];
+          if (is_known) add(*found, part, static_cast<f64>(work_ns[column]) * cost / 1e6);
         } else {
-          const i64* sent_ns = shared[flow] ? cycle + 1 + n_tasks : end_ns;
-          add_span(*found, part, sent_ns[source], end_ns[n_tasks + flow], limit_ns);
+          const i64 sent_ns = (shared[flow] ? cycle + 1 + n_tasks : end_ns)[source];
+          const bool has_come = add_span(*found, part, sent_ns, arrived_ns[flow], limit_ns);
+          if (found->cost == nullptr || found->link[part] < 0 || sent_ns < 0) continue;
+          // Of what is lost nobody knows whether it was sent.
+          if (!has_come) continue;
+          f64* ms = found->ms + part * found->most + found->count[part] - 1;
+          crossings.push_back({found->link[part], sent_ns, found->cost[part], ms});
         }
       }
     }
     other = window->width > shadow ? next_other(*window, shadow, active, other) : -1;
   } while (other >= 0);
+  take_off_waits(crossings);
+}
+
+// Adds up where `n` values lie among `n_known` ascending ones, each at a place p between 0 and 1:
+// the sums of -log(1 - p), of -log(p), and of p into `out`.
+DWELL_EXPORT void dwell_places(const f64* known, i64 n_known, const f64* values, i64 n,
+                               f64* out) noexcept {
+  out[0] = out[1] = out[2] = 0.0;
+  for (i64 i = 0; i < n; ++i) {
+    const auto [first, last] = std::equal_range(known, known + n_known, values[i]);
+    const f64 p =
+        static_cast<f64>((first - known) + (last - known) + 1) / static_cast<f64>(2 * n_known + 2);
+    out[0] -= log(1.0 - p);
+    out[1] -= log(p);
+    out[2] += p;
+  }
 }

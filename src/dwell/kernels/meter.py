@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from ctypes import POINTER, c_int64, c_void_p
+from ctypes import POINTER, c_double, c_int64, c_void_p
 from functools import cache
 from typing import Any
 
@@ -40,6 +40,8 @@ class _Found(ctypes.Structure):
         ("order", c_void_p),
         ("most", c_int64),
         ("n_parts", c_int64),
+        ("cost", c_void_p),
+        ("link", c_void_p),
     )
 
 
@@ -70,12 +72,17 @@ class CyclesLayout:
 
 
 class PartTimes:
-    """Times of the parts of a window's cycles, milliseconds, infinite where lost.
+    """Times, or demands, of the parts of a window's cycles, milliseconds, infinite where lost.
 
     Parameters
     ----------
     parts : int
         Number of parts.
+    cost : float64 array, shape (parts,), optional
+        Where demands are asked for: of a job its time alone over its core time, of a message the
+        nanoseconds that its link takes to send it.
+    link : int64 array, shape (parts,), optional
+        Number of the link of a message, if it has a rate; -1 for none.
 
     Raises
     ------
@@ -83,16 +90,19 @@ class PartTimes:
         If the library cannot be loaded: before the first window, and not in it.
     """
 
-    def __init__(self, parts: int) -> None:
+    def __init__(self, parts: int, cost: Floats | None = None, link: Ints | None = None) -> None:
         self._meter = _meter()
+        self._cost, self._link = cost, link
         self._count, self._order = np.zeros((2, parts), np.int64)
         self._window = _Window()
         self._found = _Found(None, self._count.ctypes.data, self._order.ctypes.data)
+        if cost is not None and link is not None:
+            self._found.cost, self._found.link = cost.ctypes.data, link.ctypes.data
         self._ms = np.empty((parts, 0))
 
-    def __reduce__(self) -> tuple[type[PartTimes], tuple[int]]:
+    def __reduce__(self) -> tuple[type[PartTimes], tuple[int, Floats | None, Ints | None]]:
         # As in a copy of `CyclesLayout`; what has been found stays here.
-        return PartTimes, (len(self._count),)
+        return PartTimes, (len(self._count), self._cost, self._link)
 
     def begin(
         self,
@@ -104,10 +114,11 @@ class PartTimes:
 
         Parameters
         ----------
-        cycles, shadows : sequence of four int64 arrays
+        cycles, shadows : sequence of five int64 arrays
             Of the cycles, and of their shadows: the candidate that each went through, shape (n,),
-            -1 for none; when its jobs became ready and when they had completed, (n, tasks); and
-            when its messages arrived, (n, flows). -1 for an instant that had not come.
+            -1 for none; when its jobs became ready and when they had completed, (n, tasks); when
+            its messages arrived, (n, flows); and the core time of its jobs, (n, tasks). -1 for an
+            instant that had not come, and for what is not known.
         limit_ns : int
             A job or message that began before this, and has not ended, counts as lost.
         """
@@ -126,7 +137,7 @@ class PartTimes:
         self._found.n_parts = 0
 
     def add(self, active: int, layout: CyclesLayout) -> None:
-        """Add the times of the cycles under one candidate, and then of their shadows."""
+        """Add what the cycles under one candidate show, and then their shadows."""
         self._meter(layout.row, self._window, active, self._limit_ns, self._found)
 
     def by_part(self) -> dict[int, Floats]:
@@ -134,6 +145,34 @@ class PartTimes:
         counts = self._count.tolist()
         order = self._order[: self._found.n_parts].tolist()
         return {part: self._ms[part, : counts[part]] for part in order}
+
+
+def places(known: Floats, values: Floats) -> tuple[float, float, float]:
+    """Add up where values lie among known ones, each at a place p between 0 and 1.
+
+    Parameters
+    ----------
+    known : float64 array, shape (m,)
+        Ascending.
+    values : float64 array, shape (n,)
+
+    Returns
+    -------
+    tuple of float
+        Sums of -log(1 - p), of -log(p), and of p.
+    """
+    out = (c_double * 3)()
+    _places()(known.ctypes.data, len(known), values.ctypes.data, len(values), out)
+    return out[0], out[1], out[2]
+
+
+@cache
+def _places() -> Any:
+    """Return the function of the library, with the types of its arguments."""
+    function = library().dwell_places
+    function.argtypes = c_void_p, c_int64, c_void_p, c_int64, c_void_p
+    function.restype = None
+    return function
 
 
 @cache

@@ -44,6 +44,7 @@ class QoS:
     violation_rate: float
     utilisation: Mapping[str, float]
     cut_from_ms: float | None = None
+    error: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         l95_ms, cut_from_ms = self.l95_ms, self.cut_from_ms
@@ -73,7 +74,7 @@ class QoS:
         return self.l95_ms if self.cut_from_ms is None else self.cut_from_ms
 
 
-_set_l95_ms, _set_violation_rate, _set_utilisation, _set_cut_from_ms = (
+_set_l95_ms, _set_violation_rate, _set_utilisation, _set_cut_from_ms, _set_error = (
     getattr(QoS, name).__set__ for name in QoS.__match_args__
 )
 
@@ -96,6 +97,7 @@ def unchecked_qos(
     _set_violation_rate(qos, violation_rate)
     _set_utilisation(qos, utilisation)
     _set_cut_from_ms(qos, cut_from_ms)
+    _set_error(qos, None)
     return qos
 
 

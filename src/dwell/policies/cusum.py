@@ -114,7 +114,7 @@ class Cusum(PricingPolicy):
         incumbent, pricing = self._incumbent, self._pricing
         now = incumbent.name
         costs = pricing.estimated(estimates, now)
-        measured = pricing.observed(observed, now, now)
+        measured = pricing.observed(estimates[now], now, now)
         eligible, within_caps = pricing.eligible(estimates)
         for name, value in self._sums.items():
             gain = measured - costs[name] - self.slack

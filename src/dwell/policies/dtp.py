@@ -106,7 +106,8 @@ class DTP(PricingPolicy):
             If a metric, or the estimate of a candidate, is missing. Nothing has changed then.
         """
         incumbent, pricing = self._incumbent, self._pricing
-        measured = pricing.observed(observed, incumbent.name, incumbent.previous)
+        mine = observed if estimates is None else estimates[incumbent.name]
+        measured = pricing.observed(mine, incumbent.name, incumbent.previous)
         costs = self._costs(estimates)
         if self.escape and estimates is not None and excess(observed, self.objective) > 0:
             eligible, within_caps = pricing.eligible({**estimates, incumbent.name: observed})

@@ -1,0 +1,228 @@
+"""Online: what the estimators that watch windows have in common.
+
+They keep a *present*: of every part of a cycle the demands, of every node the foreign threads, and
+which nodes are down; all of it as the cell declares it until there is evidence that it is
+otherwise. A candidate that has nothing of what is otherwise is priced as by the profile. The others
+are played by the kernel (see `Playing`): some windows when the present changes, then another one at
+every close, until the price is as sure as it has to be.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from typing import ClassVar, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.cost import censored
+from dwell.estimators.evidence import Evidence
+from dwell.estimators.foreign_threads import ForeignThreads, Stretches
+from dwell.estimators.measured import Message, Meter, Part, groups, parts_of
+from dwell.estimators.playing import Playing, Present
+from dwell.estimators.prices import L95_SHARE, RATE, SEED
+from dwell.estimators.profile import Profile, mean_ms
+from dwell.estimators.spans import patience_ns
+from dwell.model.frozen import FrozenDict
+from dwell.model.problem import Problem
+from dwell.model.qos import QoS
+
+Floats: TypeAlias = NDArray[np.float64]
+
+
+class Online(ABC):
+    """Base of the estimators that watch windows.
+
+    Attributes
+    ----------
+    shadow_fraction : float
+        Share of the cycles sent through each alternative.
+    seed : int
+        Seed of what is played.
+    regimes : int
+        Changes of regime seen since the start.
+    """
+
+    shadow_fraction = 0.0
+    seed = SEED
+    #: Steps that are played when the present changes, the first of which settles queues.
+    FIRST_STEPS: ClassVar[int] = 4
+
+    def start(self, problem: Problem) -> None:
+        """Forget everything but the profile."""
+        self.problem = problem
+        self.profile = Profile(problem)
+        self.regimes = 0
+        self._meter, self._stretches = Meter(problem), Stretches(problem)
+        self._playing = Playing(problem, self.seed)
+        self._parts = {
+            name: tuple(dict.fromkeys(parts_of(problem.pipeline, placed)))
+            for name, placed in problem.candidates.items()
+        }
+        self._foreign = {
+            name: ForeignThreads(node, self._playing.usual_threads(name))
+            for name, node in problem.fabric.nodes.items()
+        }
+        self._down: frozenset[str] = frozenset()
+        self._patience_ns = patience_ns(problem)
+        self._sent = {name: self._sent_under(name) for name in problem.candidates}
+        #: The window that has been learnt from and not been priced.
+        self._evidence: Evidence | None = None
+        #: Whether the present is another one, or has newer values of the same.
+        self._has_changed = self._has_grown = False
+
+    @abstractmethod
+    def _take_in(self, demands: Mapping[Part, Floats], evidence: Evidence) -> None:
+        """Take in the demands that a window has shown."""
+
+    @abstractmethod
+    def _otherwise(self) -> Mapping[Part, Floats]:
+        """Demands of the parts that are not as declared (see `Present`)."""
+
+    def _known_error(self, name: str, rate: float) -> tuple[float, float]:
+        """Standard errors of a candidate's L95 and V_D by the samples behind its present."""
+        return 0.0, 0.0
+
+    def learn(self, evidence: Evidence) -> None:
+        """Take in what a window showed of each part."""
+        self._evidence = evidence
+        self._take_in(self._meter.demands(evidence, self._threads), evidence)
+
+    @property
+    def _threads(self) -> dict[str, float]:
+        """Foreign threads that each node is thought to have."""
+        return {name: foreign.threads for name, foreign in self._foreign.items()}
+
+    def estimate(
+        self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
+    ) -> dict[str, QoS]:
+        """Estimate every candidate's metrics, the incumbent's too (see `Estimator`)."""
+        evidence, self._evidence = self._evidence, None
+        if evidence is not None:
+            self._look_at_nodes(evidence, observed, own, incumbent)
+            self._play()
+        played = {name: self._playing.played(name) for name in self._names}
+        prices, work = self.profile.prices, []
+        for name, price in prices.items():
+            does = played[name].own if name in played else price.own
+            sent = self._sent[name]
+            work.append((name, [(one, share + sent[one]) for one, share in does.items()]))
+        shares = self.profile.utilisation(observed, incumbent, own, work)
+        estimates = {}
+        for name in self.problem.candidates:
+            price = played.get(name, prices[name])
+            error = None
+            if name in played:
+                l95_error_ms, rate_error = self._known_error(name, price.violation_rate)
+                error = (
+                    math.hypot(price.l95_error_ms, l95_error_ms),
+                    math.hypot(price.violation_error, rate_error),
+                )
+            l95_ms, rate, uncut_ms = price.l95_ms, price.violation_rate, price.uncut_l95_ms
+            estimates[name] = QoS(l95_ms, rate, shares[name], uncut_ms, error)
+        return estimates
+
+    def _look_at_nodes(
+        self, evidence: Evidence, observed: QoS, own: Mapping[str, float], incumbent: str
+    ) -> None:
+        """Take in what a window showed of foreign threads, and of nodes that are down."""
+        price = self.profile.prices[incumbent]
+        for name, foreign in self._foreign.items():
+            used, mine = observed.utilisation[name], own[name]
+            share = max(used - mine, 0.0)
+            deviation = price.foreign_deviation[name]
+            if censored(used, mine):
+                level = self._stretches.level(evidence, name)
+                changed = foreign.see_full(share, deviation, level)
+            else:
+                changed = foreign.see_load(share, price.foreign[name], deviation)
+            if changed:
+                self._has_changed = True
+                self.regimes += 1
+        down = frozenset(self._down_nodes(evidence, own))
+        if down != self._down:
+            self._down, self._has_changed = down, True
+
+    def _down_nodes(self, evidence: Evidence, own: Mapping[str, float]) -> Iterator[str]:
+        """Nodes on which nothing has completed since jobs were lost there."""
+        limit_ns = evidence.close_ns - self._patience_ns
+        cycles, placements = evidence.cycles, tuple(self.problem.candidates.values())
+        lost = (cycles.end_ns < 0) & (cycles.ready_ns >= 0) & (cycles.ready_ns < limit_ns)
+        if not lost.any():
+            return
+        names = list(self.problem.pipeline.tasks)
+        ended_ns: dict[str, int] = {}
+        ready_ns: dict[str, list[int]] = {}
+        for code, rows in groups(evidence.placement):
+            for column, name in enumerate(names):
+                node = placements[code][name]
+                latest = int(cycles.end_ns[rows, column].max())
+                ended_ns[node] = max(ended_ns.get(node, -1), latest)
+                mine = cycles.ready_ns[rows, column][lost[rows, column]]
+                ready_ns.setdefault(node, []).extend(mine.tolist())
+        span_ns = evidence.close_ns - int(evidence.release_ns[0])
+        for node, ready in ready_ns.items():
+            after = [at_ns for at_ns in ready if at_ns > ended_ns[node]]
+            # Where a job is still at work, the node is not down.
+            idle_ns = evidence.close_ns - max(ended_ns[node], min(after, default=0))
+            capacity = self.problem.fabric.nodes[node].capacity
+            works = own[node] * capacity * span_ns >= 0.5 * idle_ns
+            if len(after) >= 2 and not works:
+                yield node
+
+    @property
+    def _names(self) -> list[str]:
+        """Candidates that have anything that is not as declared."""
+        otherwise = self._otherwise()
+        nodes = {name for name, foreign in self._foreign.items() if foreign.beyond} | self._down
+        if not otherwise and not nodes:
+            return []
+        links = {part.link for part in otherwise if isinstance(part, Message)}
+        return [
+            name
+            for name, parts in self._parts.items()
+            if any(
+                part in otherwise
+                or (part.link in links if isinstance(part, Message) else part.node in nodes)
+                for part in parts
+            )
+        ]
+
+    def _play(self) -> None:
+        """Play the candidates that are not as declared on, or anew where the present has changed."""
+        names = self._names
+        if names:
+            threads = {name: one.beyond for name, one in self._foreign.items() if one.beyond}
+            present = Present(FrozenDict(self._otherwise()), FrozenDict(threads), self._down)
+            if self._has_changed:
+                self._playing.begin(present)
+                self._playing.go_on(present, names, self.FIRST_STEPS)
+            elif self._has_grown or not all(map(self._is_sure, names)):
+                self._playing.go_on(present, names)
+        self._has_changed = self._has_grown = False
+
+    def _is_sure(self, name: str) -> bool:
+        played = self._playing.played(name)
+        if self._playing.is_full(name):
+            return True
+        sure_ms = L95_SHARE * played.l95_ms
+        return played.l95_error_ms <= sure_ms and played.violation_error <= RATE
+
+    def _sent_under(self, name: str) -> Mapping[str, float]:
+        """Share of each resource that shadow jobs take while the cell is on a candidate."""
+        problem, here = self.problem, self.problem.candidates[name]
+        pipeline, resources = problem.pipeline, problem.fabric.resources
+        share = dict.fromkeys(resources, 0.0)
+        for there in problem.candidates.values():
+            for task in pipeline.diverging(here, there):
+                if there is here or not pipeline.outputs(task):
+                    continue
+                execution = pipeline.tasks[task].on[there[task]]
+                resource = execution.resource(there[task])
+                threads = execution.threads if execution.accelerator is None else 1
+                busy_ms = mean_ms(pipeline, pipeline.tasks[task], execution) * threads
+                capacity = resources[resource].capacity
+                share[resource] += self.shadow_fraction * busy_ms / pipeline.period_ms / capacity
+        return FrozenDict(share)

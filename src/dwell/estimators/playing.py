@@ -1,0 +1,468 @@
+"""Playing: what candidates come to under a present, by the kernel.
+
+A *present* is the undisturbed cell but for what windows have shown to be otherwise: demands of some
+parts, foreign threads of some nodes, nodes that are down. The kernel plays the candidates that have
+anything of it window after window, on common draws, each from where it was left; what has been
+played under a present adds up until another one begins.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from operator import sub
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.estimators.evidence import Evidence, Instants
+from dwell.estimators.measured import Message, Meter, Part, Site, parts_of
+from dwell.estimators.pool import Reference
+from dwell.estimators.prices import SEED, Question, prices_of, unseen_error
+from dwell.kernels.advance import logged_instants, play
+from dwell.kernels.arrays import Arrays, lay_out, ordered_flows
+from dwell.kernels.random_draws import Drawing
+from dwell.kernels.realisation import NodeChange, NodeChanges, Realisation
+from dwell.kernels.rows import Rows
+from dwell.model.frozen import FrozenDict
+from dwell.model.problem import Problem
+
+Floats: TypeAlias = NDArray[np.float64]
+Ints: TypeAlias = NDArray[np.int64]
+
+#: Longer windows are played as windows of so many cycles, and shorter ones some at a time.
+LONGEST_WINDOW, STEP = 1000, 100
+#: How many cycles are drawn before they are played again, and the fewest windows of them.
+DRAWN, FEWEST = 2400, 4
+#: Steps that a candidate's price is of at most.
+KEPT = 30
+#: Cycles after those of a step that may have been released when it ends.
+BEYOND = 64
+#: Of a fraction of a thread, what is neither none nor a whole one.
+FRACTION = 0.15
+#: Most foreign threads that a node may have beyond those that are declared.
+MOST_THREADS = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Present:
+    """What is not as the cell declares it.
+
+    Parameters
+    ----------
+    demands : mapping of Part to float64 array
+        Values of a part in the order in which they are to be met, milliseconds, infinite where a
+        message is lost; those of a job are times alone on its node, those of a message delays.
+    threads : mapping of str to float
+        Foreign threads of a node beyond those of its bursts; negative: those of its bursts in the
+        mean, and so many less, all the time.
+    down : frozenset of str
+        Nodes that are down.
+    """
+
+    demands: Mapping[Part, Floats] = field(default_factory=FrozenDict)
+    threads: Mapping[str, float] = field(default_factory=FrozenDict)
+    down: frozenset[str] = frozenset()
+
+    def __repr__(self) -> str:
+        what = [*map(str, self.demands), *self.threads, *(f"{name} down" for name in self.down)]
+        return f"<Present: {', '.join(what) or 'as declared'}>"
+
+
+class Played(NamedTuple):
+    """What a candidate came to, in the mean over windows, with standard errors; see `Price`."""
+
+    l95_ms: float
+    l95_error_ms: float
+    uncut_l95_ms: float
+    violation_rate: float
+    violation_error: float
+    own: Mapping[str, float]
+
+
+class _Step(NamedTuple):
+    """What a step has shown in the mean, and what the same windows show as declared."""
+
+    l95_ms: float
+    declared_ms: float
+    uncut_ms: float
+    violation_rate: float
+    declared_rate: float
+    own: Floats
+
+
+class _Twin:
+    """A candidate that is played beside the cell, and the steps that it has shown."""
+
+    def __init__(self, first: Arrays, index: int) -> None:
+        self.arrays = first.copy()
+        self.arrays.replace(stamps=np.full_like(first.tables.stamps, index))
+        self.steps: deque[_Step] = deque(maxlen=KEPT)
+        self.price: Played | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Declared:
+    """The undisturbed cell, as `Playing` plays it.
+
+    Parameters
+    ----------
+    realisation : Realisation
+        What is drawn of it.
+    references : mapping of Part to Reference
+        The demands of every part, as windows would show them.
+    l95_ms, violation_rate : mapping of str to float64 array, shape (windows,)
+        What every window shows under each candidate.
+    """
+
+    realisation: Realisation
+    references: Mapping[Part, Reference]
+    l95_ms: Mapping[str, Floats]
+    violation_rate: Mapping[str, Floats]
+
+    def __repr__(self) -> str:
+        return f"<Declared: {self.realisation!r}, {len(self.references)} parts>"
+
+
+class Playing:
+    """Plays the candidates of a problem.
+
+    Parameters
+    ----------
+    seed : int
+        Seed of what is as declared.
+
+    Attributes
+    ----------
+    cycles : int
+        Cycles that have been played of all candidates since the start.
+    """
+
+    def __init__(self, problem: Problem, seed: int = SEED) -> None:
+        self.problem, self._seed = problem, seed
+        self.declared = declared_of(problem, seed)
+        self._prices = prices_of(problem)
+        self._window = min(problem.window_cycles, LONGEST_WINDOW)
+        self._names = tuple(problem.candidates)
+        self._step = max(STEP // self._window, 1)
+        self.cycles = 0
+        self._twins: dict[str, _Twin] = {}
+
+    def __reduce__(self) -> tuple[type[Playing], tuple[Problem, int]]:
+        # The kernel's tables have addresses; a copy begins anew.
+        return Playing, (self.problem, self._seed)
+
+    def begin(self, present: Present) -> None:
+        """Begin another present: what was played before does not count any more."""
+        if not self._twins:
+            self._lay_out()
+        self.present = present
+        self._cursor = self._offset = 0
+        self._restore()
+        tables = self._first.tables
+        changes = self._changes(present)
+        self._first.replace(changes=changes)
+        self._fill_links(present)
+        del tables
+        for twin in self._twins.values():
+            twin.steps.clear()
+            twin.arrays.replace(changes=changes)
+            twin.arrays.restart(self._first)
+        self._fill(0)
+
+    def go_on(self, present: Present, names: Collection[str], steps: int = 1) -> None:
+        """Play some candidates on; the present has the same parts, maybe with newer values."""
+        self.present = present
+        self._fill(self._cursor)
+        for _ in range(steps):
+            if self._cursor + self._step * self._window > self._real.cycles:
+                for twin in self._twins.values():
+                    twin.arrays.restart(self._first)
+                self._cursor = 0
+                self._offset += self._real.cycles
+                self._fill(0)
+            for name in names:
+                self._play(self._twins[name], name)
+            self._cursor += self._step * self._window
+
+    def _play(self, twin: _Twin, name: str) -> None:
+        first = self._cursor // self._window
+        last = first + self._step
+        for _ in range(self._step):
+            play(twin.arrays)
+        first = max(first, 1)  # in the first window queues have not settled
+        if first < last:
+            tables, stretch = twin.arrays.tables, slice(first, last)
+            seen = tables.seen[0, stretch]
+            twin.steps.append(
+                _Step(
+                    float(seen["l95_ms"].mean()),
+                    float(self.declared.l95_ms[name][stretch].mean()),
+                    float(seen["uncut_ms"].mean()),
+                    float(seen["missed"].mean()) / self._window,
+                    float(self.declared.violation_rate[name][stretch].mean()),
+                    tables.shares[0, stretch, 1].mean(axis=0),
+                )
+            )
+        twin.price = None
+        self.cycles += self._step * self._window
+
+    def played(self, name: str) -> Played:
+        """What a candidate has come to under the present."""
+        twin = self._twins[name]
+        if twin.price is None:
+            twin.price = self._price(name, twin.steps)
+        return twin.price
+
+    def _price(self, name: str, steps: Collection[_Step]) -> Played:
+        l95, declared_l95, uncut, rates, declared_rates, own = zip(*steps, strict=True)
+        known = self._prices[name]
+        l95_ms, l95_error_ms = _estimated(
+            l95, declared_l95, known.l95_ms, known.l95_error_ms, least=0.0
+        )
+        # Had one cycle more been missed and one more not (Laplace).
+        count = len(steps)
+        least = unseen_error(sum(rates) / count, count * self._step * self._window)
+        violation_rate, violation_error = _estimated(
+            rates, declared_rates, known.violation_rate, known.violation_error, least=least
+        )
+        l95_ms, shares = min(l95_ms, self.problem.censor_ms), sum(own) / count
+        return Played(
+            l95_ms,
+            l95_error_ms,
+            max(sum(uncut) / count, l95_ms),
+            min(violation_rate, 1.0),
+            violation_error,
+            FrozenDict(zip(self.problem.fabric.resources, shares.tolist(), strict=True)),
+        )
+
+    def is_full(self, name: str) -> bool:
+        """Whether the price of a candidate is of as many windows as it ever is."""
+        steps = self._twins[name].steps
+        return len(steps) == steps.maxlen
+
+    def usual_threads(self, name: str) -> float:
+        """Foreign threads of a node as declared, in the mean."""
+        bursts = self.problem.fabric.nodes[name].bursts
+        if bursts is None:
+            return 0.0
+        on, off = bursts.for_ms.expectation, bursts.every_ms.expectation
+        return bursts.threads * on / (on + off)
+
+    def _lay_out(self) -> None:
+        problem = _with_short_windows(self.problem)
+        declared = self.declared.realisation
+        # Every node has a change to begin with, so that any may be otherwise from then on.
+        begins = [NodeChange(0, name, 0, False) for name in problem.fabric.nodes]
+        changes = NodeChanges.of([*begins, *declared.node_changes])
+        self._real = replace(
+            declared,
+            exec_ns=declared.exec_ns.copy(),
+            delay_ns=declared.delay_ns.copy(),
+            node_changes=changes,
+        )
+        self._first = lay_out([(problem, self._real)])
+        tables = self._first.tables
+        tables.clock[0]["pauses"] = 1
+        self._declared_changes = tables.changes
+        self._declared_rates, self._declared_segments = tables.rates.copy(), tables.segments.copy()
+        self._declared_layers = tables.layers.copy()
+        self._nothing_ns = np.zeros(self._real.cycles, np.int64)
+        self._rows: dict[Part, Ints] = {
+            Site(*site): row for site, row in zip(self._real.sites, self._real.exec_ns, strict=True)
+        }
+        self._hops = {Message(*hop): number for number, hop in enumerate(self._real.hops)}
+        for message, number in self._hops.items():
+            self._rows[message] = self._real.delay_ns[number]
+        self._twins = {name: _Twin(self._first, i) for i, name in enumerate(self._names)}
+
+    def _restore(self) -> None:
+        """Go back to what is declared."""
+        np.copyto(self._real.exec_ns, self.declared.realisation.exec_ns)
+        np.copyto(self._real.delay_ns, self.declared.realisation.delay_ns)
+        tables = self._first.tables
+        tables.rates[:], tables.segments[:] = self._declared_rates, self._declared_segments
+        tables.layers[:] = self._declared_layers
+
+    def _fill(self, since: int) -> None:
+        """Let the cycles from one on meet the present's demands."""
+        begin = since + BEYOND if since else 0
+        places = np.arange(begin, self._real.cycles) + self._offset
+        for part, values in self.present.demands.items():
+            row = self._rows.get(part)
+            known = values[np.isfinite(values)]
+            if row is not None and len(known):
+                row[begin:] = np.rint(known * 1e6).astype(np.int64)[places % len(known)]
+
+    def _fill_links(self, present: Present) -> None:
+        """Set what links lose, and that measured delays are all that there is."""
+        tables, links = self._first.tables, self.problem.fabric.links
+        lost: dict[str, float] = {}
+        for part, values in present.demands.items():
+            if not isinstance(part, Message):
+                continue
+            share = float(np.isinf(values).mean()) if len(values) else 0.0
+            lost[part.link] = max(lost.get(part.link, 0.0), share)
+            if part in self._hops:
+                layers = tables.layers[self._hops[part]]
+                layers[layers != 0] = self._nothing_ns.ctypes.data
+        for link, share in lost.items():
+            row = tables.links[list(links).index(link)]
+            mine = slice(row["segment"], row["segment_end"])
+            if links[link].retransmit_ms is None:
+                tables.rates["loss"][mine] = share
+            else:
+                # Attempts that were lost are in the delays, and what never came was held back.
+                tables.rates["loss"][mine] = 0.0
+                tables.segments["is_down"][mine] = share >= 0.5
+
+    def _changes(self, present: Present) -> Rows:
+        """Return the changes of nodes with the present's foreign threads."""
+        rows = self._declared_changes
+        if not present.threads and not present.down:
+            return rows
+        names = list(self.problem.fabric.nodes)
+        others = [names.index(name) for name in {*present.threads, *present.down}]
+        pieces = [rows[~np.isin(rows["node"], others)]]
+        for number in others:
+            name = names[number]
+            mine = rows[rows["node"] == number]
+            pieces.append(self._with_threads(mine, present.threads.get(name, 0.0)))
+            if name in present.down:
+                pieces[-1]["is_down"] = 1
+        changes = np.concatenate(pieces)
+        return np.ascontiguousarray(changes[np.argsort(changes["at_ns"], kind="stable")])
+
+    def _with_threads(self, rows: Rows, threads: float) -> Rows:
+        """Return a node's changes with more threads, or fewer, a fraction as a share of periods."""
+        at_ns, stress = rows["at_ns"], rows["stress"]
+        if threads < 0.0:
+            spans = np.diff(np.append(at_ns, max(int(self._real.release_ns[-1]), int(at_ns[-1]))))
+            usual = float((stress * spans).sum()) / max(float(spans.sum()), 1.0)
+            rows, threads = rows[:1].copy(), max(usual + threads, 0.0)
+            at_ns, stress = rows["at_ns"], rows["stress"]
+        whole = math.floor(min(threads, MOST_THREADS))
+        rest = min(threads, MOST_THREADS) - whole
+        if rest > 1 - FRACTION:
+            whole, rest = whole + 1, 0.0
+        if rest < FRACTION:
+            changed = rows.copy()
+            changed["stress"] += whole
+            return changed
+        release_ns = self._real.release_ns[:-1]
+        all_ns = np.unique(np.concatenate((at_ns, release_ns[release_ns > at_ns[0]])))
+        cycle = np.searchsorted(release_ns, all_ns, side="right")
+        more = np.floor((cycle + 1) * rest) - np.floor(cycle * rest)
+        changed = np.zeros(len(all_ns), rows.dtype)
+        changed["at_ns"], changed["node"] = all_ns, rows["node"][0]
+        last = np.searchsorted(at_ns, all_ns, side="right") - 1
+        changed["stress"] = stress[last] + whole + more.astype(np.int64)
+        changed["is_down"] = rows["is_down"][last]
+        return changed
+
+
+def _estimated(
+    steps: Sequence[float],
+    declared: Sequence[float],
+    known: float,
+    known_error: float,
+    *,
+    least: float,
+) -> tuple[float, float]:
+    """Mean of what steps show, with its standard error.
+
+    They are on the draws of others as declared, whose mean is known: where the difference between
+    the two varies less than what is shown, it is the difference that is averaged (a control
+    variate; DOI 10.1287/opre.30.5.961).
+
+    Parameters
+    ----------
+    declared : sequence of float
+        What the same steps show as declared.
+    known, known_error : float
+        Mean as declared, with its standard error.
+    least : float
+        Standard error of the steps' own mean at least.
+    """
+    mean, error = _mean_and_error(steps)
+    more, more_error = _mean_and_error(list(map(sub, steps, declared)))
+    error, more_error = max(error, least), math.hypot(more_error, known_error)
+    return (max(known + more, 0.0), more_error) if more_error < error else (mean, error)
+
+
+def _mean_and_error(values: Sequence[float]) -> tuple[float, float]:
+    # Of few numbers; an array would take longer.
+    count = len(values)
+    mean = sum(values) / count
+    if count < 2:
+        return mean, abs(mean)
+    squares = sum((value - mean) ** 2 for value in values)
+    return mean, math.sqrt(squares / (count * (count - 1)))
+
+
+def _with_short_windows(problem: Problem) -> Problem:
+    if problem.window_cycles <= LONGEST_WINDOW:
+        return problem
+    return replace(problem, window_cycles=LONGEST_WINDOW)
+
+
+def declared_of(problem: Problem, seed: int = SEED) -> Declared:
+    """Return the undisturbed cell; what was asked before is not played again."""
+    question = Question.of(problem, "baseline", seed, DRAWN)
+    known = _known.pop(question, None) or _played_as_declared(_with_short_windows(problem), seed)
+    _known[question] = known
+    while len(_known) > REMEMBERED:
+        del _known[next(iter(_known))]
+    return known
+
+
+_known: dict[Question, Declared] = {}
+#: How many undisturbed cells are remembered.
+REMEMBERED = 64
+
+
+def _played_as_declared(problem: Problem, seed: int) -> Declared:
+    windows = max(-(-DRAWN // problem.window_cycles), FEWEST)
+    drawing = Drawing(problem, "baseline", seed=seed, windows=windows, wraps=True)
+    real = drawing.take(windows)
+    meter, block = Meter(problem), min(problem.window_cycles, STEP)
+    logged, plain = (lay_out([(problem, real)], log_jobs=keeps) for keeps in (True, False))
+    references: dict[Part, Reference] = {}
+    shown = {}
+    for index, (name, placement) in enumerate(problem.candidates.items()):
+        missing = set(parts_of(problem.pipeline, placement)) - set(references)
+        arrays = (logged if missing else plain).copy()
+        arrays.replace(stamps=np.full_like(arrays.tables.stamps, index))
+        play(arrays)
+        shown[name] = arrays.tables.seen[0]
+        if missing:
+            demands = meter.demands(_evidence_of(problem, real, arrays, index))
+            for part in missing:
+                values = np.round(demands.get(part, np.empty(0)), 6)
+                references[part] = Reference(values, block)
+    return Declared(
+        real,
+        FrozenDict(references),
+        FrozenDict({name: seen["l95_ms"].copy() for name, seen in shown.items()}),
+        FrozenDict(
+            {name: seen["missed"] / problem.window_cycles for name, seen in shown.items()}
+        ),
+    )
+
+
+def _evidence_of(problem: Problem, real: Realisation, arrays: Arrays, index: int) -> Evidence:
+    """What all cycles show that have run under a candidate."""
+    order = ordered_flows(problem.pipeline)
+    flows = np.array([order.index(flow) for flow in problem.pipeline.flows], np.int64)
+    (instants,) = logged_instants(arrays, 0, real.cycles, flows)
+    return Evidence(
+        close_ns=int(real.release_ns[-1]),
+        release_ns=real.release_ns[:-1],
+        placement=np.full(real.cycles, index),
+        cycles=Instants(*instants),
+        shadow_placement=np.full(real.cycles, -1),
+        shadows=None,
+    )
