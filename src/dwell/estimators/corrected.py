@@ -88,7 +88,7 @@ def _like(pool: Pool, witness: Pool) -> Floats:
     values, usual = pool.reference.values, witness.reference.usual
     now = witness.usual
     if not pool.additive:
-        return values * (now / usual) if 0 < usual and now < np.inf else values
+        return values * (now / usual) if usual > 0 and now < np.inf else values
     if now < np.inf:
         values = values + max(now - usual, 0.0)
     lost = witness.lost - float(np.isinf(values).mean())

@@ -7,6 +7,7 @@ there the cell's own jobs tell, by how much longer they took than the core time 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -14,25 +15,36 @@ from numpy.typing import NDArray
 
 from dwell.estimators.evidence import Evidence, Instants
 from dwell.estimators.measured import groups
+from dwell.estimators.pool import newest
 from dwell.model.fabric import Node
 from dwell.model.problem import Problem
 
 Floats: TypeAlias = NDArray[np.float64]
+Ints: TypeAlias = NDArray[np.int64]
 
 #: Foreign load is other than declared where it is so many deviations of a window off, and a share
 #: of the cores beyond that.
 DEVIATIONS, LEAST_SHARE = 4.0, 0.05
 #: So many jobs tell how many threads they ran beside.
 JOBS = 3
+#: So much longer than alone jobs take that are slowed, and such a share of them are most.
+SLOWED, MOST = 1.02, 0.9
 #: Windows over which a level is averaged.
-WINDOWS = 6
+WINDOWS = 3
 
 
 class Level(NamedTuple):
-    """Foreign threads beside which jobs ran, with the standard error."""
+    """Foreign threads beside which jobs ran beyond those of bursts, with the standard error.
+
+    Parameters
+    ----------
+    is_slowed : bool
+        Whether they took something of what most jobs wanted; if not, there may be fewer.
+    """
 
     threads: float
     error: float
+    is_slowed: bool
 
 
 class _Jobs(NamedTuple):
@@ -40,6 +52,7 @@ class _Jobs(NamedTuple):
     end_ns: Floats
     alone_ns: Floats
     cores: Floats
+    task: Floats
 
     @property
     def taken_ns(self) -> Floats:
@@ -49,25 +62,18 @@ class _Jobs(NamedTuple):
 class ForeignThreads:
     """Foreign threads of one node beyond those that are declared.
 
-    Parameters
-    ----------
-    usual_threads : float
-        Those of its bursts, in the mean.
-
     Attributes
     ----------
     beyond : float
         How many more there are; negative where there are fewer.
-    is_least : bool
-        Whether there are at least so many, and maybe more.
     """
 
-    def __init__(self, node: Node, usual_threads: float) -> None:
-        self.node, self.usual_threads = node, usual_threads
-        self.beyond, self.is_least = 0.0, False
+    def __init__(self, node: Node) -> None:
+        self.node = node
+        #: Those of its bursts, in the mean.
+        self.usual = share_of_bursts(node) * node.bursts.threads if node.bursts else 0.0
+        self.beyond = 0.0
         self._mean, self._windows = 0.0, 0
-        #: Threads of the bursts for each share of the node that they take.
-        self._threads_each = max(node.capacity, node.bursts.threads if node.bursts else 0.0)
 
     def __repr__(self) -> str:
         return f"<ForeignThreads of {self.node.name}: {self.beyond:+.2g} beyond the declared>"
@@ -75,52 +81,65 @@ class ForeignThreads:
     @property
     def threads(self) -> float:
         """All of them, in the mean."""
-        return max(self.usual_threads + self.beyond, 0.0)
+        return max(self.usual + self.beyond, 0.0)
 
-    def see_load(self, share: float, usual: float, deviation: float) -> bool:
-        """Take in the foreign share of a node that is not full; returns whether that is a change.
+    def see(
+        self,
+        share: float,
+        usual: float,
+        deviation: float,
+        level: Callable[[], Level | None],
+        *,
+        is_full: bool,
+    ) -> bool:
+        """Take in what a window showed; returns whether that is a change.
 
         Parameters
         ----------
+        share : float
+            Of the node, that others took.
         usual, deviation : float
             Mean and standard deviation of a window's share as declared.
+        level : callable
+            Says what the cell's jobs tell, if anything; asked where the share does not tell all.
+        is_full : bool
+            Whether nothing of the node was left, so that there may be more than the share says.
         """
+        capacity = self.node.capacity
         noise = DEVIATIONS * deviation + LEAST_SHARE
-        off = share - usual
-        beyond = 0.0 if abs(off) <= noise else off * self.node.capacity
-        return self._see(beyond, noise * self.node.capacity)
-
-    def see_full(self, share: float, deviation: float, level: Level | None) -> bool:
-        """Take in that the node is full, and others have a part of it; as `see_load`.
-
-        Parameters
-        ----------
-        level : Level, optional
-            What the cell's jobs say.
-        """
-        if level is not None:
-            error = math.hypot(level.error, deviation * self._threads_each)
-            noise = DEVIATIONS * error + LEAST_SHARE * (self.node.capacity + level.threads)
-            return self._see(level.threads - self.usual_threads, noise)
-        least = share * self.node.capacity
-        if self.threads + LEAST_SHARE * self.node.capacity >= least and self.beyond > 0.0:
+        beyond = (share - usual) * capacity
+        if abs(beyond) <= noise * capacity and not is_full:
+            return self._see(0.0, noise * capacity)
+        told = level()
+        if told is not None and (is_full or told.is_slowed):
+            noise = DEVIATIONS * told.error + LEAST_SHARE * (capacity + told.threads)
+            return self._see(told.threads, noise)
+        if not is_full:
+            return self._see(beyond, noise * capacity)
+        least = share * capacity
+        if self.threads + LEAST_SHARE * capacity >= least and self.beyond > 0.0:
             return False  # what was known before says more
         # A thread for each core is the fewest that fill it.
-        changed = self._see(max(self.node.capacity - self.usual_threads, 0.0), least)
-        self.is_least = True
-        return changed
+        return self._see(max(capacity - self.usual, 0.0), least)
 
     def _see(self, seen: float, noise: float) -> bool:
-        self.is_least = False
         is_jump = abs(seen - self._mean) > noise or (seen == 0.0) != (self._mean == 0.0)
         self._windows = 1 if is_jump else min(self._windows + 1, WINDOWS)
         self._mean += (seen - self._mean) / self._windows
         # What drifts is taken over in steps.
-        step = LEAST_SHARE * (self.node.capacity + abs(self._mean))
+        step = LEAST_SHARE / 2 * (self.node.capacity + abs(self._mean))
         if not is_jump and abs(self._mean - self.beyond) <= step:
             return False
         self.beyond = self._mean
         return True
+
+
+def share_of_bursts(node: Node) -> float:
+    """Share of the time in which a node has the bursts that are declared."""
+    if node.bursts is None:
+        return 0.0
+    on_ms, off_ms = node.bursts.for_ms.expectation, node.bursts.every_ms.expectation
+    return on_ms / (on_ms + off_ms)
 
 
 class Stretches:
@@ -139,19 +158,18 @@ class Stretches:
         with foreign threads as equals.
         """
         node = self._problem.fabric.nodes[name]
+        bursts = share_of_bursts(node)
         own = self._jobs(evidence.cycles, evidence.placement, name)
         if own is not None and len(own.cores) >= JOBS:
-            return _level(node, own, None)
+            return _level(node, bursts, own, None)
         if evidence.shadows is None or not evidence.shadows_share:
             return None
         shadows = self._jobs(evidence.shadows, evidence.shadow_placement, name)
         if shadows is None or len(shadows.cores) < JOBS:
             return None
-        return _level(node, shadows, own)
+        return _level(node, bursts, shadows, own)
 
-    def _jobs(
-        self, instants: Instants, placement: NDArray[np.integer], name: str
-    ) -> _Jobs | None:
+    def _jobs(self, instants: Instants, placement: NDArray[np.integer], name: str) -> _Jobs | None:
         if instants.start_ns is None or instants.work_ns is None:
             return None
         found = []
@@ -165,8 +183,8 @@ class Stretches:
             pieces = [table[:, columns].astype(float) for table in (of.start_ns, of.end_ns)]
             alone_ns = of.work_ns[:, columns] / cores
             known = (pieces[0] >= 0) & (pieces[1] >= 0) & (alone_ns > 0)
-            wide = np.broadcast_to(cores, known.shape)
-            found.append([*(piece[known] for piece in pieces), alone_ns[known], wide[known]])
+            wide = [np.broadcast_to(row, known.shape)[known] for row in (cores, columns)]
+            found.append([*(piece[known] for piece in pieces), alone_ns[known], *wide])
         if not found:
             return None
         return _Jobs(*map(np.concatenate, zip(*found, strict=True)))
@@ -184,36 +202,53 @@ class Stretches:
         return self._on[code, name]
 
 
-def _level(node: Node, jobs: _Jobs, before: _Jobs | None) -> Level:
-    """Foreign threads beside which jobs ran, those of others before them.
+def _level(node: Node, bursts: float, jobs: _Jobs, before: _Jobs | None) -> Level:
+    """Foreign threads beside which jobs ran since the last change, but those of bursts.
 
     Parameters
     ----------
+    bursts : float
+        Share of the time in which there are bursts.
     before : _Jobs, optional
         Own jobs, which have their cores first; of `jobs` where None.
     """
-    slowed = jobs.taken_ns / jobs.alone_ns
+    taken_ns = jobs.taken_ns
+    slowed = taken_ns / jobs.alone_ns
     spare = node.spare if node.quota is None else node.capacity
     if node.scheduler != "fair":
         threads = slowed * spare - node.cores
-        return Level(max(float(np.median(threads)), 0.0), _error(threads))
-    beside = _beside(jobs, jobs)
-    if before is None:
-        threads = slowed * spare - beside
     else:
-        own = _beside(jobs, before)
-        left = np.maximum(spare - own, 0.0)
-        for _ in range(3):
-            threads = np.maximum(slowed * left - beside, 0.0)
-            load = own + threads
-            left = np.where(load <= spare, spare - own, spare * threads / np.maximum(load, 1e-9))
-    # By time: a long job has met more of what comes and goes.
-    mean = float((threads * jobs.taken_ns).sum() / jobs.taken_ns.sum())
-    return Level(max(mean, 0.0), _error(threads))
+        beside = _beside(jobs, jobs)
+        own = None if before is None else _beside(jobs, before)
+        threads = slowed * spare - beside if own is None else _behind(slowed, spare, beside, own)
+    # Some jobs leave others room, and take no longer for it: they say only how many there are at
+    # most. Each task's jobs since its last change are looked at by themselves.
+    since = [_since_change(jobs, threads, task) for task in np.unique(jobs.task)]
+    told = [rows for rows in since if float((slowed[rows] > SLOWED).mean()) >= MOST]
+    threads = threads[np.concatenate(told or since)]
+    # The middle of what ran beside none of the bursts, which come for less of the time.
+    place = (1.0 - bursts) / 2
+    off = math.sqrt(place * (1.0 - place) / len(threads))
+    low, beyond, high = np.quantile(threads, [max(place - off, 0.0), place, min(place + off, 1.0)])
+    return Level(max(float(beyond), 0.0), float(high - low) / 2, bool(told))
 
 
-def _error(threads: Floats) -> float:
-    return float(threads.std(ddof=1)) / math.sqrt(len(threads))
+def _since_change(jobs: _Jobs, threads: Floats, task: float) -> Ints:
+    """Rows of a task's jobs since the last change within the window."""
+    mine = np.flatnonzero(jobs.task == task)
+    mine = mine[np.argsort(jobs.end_ns[mine], kind="stable")]
+    return mine[newest(threads[mine]) :]
+
+
+def _behind(slowed: Floats, spare: float, beside: Floats, own: Floats) -> Floats:
+    """Foreign threads that share with shadow jobs what own jobs leave."""
+    left = np.maximum(spare - own, 0.0)
+    threads = np.maximum(slowed * left - beside, 0.0)
+    for _ in range(2):
+        load = own + threads
+        left = np.where(load <= spare, spare - own, spare * threads / np.maximum(load, 1e-9))
+        threads = np.maximum(slowed * left - beside, 0.0)
+    return threads
 
 
 def _beside(jobs: _Jobs, others: _Jobs) -> Floats:

@@ -171,7 +171,9 @@ class Meter:
 
     def _links(self) -> Ints:
         """Number of each part's link, if it is a message on one that has a rate; else -1."""
-        rated = [link.name for link in self._problem.fabric.links.values() if link.rate_mbps < np.inf]
+        rated = [
+            link.name for link in self._problem.fabric.links.values() if link.rate_mbps < np.inf
+        ]
         links = [
             rated.index(part.link) if isinstance(part, Message) and part.link in rated else -1
             for part in self._parts
@@ -219,7 +221,9 @@ def cores_of(node: Node, execution: Execution) -> float:
 def _cost(problem: Problem, part: Part) -> float:
     """Time of a job alone over its core time; of a message, nanoseconds to send it."""
     if isinstance(part, Message):
-        bytes_of = {(flow.source, flow.target): flow.payload_bytes for flow in problem.pipeline.flows}
+        bytes_of = {
+            (flow.source, flow.target): flow.payload_bytes for flow in problem.pipeline.flows
+        }
         rate_mbps = problem.fabric.links[part.link].rate_mbps
         return float(round(8e3 * bytes_of[part.source, part.target] / rate_mbps))
     node = problem.fabric.nodes[part.node]

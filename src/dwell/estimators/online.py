@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import ClassVar, TypeAlias
 
 import numpy as np
@@ -62,7 +63,7 @@ class Online(ABC):
             for name, placed in problem.candidates.items()
         }
         self._foreign = {
-            name: ForeignThreads(node, self._playing.usual_threads(name))
+            name: ForeignThreads(node)
             for name, node in problem.fabric.nodes.items()
         }
         self._down: frozenset[str] = frozenset()
@@ -132,12 +133,10 @@ class Online(ABC):
         for name, foreign in self._foreign.items():
             used, mine = observed.utilisation[name], own[name]
             share = max(used - mine, 0.0)
-            deviation = price.foreign_deviation[name]
-            if censored(used, mine):
-                level = self._stretches.level(evidence, name)
-                changed = foreign.see_full(share, deviation, level)
-            else:
-                changed = foreign.see_load(share, price.foreign[name], deviation)
+            usual, deviation = price.foreign[name], price.foreign_deviation[name]
+            level = partial(self._stretches.level, evidence, name)
+            is_full = censored(used, mine)
+            changed = foreign.see(share, usual, deviation, level, is_full=is_full)
             if changed:
                 self._has_changed = True
                 self.regimes += 1
@@ -200,7 +199,7 @@ class Online(ABC):
                 self._playing.begin(present)
                 self._playing.go_on(present, names, self.FIRST_STEPS)
             elif self._has_grown or not all(map(self._is_sure, names)):
-                self._playing.go_on(present, names)
+                self._playing.go_on(present, names, has_grown=self._has_grown)
         self._has_changed = self._has_grown = False
 
     def _is_sure(self, name: str) -> bool:

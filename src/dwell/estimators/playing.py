@@ -37,8 +37,8 @@ Ints: TypeAlias = NDArray[np.int64]
 LONGEST_WINDOW, STEP = 1000, 100
 #: How many cycles are drawn before they are played again, and the fewest windows of them.
 DRAWN, FEWEST = 2400, 4
-#: Steps that a candidate's price is of at most.
-KEPT = 30
+#: Steps that a candidate's price is of at most; and while demands of the present change.
+KEPT, RECENT = 30, 6
 #: Cycles after those of a step that may have been released when it ends.
 BEYOND = 64
 #: Of a fraction of a thread, what is neither none nor a whole one.
@@ -173,10 +173,22 @@ class Playing:
             twin.arrays.restart(self._first)
         self._fill(0)
 
-    def go_on(self, present: Present, names: Collection[str], steps: int = 1) -> None:
-        """Play some candidates on; the present has the same parts, maybe with newer values."""
+    def go_on(
+        self, present: Present, names: Collection[str], steps: int = 1, *, has_grown: bool = False
+    ) -> None:
+        """Play some candidates on; the present has the same parts, maybe with newer values.
+
+        Parameters
+        ----------
+        has_grown : bool
+            Whether values are newer: prices are then of the most recent steps.
+        """
         self.present = present
-        self._fill(self._cursor)
+        if has_grown:
+            self._fill(self._cursor)
+            for name in names:
+                while len(self._twins[name].steps) >= RECENT:
+                    self._twins[name].steps.popleft()
         for _ in range(steps):
             if self._cursor + self._step * self._window > self._real.cycles:
                 for twin in self._twins.values():
@@ -243,14 +255,6 @@ class Playing:
         """Whether the price of a candidate is of as many windows as it ever is."""
         steps = self._twins[name].steps
         return len(steps) == steps.maxlen
-
-    def usual_threads(self, name: str) -> float:
-        """Foreign threads of a node as declared, in the mean."""
-        bursts = self.problem.fabric.nodes[name].bursts
-        if bursts is None:
-            return 0.0
-        on, off = bursts.for_ms.expectation, bursts.every_ms.expectation
-        return bursts.threads * on / (on + off)
 
     def _lay_out(self) -> None:
         problem = _with_short_windows(self.problem)
@@ -447,9 +451,7 @@ def _played_as_declared(problem: Problem, seed: int) -> Declared:
         real,
         FrozenDict(references),
         FrozenDict({name: seen["l95_ms"].copy() for name, seen in shown.items()}),
-        FrozenDict(
-            {name: seen["missed"] / problem.window_cycles for name, seen in shown.items()}
-        ),
+        FrozenDict({name: seen["missed"] / problem.window_cycles for name, seen in shown.items()}),
     )
 
 

@@ -22,7 +22,7 @@ from dwell.kernels.meter import places
 Floats: TypeAlias = NDArray[np.float64]
 
 #: Most values that a pool holds, and fewest that it keeps however old they are.
-LARGEST = 400
+LARGEST = 200
 ENOUGH = 12
 #: Deviations from chance that are another regime; that are none, where what is declared is taken
 #: back; and that tell new values from measured ones there.
@@ -196,7 +196,7 @@ class Pool:
 
     def _begin_anew(self, values: Floats, window: int) -> None:
         """Begin another regime; where its values are few, with the declared shape."""
-        values = newest(values)
+        values = values[newest(values) :]
         new = middle(values)
         few = len(values) < ENOUGH and max(new, self.reference.usual) < math.inf
         shape = self.moved(new) if few else np.empty(0)
@@ -293,14 +293,14 @@ class _Chunk(NamedTuple):
     shift: Shift
 
 
-def newest(values: Floats) -> Floats:
-    """Return the values since the last change in a window, if there was one.
+def newest(values: Floats) -> int:
+    """Return the first of a window's values since its last change, if there was one; else 0.
 
     The quarters before and after a change differ in their ranks; infinite values are the largest.
     """
     count = len(values)
     if count < LEAST:
-        return values
+        return 0
     ordered = np.sort(values)
     ranks = ordered.searchsorted(values, "left") + ordered.searchsorted(values, "right")
     ends = np.array([count // 4, count // 2, 3 * count // 4])
@@ -309,7 +309,7 @@ def newest(values: Floats) -> Floats:
     # Twice the ranks have four times the variance of a uniform distribution over them.
     off = np.abs(gap) / (count * np.sqrt((1 / ends + 1 / (count - ends)) / 3))
     at = int(off.argmax())
-    return values[ends[at] :] if off[at] >= CHANGED else values
+    return int(ends[at]) if off[at] >= CHANGED else 0
 
 
 def _likeness(ordered: Floats, values: Floats, block: int) -> float:

@@ -201,9 +201,7 @@ class Scaling(Online):
             cut_from_ms=max(qos.uncut_l95_ms, bound_ms),
         )
 
-    def _executed(
-        self, column: int, task: str, active: Placement, placement: Placement
-    ) -> Floats:
+    def _executed(self, column: int, task: str, active: Placement, placement: Placement) -> Floats:
         """Bound the time of a task's job in each cycle."""
         here, there, alone_ms = active[task], placement[task], self._jobs[:, column]
         if here == there:

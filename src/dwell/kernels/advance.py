@@ -56,9 +56,7 @@ def post_event(arrays: Arrays, at_ns: int, key: int) -> None:
     _functions()[1](arrays.address, at_ns, key)
 
 
-def logged_instants(
-    arrays: Arrays, first: int, last: int, flows: Ints
-) -> list[tuple[Ints, ...]]:
+def logged_instants(arrays: Arrays, first: int, last: int, flows: Ints) -> list[tuple[Ints, ...]]:
     """Return instants of cycles that the logs still have, nanoseconds; -1 for never.
 
     Parameters
