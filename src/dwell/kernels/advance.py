@@ -58,8 +58,8 @@ def post_event(arrays: Arrays, at_ns: int, key: int) -> None:
 
 def logged_instants(
     arrays: Arrays, first: int, last: int, flows: Ints
-) -> list[tuple[Ints, Ints, Ints]]:
-    """Return instants of cycles that the logs still have, nanoseconds; -1 for never.
+) -> list[tuple[Ints, Ints, Ints, Ints, Ints]]:
+    """Return what the logs still have of cycles, nanoseconds; -1 for never.
 
     Parameters
     ----------
@@ -70,25 +70,23 @@ def logged_instants(
 
     Returns
     -------
-    list of (ready_ns, end_ns, arrived_ns)
-        By cell: when all inputs of a job were there, when it had completed, int64 arrays of shape
-        (cycles, tasks), and when messages arrived, (cycles, flows).
+    list of (ready_ns, end_ns, arrived_ns, start_ns, work_ns)
+        By cell: when all inputs of a job were there, and when it had completed, int64 arrays of
+        shape (cycles, tasks), when messages arrived, (cycles, flows), when a job started, and the
+        core time that it has received, if it has completed, (cycles, tasks).
     """
     tables, count = arrays.tables, last - first
     jobs = count * (tables.jobs.size // tables.slots.size)
-    found = np.empty((len(tables.cells), 2 * jobs + count * len(flows)), np.int64)
+    found = np.empty((len(tables.cells), 4 * jobs + count * len(flows)), np.int64)
     _functions()[3](
         *(arrays.address, first, count),
         *(flows.ctypes.data, len(flows), found.ctypes.data),
     )
-    return [
-        (
-            of[:jobs].reshape(count, -1),
-            of[jobs : 2 * jobs].reshape(count, -1),
-            of[2 * jobs :].reshape(count, len(flows)),
-        )
-        for of in found
-    ]
+    by_cell = []
+    for of in found:
+        ready, end, start, work = of[: 4 * jobs].reshape(4, count, -1)
+        by_cell.append((ready, end, of[4 * jobs :].reshape(count, len(flows)), start, work))
+    return by_cell
 
 
 def send_state(
