@@ -69,7 +69,8 @@ class CycleResult:
 class JobResult:
     """One execution of a task: it exists from the instant at which all its inputs are there.
 
-    `end_ns` is its completion, or the instant at which it was lost.
+    `end_ns` is its completion, or the instant at which it was lost. `core` is the core time that it
+    has received, nanoseconds; of one on an accelerator, the time that it has had its place.
     """
 
     node: str
@@ -77,6 +78,7 @@ class JobResult:
     start_ns: int | None
     end_ns: int | None
     outcome: str
+    core: Fraction
 
 
 @dataclass(frozen=True)
@@ -198,6 +200,7 @@ class Job:
     ready: int
     left: Fraction
     senders: tuple[Job, ...]
+    core: Fraction = Fraction(0)
     start: int | None = None
     started_by: int = -1
     end: int | None = None
@@ -220,7 +223,9 @@ class Job:
 
     @property
     def result(self) -> JobResult:
-        return JobResult(self.node, self.ready, self.start, self.end, self.outcome)
+        return JobResult(
+            self.node, self.ready, self.start, self.end, self.outcome, self.core
+        )
 
 
 @dataclass(eq=False)
@@ -558,7 +563,12 @@ class NodeState:
         if self.stopped:
             return Fraction(0)
         share = (self.share if cell == ITSELF else self.share_of_shadows) * self.pace
-        return share / (Fraction(self.node.interference) if self.foreign else 1)
+        return share / self.slowness
+
+    @property
+    def slowness(self) -> Fraction:
+        """How many times as much core time jobs take."""
+        return Fraction(self.node.interference) if self.foreign else Fraction(1)
 
     @property
     def free_of_background(self) -> Fraction:
@@ -615,6 +625,7 @@ class NodeState:
             job.left -= speeds[job.cell] * self.part(job) * elapsed
             received = before - max(job.left, Fraction(0))
             self.work[job.cell] += job.execution.threads * received
+            job.core += job.execution.threads * received * self.slowness
         for kind, jobs in self.served.items():
             places = self.places[kind]
             for job in jobs:
@@ -623,6 +634,7 @@ class NodeState:
                 received = min(Fraction(elapsed), max(job.left, Fraction(0)))
                 job.left -= elapsed
                 places[1 + job.cell] += received
+                job.core += received
                 places[0] += elapsed
         self.busy += (rate * self.pace + self.behind) * elapsed
         self.left -= rate * elapsed

@@ -67,6 +67,8 @@ EXAMPLES = int(os.environ.get("DWELL_EXAMPLES", "80"))
 # Of the problems that take longer: those with shadows, and those in which orders take time.
 LONGER = int(os.environ.get("DWELL_EXAMPLES", "40"))
 FAIR_TOLERANCE_NS = NEAR_NS
+# Core time of a job that foreign threads interfered with is a sum of floats.
+WORK_TOLERANCE_NS = 1
 MOST_EXCLUDED = 0.15
 EVERY: tuple[Scheduler, ...] = ("fair", "fifo", "priority", "turns")
 
@@ -141,7 +143,10 @@ class Case:
 
 @dataclass(frozen=True)
 class Played:
-    """What a run left behind; `arrived` by cell, cycle, source and target."""
+    """What a run left behind; `arrived` by cell, cycle, source and target.
+
+    `work_ns` is the core time of jobs that are done, by cell, cycle and task.
+    """
 
     cycles: pl.DataFrame
     jobs: pl.DataFrame
@@ -150,6 +155,7 @@ class Played:
     probe: Probe | None = None
     arrived: Mapping[tuple[int, int, str, str], int] | None = None
     core_ns: NDArray[np.float64] | None = None
+    work_ns: Mapping[tuple[int, int, str], int] | None = None
 
 
 def make_case(
@@ -250,6 +256,8 @@ def differences(case: Case, found: Played, result: Result, tolerance_ns: int) ->
         yield from arrival_differences(found.arrived, result, tolerance_ns)
     if found.core_ns is not None:
         yield from core_differences(case, found.core_ns, result)
+    if found.work_ns is not None:
+        yield from work_differences(found.work_ns, result)
 
 
 def differs(found: int | None, expected: int | None, tolerance_ns: int) -> bool:
@@ -316,6 +324,17 @@ def arrival_differences(
         found, expected = arrived.get(key), result.arrived.get(key)
         if differs(found, expected, tolerance_ns):
             yield f"arrival {key}: {found}, expected {expected}"
+
+
+def work_differences(work_ns: Mapping[tuple[int, int, str], int], result: Result) -> Iterator[str]:
+    jobs = {(ITSELF, *key): job for key, job in result.jobs.items()}
+    jobs |= {(SHADOW, *key): job for key, job in result.shadow_jobs.items()}
+    expected = {key: float(job.core) for key, job in jobs.items() if job.outcome == "done"}
+    if work_ns.keys() != expected.keys():
+        yield f"core time of jobs {work_ns.keys() ^ expected.keys()}"
+    for key in work_ns.keys() & expected.keys():
+        if abs(work_ns[key] - expected[key]) > WORK_TOLERANCE_NS:
+            yield f"job {key}: core time {work_ns[key]}, expected {expected[key]}"
 
 
 def window_differences(case: Case, windows: pl.DataFrame, result: Result) -> Iterator[str]:
@@ -443,9 +462,10 @@ def evidence_differences(
             assert found.shape == expected.shape
             # What is unknown in one is unknown in the other.
             same = (found < 0) == (expected < 0)
-            if not (same & (abs(found - expected) <= tolerance_ns)).all():
+            near_ns = WORK_TOLERANCE_NS if name == "work_ns" else tolerance_ns
+            if not (same & (abs(found - expected) <= near_ns)).all():
                 yield f"{where}: {name} of cell {cell} {found}, expected {expected}"
-            if (found > evidence.close_ns).any():
+            if name != "work_ns" and (found > evidence.close_ns).any():
                 yield f"{where}: {name} of cell {cell} {found} after the close"
 
 
@@ -455,20 +475,25 @@ def known_instants(
     """What evidence says, and what was known, for each kind of instants."""
     pipeline = case.problem.pipeline
     cycles = range(window.first_cycle, window.first_cycle + case.problem.window_cycles)
-    ready = [[-1] * len(pipeline.tasks) for _ in cycles]
-    ended = [[-1] * len(pipeline.tasks) for _ in cycles]
+    ready, ended, started, work = np.full((4, len(cycles), len(pipeline.tasks)), -1)
     for (whose, cycle, task), job in window.known.items():
         if whose == cell:
             row, column = cycle - window.first_cycle, list(pipeline.tasks).index(task)
-            ready[row][column] = job.ready_ns
+            ready[row, column] = job.ready_ns
+            if job.start_ns is not None:
+                started[row, column] = job.start_ns
             if job.outcome == "done" and job.end_ns is not None:
-                ended[row][column] = job.end_ns
+                ended[row, column], work[row, column] = job.end_ns, round(job.core)
     arrived = [
         [window.arrived.get((cell, k, f.source, f.target), -1) for f in pipeline.flows]
         for k in cycles
     ]
-    yield "ready_ns", found.ready_ns, np.array(ready)
-    yield "end_ns", found.end_ns, np.array(ended)
+    assert found.start_ns is not None
+    assert found.work_ns is not None
+    yield "ready_ns", found.ready_ns, ready
+    yield "end_ns", found.end_ns, ended
+    yield "start_ns", found.start_ns, started
+    yield "work_ns", found.work_ns, work
     yield "arrived_ns", found.arrived_ns, np.array(arrived, np.int64).reshape(len(cycles), -1)
 
 
@@ -523,8 +548,14 @@ def play_stamped(
         if at_ns >= 0
     }
     core_ns = np.stack([arrays.tables.opened[0], arrays.tables.closed[0]])
+    work = arrays.tables.log["work_ns"].reshape(2, real.cycles, -1)
+    names = list(problem.pipeline.tasks)
+    work_ns = {
+        (cell, cycle, names[i]): int(work[cell, cycle, i])
+        for cell, cycle, i in np.argwhere(work >= 0).tolist()
+    }
     cycles, jobs, windows = (tables[name]() for name in ("cycles", "jobs", "windows"))
-    return Played(cycles, jobs, windows, arrived=arrived, core_ns=core_ns)
+    return Played(cycles, jobs, windows, arrived=arrived, core_ns=core_ns, work_ns=work_ns)
 
 
 def examine_stamped(seed: int, case: Case, tolerance_ns: int) -> list[str] | None:

@@ -24,6 +24,8 @@ UNKNOWN = -1
 class Instants:
     """Instants of the jobs and messages of a window's cycles, nanoseconds; `UNKNOWN` if never.
 
+    What an engine does not know of any job is None.
+
     Parameters
     ----------
     ready_ns, end_ns : int64 array, shape (W, tasks)
@@ -31,6 +33,11 @@ class Instants:
     arrived_ns : int64 array, shape (W, flows)
         When the message of a flow was handed to its target; it was sent when its source's job
         ended. On one node it is handed over at once.
+    start_ns : int64 array, shape (W, tasks), optional
+        When a worker began with a job.
+    work_ns : int64 array, shape (W, tasks), optional
+        Core time that a completed job received, over all of its threads; that of one on an
+        accelerator is from its start to its end.
     """
 
     ready_ns: Ints
@@ -44,10 +51,13 @@ class Instants:
 
     def at(self, rows: Rows) -> Instants:
         """Instants of some of the cycles."""
-        start_ns = None if self.start_ns is None else self.start_ns[rows]
-        work_ns = None if self.work_ns is None else self.work_ns[rows]
-        known = self.ready_ns[rows], self.end_ns[rows], self.arrived_ns[rows]
-        return Instants(*known, start_ns, work_ns)
+        return Instants(
+            ready_ns=self.ready_ns[rows],
+            end_ns=self.end_ns[rows],
+            arrived_ns=self.arrived_ns[rows],
+            start_ns=None if self.start_ns is None else self.start_ns[rows],
+            work_ns=None if self.work_ns is None else self.work_ns[rows],
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +74,9 @@ class Evidence:
     shadows : Instants or None
         Instants of the jobs and messages that a shadow did not share with the cycle itself. It
         stops before the sinks: its last messages arrive there and are discarded.
+    shadows_share : bool
+        Whether shadow jobs share the cores that own jobs leave with foreign threads as equals. Where
+        they stand behind these, how long they take says nothing of how many there are.
     """
 
     close_ns: int

@@ -36,30 +36,23 @@ DWELL_EXPORT void dwell_post_event(const Tables* tables, i64 at_ns, i64 key) noe
   queue.save(tables->clock[0]);
 }
 
-// Copies the instants of `n` cycles from the logs, cell after cell, and in it one table after
-// another: when jobs became ready, when they completed, (n, tasks), and when the messages of
-// `n_flows` flows arrived, (n, n_flows); -1 for never.
+// Copies what the logs have of `n` cycles, cell after cell, and in it one table after another: when
+// jobs became ready, when they completed, when they started and the core time that they took, (n,
+// tasks), and when the messages of `n_flows` flows arrived, (n, n_flows); -1 for never.
 DWELL_EXPORT void dwell_logged_instants(const Tables* tables, i64 first, i64 n, const i64* flows,
                                         i64 n_flows, i64* out) noexcept {
   const Simulation<false, false> s(*tables);
   for (i64 cell = 0; cell < s.cells.size; ++cell) {
-    i64 *ready_ns = out, *end_ns = ready_ns + n * s.n_tasks, *start_ns = end_ns + n * s.n_tasks;
-    i64 *work_ns = start_ns + n * s.n_tasks, *arrived_ns = work_ns + n * s.n_tasks;
+    const i64 jobs = n * s.n_tasks;
+    i64 *ready_ns = out, *end_ns = ready_ns + jobs, *start_ns = end_ns + jobs;
+    i64 *work_ns = start_ns + jobs, *arrived_ns = work_ns + jobs;
     for (i64 cycle = first; cycle < first + n; ++cycle) {
       const i64 row = s.log_row(cell, cycle);
-      for (i64 task = 0; task < s.n_tasks; ++task) {
-        const i64 at = row * s.n_tasks + task;
+      for (i64 at = row * s.n_tasks; at < (row + 1) * s.n_tasks; ++at) {
         *ready_ns++ = s.log[at].ready_ns;
-        const bool done = s.log_outcome[at] == kDone;
-        *end_ns++ = done ? s.log[at].end_ns : -1;
+        *end_ns++ = s.log_outcome[at] == kDone ? s.log[at].end_ns : -1;
         *start_ns++ = s.log[at].start_ns;
-        const i16 stamp = s.stamp(cell, cycle);
-        i64 work = -1;
-        if (done && stamp >= 0) {
-          const Site& site = s.sites[s.site_of[(s.cells[cell].candidate_0 + stamp) * s.n_tasks + task]];
-          work = site.threads * site.exec_ns[cycle];
-        }
-        *work_ns++ = work;
+        *work_ns++ = s.log[at].work_ns;
       }
       for (i64 i = 0; i < n_flows; ++i) *arrived_ns++ = s.log_arrived[row * s.n_flows + flows[i]];
     }

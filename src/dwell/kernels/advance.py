@@ -56,8 +56,10 @@ def post_event(arrays: Arrays, at_ns: int, key: int) -> None:
     _functions()[1](arrays.address, at_ns, key)
 
 
-def logged_instants(arrays: Arrays, first: int, last: int, flows: Ints) -> list[tuple[Ints, ...]]:
-    """Return instants of cycles that the logs still have, nanoseconds; -1 for never.
+def logged_instants(
+    arrays: Arrays, first: int, last: int, flows: Ints
+) -> list[tuple[Ints, Ints, Ints, Ints, Ints]]:
+    """Return what the logs still have of cycles, nanoseconds; -1 for never.
 
     Parameters
     ----------
@@ -68,9 +70,10 @@ def logged_instants(arrays: Arrays, first: int, last: int, flows: Ints) -> list[
 
     Returns
     -------
-    list of (ready_ns, end_ns, arrived_ns)
-        By cell: when all inputs of a job were there, when it had completed, int64 arrays of shape
-        (cycles, tasks), and when messages arrived, (cycles, flows).
+    list of (ready_ns, end_ns, arrived_ns, start_ns, work_ns)
+        By cell: when all inputs of a job were there, and when it had completed, int64 arrays of
+        shape (cycles, tasks), when messages arrived, (cycles, flows), when a job started, and the
+        core time that it has received, if it has completed, (cycles, tasks).
     """
     tables, count = arrays.tables, last - first
     jobs = count * (tables.jobs.size // tables.slots.size)
@@ -79,16 +82,11 @@ def logged_instants(arrays: Arrays, first: int, last: int, flows: Ints) -> list[
         *(arrays.address, first, count),
         *(flows.ctypes.data, len(flows), found.ctypes.data),
     )
-    return [
-        (
-            of[:jobs].reshape(count, -1),
-            of[jobs : 2 * jobs].reshape(count, -1),
-            of[4 * jobs :].reshape(count, len(flows)),
-            of[2 * jobs : 3 * jobs].reshape(count, -1),
-            of[3 * jobs : 4 * jobs].reshape(count, -1),
-        )
-        for of in found
-    ]
+    by_cell = []
+    for of in found:
+        ready, end, start, work = of[: 4 * jobs].reshape(4, count, -1)
+        by_cell.append((ready, end, of[4 * jobs :].reshape(count, len(flows)), start, work))
+    return by_cell
 
 
 def send_state(

@@ -599,7 +599,7 @@ class _Layout:
             "rates": np.concatenate([structs["rates"], *self.rates]),
             "changes": changes,
             "seen": np.zeros((cells, windows), row_types()["seen"]),
-            "log": _as_rows("log", np.full((logged * self.max_tasks, 3), -1)),
+            "log": _as_rows("log", np.full((logged * self.max_tasks, 4), -1)),
         }
         return Tables(
             **structs,

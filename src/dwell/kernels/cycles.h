@@ -6,11 +6,23 @@
 
 namespace dwell {
 
+// Core time that a job has received that is done: its work, which takes more of it beside foreign
+// threads where they interfere.
+template <class S>
+i64 core_time(const S& s, const Job& job, i64 cycle) {
+  const Site& site = s.site(job);
+  const i64 exec_ns = site.exec_ns[cycle];
+  if (exec_ns > kLastNs / site.threads) return kLastNs;
+  const f64 more = job.beside_ns * (1.0 / s.server(site).beside - 1.0);
+  return later(site.threads * exec_ns, whole_ns(std::rint(static_cast<f64>(site.need) * more)));
+}
+
 template <class S>
 void log_job(S& s, i64 cell, i64 cycle, i64 task, const Job& job, Outcome outcome, i64 end_ns) {
   if (S::kPlain || s.log.size == 0) return;
-  const i64 entry = s.log_row(cell, cycle) * s.n_tasks + task;
-  s.log[entry] = Log{job.ready_ns, job.started_ns, end_ns};
+  const i64 entry = s.log_entry(cell, cycle, task);
+  const i64 work_ns = outcome == kDone ? core_time(s, job, cycle) : -1;
+  s.log[entry] = Log{job.ready_ns, job.started_ns, end_ns, work_ns};
   s.log_outcome[entry] = outcome;
 }
 
@@ -19,7 +31,7 @@ template <class S>
 void clear_log(S& s, i64 cell, i64 cycle) {
   if (S::kPlain || s.log.size == 0) return;
   const i64 row = s.log_row(cell, cycle);
-  std::fill_n(&s.log[row * s.n_tasks], s.n_tasks, Log{-1, -1, -1});
+  std::fill_n(&s.log[row * s.n_tasks], s.n_tasks, Log{-1, -1, -1, -1});
   std::fill_n(&s.log_outcome[row * s.n_tasks], s.n_tasks, i8{kInFlight});
   std::fill_n(&s.log_arrived[row * s.n_flows], s.n_flows, i64{-1});
 }
@@ -314,7 +326,10 @@ void begin_cycle(S& s, i64 cell, i64 cycle, i64 active, bool is_shadow, i64 now)
     const Task& fixed = s.task(cell, task);
     Job& job = s.job(cell, cycle, task);
     job.missing = fixed.n_in;
-    if (!S::kPlain) job.ready_ns = -1;
+    if (!S::kPlain) {
+      job.ready_ns = -1;
+      job.beside_ns = 0.0;
+    }
     job.started_ns = -1;
     job.site = s.site_of[candidate * s.n_tasks + task];
     job.compute_ns = 0;

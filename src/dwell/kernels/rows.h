@@ -84,9 +84,9 @@ using Times = const i64*;
 // row of `quotas`, -1 for none. Shadow jobs run on a server of their own, `below` that of the own
 // jobs, which is `above` it; -1 for none. To it `stress`, `is_down` and `is_stopped` are copied,
 // `cores` and `spare` are what is left to it, and it adds `lent` busy cores and `background` to
-// those above.
+// those above. `beside_ns` is what of `virtual_ns` went by beside foreign threads.
 #define DWELL_SERVER(field)                                                                      \
-  field(f64, virtual_ns) field(f64, speed)                                                       \
+  field(f64, virtual_ns) field(f64, beside_ns) field(f64, speed)                                 \
   field(i64, last_ns) field(i64, next_ns) field(i64, next_key)                                   \
   field(i64, used) field(i64, stress) field(i64, cores) field(i64, lent)                         \
   field(i32, above) field(i32, below)                                                            \
@@ -147,17 +147,20 @@ using Times = const i64*;
   field(i64, rank) field(i64, ready_ns) field(i64, key) field(f64, left_ns)
 
 // A job in flight. `missing` counts the inputs that have not arrived; `rest_ns` is the work of the
-// threads that the one at work hands its job over to.
+// threads that the one at work hands its job over to. `beside_ns` is what it did beside foreign
+// threads, by the `beside_ns` of its server; less that clock while it runs.
 #define DWELL_JOB(field)                                                                         \
   field(i64, ready_ns) field(i64, started_ns) field(i64, compute_ns) field(i64, network_ns)      \
-  field(i64, rest_ns) field(i64, next) field(i32, site) field(i32, missing)
+  field(i64, rest_ns) field(i64, next) field(f64, beside_ns) field(i32, site)                    \
+  field(i32, missing)
 
 // A cycle in flight. `live` counts its jobs and messages that are under way.
 #define DWELL_SLOT(field)                                                                        \
   field(i64, cycle) field(i32, candidate) field(i32, pair) field(i32, live)                      \
   field(i32, sinks_left) field(i32, is_lost)
 
-#define DWELL_LOG(field) field(i64, ready_ns) field(i64, start_ns) field(i64, end_ns)
+#define DWELL_LOG(field)                                                                         \
+  field(i64, ready_ns) field(i64, start_ns) field(i64, end_ns) field(i64, work_ns)
 
 // A closed window as it could be known then: `uncut_ms` is L95 without the cell's `longest_ms`.
 #define DWELL_SEEN(field)                                                                        \

@@ -132,11 +132,19 @@ i64 account(S& s, Server& server, i64 now) {
   return elapsed;
 }
 
+// Lets a time pass on a server's virtual clock.
+template <class S>
+void advance_clock(S&, Server& server, i64 elapsed) {
+  const f64 advanced = static_cast<f64>(elapsed) * server.speed;
+  server.virtual_ns += advanced;
+  if (!S::kPlain && server.stress > 0) server.beside_ns += advanced;
+}
+
 // Brings a server's virtual clock and busy time up to now.
 template <class S>
 void tick(S& s, Server& server, i64 now) {
   const i64 elapsed = account(s, server, now);
-  if (server.n_run > 0) server.virtual_ns += static_cast<f64>(elapsed) * server.speed;
+  if (server.n_run > 0) advance_clock(s, server, elapsed);
 }
 
 // Sets the common speed after threads, stress or quota changed; the clock must be up to date.
@@ -190,11 +198,35 @@ void schedule(S& s, Server& server, i64 now) {
   announce(s, server, later(now, wait), first.key);
 }
 
+// Notes that a worker begins with a job.
+template <class S>
+void note_start(S& s, i64 key, Job& job, i64 now) {
+  job.started_ns = now;
+  if (S::kPlain || s.log.size == 0) return;
+  s.log[s.log_entry(cell_of(key), cycle_of(key), item_of(key))].start_ns = now;
+}
+
+// Lets a job run, or go on, that has so much work left.
+template <class S>
+void run(S& s, Server& server, i64 key, Job& job, f64 left, i64 now) {
+  if (server.n_run == 0) server.virtual_ns = server.beside_ns = 0.0;
+  if (job.started_ns < 0) note_start(s, key, job, now);
+  if (!S::kPlain) job.beside_ns -= server.beside_ns;
+  push(running_of(s, server), server.n_run++, Running{server.virtual_ns + left, key});
+}
+
+// Notes what a job that stops running did beside foreign threads; the clock must be up to date.
+template <class S>
+void note_beside(S& s, const Server& server, const Running& row) {
+  if (S::kPlain) return;
+  // What the clock is past its end, which comes at a whole nanosecond, is not its work.
+  const f64 past = server.stress > 0 ? std::min(row.finish_ns - server.virtual_ns, 0.0) : 0.0;
+  s.job(row.key).beside_ns += server.beside_ns + past;
+}
+
 template <class S>
 void start(S& s, Server& server, const Site& site, i64 key, Job& job, f64 left, i64 now) {
-  if (server.n_run == 0) server.virtual_ns = 0.0;
-  if (job.started_ns < 0) job.started_ns = now;
-  push(running_of(s, server), server.n_run++, Running{server.virtual_ns + left, key});
+  run(s, server, key, job, left, now);
   server.used += site.need;
 }
 
@@ -225,6 +257,7 @@ template <class S>
     }
   }
   if (worst < 0) return false;
+  note_beside(s, server, running[worst]);
   pop(running, server.n_run--, worst);
   server.used -= s.site(s.job(last.key)).need;
   queue_up(s, server, last);
@@ -273,7 +306,8 @@ void leave(S& s, Server& server, const Site& site, i64 now) {
   const i64 elapsed = account(s, server, now);
   const i64 n = server.n_run;
   // The virtual clock of an empty server starts anew.
-  if (n > 1) server.virtual_ns += static_cast<f64>(elapsed) * server.speed;
+  if (!S::kPlain || n > 1) advance_clock(s, server, elapsed);
+  note_beside(s, server, *running_of(s, server));
   pop(running_of(s, server), n);
   server.n_run -= 1;
   if (takes_turns(s, server)) {

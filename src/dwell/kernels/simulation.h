@@ -56,6 +56,10 @@ struct Simulation : Tables {
     return clock[0].logs_all ? output(cell, cycle) : slot_row(cell, cycle);
   }
 
+  i64 log_entry(i64 cell, i64 cycle, i64 task) const {
+    return log_row(cell, cycle) * n_tasks + task;
+  }
+
   // Hop that a flow takes in a cycle, -1 on the same node.
   i64 hop(i64 cell, i64 cycle, i64 flow) const {
     return route[slot(cell, cycle).candidate * n_flows + flow];

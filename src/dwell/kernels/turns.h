@@ -29,6 +29,7 @@ void put_back(S& s, Server& server, Quota& quota) {
   } else {
     const Running& first = *running_of(s, server);
     const f64 left = std::max(first.finish_ns - server.virtual_ns, 0.0);
+    note_beside(s, server, first);
     queue_up(s, server, Waiting{received, s.job(first.key).ready_ns, first.key, left});
     server.n_run = 0;
   }
@@ -132,11 +133,7 @@ void take_turn(S& s, Server& server, i64 now) {
   quota.turn_begun_ns = first.rank;
   pop(waiting_of(s, server), server.n_wait--);
   if (first.key == kForeign) return;
-  server.virtual_ns = 0.0;
-  Job& job = s.job(first.key);
-  if (job.started_ns < 0) job.started_ns = now;
-  push(running_of(s, server), 0, Running{first.left_ns, first.key});
-  server.n_run = 1;
+  run(s, server, first.key, s.job(first.key), first.left_ns, now);
   set_speed(s, server);
 }
 

@@ -279,23 +279,12 @@ def _decided_by_kernel(played: PlayedRealisation) -> TableArrays:
     return TableArrays(columns)
 
 
-def _log_running(played: PlayedRealisation, log: Rows) -> None:
-    """Note the start of jobs that were running when the run ended; they have no end."""
-    tables = played.arrays.tables
-    jobs = tables.jobs.reshape(len(tables.slots), -1)
-    for slot in np.nonzero(tables.slots["live"] > 0)[0]:
-        mine = log[slot // tables.clock["n_slots"][0], tables.slots["cycle"][slot]]
-        running = (mine["ready_ns"] >= 0) & (mine["end_ns"] < 0)
-        mine["start_ns"][running] = jobs[slot, : len(mine)]["started_ns"][running]
-
-
 def _jobs(played: PlayedRealisation) -> pl.DataFrame:
     problem, tables = played.problem, played.arrays.tables
     tasks = tuple(problem.pipeline.tasks)
     nodes = tuple(problem.fabric.nodes)
     cells, cycles = len(tables.cells), played.realisation.cycles
     log = tables.log.reshape(cells, cycles, len(tasks))
-    _log_running(played, log)
     outcome = tables.log_outcome.reshape(cells, cycles, len(tasks))
     # Sites of a shadow follow those of its cell in the same order.
     site_node = np.array([nodes.index(node) for _, node in played.realisation.sites] * cells)
