@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -24,6 +26,13 @@ def test_instants_of_some_cycles_are_rows_of_all(rows: Rows) -> None:
     assert some.ready_ns.tolist() == [[2, 3], [4, 5]]
     assert some.end_ns.tolist() == [[102, 103], [104, 105]]
     assert some.arrived_ns.tolist() == [[UNKNOWN], [UNKNOWN]]
+    assert (some.start_ns, some.work_ns) == (None, None)
+    every = replace(instants(5), start_ns=instants(5).ready_ns, work_ns=instants(5).end_ns)
+    some = every.at(rows)
+    assert some.start_ns is not None
+    assert some.start_ns.tolist() == [[2, 3], [4, 5]]
+    assert some.work_ns is not None
+    assert some.work_ns.tolist() == [[102, 103], [104, 105]]
 
 
 def test_it_says_how_many_cycles_had_a_shadow() -> None:

@@ -10,6 +10,10 @@ import numpy as np
 import pytest
 
 import dwell
+from dwell.kernels.advance import logged_instants, play
+from dwell.kernels.arrays import lay_out
+from dwell.kernels.codes import Status
+from dwell.kernels.realisation import NodeChange
 from dwell.model import (
     Constant,
     Execution,
@@ -20,7 +24,7 @@ from dwell.model import (
 )
 from dwell.record import Run
 from dwell.sim import Phase
-from tests.cells.generated import MS, make_problem
+from tests.cells.generated import MS, make_problem, make_realisation
 
 
 @pytest.mark.parametrize(("exec_ms", "latency_ms"), [(3.0, 3.0), (5.0, 5.0), (8.0, 13.0)])
@@ -294,3 +298,33 @@ def test_threads_that_hand_a_job_on_wait_for_their_turns() -> None:
     assert min(at_once) >= 4.0 + 1.4
     # The last goes first: nobody has had another turn.
     assert max(at_once) < 4.0 + 1.4 + 4.0
+
+
+SLOWED = Node("R", "robot", interference=2.0)
+
+
+@pytest.mark.parametrize(
+    ("node", "threads", "accelerator", "core_ms"),
+    [
+        # While 2 foreign threads are there, 9 ms, it receives 3 ms of the core, or 18 of two.
+        (SLOWED, 1, None, 3 + 3 + (8 - 3 - 3 / 2)),
+        (replace(SLOWED, cores=4), 2, None, 6 + 18 + (16 - 6 - 18 / 2)),
+        (replace(SLOWED, scheduler="fifo"), 3, None, 3 + 3 + (24 - 3 - 3 / 2)),
+        # What does not interfere makes it later, and is no work.
+        (Node("R", "robot"), 3, None, 24),
+        (Node("R", "robot", quota=Quota(0.25, 10.0), contention=0.5), 1, None, 8),
+        (replace(SLOWED, accelerators={"gpu": 1}), 1, "gpu", 8),
+    ],
+    ids=["fair", "cores", "fifo", "no interference", "contention", "accelerator"],
+)
+def test_core_time_is_more_than_work_where_foreign_threads_interfere(
+    node: Node, threads: int, accelerator: str | None, core_ms: float
+) -> None:
+    execution = Execution(Constant(8.0), threads=threads, accelerator=accelerator)
+    problem = make_problem([node], [Task("work", {"R": execution})], period_ms=200.0)
+    changes = [NodeChange(3 * MS, "R", 2, False), NodeChange(12 * MS, "R", 0, False)]
+    real = make_realisation(problem, windows=1, node_changes=changes)
+    arrays = lay_out([(problem, real)], log_jobs=True)
+    assert play(arrays) == Status.FINISHED
+    ((*_, start_ns, work_ns),) = logged_instants(arrays, 0, 1, np.empty(0, np.int64))
+    assert (start_ns.tolist(), work_ns.tolist()) == ([[0]], [[round(core_ms * MS)]])

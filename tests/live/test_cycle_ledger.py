@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import example, given
@@ -44,11 +46,14 @@ def cycle(number: int = 0, *, placement: str = "SO", shadow: str = "") -> LiveCy
     return LiveCycle.of(stamp(number, placement, shadow), 0)
 
 
+CPU_NS = 2 * MS
+
+
 def hop(task: str, *, source: str = "", ended: bool = True) -> Hop:
     node, ready, begin, end = JOBS[task]
     at = [RELEASE_NS + round(ms * MS) for ms in (ready, begin, end)]
     inputs = ((source, at[0]),) if source else ()
-    return Hop(task, node, at[0], at[1], at[2] if ended else UNKNOWN, inputs)
+    return Hop(task, node, at[0], at[1], at[2] if ended else UNKNOWN, inputs, cpu_ns=CPU_NS)
 
 
 def hops() -> tuple[Hop, ...]:
@@ -132,11 +137,39 @@ def test_evidence_is_what_had_happened_at_the_close(ledger: Ledger, problem: Pro
         "planning": UNKNOWN,
         "control": UNKNOWN,
     }
+    assert found.cycles.start_ns is not None
+    started = [RELEASE_NS, RELEASE_NS + 8 * MS, RELEASE_NS + round(18.5 * MS), UNKNOWN]
+    assert found.cycles.start_ns[0].tolist() == started
+    assert found.cycles.work_ns is not None
+    assert found.cycles.work_ns[0].tolist() == [CPU_NS, CPU_NS, UNKNOWN, UNKNOWN]
+    assert (found.cycles.start_ns[1] == UNKNOWN).all()
+    assert (found.cycles.work_ns[1] == UNKNOWN).all()
+    assert not found.shadows_share
     assert found.placement.tolist() == [list(problem.candidates).index("SO")] * 2
     assert found.shadows is None
     # Of one that never came, the first message to another node is taken to have been lost.
     assert found.cycles.end_ns[1, tasks.index("sensing")] == RELEASE_NS
     assert (found.cycles.arrived_ns[1] == UNKNOWN).all()
+
+
+def test_work_on_an_accelerator_is_the_time_that_a_job_had_it(problem: Problem) -> None:
+    fabric, pipeline = problem.fabric, problem.pipeline
+    edge = dataclasses.replace(fabric.nodes["E"], accelerators={"gpu": 1})
+    perception = pipeline.tasks["perception"]
+    served = dataclasses.replace(perception.on["E"], accelerator="gpu")
+    perception = dataclasses.replace(perception, on={**perception.on, "E": served})
+    accelerated = dataclasses.replace(
+        problem,
+        fabric=dataclasses.replace(fabric, nodes={**fabric.nodes, "E": edge}),
+        pipeline=dataclasses.replace(pipeline, tasks={**pipeline.tasks, "perception": perception}),
+    )
+    ledger = Ledger(accelerated, Offsets("E", problem.stamper_node, system_bound_ns=0))
+    one = cycle()
+    one.take(completion(one), None)
+    close_ns = RELEASE_NS + 60 * MS
+    found = ledger.evidence([one], np.array([RELEASE_NS]), close_ns, shadows=False).cycles
+    assert found.work_ns is not None
+    assert found.work_ns[0].tolist() == [CPU_NS, 10 * MS, CPU_NS, CPU_NS]
 
 
 def test_of_a_shadow_what_it_did_not_share_is_told_apart(ledger: Ledger, problem: Problem) -> None:

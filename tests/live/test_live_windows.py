@@ -126,8 +126,29 @@ class Clocks:
         return t_ns + self.ahead_ns.get(node, 0)
 
 
-def messages_of(played: Played, clocks: Clocks) -> list[Event]:
-    """Return what the processes of a live cell would have said in a simulated run."""
+#: Core time of jobs by cycle, whether of its shadow, and task.
+Work = Mapping[tuple[int, bool, str], int]
+NO_WORK: Work = FrozenDict()
+
+
+def work_of(played: Played) -> Work:
+    """Core time of the jobs that had completed when their windows closed."""
+    work_ns = {}
+    firsts, tasks = played.run.windows["first_cycle"], list(played.problem.pipeline.tasks)
+    for first, evidence in zip(firsts, played.seen.evidence, strict=True):
+        for shadow, instants in ((False, evidence.cycles), (True, evidence.shadows)):
+            assert instants is not None
+            assert instants.work_ns is not None
+            for (row, column), ns in np.ndenumerate(instants.work_ns):
+                work_ns[first + row, shadow, tasks[column]] = int(ns)
+    return work_ns
+
+
+def messages_of(played: Played, clocks: Clocks, work_ns: Work = NO_WORK) -> list[Event]:
+    """Return what the processes of a live cell would have said in a simulated run.
+
+    Processes tell the core time of jobs of which `work_ns` has it.
+    """
     problem, run = played.problem, played.run
     flows = problem.pipeline.flows
     into = {flow.target: flow.source for flow in flows}
@@ -148,8 +169,10 @@ def messages_of(played: Played, clocks: Clocks) -> list[Event]:
         ready_ns = clocks.at(node, job["ready_ns"])
         inputs = ((into[task], ready_ns),) if task in into else ()
         start_ns, end_ns = (clocks.at(node, job[name]) for name in ("start_ns", "end_ns"))
-        hop = Hop(task, node, ready_ns, start_ns, end_ns, inputs)
-        hops.setdefault((job["cycle"], bool(job.get("shadow"))), []).append(hop)
+        whose = job["cycle"], bool(job.get("shadow"))
+        cpu_ns = work_ns.get((*whose, task), UNKNOWN)
+        hop = Hop(task, node, ready_ns, start_ns, end_ns, inputs, cpu_ns=cpu_ns)
+        hops.setdefault(whose, []).append(hop)
     events: list[Event] = []
     term, before = 1, None
     for entry in run.cycles.iter_rows(named=True):
@@ -274,7 +297,7 @@ def test_the_controller_is_given_what_the_simulators_is(
         assert np.allclose(mine.core_ns, theirs.core_ns, rtol=1e-9, atol=10)
         assert np.array_equal(shown.placement, there.placement)
         assert np.array_equal(shown.shadow_placement, there.shadow_placement)
-        for what in ("ready_ns", "end_ns", "arrived_ns"):
+        for what in ("ready_ns", "start_ns", "end_ns", "arrived_ns"):
             ours, known = getattr(shown.cycles, what), getattr(there.cycles, what)
             assert np.array_equal(ours[done], known[done])
             if what == "arrived_ns":
@@ -286,6 +309,33 @@ def test_the_controller_is_given_what_the_simulators_is(
             assert np.array_equal(ours[stopped], known[stopped])
             assert (ours[~stopped] == UNKNOWN).all()
             assert stopped.any() or name == "impaired"
+
+
+@pytest.mark.parametrize("name", ["stressed", "impaired"])
+def test_core_time_that_processes_tell_is_evidence_as_in_the_simulator(
+    name: str, request: pytest.FixtureRequest
+) -> None:
+    played: Played = request.getfixturevalue(name)
+    messages = messages_of(played, Clocks(), work_of(played))
+    _, _, _, evidence, _ = replay(played, SYNCHRONOUS, messages)
+    for theirs, shown, there in zip(
+        played.seen.windows, evidence, played.seen.evidence, strict=False
+    ):
+        done = known_at_close(there, theirs)
+        of = (shown.cycles, there.cycles, shown.shadows, there.shadows)
+        ours, known, of_shadows, known_of_shadows = (
+            instants.work_ns for instants in of if instants is not None
+        )
+        assert ours is not None
+        assert known is not None
+        assert np.array_equal(ours[done], known[done])
+        assert (known[done] > 0).all()
+        assert of_shadows is not None
+        assert known_of_shadows is not None
+        stopped = of_shadows.max(axis=1) > 0
+        assert np.array_equal(of_shadows[stopped], known_of_shadows[stopped])
+        assert stopped.any() or name == "impaired"
+        assert (there.shadows_share, shown.shadows_share) == (True, False)
 
 
 def test_the_record_is_the_simulators(stressed: Played, tmp_path: Path) -> None:

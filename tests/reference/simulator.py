@@ -223,9 +223,7 @@ class Job:
 
     @property
     def result(self) -> JobResult:
-        return JobResult(
-            self.node, self.ready, self.start, self.end, self.outcome, self.core
-        )
+        return JobResult(self.node, self.ready, self.start, self.end, self.outcome, self.core)
 
 
 @dataclass(eq=False)

@@ -715,7 +715,7 @@ def test_evidence_is_the_same_with_and_without_a_log_of_all_jobs(
         for of, expected in ((one.cycles, other.cycles), (one.shadows, other.shadows)):
             assert of is not None
             assert expected is not None
-            for name in ("ready_ns", "end_ns", "arrived_ns"):
+            for name in ("ready_ns", "start_ns", "end_ns", "work_ns", "arrived_ns"):
                 np.testing.assert_array_equal(getattr(of, name), getattr(expected, name))
 
 
@@ -913,7 +913,7 @@ def test_evidence_is_what_the_jobs_had_done_when_the_window_closed(name: str) ->
 
 
 def _instants(jobs: pl.DataFrame) -> list[tuple[Any, ...]]:
-    columns = ("cycle", "task", "shadow", "node", "ready_ns", "end_ns", "outcome")
+    columns = ("cycle", "task", "shadow", "node", "ready_ns", "start_ns", "end_ns", "outcome")
     return jobs.select(columns).rows()
 
 
@@ -929,14 +929,18 @@ def _check(
     for row, k in enumerate(range(begin, begin + problem.window_cycles)):
         for shadow, instants in ((False, evidence.cycles), (True, evidence.shadows)):
             assert instants is not None
+            assert instants.start_ns is not None
+            assert instants.work_ns is not None
+            of = instants.ready_ns, instants.start_ns, instants.end_ns
             for column, name in enumerate(problem.pipeline.tasks):
-                _, ready, end, outcome = rows.get((k, name, shadow), (None, None, None, ""))
+                nothing = (None, None, None, None, "")
+                _, ready, start, end, outcome = rows.get((k, name, shadow), nothing)
                 known = [
                     -1 if ns is None or ns > close or not counts else ns
-                    for ns, counts in ((ready, True), (end, outcome == "done"))
+                    for ns, counts in ((ready, True), (start, True), (end, outcome == "done"))
                 ]
-                found = [instants.ready_ns[row, column], instants.end_ns[row, column]]
-                assert found == known
+                assert [table[row, column] for table in of] == known
+                assert (instants.work_ns[row, column] < 0) == (known[-1] < 0)
                 unknown += (end or 0) > close
             for column, flow in enumerate(problem.pipeline.flows):
                 arrived = instants.arrived_ns[row, column]

@@ -75,8 +75,8 @@ class Evidence:
         Instants of the jobs and messages that a shadow did not share with the cycle itself. It
         stops before the sinks: its last messages arrive there and are discarded.
     shadows_share : bool
-        Whether shadow jobs share the cores that own jobs leave with foreign threads as equals. Where
-        they stand behind these, how long they take says nothing of how many there are.
+        Whether shadow jobs share the cores that own jobs leave with foreign threads as equals.
+        Where they stand behind these, how long they take says nothing of how many there are.
     """
 
     close_ns: int

@@ -380,7 +380,7 @@ class Ledger:
                 if execution is None or execution.accelerator is None or hop.ended_ns == UNKNOWN:
                     continue
                 spent = shadow if is_shadow else own
-                spent[execution.resource(hop.node)] += max(hop.ended_ns - hop.started_ns, 0)
+                spent[execution.resource(hop.node)] += self._work_ns(hop)
         return {
             name: (
                 float(own[name]) if name in own or name not in placed else math.nan,
@@ -407,6 +407,15 @@ class Ledger:
         """Execution of a job; None where its task does not run there."""
         task = self._pipeline.tasks.get(hop.task)
         return None if task is None else task.on.get(hop.node)
+
+    def _work_ns(self, hop: Hop) -> int:
+        """CPU time of a job that has ended, or the time that it had an accelerator."""
+        execution = self._execution(hop)
+        if execution is None or hop.ended_ns == UNKNOWN:
+            return UNKNOWN
+        if execution.accelerator is None:
+            return hop.cpu_ns
+        return max(hop.ended_ns - hop.started_ns, 0)
 
     def jobs(self, cycle: LiveCycle) -> list[Values]:
         """Return rows of ``jobs``: all known to have become ready for a cycle or its shadow."""
@@ -520,31 +529,36 @@ class Ledger:
                 self._enter(known, row, cycle, report.hops, self._every)
             if cycle.heard and not (cycle.deaf or cycle.reports or cycle.replaced or cycle.told):
                 self._mark_lost(known, row, cycle)
-        for group in (known, of_shadows):
-            for instants in (group.ready_ns, group.end_ns, group.arrived_ns):
-                instants[instants > close_ns] = UNKNOWN
+        for tables in (known, of_shadows):
+            tables["work_ns"][tables["end_ns"] > close_ns] = UNKNOWN
+            for name in ("ready_ns", "start_ns", "end_ns", "arrived_ns"):
+                tables[name][tables[name] > close_ns] = UNKNOWN
         return Evidence(
             close_ns=close_ns,
             release_ns=release_ns,
             placement=np.array([self._codes[cycle.placement] for cycle in cycles], np.int64),
-            cycles=known,
+            cycles=Instants(**known),
             shadow_placement=through,
-            shadows=of_shadows if shadows else None,
+            shadows=Instants(**of_shadows) if shadows else None,
+            # Agents put shadow jobs into the system's lowest scheduling class.
+            shadows_share=False,
         )
 
-    def _unknown(self, cycles: int) -> Instants:
-        tasks, flows = (cycles, len(self._tasks)), (cycles, len(self._flows))
-        return Instants(*(np.full(shape, UNKNOWN, np.int64) for shape in (tasks, tasks, flows)))
+    def _unknown(self, cycles: int) -> dict[str, Ints]:
+        """Return what `Instants` are made of, with nothing known."""
+        columns = dict.fromkeys(("ready_ns", "start_ns", "end_ns", "work_ns"), len(self._tasks))
+        columns["arrived_ns"] = len(self._flows)
+        return {name: np.full((cycles, n), UNKNOWN, np.int64) for name, n in columns.items()}
 
     def _enter(
         self,
-        known: Instants,
+        known: Mapping[str, Ints],
         row: int,
         cycle: LiveCycle,
         hops: Iterable[Hop],
         apart: frozenset[str],
     ) -> None:
-        """Enter the instants of jobs, and of the messages that reached them."""
+        """Enter instants and work of jobs, and the instants of the messages that reached them."""
         for hop in hops:
             column = self._tasks.get(hop.task)
             if column is None or hop.task not in apart:
@@ -554,24 +568,26 @@ class Ledger:
                 continue
             shift_ns = ready_ns - hop.arrived_ns
             if hop.ended_ns != UNKNOWN:
-                known.end_ns[row, column] = max(hop.ended_ns + shift_ns, 0)
+                known["start_ns"][row, column] = max(hop.started_ns + shift_ns, 0)
+                known["end_ns"][row, column] = max(hop.ended_ns + shift_ns, 0)
+                known["work_ns"][row, column] = self._work_ns(hop)
             # Where a shadow stops, its last messages arrive for a job that never runs.
             if hop.ended_ns != UNKNOWN or hop.task not in self.sinks:
-                known.ready_ns[row, column] = max(ready_ns, 0)
+                known["ready_ns"][row, column] = max(ready_ns, 0)
             for source, arrived_ns in hop.inputs:
                 flow = self._flows.get((source, hop.task))
                 if flow is not None:
-                    known.arrived_ns[row, flow] = max(arrived_ns + shift_ns, 0)
+                    known["arrived_ns"][row, flow] = max(arrived_ns + shift_ns, 0)
 
-    def _mark_lost(self, known: Instants, row: int, cycle: LiveCycle) -> None:
+    def _mark_lost(self, known: Mapping[str, Ints], row: int, cycle: LiveCycle) -> None:
         """Take the first message to another node that is not known to have arrived as lost."""
         nodes = self._candidates[cycle.placement]
         for flow in self._forward:
             column = self._flows[flow.source, flow.target]
-            if nodes[flow.source] != nodes[flow.target] and known.arrived_ns[row, column] < 0:
+            if nodes[flow.source] != nodes[flow.target] and known["arrived_ns"][row, column] < 0:
                 source = self._tasks[flow.source]
-                if known.end_ns[row, source] < 0:
-                    known.end_ns[row, source] = cycle.at_ns
+                if known["end_ns"][row, source] < 0:
+                    known["end_ns"][row, source] = cycle.at_ns
                 return
 
     def unreached(self, cycle: LiveCycle, through: str) -> tuple[str, str] | None:
