@@ -12,6 +12,9 @@ objective weighs cloud nodes apart; otherwise they count as edge nodes.
 
 All arithmetic is in `price`, which takes floats and arrays alike: a window priced alone and a
 window priced among thousands give the same bits.
+
+Estimates have standard errors (`QoS.error`), and a rule that compares two of them takes a
+difference as shown where it is larger than their `margin`.
 """
 
 from __future__ import annotations
@@ -30,14 +33,17 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 __all__ = [
+    "ERRORS",
     "SATURATED",
     "TierNodes",
     "TierUtilisation",
     "busiest",
     "censored",
     "cost",
+    "cost_error",
     "excess",
     "hamming",
+    "margin",
     "price",
     "tier_nodes",
     "tier_utilisation",
@@ -47,6 +53,8 @@ Metric = TypeVar("Metric", float, "NDArray[np.float64]")
 
 #: Utilisation from which a resource is full: what more is asked of it cannot be seen any more.
 SATURATED = 0.995
+#: How many standard errors a difference of two estimates must exceed, beside a rule's threshold.
+ERRORS = 1.0
 
 
 class TierNodes(NamedTuple):
@@ -202,6 +210,36 @@ def cost(qos: QoS, current: Placement, previous: Placement, objective: Objective
     if not math.isfinite(J):
         raise MetricError(f"J is {J!r} for {qos}; a metric is too large for its weight and target")
     return J
+
+
+def cost_error(error: tuple[float, float] | None, objective: Objective) -> float:
+    """Standard error of the J of one estimate, from those of its L95 and V_D (`QoS.error`).
+
+    The two terms are added as they are, not in quadrature: L95 and V_D are of the same cycles, and
+    where one comes out too high, so does the other. No correlation of them gives more.
+    """
+    if error is None:
+        return 0.0
+    l95_ms, violation_rate = error
+    weights = objective.weights
+    return (
+        weights.latency * (l95_ms / objective.targets.latency_ms)
+        + weights.violations * violation_rate
+    )
+
+
+def margin(one: float, other: float) -> float:
+    """Return what a difference of two estimates must exceed to be more than their error.
+
+    It is `ERRORS` standard errors of the difference of two independent estimates. Of estimates from
+    the same draws the difference is known better than that.
+
+    Parameters
+    ----------
+    one, other : float
+        Standard error of each.
+    """
+    return ERRORS * math.sqrt(one * one + other * other)
 
 
 def censored(used: Metric, own: Metric) -> bool | NDArray[np.bool_]:

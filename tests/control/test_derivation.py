@@ -16,6 +16,7 @@ from typing import Any, TypeAlias
 import pytest
 
 import dwell
+from dwell.estimators import Evidence, Profile
 from dwell.model import Caps, NodeDisturbance, Problem, QoS
 from dwell.policies import DTP, Cusum, WorkFunction
 
@@ -45,7 +46,9 @@ class Record:
 
     def __init__(self, folder: Path) -> None:
         self.meta = json.loads((folder / "run.json").read_text(encoding="utf-8"))
-        self.rows = list(dwell.open_run(folder).decisions.iter_rows(named=True))
+        run = dwell.open_run(folder)
+        self.rows = list(run.decisions.iter_rows(named=True))
+        self.windows = {row["window"]: row for row in run.windows.iter_rows(named=True)}
         document = self.meta["problem"]
         self.parameters = self.meta["parameters"]
         first = {name: next(iter(task["on"])) for name, task in document["tasks"].items()}
@@ -85,14 +88,34 @@ class Record:
             + weights["switching"] * self.moved(name, before)
         )
 
+    def error(self, row: Row, name: str) -> float:
+        """Standard error of that J."""
+        weights, targets = self.objective["weights"], self.objective["targets"]
+        latency = weights["latency"] * row[f"est_l95_error_ms_{name}"] / targets["latency_ms"]
+        return float(latency + weights["violations"] * row[f"est_violation_error_{name}"])
+
+    def margin(self, row: Row, name: str) -> float:
+        """What an advantage of a candidate over the incumbent must exceed."""
+        return math.hypot(self.error(row, name), self.error(row, row["incumbent"]))
+
     def over(self, row: Row, name: str) -> float | None:
         """Largest value / cap - 1, of an L95 as J has it; None without caps."""
+        used = max(row[f"est_u_{one}_{name}"] for one in (*self.nodes, *self.accelerators))
+        return self.excess(row[f"est_l95_ms_{name}"], used)
+
+    def is_seen_over(self, row: Row) -> bool:
+        """Whether the window that a decision was made on showed more than a cap."""
+        seen = self.windows[row["window"]]
+        used = max(seen[f"u_{one}"] for one in (*self.nodes, *self.accelerators))
+        over = self.excess(seen["seen_l95_ms"], used)
+        return over is not None and over > 0
+
+    def excess(self, l95_ms: float, used: float) -> float | None:
         caps = self.objective.get("caps", {})
         if not caps:
             return None
-        used = max(row[f"est_u_{one}_{name}"] for one in (*self.nodes, *self.accelerators))
         full = max(used, 1.0) if used >= 0.995 else used
-        over = row[f"est_l95_ms_{name}"] / caps.get("latency_ms", math.inf) - 1
+        over = l95_ms / caps.get("latency_ms", math.inf) - 1
         return max(float(over), float(full / caps.get("utilisation", math.inf) - 1))
 
     def choosable(self, row: Row) -> tuple[list[str], bool]:
@@ -104,10 +127,10 @@ class Record:
         least = min(over.values())
         return [name for name in self.names if over[name] <= least + TOLERANCE], False
 
-    def reason(self, row: Row, best: str, *, within: bool) -> str:
+    def reason(self, row: Row, best: str, choice: list[str], *, within: bool) -> str:
         if not within:
             return "infeasible"
-        out = [name for name in self.names if not row[f"eligible_{name}"]]
+        out = [name for name in self.names if name not in choice]
         capped = any(row[f"j_{name}"] < row[f"j_{best}"] for name in out)
         return "capped" if capped else "migrate"
 
@@ -146,17 +169,17 @@ class Hysteresis(Rule):
 
     def wants(self, row: Row) -> tuple[str, str]:
         record, now = self.record, self.now
-        measured = record.cost(row, now, self.before)
         names, within = record.choosable(row)
         best = cheapest({name: row[f"j_{name}"] for name in names}, now)
-        over = row[f"excess_{now}"]
-        if self.parameters["escape"] and over is not None and over > 0 and within:
-            return best, record.reason(row, best, within=True)
+        elsewhere = [name for name in names if name != now or not within]
+        if self.parameters["escape"] and record.is_seen_over(row) and within and elsewhere:
+            best = cheapest({name: row[f"j_{name}"] for name in elsewhere}, now)
+            return best, record.reason(row, best, elsewhere, within=True)
         if self.dwelt < self.parameters["min_dwell"]:
             return now, "dwell"
-        gain = measured - row[f"j_{best}"]
-        if best != now and gain > self.parameters["min_improvement"]:
-            return best, record.reason(row, best, within=within)
+        gain = record.cost(row, now, self.before) - row[f"j_{best}"]
+        if best != now and gain > self.parameters["min_improvement"] + record.margin(row, best):
+            return best, record.reason(row, best, names, within=within)
         return now, "hold" if within else "infeasible"
 
 
@@ -168,17 +191,17 @@ class Sums(Rule):
 
     def wants(self, row: Row) -> tuple[str, str]:
         record, now, set_to = self.record, self.now, self.parameters
-        measured = record.cost(row, now, now)
+        stays = record.cost(row, now, now)
         for name in record.names:
-            gain = measured - row[f"j_{name}"] - set_to["slack"]
+            gain = stays - row[f"j_{name}"] - set_to["slack"] - record.margin(row, name)
             grown = max(0.0, set_to["memory"] * self.sums[name] + gain)
             self.sums[name] = 0.0 if name == now else grown
         names, within = record.choosable(row)
         due = {n: row[f"j_{n}"] for n in names if self.sums[n] > set_to["threshold"]}
         best = cheapest(due, now) if due else now
-        if best == now or row[f"j_{best}"] >= measured:
+        if best == now or row[f"j_{best}"] >= stays:
             return now, "hold" if within else "infeasible"
-        return best, record.reason(row, best, within=within)
+        return best, record.reason(row, best, names, within=within)
 
     def take(self, name: str) -> None:
         if name != self.now:
@@ -210,17 +233,23 @@ class Hindsight(Rule):
         ties = [n for n in names if totals[n] <= bound]
         away = [n for n in ties if self.distance(n, now) > 1e-9] if now in ties else ties
         best = away[0] if away else now
-        if best == now:
+        margin = record.margin(row, best)
+        saved = served[now] - least - totals[best]
+        if best == now or (now in names and margin > 0 and saved <= margin):
             return now, "hold" if within else "infeasible"
-        return best, record.reason(row, best, within=within)
+        return best, record.reason(row, best, names, within=within)
 
 
 class Quickest(Rule):
     """Latency-first."""
 
     def wants(self, row: Row) -> tuple[str, str]:
-        best = cheapest({n: row[f"est_l95_ms_{n}"] for n in self.record.names}, self.now)
-        return best, "hold" if best == self.now else "migrate"
+        l95_ms = {name: row[f"est_l95_ms_{name}"] for name in self.record.names}
+        best = cheapest(l95_ms, self.now)
+        errors = (row[f"est_l95_error_ms_{name}"] for name in (best, self.now))
+        if best == self.now or l95_ms[self.now] - l95_ms[best] <= math.hypot(*errors):
+            return self.now, "hold"
+        return best, "migrate"
 
 
 class Thresholds(Rule):
@@ -231,16 +260,31 @@ class Thresholds(Rule):
     def begin(self) -> None:
         self.seen: list[Row] = []
 
-    def shown(self, name: str) -> tuple[float, float, float]:
+    def expected(self, name: str) -> tuple[float, float, float]:
         """Means of L95, U_r and U_e of a candidate."""
+        return self.means(self.seen, f"est_l95_ms_{name}", "est_u_{}_" + name)
 
+    def observed(self) -> tuple[float, float, float]:
+        """Means of what the windows showed."""
+        windows = [self.record.windows[row["window"]] for row in self.seen]
+        return self.means(windows, "seen_l95_ms", "u_{}")
+
+    def means(self, rows: list[Row], l95_ms: str, used: str) -> tuple[float, float, float]:
         def mean(columns: list[str]) -> float:
-            largest = [float(max(row[column] for column in columns)) for row in self.seen]
+            largest = [float(max(row[column] for column in columns)) for row in rows]
             return sum(largest) / len(largest)
 
-        robots = [f"est_u_{n}_{name}" for n, of in self.record.nodes.items() if of == "robot"]
-        edges = [f"est_u_{n}_{name}" for n, of in self.record.nodes.items() if of == "edge"]
-        return mean([f"est_l95_ms_{name}"]), mean(robots), mean(edges)
+        robots = [used.format(n) for n, of in self.record.nodes.items() if of == "robot"]
+        edges = [used.format(n) for n, of in self.record.nodes.items() if of == "edge"]
+        return mean([l95_ms]), mean(robots), mean(edges)
+
+    def margin(self, here: str, there: str) -> float:
+        """What an advantage must exceed: of the error of L95 alone, which is the means'."""
+        columns = [f"est_l95_error_ms_{name}" for name in (here, there)]
+        means = [sum(row[column] for row in self.seen) / len(self.seen) for column in columns]
+        objective = self.record.objective
+        scale = objective["weights"]["latency"] / objective["targets"]["latency_ms"]
+        return float(scale * math.hypot(*means))
 
     def total(self, shown: tuple[float, float, float], moved: float) -> float:
         weights, targets = self.record.objective["weights"], self.record.objective["targets"]
@@ -262,13 +306,14 @@ class Thresholds(Rule):
         self.seen.append(row)
         if len(self.seen) < size:
             return now, stays
-        l95_ms, robot, edge = here = self.shown(now)
+        l95_ms, robot, edge = self.observed()
         home = now == set_to["local"]
         other = set_to["offload"] if home else set_to["local"]
         busy = robot > set_to["robot"] if home else edge > set_to["edge"]
         asked = l95_ms > set_to["latency_ms"] or busy
         moved = self.record.moved(now, other)
-        cheaper = self.total(self.shown(other), moved) < self.total(here, 0.0)
+        saved = self.total(self.expected(now), 0.0) - self.total(self.expected(other), moved)
+        cheaper = saved > self.margin(now, other)
         self.begin()
         if stays == "hold" and asked and (cheaper or not self.cost_answers):
             return other, "migrate"
@@ -359,6 +404,66 @@ def test_every_decision_follows_from_its_row(
         rule = RULES[policy](record, "SO" if policy == "SO" else "LOC")
         for row, name, reason in derive(record, rule):
             assert (row["placement"], row["reason"]) == (name, reason), row["window"]
+
+
+class Doubting:
+    """Learns nothing and says so: the profile, by turns too low and too high, with its errors.
+
+    The incumbent's estimate is one as the others', and not what was observed.
+    """
+
+    def __init__(self, share: float) -> None:
+        self.share = share
+
+    def start(self, problem: Problem) -> None:
+        self.profile, self.window = Profile(problem), 0
+
+    def learn(self, evidence: Evidence) -> None:
+        self.window += 1
+
+    def estimate(
+        self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
+    ) -> Mapping[str, QoS]:
+        known = self.profile.estimate(observed=observed, incumbent=incumbent, own=own)
+        return {
+            name: replace(
+                qos,
+                l95_ms=qos.l95_ms * (1 + 0.3 * math.sin(self.window / 2 + 2 * i)),
+                cut_from_ms=None,
+                error=(self.share * qos.l95_ms * (1 + i), self.share * i / 10),
+            )
+            for i, (name, qos) in enumerate(known.items())
+        }
+
+
+@pytest.mark.parametrize(("policy", "escape"), [*((p, False) for p in RULES), ("dtp", True)])
+@pytest.mark.parametrize("caps", ["own", "latency"])
+def test_a_learners_decision_follows_from_its_row_with_its_errors(
+    canonical: Problem, policy: str, caps: str, escape: bool, tmp_path: Path
+) -> None:
+    problem = capped(canonical, caps)
+    controller = replace(problem.controller, escape=escape, min_dwell=1, min_improvement=0.02)
+    problem = replace(problem, controller=controller)
+    moves = {}
+    for share in (0.0, 0.2):
+        folder = tmp_path / str(share)
+        run = dwell.simulate(
+            problem,
+            scenario="robot-cpu-stress",
+            policy=policy,
+            estimator=Doubting(share),
+            seed=2,
+            windows=40,
+        )
+        run.save(folder)
+        record = Record(folder)
+        for row, name, reason in derive(
+            record, RULES[policy](record, "SO" if policy == "SO" else "LOC")
+        ):
+            assert (row["placement"], row["reason"]) == (name, reason), row["window"]
+        moves[share] = run.decisions["migrated"].sum()
+    if policy in ("dtp", "cusum", "work-function", "latency-first") and caps == "own":
+        assert moves[0.2] < moves[0.0]
 
 
 @pytest.mark.parametrize("policy", ["dtp", "cusum", "work-function"])

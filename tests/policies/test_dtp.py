@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dwell.cost import cost, excess
+from dwell.cost import ERRORS, cost, excess
 from dwell.errors import DwellError, MetricError, PlacementError, PolicyError
 from dwell.model import Caps, Decision, Objective, Placement, QoS
 from dwell.policies import DTP, check_policy
@@ -30,6 +30,8 @@ metrics = st.builds(
     violation_rate=shares,
     utilisation=st.fixed_dictionaries(dict.fromkeys(OBJECTIVE.tiers, shares)),
 )
+errors = st.none() | st.tuples(st.sampled_from([0.0, 2.0, 40.0]), st.sampled_from([0.0, 0.1]))
+erring = st.builds(lambda one, error: replace(one, error=error), metrics, errors)
 windows = st.lists(st.fixed_dictionaries(dict.fromkeys(CANDIDATES, metrics)), max_size=40)
 
 
@@ -48,12 +50,14 @@ def dtp(
     )
 
 
-def run(policy: DTP, shown: Sequence[Mapping[str, QoS]]) -> list[Decision]:
-    """Return its decisions when the incumbent's estimate is what was observed."""
+def run(
+    policy: DTP, shown: Sequence[Mapping[str, QoS]], observed: QoS | None = None
+) -> list[Decision]:
+    """Return its decisions; where None, the incumbent's estimate is what was observed."""
     decisions = []
     for window in shown:
-        observed = window[policy.incumbent]
-        decisions.append(policy.decide(observed=observed, estimates=window))
+        seen = observed or window[policy.incumbent]
+        decisions.append(policy.decide(observed=seen, estimates=window))
     return decisions
 
 
@@ -61,7 +65,8 @@ def run(policy: DTP, shown: Sequence[Mapping[str, QoS]]) -> list[Decision]:
 
 
 @given(
-    windows,
+    windows | st.lists(st.fixed_dictionaries(dict.fromkeys(CANDIDATES, erring)), max_size=40),
+    st.none() | metrics,
     st.sampled_from(list(CANDIDATES)),
     st.integers(0, 4),
     st.sampled_from([0.0, 0.05, 0.5]),
@@ -69,14 +74,16 @@ def run(policy: DTP, shown: Sequence[Mapping[str, QoS]]) -> list[Decision]:
 )
 def test_it_is_algorithm_1(
     shown: list[dict[str, QoS]],
+    observed: QoS | None,
     initial: str,
     min_dwell: int,
     min_improvement: float,
     objective: Objective,
 ) -> None:
+    """Whatever was observed: what is compared are estimates."""
     policy = dtp(min_dwell, min_improvement, initial, objective)
     expected = algorithm_1(shown, CANDIDATES, initial, objective, min_dwell, min_improvement)
-    for decision, row in zip(run(policy, shown), expected, strict=True):
+    for decision, row in zip(run(policy, shown, observed), expected, strict=True):
         assert decision.name == row.placement
         assert decision.placement == CANDIDATES[row.placement]
         assert decision.migrated == row.migrated
@@ -162,11 +169,36 @@ def test_an_improvement_must_exceed_the_threshold() -> None:
     assert (moved.name, moved.reason, moved.migrated) == ("SO", "migrate", True)
 
 
-def test_the_measured_cost_carries_the_switch_of_the_last_decision() -> None:
+def test_an_improvement_must_exceed_the_error_of_the_difference_too() -> None:
+    free = replace(NO_CAPS, weights=replace(OBJECTIVE.weights, switching=0.0))
+    assert ERRORS == 1.0
+
+    def name(here: tuple[float, float] | None, there: tuple[float, float] | None) -> str:
+        # 40 ms less, and J less by 1.
+        loc, so = replace(qos(80.0), error=here), replace(qos(40.0), error=there)
+        return run(dtp(0, 0.5, objective=free), [estimates(loc, so, qos(80.0))])[0].name
+
+    assert name(None, None) == name((0.0, 0.0), None) == "SO"
+    # 40 ms are 1 of J, as is a third of V_D; the two of one estimate are added.
+    assert name((19.9, 0.0), None) == name(None, (19.9, 0.0)) == "SO"
+    assert name((20.1, 0.0), None) == name(None, (20.1, 0.0)) == "LOC"
+    assert (name((9.9, 0.25 / 3), None), name((10.1, 0.25 / 3), None)) == ("SO", "LOC")
+    # Those of two estimates are not: 12 and 16 make 20.
+    assert (name((12.0, 0.0), (15.9, 0.0)), name((12.0, 0.0), (16.1, 0.0))) == ("SO", "LOC")
+
+
+def test_the_cheapest_is_tested_and_no_other_in_its_place() -> None:
+    shown = estimates(qos(80.0), replace(qos(20.0), error=(90.0, 0.0)), qos(30.0))
+    decision = run(dtp(), [shown])[0]
+    assert (decision.name, decision.reason) == ("LOC", "hold")
+    assert decision.delta_j == decision.costs["LOC"] - decision.costs["SO"]
+
+
+def test_the_incumbents_cost_carries_the_switch_of_the_last_decision() -> None:
     policy = dtp(0, 0.0)
     shown = estimates(qos(100.0), qos(100.0), qos(20.0))
     # LOC -> HYB moves one task of four: 0.5 * 0.25 is charged to HYB's estimate, and once more
-    # to HYB's measurement in the window after.
+    # to HYB as the incumbent in the window after.
     first = policy.decide(observed=shown["LOC"], estimates=shown)
     assert first.name == "HYB"
     assert first.delta_j == pytest.approx(2.5 - 0.5 - 0.125)
@@ -184,12 +216,13 @@ def test_candidates_pay_for_the_move_from_the_incumbent() -> None:
 
 def test_the_best_being_the_incumbent_is_a_hold_and_does_not_restart_the_dwell() -> None:
     policy = dtp(0, 0.0)
-    shown = estimates(qos(20.0), qos(30.0), qos(30.0))
-    # An incumbent that is worse than its own estimate: Delta J is large, and means nothing.
+    policy.adopt("SO")
+    shown = estimates(qos(30.0), qos(20.0), qos(30.0))
+    # Delta J of the first window is what the move before it has cost, and means nothing.
     decisions = [policy.decide(observed=qos(110.0), estimates=shown) for _ in range(3)]
     assert [d.reason for d in decisions] == ["hold"] * 3
     assert [d.dwell for d in decisions] == [1, 2, 3]
-    assert all(d.delta_j > 2 and not d.migrated for d in decisions)
+    assert [d.delta_j for d in decisions] == [0.25, 0.0, 0.0]
 
 
 @pytest.mark.parametrize("initial", list(CANDIDATES))
@@ -420,9 +453,9 @@ def test_a_candidate_must_be_a_placement() -> None:
         (qos(), {"LOC": qos(), "SO": None, "HYB": qos()}, "the estimate of SO is None"),
         (qos(), [qos()], "it must map every candidate to a QoS"),
         (
-            QoS(1.0, 0.0, {"R1": 0.1, "R2": 0.1}),
-            estimates(qos(), qos(), qos()),
-            "observed has no utilisation of E",
+            qos(),
+            estimates(QoS(1.0, 0.0, {"R1": 0.1, "R2": 0.1}), qos(), qos()),
+            "the estimate of LOC has no utilisation of E",
         ),
         (
             qos(),
@@ -444,7 +477,7 @@ def test_missing_metrics_are_an_error_and_change_nothing(
 def test_a_cost_that_is_not_finite_is_an_error() -> None:
     heavy = replace(NO_CAPS, weights=replace(OBJECTIVE.weights, latency=1e9))
     with pytest.raises(MetricError, match="has no finite J"):
-        dtp(objective=heavy).decide(observed=qos(1e305), estimates=estimates(qos(), qos(), qos()))
+        dtp(objective=heavy).decide(observed=qos(), estimates=estimates(qos(1e305), qos(), qos()))
 
 
 @pytest.mark.parametrize("value", [math.nan, -1.0, math.inf])

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import pytest
 
+from dwell.cost import ERRORS
 from dwell.errors import MetricError, PolicyError
 from dwell.policies import LatencyFirst
 from tests.cells.paper import CANDIDATES, OBJECTIVE, estimates, problem, qos
@@ -53,6 +55,22 @@ def test_ties_of_others_go_to_the_first_candidate() -> None:
     assert latency_first().decide(observed=qos(), estimates=shown).name == "SO"
     turned = dict(reversed(list(shown.items())))
     assert latency_first().decide(observed=qos(), estimates=turned).name == "SO"
+
+
+@pytest.mark.parametrize(
+    ("errors_ms", "name"),
+    [((0.0, 0.0), "SO"), ((2.9, 0.0), "SO"), ((0.0, 3.1), "LOC"), ((2.2, 2.2), "LOC")],
+)
+def test_the_lowest_must_be_lower_by_more_than_the_error(
+    errors_ms: tuple[float, float], name: str
+) -> None:
+    assert ERRORS == 1.0
+    here, there = (
+        replace(qos(l95_ms), error=(error_ms, 1.0))
+        for l95_ms, error_ms in zip((10.0, 7.0), errors_ms, strict=True)
+    )
+    shown = estimates(here, there, qos(8.0))
+    assert latency_first().decide(observed=qos(), estimates=shown).name == name
 
 
 def test_with_an_objective_costs_are_recorded() -> None:

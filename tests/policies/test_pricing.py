@@ -1,8 +1,11 @@
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import pytest
 
-from dwell.cost import cost, tier_utilisation
+from dwell.cost import ERRORS, cost, tier_utilisation
 from dwell.errors import MetricError, PolicyError
 from dwell.model import Caps, Objective, Placement, QoS, Targets, Tier, Weights
 from dwell.policies.pricing import Pricing
@@ -28,7 +31,7 @@ def test_prices_are_those_of_the_formulas() -> None:
     found = pricing().estimated(estimates, "LOC")
     for name, placement in CANDIDATES.items():
         assert found[name] == cost(estimates[name], placement, CANDIDATES["LOC"], OBJECTIVE)
-    assert pricing().observed(qos(), "SO", "LOC") == cost(
+    assert pricing().cost(qos(), "SO", "LOC") == cost(
         qos(), CANDIDATES["SO"], CANDIDATES["LOC"], OBJECTIVE
     )
 
@@ -78,11 +81,23 @@ def test_what_cannot_be_priced_is_named() -> None:
         Pricing(CANDIDATES, "cheap")  # type: ignore[arg-type]
     with pytest.raises(MetricError, match="nothing for candidate SO"):
         pricing().estimated({"LOC": qos()}, "LOC")
-    with pytest.raises(MetricError, match="observed has no utilisation of R2"):
-        pricing().observed(QoS(1.0, 0.0, {"R1": 0.1, "E": 0.1}), "LOC", "LOC")
+    with pytest.raises(MetricError, match="the window of LOC has no utilisation of R2"):
+        pricing().cost(QoS(1.0, 0.0, {"R1": 0.1, "E": 0.1}), "LOC", "LOC")
     with pytest.raises(MetricError, match="must be a QoS"):
-        pricing().observed(3, "LOC", "LOC")  # type: ignore[arg-type]
+        pricing().cost(3, "LOC", "LOC")  # type: ignore[arg-type]
     with pytest.raises(MetricError, match="no finite J"):
-        pricing(Objective(Weights(latency=1e9), Targets(1e-9), tiers=OBJECTIVE.tiers)).observed(
+        pricing(Objective(Weights(latency=1e9), Targets(1e-9), tiers=OBJECTIVE.tiers)).cost(
             qos(1e300), "LOC", "LOC"
         )
+
+
+def test_the_margin_is_that_of_the_errors_of_j() -> None:
+    certain, exact = qos(), replace(qos(), error=(0.0, 0.0))
+    one, other = replace(qos(), error=(3.0, 0.1)), replace(qos(), error=(1.5, 0.0))
+    weights = OBJECTIVE.weights
+    J = weights.latency * 3.0 / 30.0 + weights.violations * 0.1
+    found = pricing()
+    assert found.margin(certain, certain) == found.margin(certain, exact) == 0.0
+    assert found.margin(one, certain) == found.margin(exact, one) == pytest.approx(ERRORS * J)
+    both = ERRORS * math.hypot(J, weights.latency * 1.5 / 30.0)
+    assert found.margin(one, other) == found.margin(other, one) == pytest.approx(both)

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dwell.cost import ERRORS
 from dwell.errors import MetricError, PolicyError
 from dwell.model import Caps, Objective, Placement, QoS, Targets, Weights
 from dwell.policies import WorkFunction
@@ -298,13 +299,48 @@ def test_small_advantages_add_up() -> None:
     assert names == ["LOC"] * 9 + ["HYB"]
 
 
-def test_the_cost_of_the_incumbent_is_the_measured_one() -> None:
+def test_the_cost_of_the_incumbent_is_its_estimate() -> None:
     policy = WorkFunction(candidates=CANDIDATES, initial="LOC", objective=bare(1.0))
     window = shown(CANDIDATES, [0.0, 9.0, 0.0])
-    assert policy.decide(observed=qos(0.0), estimates=window).name == "LOC"
-    decision = policy.decide(observed=qos(3.0), estimates=window)
+    assert policy.decide(observed=qos(3.0), estimates=window).name == "LOC"
+    decision = policy.decide(observed=qos(0.0), estimates={**window, "LOC": qos(3.0)})
     assert decision.name == "HYB"
-    assert decision.costs == {"LOC": 0.0, "SO": 9.5, "HYB": 0.25}
+    assert decision.costs == {"LOC": 3.0, "SO": 9.5, "HYB": 0.25}
+
+
+def erring(costs: Costs, error_ms: float) -> dict[str, QoS]:
+    """Metrics as those of `shown`, whose L95 has a standard error."""
+    window = shown(CANDIDATES, costs)
+    return {name: replace(one, error=(error_ms, 0.0)) for name, one in window.items()}
+
+
+@pytest.mark.parametrize(("error_ms", "moves"), [(0.0, True), (0.70, True), (0.71, False)])
+def test_an_advantage_within_its_error_never_moves_however_long_it_lasts(
+    error_ms: float, moves: bool
+) -> None:
+    policy = WorkFunction(candidates=CANDIDATES, initial="LOC", objective=bare(4.0))
+    window = erring([11.0, 20.0, 10.0], error_ms)
+    assert ERRORS == 1.0
+    names = [policy.decide(observed=qos(), estimates=window).name for _ in range(50)]
+    assert names[-1] == ("HYB" if moves else "LOC")
+
+
+@given(cases(fewest=2))
+def test_errors_of_0_change_nothing(case: Case) -> None:
+    plain, exact = case.policy(), case.policy()
+    for costs in case.windows:
+        window = shown(case.candidates, costs)
+        known = {name: replace(one, error=(0.0, 0.0)) for name, one in window.items()}
+        one = plain.decide(observed=qos(), estimates=window)
+        other = exact.decide(observed=qos(), estimates=known)
+        assert (one, plain.work) == (replace(other, delta_j=one.delta_j), exact.work)
+
+
+def test_an_incumbent_over_a_cap_is_left_whatever_the_errors() -> None:
+    capped = replace(bare(1.0), caps=Caps(latency_ms=4.0))
+    policy = WorkFunction(candidates=CANDIDATES, initial="LOC", objective=capped)
+    decision = policy.decide(observed=qos(), estimates=erring([4.125, 4.0, 4.25], 9.0))
+    assert (decision.name, decision.reason) == ("SO", "capped")
 
 
 def test_what_is_over_a_cap_is_not_chosen_but_remembered() -> None:
@@ -366,8 +402,16 @@ GOOD = estimates(qos(5.0), qos(), qos())
     ("observed", "window", "message"),
     [
         (None, GOOD, "observed is None"),
-        (QoS(5.0, 0.0, {"R1": 0.5}), GOOD, "observed has no utilisation of E"),
-        (QoS(1e308, 0.0, {"R1": 1.7e308, "E": 0.0, "R2": 0.0}), GOOD, "no finite J"),
+        (
+            qos(5.0),
+            {**GOOD, "LOC": QoS(5.0, 0.0, {"R1": 0.5})},
+            "the estimate of LOC has no utilisation of E",
+        ),
+        (
+            qos(5.0),
+            {**GOOD, "SO": QoS(1e308, 0.0, {"R1": 1.7e308, "E": 0.0, "R2": 0.0})},
+            "no finite J",
+        ),
         (qos(5.0), None, "estimates is None"),
         (qos(5.0), {"LOC": qos(), "HYB": qos()}, "nothing for candidate SO"),
         (qos(5.0), {**GOOD, "HYB": 3}, "the estimate of HYB is 3"),

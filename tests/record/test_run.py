@@ -103,6 +103,8 @@ def test_the_columns_that_every_run_has() -> None:
         *(f"j_{name}" for name in names),
         *(f"est_l95_ms_{name}" for name in names),
         *(f"est_violation_rate_{name}" for name in names),
+        *(f"est_l95_error_ms_{name}" for name in names),
+        *(f"est_violation_error_{name}" for name in names),
         *(f"est_u_{node}_{name}" for node in ("R1", "E", "R2") for name in names),
         *(f"eligible_{name}" for name in names),
         *(f"excess_{name}" for name in names),

@@ -47,6 +47,17 @@ def price(q: QoS, now: Nodes, before: Nodes, objective: Objective) -> float:
     return total + a.switching * switching(now, before)
 
 
+def doubt(one: QoS, other: QoS, objective: Objective) -> float:
+    """One standard error of a difference of J."""
+    a, bar = objective.weights, objective.targets
+
+    def of(q: QoS) -> float:
+        l95_ms, rate = q.error or (0.0, 0.0)
+        return a.latency * (l95_ms / bar.latency_ms) + a.violations * rate
+
+    return math.sqrt(of(one) * of(one) + of(other) * of(other))
+
+
 def worst(q: QoS, objective: Objective) -> float:
     """Largest value / cap - 1; a node that is full to 0.995 counts as full."""
     used = [max(u, 1.0) if u >= 0.995 else u for u in q.utilisation.values()]
@@ -70,8 +81,7 @@ def algorithm_1(
     rows = []
     for shown in windows:
         before, now = pi[-2:]
-        collected = shown[now]
-        J_measured = price(collected, candidates[now], candidates[before], objective)
+        J_now = price(shown[now], candidates[now], candidates[before], objective)
         J_of = {c: price(shown[c], candidates[c], candidates[now], objective) for c in candidates}
         if n_d < N_min:
             n_d += 1
@@ -86,8 +96,9 @@ def algorithm_1(
         lowest = min(J_of[c] for c in allowed)
         ties = [c for c in allowed if J_of[c] == lowest]
         star = now if now in ties else ties[0]
-        Delta = J_measured - J_of[star]
-        if star != now and Delta > Delta_min:
+        Delta = J_now - J_of[star]
+        migrates = star != now and Delta > Delta_min + doubt(shown[now], shown[star], objective)
+        if migrates:
             n_d = 0
             pi.append(star)
             left_out = any(J_of[c] < lowest for c in candidates if c not in allowed)
@@ -96,5 +107,5 @@ def algorithm_1(
             n_d += 1
             pi.append(now)
             reason = "infeasible" if infeasible else "hold"
-        rows.append(Row(pi[-1], star != now and Delta > Delta_min, reason, n_d, Delta, J_of))
+        rows.append(Row(pi[-1], migrates, reason, n_d, Delta, J_of))
     return rows

@@ -19,6 +19,7 @@ from dwell.estimators import Estimator, Evidence, Learner, Support
 from dwell.estimators import by_name as estimator_by_name
 from dwell.model import Caps, Decision, FrozenDict, Objective, Problem, QoS
 from dwell.model.bounds import SHADOW_FRACTION
+from dwell.model.qos import NO_ERROR
 from dwell.model.semantics import too_many_shadows
 from dwell.model.table_columns import DECISIONS, Feature, columns_of, those_with
 from dwell.model.user_classes import is_class_path
@@ -172,9 +173,10 @@ class Controller:
         """Names of the columns of `Log.decisions`.
 
         J of every candidate (null where the policy prices none), what was estimated of it (L95 in
-        ms, violation rate, utilisation of every resource), whether it is within the caps, by how
-        much it is over them at most (null without caps), and where the estimator says it, how many
-        samples stand behind the estimate and how old (windows) the newest is.
+        ms, violation rate, their standard errors, utilisation of every resource), whether it is
+        within the caps, by how much it is over them at most (null without caps), and where the
+        estimator says it, how many samples stand behind the estimate and how old (windows) the
+        newest is.
         """
         features: tuple[Feature, ...] = ("support",) if self.supports else ()
         resources = self.problem.fabric.resources.values()
@@ -279,9 +281,10 @@ class Controller:
         """Decide on metrics that are already aggregated (see `close`)."""
         incumbent = self.incumbent
         # With the switching term of the decision that led to it.
-        measured = self._pricing.observed(observed, incumbent, self.previous)
+        measured = self._pricing.cost(observed, incumbent, self.previous)
         estimates = dict(self.estimator.estimate(observed=observed, incumbent=incumbent, own=own))
         if self._learner is None:
+            # It knows no more of the incumbent than the window shows.
             estimates[incumbent] = observed
         before = copy.deepcopy(self.policy) if self.on_fallback else self.policy
         decision = self._checked(self.policy.decide(observed=observed, estimates=estimates))
@@ -400,6 +403,7 @@ class Controller:
         )
         log.seen.append((observed.l95_ms, observed.violation_rate, measured))
         known = [estimates[name] for name in names]
+        errors = [estimate.error or NO_ERROR for estimate in known]
         used = [estimate.utilisation for estimate in known]
         log.decisions.append(
             (
@@ -407,6 +411,8 @@ class Controller:
                 *(map(costs.get, names) if costs else self._none),
                 *[estimate.l95_ms for estimate in known],
                 *[estimate.violation_rate for estimate in known],
+                *[l95_ms for l95_ms, _ in errors],
+                *[violation_rate for _, violation_rate in errors],
                 *[shares.get(name) for name in self.resources for shares in used],
                 *self._capped(known),
                 *self._supported(),

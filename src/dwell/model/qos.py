@@ -15,6 +15,8 @@ Reason: TypeAlias = Literal["dwell", "hold", "migrate", "capped", "infeasible", 
 #: Every reason, in the order in which they are looked at.
 REASONS: tuple[Reason, ...] = get_args(Reason)
 INFINITY = math.inf
+#: Standard errors of L95 and V_D that count where a QoS says none.
+NO_ERROR = (0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +35,9 @@ class QoS:
     cut_from_ms : float, optional
         L95 that `l95_ms` stands for in J where it is larger than that; infinite where it is lost.
         Caps are compared with it.
+    error : tuple of float, optional
+        Standard errors of `l95_ms` (milliseconds) and of `violation_rate`; finite, at least 0.
+        None says nothing of them, and counts as 0.
 
     Raises
     ------
@@ -65,6 +70,12 @@ class QoS:
                 )
             if cut_from_ms == l95_ms:
                 object.__setattr__(self, "cut_from_ms", None)
+        if self.error is not None:
+            for metric, value in zip(("l95_ms", "violation_rate"), self.error, strict=True):
+                if not 0 <= value < INFINITY:
+                    raise MetricError(
+                        f"error of {metric} is {value!r}; it must be finite and at least 0"
+                    )
         if type(self.utilisation) is not FrozenDict:
             object.__setattr__(self, "utilisation", FrozenDict(self.utilisation))
 
@@ -84,12 +95,13 @@ def unchecked_qos(
     violation_rate: float,
     utilisation: FrozenDict[str, float],
     cut_from_ms: float | None,
+    error: tuple[float, float] | None = None,
 ) -> QoS:
     """Make a QoS of metrics that are known to be good, in a third of the time.
 
     Parameters
     ----------
-    l95_ms, violation_rate, utilisation, cut_from_ms
+    l95_ms, violation_rate, utilisation, cut_from_ms, error
         As a `QoS` has them: `cut_from_ms` is None where it is `l95_ms`.
     """
     qos: QoS = object.__new__(QoS)
@@ -97,7 +109,7 @@ def unchecked_qos(
     _set_violation_rate(qos, violation_rate)
     _set_utilisation(qos, utilisation)
     _set_cut_from_ms(qos, cut_from_ms)
-    _set_error(qos, None)
+    _set_error(qos, error)
     return qos
 
 
@@ -120,8 +132,8 @@ class Decision:
     dwell : int
         Windows since the last migration, after this decision (n_d).
     delta_j : float
-        Measured J of the incumbent less the estimated J of the best candidate; NaN where not
-        computed.
+        J of the incumbent, with the switching term of its own last decision, less J of the best
+        candidate; NaN where not computed.
     """
 
     placement: Placement

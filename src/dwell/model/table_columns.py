@@ -185,7 +185,8 @@ DECISIONS = (
     Column(
         "delta_j",
         "Float64",
-        "Measured J of the incumbent less the estimated J of the best candidate.",
+        "J of the incumbent, with the switching term of its own last decision, less J of the best "
+        "candidate.",
         null="the policy computes none",
     ),
     Column(
@@ -196,6 +197,19 @@ DECISIONS = (
     ),
     Column("est_l95_ms_{candidate}", "Float64", "Its estimated L95.", "ms", GUARD),
     Column("est_violation_rate_{candidate}", "Float64", "Its estimated V_D.", null=GUARD),
+    Column(
+        "est_l95_error_ms_{candidate}",
+        "Float64",
+        "Standard error of its estimated L95; 0 where the estimator says none.",
+        "ms",
+        GUARD,
+    ),
+    Column(
+        "est_violation_error_{candidate}",
+        "Float64",
+        "Standard error of its estimated V_D; 0 likewise.",
+        null=GUARD,
+    ),
     Column(
         "est_u_{resource}_{candidate}",
         "Float64",

@@ -24,7 +24,8 @@ the close of the last of them, with means over them, and unless the dwell goes o
        C(s) = a_L * L95 / L_target + a_r * U_r / U_r_target + a_e * U_e / U_e_target
               [+ a_c * U_c / U_c_target] + a_S * S
 
-   with what was observed and S = 0 for staying, and with what was estimated of the other side.
+   with what was estimated of both sides, and S = 0 for staying; less by more than the
+   `dwell.cost.margin` of the two, which is 0 where estimates say no errors.
 
 At other closes it stays (``hold``, or ``dwell`` while the dwell lasts). A move, its own or somebody
 else's, begins the next such windows.
@@ -36,32 +37,37 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from dwell.cost import TierUtilisation, price
+from dwell.cost import TierUtilisation, cost_error, margin, price
 from dwell.errors import MetricError
 from dwell.model.bounds import EVERY_MS
 from dwell.model.objective import Objective
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
-from dwell.model.qos import Decision, QoS
+from dwell.model.qos import NO_ERROR, Decision, QoS
 from dwell.policies.atp_thresholds import ATPThresholds
 from dwell.policies.incumbent import check_parameter
 
 
 class _Shown(NamedTuple):
-    """Metrics of a window that the rule reads, observed or estimated: L95 (ms), U_r, U_e, U_c."""
+    """Metrics that the rule reads, observed or estimated: L95 and its error (ms), U_r, U_e, U_c.
+
+    The error of a mean is the mean of errors: estimates of windows in a row have the same samples.
+    """
 
     l95_ms: float
+    l95_error_ms: float
     used: TierUtilisation
 
 
 def _mean(windows: Sequence[_Shown]) -> _Shown:
     # Added one after another: from Python 3.12 on, `sum` rounds floats otherwise.
-    l95_ms = robot = edge = cloud = 0.0
+    l95_ms = l95_error_ms = robot = edge = cloud = 0.0
     for one in windows:
-        l95_ms += one.l95_ms
+        l95_ms, l95_error_ms = l95_ms + one.l95_ms, l95_error_ms + one.l95_error_ms
         robot, edge, cloud = robot + one.used.robot, edge + one.used.edge, cloud + one.used.cloud
     count = len(windows)
-    return _Shown(l95_ms / count, TierUtilisation(robot / count, edge / count, cloud / count))
+    used = TierUtilisation(robot / count, edge / count, cloud / count)
+    return _Shown(l95_ms / count, l95_error_ms / count, used)
 
 
 class ATP(ATPThresholds):
@@ -153,16 +159,12 @@ class ATP(ATPThresholds):
             If a metric, or the estimate of a candidate, is missing. Nothing has changed then.
         """
         incumbent = self._incumbent
-        used = self._pricing.used(observed)
-        here = _Shown(observed.l95_ms, used)
+        shown = (*self._observed, self._shown(observed))
         costs = self._costs(estimates)
-        there: Mapping[str, _Shown] | None = None
+        expected: Mapping[str, _Shown] | None = None
         if estimates is not None:
-            there = {
-                name: _Shown(estimates[name].l95_ms, self._pricing.used(estimates[name]))
-                for name in self.candidates
-            }
-        shown, told = (*self._observed, here), (*self._estimated, there)
+            expected = {name: self._shown(estimates[name]) for name in self.candidates}
+        told = (*self._estimated, expected)
         dwells = incumbent.dwell < self.min_dwell
         if len(shown) < self.every_windows:
             self._observed, self._estimated = shown, told
@@ -172,20 +174,31 @@ class ATP(ATPThresholds):
             return incumbent.stay("dwell", costs)
         mean = _mean(shown)
         other, over = self._question(mean.l95_ms, mean.used)
-        saved = math.nan
+        saved, least = math.nan, 0.0
         if over:
-            known = [one[other] for one in told if one is not None]
+            known = [one for one in told if one is not None]
             if len(known) < len(told):
                 raise MetricError(
                     f"estimates is None in {len(told) - len(known)} of the {len(told)} windows "
                     f"decided on; give one for each of {', '.join(self.candidates)}"
                 )
+            here, there = (_mean([one[name] for one in known]) for name in (incumbent.name, other))
             moved = self._pricing.switching(incumbent.name)[other]
-            saved = self._cost(mean, 0.0) - self._cost(_mean(known), moved)
+            saved = self._cost(here, 0.0) - self._cost(there, moved)
+            least = margin(self._error(here), self._error(there))
         self._begin()
-        if over and saved > 0:
+        if over and saved > least:
             return incumbent.move(other, "migrate", costs, saved)
         return incumbent.stay("hold", costs, saved)
+
+    def _shown(self, qos: QoS) -> _Shown:
+        used = self._pricing.used(qos)
+        l95_error_ms, _ = qos.error or NO_ERROR
+        return _Shown(qos.l95_ms, l95_error_ms, used)
+
+    def _error(self, shown: _Shown) -> float:
+        """Return the standard error of C."""
+        return cost_error((shown.l95_error_ms, 0.0), self.objective)
 
     def _cost(self, shown: _Shown, switching: float) -> float:
         """C of the module's head: J without violations."""

@@ -5,19 +5,20 @@ threshold on one window's difference and a minimum dwell, each candidate s has a
 what it would have saved, as in Page's test for a change of the mean (Biometrika 41, 1954,
 DOI 10.1093/biomet/41.1-2.100)::
 
-    g(s) < -max(0, memory * g(s) + J(incumbent) - J(s) - slack)
+    g(s) < -max(0, memory * g(s) + J(incumbent) - J(s) - slack - margin(s))
 
-J(incumbent) is the measured one without its switching term, J(s) the estimated one against the
-incumbent, switching term included. If any eligible g(s) exceeds the threshold, the cheapest of
-those candidates becomes the incumbent, if it is cheaper in this window too, and all sums begin
-again at 0.
+J is that of the estimates, against the incumbent, whose own switching term is therefore 0;
+margin(s) is the `dwell.cost.margin` of the two, 0 where estimates say no errors. An error stays as
+long as the samples behind it, so that it must not add up: it is taken off in every window. If any
+eligible g(s) exceeds the threshold, the cheapest of those candidates becomes the incumbent, if it
+is cheaper in this window too, and all sums begin again at 0.
 
-An advantage above ``threshold + slack`` moves the cell at once, whatever the last move's date; one
-below ``slack + (1 - memory) * threshold`` never does, however long it lasts. There is no minimum
-dwell: what bounds migrations is what they are worth. Before each of them, and after the one before
-it, the advantages of the candidate it goes to, each without the slack and where it is one at all,
-have added up to more than the threshold. So, with A the sum over all windows of the largest such
-advantage, there are fewer than A / threshold migrations.
+An advantage above ``threshold + slack + margin`` moves the cell at once, whatever the last move's
+date; one below ``slack + margin + (1 - memory) * threshold`` never does, however long it lasts.
+There is no minimum dwell: what bounds migrations is what they are worth. Before each of them, and
+after the one before it, the advantages of the candidate it goes to, each less slack and margin
+where that is above 0, have added up to more than the threshold. So, with A the sum over all windows
+of the largest such advantage, there are fewer than A / threshold migrations.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from dwell.model.problem import Problem
 from dwell.model.qos import Decision, QoS
 from dwell.policies.dtp import cheapest
 from dwell.policies.incumbent import PricingPolicy, check_parameter
+from dwell.policies.pricing import check_metrics
 
 
 class Cusum(PricingPolicy):
@@ -47,7 +49,8 @@ class Cusum(PricingPolicy):
     threshold : float
         Sum that an advantage must exceed, in units of J.
     slack : float
-        Advantage of a window that counts as none, in units of J.
+        Advantage of a window, beside the margin of the estimates, that counts as none, in units of
+        J.
     memory : float
         Share of a sum that outlives a window, in (0, 1].
 
@@ -113,17 +116,19 @@ class Cusum(PricingPolicy):
         """
         incumbent, pricing = self._incumbent, self._pricing
         now = incumbent.name
+        check_metrics(observed, "observed")
         costs = pricing.estimated(estimates, now)
-        measured = pricing.observed(estimates[now], now, now)
+        stays, known = costs[now], estimates[now]
         eligible, within_caps = pricing.eligible(estimates)
         for name, value in self._sums.items():
-            gain = measured - costs[name] - self.slack
+            least = self.slack + pricing.margin(estimates[name], known)
+            gain = stays - costs[name] - least
             self._sums[name] = 0.0 if name == now else max(0.0, self.memory * value + gain)
         due = [name for name in eligible if self._sums[name] > self.threshold]
         if not due:
             return incumbent.stay("hold" if within_caps else "infeasible", costs, 0.0)
         best = cheapest(costs, due, now)
-        delta_j = measured - costs[best]
+        delta_j = stays - costs[best]
         if delta_j <= 0:
             return incumbent.stay("hold" if within_caps else "infeasible", costs, delta_j)
         self._sums = dict.fromkeys(self.candidates, 0.0)

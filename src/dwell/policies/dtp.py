@@ -3,9 +3,12 @@
 Window k ran under the incumbent, placement k - 1. The lines of the algorithm, with its corner
 cases decided:
 
-* J of the incumbent is the measured one, with the switching term of its own last decision
-  (placement k - 1 against k - 2); J of every candidate, the incumbent included, is the estimated
-  one against the incumbent.
+* J of the incumbent is that of its entry in the estimates, with the switching term of its own last
+  decision (placement k - 1 against k - 2); J of every candidate, the incumbent included, is that of
+  its entry against the incumbent. The incumbent's entry is what was measured, as in the paper,
+  unless the estimator learns: both sides of Delta J are then its predictions.
+* Delta J must exceed Delta_min and the `dwell.cost.margin` of the two estimates, which is 0 where
+  they say no errors.
 * n_d counts windows since the last migration and blocks while n_d < N_min. Two migrations are
   therefore at least N_min + 1 windows apart, and K windows hold at most
   floor(K / (N_min + 1)) of them, whatever the metrics do.
@@ -32,6 +35,7 @@ from dwell.model.objective import Objective
 from dwell.model.placement import Placement
 from dwell.model.qos import Decision, QoS
 from dwell.policies.incumbent import PricingPolicy, check_parameter
+from dwell.policies.pricing import check_metrics
 
 
 class DTP(PricingPolicy):
@@ -48,7 +52,7 @@ class DTP(PricingPolicy):
     min_dwell : int
         N_min, windows; 0 lets every window migrate.
     min_improvement : float
-        Delta_min, in units of J: an improvement must exceed it.
+        Delta_min, in units of J: an improvement must exceed it, and the margin of the estimates.
     escape : bool
         Whether an incumbent over a cap may leave before the hysteresis is met.
 
@@ -90,10 +94,10 @@ class DTP(PricingPolicy):
         Parameters
         ----------
         observed : QoS
-            Metrics of the window under the incumbent.
+            Metrics of the window under the incumbent; the escape looks at them.
         estimates : mapping of str to QoS, optional
-            Metrics by candidate, the incumbent's being `observed`; Algorithm 1 does without them
-            in a dwell window, and so may the caller.
+            Metrics by candidate; Algorithm 1 does without them in a dwell window, and so may the
+            caller.
 
         Returns
         -------
@@ -106,15 +110,14 @@ class DTP(PricingPolicy):
             If a metric, or the estimate of a candidate, is missing. Nothing has changed then.
         """
         incumbent, pricing = self._incumbent, self._pricing
-        mine = observed if estimates is None else estimates[incumbent.name]
-        measured = pricing.observed(mine, incumbent.name, incumbent.previous)
+        check_metrics(observed, "observed")
         costs = self._costs(estimates)
         if self.escape and estimates is not None and excess(observed, self.objective) > 0:
             eligible, within_caps = pricing.eligible({**estimates, incumbent.name: observed})
             if within_caps:
                 best = cheapest(costs, eligible, incumbent.name)
                 reason = pricing.reason(best, costs, eligible, within_caps=True)
-                return incumbent.move(best, reason, costs, measured - costs[best])
+                return incumbent.move(best, reason, costs, self._stays(estimates) - costs[best])
         if incumbent.dwell < self.min_dwell:
             return incumbent.stay("dwell", costs)
         if estimates is None:
@@ -124,11 +127,17 @@ class DTP(PricingPolicy):
             )
         eligible, within_caps = pricing.eligible(estimates)
         best = cheapest(costs, eligible, incumbent.name)
-        delta_j = measured - costs[best]
-        if best != incumbent.name and delta_j > self.min_improvement:
+        delta_j = self._stays(estimates) - costs[best]
+        least = self.min_improvement + pricing.margin(estimates[best], estimates[incumbent.name])
+        if best != incumbent.name and delta_j > least:
             reason = pricing.reason(best, costs, eligible, within_caps=within_caps)
             return incumbent.move(best, reason, costs, delta_j)
         return incumbent.stay("hold" if within_caps else "infeasible", costs, delta_j)
+
+    def _stays(self, estimates: Mapping[str, QoS]) -> float:
+        """J of the incumbent, with the switching term of its own last decision."""
+        name, previous = self._incumbent.name, self._incumbent.previous
+        return self._pricing.cost(estimates[name], name, previous)
 
 
 def cheapest(costs: Mapping[str, float], eligible: Iterable[str], incumbent: str) -> str:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from dwell.model.qos import Decision, QoS
+from dwell.cost import margin
+from dwell.model.qos import NO_ERROR, Decision, QoS
 from dwell.policies.incumbent import CandidatePolicy
 from dwell.policies.pricing import check_metrics, explain_estimate
 
@@ -14,7 +15,8 @@ class LatencyFirst(CandidatePolicy):
 
     This is latency-driven service selection, what FogROS2-LS (Chen et al., ICRA 2024) does among
     replicated deployments of a service: it knows no deadline, no utilisation, no caps and no price
-    of a move. Ties go to the incumbent, then to the order of the candidates.
+    of a move. Ties go to the incumbent, then to the order of the candidates. Where estimates have
+    errors, the lowest must be below the incumbent's by more than their `dwell.cost.margin`.
 
     Parameters
     ----------
@@ -45,6 +47,13 @@ class LatencyFirst(CandidatePolicy):
             explain_estimate(estimates, name, self.candidates)
             raise
         costs = self._costs(estimates)
-        if best == incumbent.name:
+        here, there = estimates[incumbent.name], estimates[best]
+        if best == incumbent.name or here.l95_ms - lowest <= _margin_ms(here, there):
             return incumbent.stay("hold", costs)
         return incumbent.move(best, "migrate", costs)
+
+
+def _margin_ms(one: QoS, other: QoS) -> float:
+    if one.error is None and other.error is None:
+        return 0.0
+    return margin((one.error or NO_ERROR)[0], (other.error or NO_ERROR)[0])

@@ -11,7 +11,16 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from operator import itemgetter
 from typing import NoReturn
 
-from dwell.cost import TierUtilisation, busiest, excess, hamming, price, tier_nodes
+from dwell.cost import (
+    TierUtilisation,
+    busiest,
+    cost_error,
+    excess,
+    hamming,
+    margin,
+    price,
+    tier_nodes,
+)
 from dwell.errors import MetricError, PolicyError
 from dwell.model.frozen import FrozenDict
 from dwell.model.objective import Objective
@@ -105,8 +114,8 @@ class Pricing:
         except (AttributeError, KeyError, TypeError):
             self._explain(qos, "observed")
 
-    def observed(self, qos: QoS, current: str, previous: str) -> float:
-        """J of the window that `qos` was observed in.
+    def cost(self, qos: QoS, current: str, previous: str) -> float:
+        """J of a window under `current`, when `previous` was the candidate before it.
 
         Raises
         ------
@@ -116,9 +125,9 @@ class Pricing:
         try:
             value = self._price(qos, self.switching(previous)[current])
         except (AttributeError, KeyError, TypeError):
-            self._explain(qos, "observed")
+            self._explain(qos, f"the window of {current}")
         if not value < INFINITY:
-            self._explain(qos, "observed")
+            self._explain(qos, f"the window of {current}")
         return value
 
     def estimated(self, estimates: Mapping[str, QoS], incumbent: str) -> FrozenDict[str, float]:
@@ -141,6 +150,14 @@ class Pricing:
             name = max(costs, key=costs.__getitem__)
             self._explain(estimates[name], f"the estimate of {name}")
         return FrozenDict(costs)
+
+    def margin(self, one: QoS, other: QoS) -> float:
+        """Return what J of two estimates must differ by to be more than their error."""
+        if one.error is None and other.error is None:
+            return 0.0
+        return margin(
+            cost_error(one.error, self.objective), cost_error(other.error, self.objective)
+        )
 
     def eligible(self, estimates: Mapping[str, QoS]) -> tuple[list[str], bool]:
         """Candidates to choose from, and whether they respect the caps.

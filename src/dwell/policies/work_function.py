@@ -11,9 +11,9 @@ in advance, began on the initial candidate, and ends on s::
     w_0(s) = d(initial, s)
     w_k(s) = min over x of  w_{k-1}(x) + r_k(x) + d(x, s)
 
-where r_k(x) is J of window k under x without its switching term. The next candidate is the s that
-minimises w_k(s) + d(s, incumbent) among those with w_k(s) = w_{k-1}(s) + r_k(s), that is, among
-those that it would be best to have spent window k on in order to end there.
+where r_k(x) is J of window k under x, as estimated, without its switching term. The next candidate
+is the s that minimises w_k(s) + d(s, incumbent) among those with w_k(s) = w_{k-1}(s) + r_k(s), that
+is, among those that it would be best to have spent window k on in order to end there.
 
 How it is computed
     Both conditions together say: s minimises w_{k-1}(s) + r_k(s) + d(s, incumbent). The minimum of
@@ -22,11 +22,18 @@ How it is computed
     w_k is subtracted in each window, so that w_k lies in [0, weights.switching] however long a run
     is; decisions depend on differences alone.
 
+Errors of estimates
+    The cell moves to s only where w_{k-1} + r_k of the incumbent exceeds the sum above by more than
+    the `dwell.cost.margin` of the two estimates. Since w_{k-1}(incumbent) - w_{k-1}(s) is never
+    more than d(s, incumbent), that takes a window in which s is cheaper by more than the margin,
+    and errors that last add up to no move. An incumbent that is not eligible is left without it:
+    there caps decide, not J. Where estimates say no errors, all is as above.
+
 What is not claimed
     The algorithm costs at most 2n - 1 times the optimum, plus a constant, if it sees a window's
     costs before it chooses where to spend that window, if the costs are exact, and if nothing
-    stops it from moving. Here a window is over when its costs are seen, those of all candidates
-    but the incumbent are estimates, and caps exclude candidates. **No bound holds**: costs that
+    stops it from moving. Here a window is over when its costs are seen, they are estimates, and
+    caps and margins exclude candidates. **No bound holds**: costs that
     always strike the incumbent are paid in full every time, however large. What it is worth on a
     cell has to be measured.
 """
@@ -42,6 +49,7 @@ from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.qos import Decision, QoS
 from dwell.policies.incumbent import PricingPolicy
+from dwell.policies.pricing import check_metrics
 
 #: Sums whose relative difference is at most this are a tie: w_k carries rounding errors.
 TIE_TOLERANCE = 1e-9
@@ -105,9 +113,9 @@ class WorkFunction(PricingPolicy):
         Parameters
         ----------
         observed : QoS
-            Metrics of the window under the incumbent; its r_k is the measured one.
+            Metrics of the window under the incumbent; nothing is decided by them.
         estimates : mapping of str to QoS
-            Metrics by candidate; r_k of the others, and the caps of all.
+            Metrics by candidate: r_k, and the caps.
 
         Returns
         -------
@@ -122,12 +130,10 @@ class WorkFunction(PricingPolicy):
         """
         incumbent, pricing = self._incumbent, self._pricing
         now = incumbent.name
+        check_metrics(observed, "observed")
         costs = pricing.estimated(estimates, now)
         # From a candidate to itself: J of a window that no move preceded.
-        window = [
-            pricing.observed(observed if name == now else estimates[name], name, name)
-            for name in self.candidates
-        ]
+        window = [pricing.cost(estimates[name], name, name) for name in self.candidates]
         served = list(map(add, self._work, window))
         # Subtracted before distances are added: large costs then round off nothing of w_k.
         least = min(served)
@@ -135,10 +141,18 @@ class WorkFunction(PricingPolicy):
         self._work = tuple(min(map(add, reduced, row)) for row in self._distances)
         eligible, within_caps = pricing.eligible(estimates)
         best = self._choose(served, eligible)
-        if best == now:
+        if best == now or (now in eligible and self._unsure(best, served, estimates)):
             return incumbent.stay("hold" if within_caps else "infeasible", costs)
         reason = pricing.reason(best, costs, eligible, within_caps=within_caps)
         return incumbent.move(best, reason, costs)
+
+    def _unsure(self, best: str, served: list[float], estimates: Mapping[str, QoS]) -> bool:
+        """Whether what a move saves in the sums is no more than the margin of the estimates."""
+        now = self._incumbent.name
+        least = self._pricing.margin(estimates[best], estimates[now])
+        here, there = self._index[now], self._index[best]
+        # Without errors a tie is a move.
+        return least > 0 and served[here] - served[there] - self._distances[here][there] <= least
 
     def _choose(self, served: list[float], eligible: list[str]) -> str:
         """Return the eligible candidate with the least ``served + distance``; ties move.

@@ -270,7 +270,10 @@ def _decided_by_kernel(played: PlayedRealisation) -> TableArrays:
         "dwell": decided["dwell"],
         "delta_j": decided["delta_j"],
     }
-    priced = controller.decision_columns[len(columns) :]
+    # It decides by estimates without errors alone.
+    errors = ("est_l95_error_ms", "est_violation_error")
+    columns |= {f"{error}_{name}": np.zeros(count) for error in errors for name in names}
+    priced = [column for column in controller.decision_columns if column not in columns]
     columns |= {name: tables.priced[:count, i] for i, name in enumerate(priced)}
     for name in names:
         columns[f"eligible_{name}"] = tables.priced[:count, priced.index(f"eligible_{name}")] > 0
