@@ -19,16 +19,10 @@ Age
 
 from __future__ import annotations
 
-from typing import ClassVar, TypeAlias
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import ClassVar
 
 from dwell.estimators.learning import Learning
 from dwell.estimators.measured import Message, Part
-from dwell.estimators.pool import Pool
-
-Floats: TypeAlias = NDArray[np.float64]
 
 
 class Corrected(Learning):
@@ -68,32 +62,9 @@ class Corrected(Learning):
                 if part not in measured and isinstance(part, Message) == isinstance(
                     surest, Message
                 ):
-                    self._follow(self._pools[part], self._pools[surest])
-
-    def _follow(self, pool: Pool, witness: Pool) -> None:
-        """Let a part be otherwise as another one is."""
-        if witness.is_declared:
-            pool.reset()
-        elif pool.reference.usual < np.inf and witness.reference.usual < np.inf:
-            pool.replace(_like(pool, witness), self._window)
+                    self._pools[part].follow(self._pools[surest], self._window)
 
 
 def _place(part: Part) -> str:
     """The node or link that a part is on."""
     return part.link if isinstance(part, Message) else part.node
-
-
-def _like(pool: Pool, witness: Pool) -> Floats:
-    """The declared values, with the extra delay and the losses, or the slowdown, of another part."""
-    values, usual = pool.reference.values, witness.reference.usual
-    now = witness.usual
-    if not pool.additive:
-        return values * (now / usual) if usual > 0 and now < np.inf else values
-    if now < np.inf:
-        values = values + max(now - usual, 0.0)
-    lost = witness.lost - float(np.isinf(values).mean())
-    if lost > 0:
-        values = values.copy()
-        finite = np.flatnonzero(np.isfinite(values))
-        values[finite[: round(lost * len(values))]] = np.inf
-    return values

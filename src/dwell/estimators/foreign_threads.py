@@ -170,24 +170,19 @@ class Stretches:
         return _level(node, bursts, shadows, own)
 
     def _jobs(self, instants: Instants, placement: NDArray[np.integer], name: str) -> _Jobs | None:
-        if instants.start_ns is None or instants.work_ns is None:
+        start_ns, end_ns, work_ns = instants.start_ns, instants.end_ns, instants.work_ns
+        if start_ns is None or work_ns is None:
             return None
         found = []
         for code, rows in groups(placement):
             columns, cores = self._tasks_on(int(code), name)
-            if code < 0 or not columns:
+            if not columns:
                 continue
-            of = instants.at(rows)
-            assert of.start_ns is not None
-            assert of.work_ns is not None
-            pieces = [table[:, columns].astype(float) for table in (of.start_ns, of.end_ns)]
-            alone_ns = of.work_ns[:, columns] / cores
-            known = (pieces[0] >= 0) & (pieces[1] >= 0) & (alone_ns > 0)
-            wide = [np.broadcast_to(row, known.shape)[known] for row in (cores, columns)]
-            found.append([*(piece[known] for piece in pieces), alone_ns[known], *wide])
-        if not found:
-            return None
-        return _Jobs(*map(np.concatenate, zip(*found, strict=True)))
+            begun, ended, work = (of[rows][:, columns] for of in (start_ns, end_ns, work_ns))
+            known = (begun >= 0) & (ended >= 0) & (work > 0)
+            wide = [np.broadcast_to(row, known.shape) for row in (cores, columns)]
+            found.append([of[known].astype(float) for of in (begun, ended, work / cores, *wide)])
+        return _Jobs(*map(np.concatenate, zip(*found, strict=True))) if found else None
 
     def _tasks_on(self, code: int, name: str) -> tuple[list[int], Floats]:
         if (code, name) not in self._on:

@@ -106,13 +106,12 @@ class Meter:
         for number, part in enumerate(self._parts):
             if isinstance(part, Site) and foreign.get(part.node, 0.0) >= BESIDE:
                 self._cost[number] /= self._problem.fabric.nodes[part.node].interference
-        placement, through = evidence.placement, evidence.shadow_placement
         cycles, shadows = evidence.cycles, evidence.shadows
-        told = replace(
-            evidence,
-            cycles=self.with_work(cycles, placement, foreign),
-            shadows=None if shadows is None else self.with_work(shadows, through, foreign),
-        )
+        work_ns = self.work_ns(cycles, evidence.placement, foreign)
+        told = replace(evidence, cycles=replace(cycles, work_ns=work_ns))
+        if shadows is not None:
+            work_ns = self.work_ns(shadows, evidence.shadow_placement, foreign)
+            told = replace(told, shadows=replace(shadows, work_ns=work_ns))
         return self._take_apart(self._demands, told)
 
     def _take_apart(self, found: PartTimes, evidence: Evidence) -> dict[Part, Floats]:
@@ -126,10 +125,10 @@ class Meter:
             found.add(active, self._layout(active))
         return {self._parts[part]: values for part, values in found.by_part().items()}
 
-    def with_work(
+    def work_ns(
         self, instants: Instants, placement: NDArray[np.integer], foreign: Mapping[str, float]
-    ) -> Instants:
-        """Tell the core time of jobs of which it is not known by how long they took.
+    ) -> Ints:
+        """Core time of each job: where it is not known, told by how long the job took.
 
         Parameters
         ----------
@@ -137,10 +136,15 @@ class Meter:
             Candidate that each cycle, or shadow, went through; -1 for none.
         foreign : mapping of str to float
             As in `demands`.
+
+        Returns
+        -------
+        int64 array, shape (n, tasks)
+            -1 for a job that has not completed.
         """
-        ended = instants.end_ns >= 0
-        if instants.work_ns is not None and not (ended & (instants.work_ns < 0)).any():
-            return instants
+        ended, known_ns = instants.end_ns >= 0, instants.work_ns
+        if known_ns is not None and not (ended & (known_ns < 0)).any():
+            return known_ns
         begun_ns = instants.ready_ns if instants.start_ns is None else instants.start_ns
         begun_ns = np.where(begun_ns >= 0, begun_ns, instants.ready_ns)
         work_ns = np.full_like(instants.end_ns, UNKNOWN)
@@ -150,9 +154,7 @@ class Meter:
                 taken_ns = instants.end_ns[rows] - begun_ns[rows]
                 work_ns[rows] = np.rint(taken_ns * cores)
         work_ns[~ended | (begun_ns < 0)] = UNKNOWN
-        if instants.work_ns is not None:
-            work_ns = np.where(instants.work_ns >= 0, instants.work_ns, work_ns)
-        return replace(instants, work_ns=work_ns)
+        return work_ns if known_ns is None else np.where(known_ns >= 0, known_ns, work_ns)
 
     def _cores_received(self, placement: Placement, foreign: Mapping[str, float]) -> Floats:
         """Cores that the job of each task has in the mean beside foreign threads."""

@@ -22,8 +22,8 @@ from dwell.cost import censored
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.foreign_threads import ForeignThreads, Stretches
 from dwell.estimators.measured import Message, Meter, Part, groups, parts_of
-from dwell.estimators.playing import Playing, Present
-from dwell.estimators.prices import L95_SHARE, RATE, SEED
+from dwell.estimators.playing import Played, Playing, Present
+from dwell.estimators.prices import L95_SHARE, RATE, SEED, Price
 from dwell.estimators.profile import Profile, mean_ms
 from dwell.estimators.spans import patience_ns
 from dwell.model.frozen import FrozenDict
@@ -62,10 +62,7 @@ class Online(ABC):
             name: tuple(dict.fromkeys(parts_of(problem.pipeline, placed)))
             for name, placed in problem.candidates.items()
         }
-        self._foreign = {
-            name: ForeignThreads(node)
-            for name, node in problem.fabric.nodes.items()
-        }
+        self._foreign = {name: ForeignThreads(node) for name, node in problem.fabric.nodes.items()}
         self._down: frozenset[str] = frozenset()
         self._patience_ns = patience_ns(problem)
         self._sent = {name: self._sent_under(name) for name in problem.candidates}
@@ -106,14 +103,14 @@ class Online(ABC):
             self._play()
         played = {name: self._playing.played(name) for name in self._names}
         prices, work = self.profile.prices, []
-        for name, price in prices.items():
-            does = played[name].own if name in played else price.own
+        for name in prices:
+            does = played[name].own if name in played else prices[name].own
             sent = self._sent[name]
             work.append((name, [(one, share + sent[one]) for one, share in does.items()]))
         shares = self.profile.utilisation(observed, incumbent, own, work)
         estimates = {}
         for name in self.problem.candidates:
-            price = played.get(name, prices[name])
+            price: Played | Price = played.get(name, prices[name])
             error = None
             if name in played:
                 l95_error_ms, rate_error = self._known_error(name, price.violation_rate)
@@ -135,7 +132,7 @@ class Online(ABC):
             share = max(used - mine, 0.0)
             usual, deviation = price.foreign[name], price.foreign_deviation[name]
             level = partial(self._stretches.level, evidence, name)
-            is_full = censored(used, mine)
+            is_full = bool(censored(used, mine))
             changed = foreign.see(share, usual, deviation, level, is_full=is_full)
             if changed:
                 self._has_changed = True
@@ -190,7 +187,7 @@ class Online(ABC):
         ]
 
     def _play(self) -> None:
-        """Play the candidates that are not as declared on, or anew where the present has changed."""
+        """Play the candidates that are not as declared, anew where the present has changed."""
         names = self._names
         if names:
             threads = {name: one.beyond for name, one in self._foreign.items() if one.beyond}

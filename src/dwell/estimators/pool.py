@@ -182,6 +182,27 @@ class Pool:
         self._add(values, declared, window, memory)
         return False
 
+    def follow(self, witness: Pool, window: int) -> None:
+        """Be otherwise as another part is: so many times its usual values, or so much more."""
+        if witness.is_declared:
+            self.reset()
+        elif max(self.reference.usual, witness.reference.usual) < math.inf:
+            self.replace(self._as(witness), window)
+
+    def _as(self, witness: Pool) -> Floats:
+        """The declared values, with the extra delay and the losses, or the slowdown, of another."""
+        values, usual, now = self.reference.values, witness.reference.usual, witness.usual
+        if not self.additive:
+            return values * (now / usual) if usual > 0 and now < math.inf else values
+        if now < math.inf:
+            values = values + max(now - usual, 0.0)
+        lost = witness.lost - float(np.isinf(values).mean())
+        if lost > 0:
+            values = values.copy()
+            finite = np.flatnonzero(np.isfinite(values))
+            values[finite[: round(lost * len(values))]] = np.inf
+        return values
+
     def moved(self, to: float) -> Floats:
         """The declared values, stretched or shifted so that their median is another."""
         values, usual = self.reference.values, self.reference.usual

@@ -1,31 +1,27 @@
-"""Scaling: careful estimates from what the active placement was measured to take.
+"""Scaling: what candidates come to by what the active placement was measured to take.
 
-A job that a candidate runs where it runs now counts with its own work, as long as it would take
-alone there; one that the candidate runs elsewhere counts with that times the known ratio of the two
-nodes' compute times. A message that crosses the same link as now counts with its delay; on any
-other link with the declared bound of that link. With these in the place of what is declared every
-candidate is played (see `dwell.estimators.online`), and never counts as less than its bound. Of a
-job that waited or was replaced the work is not known; it counts as the longest that is.
+There are no shadow jobs: what the active placement shows of its own parts is all that is known. A
+task that needs more than is declared where it runs now needs so many times as much elsewhere, too.
+A *ratio* that is given says what a task needs on another node, over what it needs on this one, in
+every cycle; a *bound* that is given is the largest delay of a link that is not in use. With these
+in the place of what is declared the candidates are played (see `dwell.estimators.online`).
 
 What is bounded
-    The latency of each cycle as it would be *queue-free* under the candidate: the longest path of
-    its execution times, each alone on a node without stress and quota, and of its messages, each
-    alone on its link. So the bound holds, cycle by cycle on the same realisation, where every job
-    of the window has completed and
+    Where all of its ratios and bounds are given, a candidate never counts as less than its
+    *queue-free* window: of every cycle the longest path of its execution times, each alone on a
+    node without stress and quota, and of its messages, each alone on its link. So L95 and V_D are
+    bounds on those, cycle by cycle on the same realisation, where every job of the window has
+    completed and
 
     * ratios are true: exec there <= ratio * exec here in every cycle (a task with more threads than
       a node has cores takes threads / cores times as long there, which counts);
-    * declared bounds hold: no message takes longer on a link that its flow does not use now,
-      repeated attempts included, nor is one lost there;
+    * bounds hold: no message takes longer on a link that its flow does not use now, repeated
+      attempts included, nor is one lost there;
     * a link that its flow does use is no worse for the message at the instant at which the
       candidate would send it. Where it is as it was declared, that is so.
 
-    And so it does for the L95 and the V_D of the window's cycles, up to the censoring of L95 at
-    ``problem.censor_ms``.
-
-What is not
-    Ratios that are not given are taken from the profile: its 95th percentile there over its median
-    here. That is no bound on a cycle, only a cautious factor.
+    Of a job that waited or was replaced the work is not known; it counts as the longest that is.
+    L95 is cut at ``problem.censor_ms``.
 """
 
 from __future__ import annotations
@@ -40,12 +36,11 @@ from numpy.typing import NDArray
 
 from dwell.errors import Fault, ProblemError
 from dwell.estimators.evidence import Evidence
+from dwell.estimators.learning import Learning
 from dwell.estimators.measured import Message, Part, Site, cores_of, message_of
-from dwell.estimators.online import Online
 from dwell.estimators.paths import longest_path, order_statistic, steps_of
 from dwell.estimators.spans import spans_of
 from dwell.model.bounds import VALUE, shown
-from dwell.model.pipeline import Flow
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS
@@ -56,17 +51,16 @@ Floats: TypeAlias = NDArray[np.float64]
 NS_PER_MS = 1e6
 
 
-class Scaling(Online):
-    """Estimates upper bounds of QoS from the active placement alone.
+class Scaling(Learning):
+    """Estimates QoS from the active placement alone.
 
     Parameters
     ----------
     ratios : mapping of (task, node, other node) to float, optional
-        Compute time on the other node over that on the node; what is missing is the 95th percentile
-        of the profile's there over its median here.
+        Compute time on the other node over that on the node; what is missing is as declared.
     bounds_ms : mapping of str to float, optional
         Largest delay of each link (``R1->E``), transmission not included, milliseconds; what is
-        missing is the largest that the undisturbed cell shows.
+        missing is as declared.
 
     Raises
     ------
@@ -74,7 +68,8 @@ class Scaling(Online):
         If a ratio or bound is negative or not finite, or is of something that does not exist.
     """
 
-    FIRST_STEPS: ClassVar[int] = 2
+    MEMORY: ClassVar[float] = 1.0
+    UNSEEN: ClassVar[float] = math.inf
 
     def __init__(
         self,
@@ -82,58 +77,53 @@ class Scaling(Online):
         ratios: Mapping[tuple[str, str, str], float] | None = None,
         bounds_ms: Mapping[str, float] | None = None,
     ) -> None:
-        self._given, self._bounds = dict(ratios or {}), dict(bounds_ms or {})
-        self.start(problem)
+        self._ratios, self._bounds = dict(ratios or {}), dict(bounds_ms or {})
+        super().__init__(problem, shadow_fraction=0.0)
 
     def __repr__(self) -> str:
-        return f"Scaling(ratios={self._given}, bounds_ms={self._bounds})"
+        return f"Scaling(ratios={self._ratios}, bounds_ms={self._bounds})"
 
     def start(self, problem: Problem) -> None:
-        """Forget the last window."""
-        faults = [*_unknown_ratios(self._given, problem), *_unknown_bounds(self._bounds, problem)]
+        """Forget all windows."""
+        faults = [*_unknown_ratios(self._ratios, problem), *_unknown_bounds(self._bounds, problem)]
         if faults:
             raise ProblemError(faults)
         super().start(problem)
-        self._references = self._playing.declared.references
         self._steps = steps_of(problem.pipeline)
         names = list(problem.pipeline.tasks)
         self._sources = [names.index(flow.source) for flow in problem.pipeline.flows]
-        self._ratios = dict(self._given)
         #: Longest work of each task that is known, on the node that it was on.
         self._longest: dict[Site, float] = {}
         self._active: Placement | None = None
         #: Times of each cycle of the last window, milliseconds: of its jobs alone, of its messages.
         self._jobs, self._messages = np.empty((0, 0)), np.empty((0, 0))
-        self._delays: Mapping[Part, Floats] = {}
 
     def _take_in(self, demands: Mapping[Part, Floats], evidence: Evidence) -> None:
-        """Take in what the cycles of a window took; those of an earlier placement are left out."""
+        super()._take_in(demands, evidence)
         newest = int(evidence.placement[-1])
-        self._active = active = tuple(self.problem.candidates.values())[newest]
+        active = tuple(self.problem.candidates.values())[newest]
+        self._has_changed |= active != self._active
+        self._active = active
+        if self._ratios or self._bounds:
+            self._has_grown = True
+            self._keep_cycles(evidence, newest)
+
+    def _keep_cycles(self, evidence: Evidence, newest: int) -> None:
+        """Keep what cycles took; those of an earlier placement are left out."""
+        active = tuple(self.problem.candidates.values())[newest]
         rows = evidence.placement == newest
-        cycles = self._meter.with_work(evidence.cycles, evidence.placement, self._threads).at(rows)
-        work_ns = cycles.work_ns
-        assert work_ns is not None
-        alone_ms = np.where(work_ns >= 0, work_ns, np.nan) / self._cores(active) / NS_PER_MS
+        cycles = evidence.cycles.at(rows)
+        work_ns = self._meter.work_ns(evidence.cycles, evidence.placement, self._threads)[rows]
+        cores = [
+            cores_of(self.problem.fabric.nodes[active[name]], task.on[active[name]])
+            for name, task in self.problem.pipeline.tasks.items()
+        ]
+        alone_ms = np.where(work_ns >= 0, work_ns, np.nan) / cores / NS_PER_MS
         for column, task in enumerate(self.problem.pipeline.tasks):
             alone_ms[:, column] = self._filled(Site(task, active[task]), alone_ms[:, column])
         limit_ns = evidence.close_ns - self._patience_ns
         self._jobs = alone_ms
         self._messages = spans_of(cycles, cycles.end_ns[:, self._sources], limit_ns).message_ms
-        self._delays = {
-            part: values.copy() for part, values in demands.items() if isinstance(part, Message)
-        }
-        self._has_changed = True
-
-    def _cores(self, placement: Placement) -> Floats:
-        """Cores that the job of each task has where nothing is in its way."""
-        nodes = self.problem.fabric.nodes
-        return np.array(
-            [
-                cores_of(nodes[placement[name]], task.on[placement[name]])
-                for name, task in self.problem.pipeline.tasks.items()
-            ]
-        )
 
     def _filled(self, site: Site, alone_ms: Floats) -> Floats:
         """Let work that is not known be the longest that is."""
@@ -141,43 +131,42 @@ class Scaling(Online):
         if len(known):
             self._longest[site] = float(known.max())
         elif site not in self._longest:
-            declared = self._references[site].values
+            declared = self._pools[site].reference.values
             self._longest[site] = order_statistic(declared) if len(declared) else 0.0
         return np.where(np.isnan(alone_ms), self._longest[site], alone_ms)
 
+    def _correct(self, changed: set[Part], measured: frozenset[Part]) -> None:
+        for part in changed & measured:
+            if isinstance(part, Site):
+                for other, pool in self._pools.items():
+                    if isinstance(other, Site) and other.task == part.task and other != part:
+                        pool.follow(self._pools[part], self._window)
+
     def _otherwise(self) -> dict[Part, Floats]:
+        found = super()._otherwise()
         active = self._active
-        if active is None:
-            return {}
-        found: dict[Part, Floats] = {}
-        for placement in self.problem.candidates.values():
-            for column, task in enumerate(self.problem.pipeline.tasks):
-                site = Site(task, placement[task])
-                if site not in found:
-                    found[site] = self._executed(column, task, active, placement)
-            for flow in self.problem.pipeline.flows:
-                part = message_of(flow.source, flow.target, placement)
-                if part is None or part in found:
-                    continue
-                is_active = part == message_of(flow.source, flow.target, active)
-                if is_active and part in self._delays:
-                    found[part] = self._delays[part]
-                else:
-                    found[part] = np.array([self._bound_ms(part)])
+        if active is None or not len(self._jobs):
+            return found
+        columns = list(self.problem.pipeline.tasks)
+        for (task, here, there), ratio in self._ratios.items():
+            if here == active[task] != there:
+                found[Site(task, there)] = self._jobs[:, columns.index(task)] * ratio
+        for part in self._pools:
+            if not isinstance(part, Message) or part.link not in self._bounds:
+                continue
+            if part != message_of(part.source, part.target, active):
+                found[part] = np.array([self._bounds[part.link]])
         return found
 
     def estimate(
         self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
     ) -> dict[str, QoS]:
-        """Estimate every candidate's metrics (see `Estimator`); by the profile before any window."""
+        """Estimate every candidate's metrics (see `Estimator`); before any window by the profile."""
         estimates = super().estimate(observed=observed, incumbent=incumbent, own=own)
-        active = self._active
-        if active is None:
-            return estimates
-        return {
-            name: self._at_least(estimates[name], placement, active)
-            for name, placement in self.problem.candidates.items()
-        }
+        if self._active is not None and len(self._jobs):
+            for name, placement in self.problem.candidates.items():
+                estimates[name] = self._at_least(estimates[name], placement, self._active)
+        return estimates
 
     def _at_least(self, qos: QoS, placement: Placement, active: Placement) -> QoS:
         """Let metrics be no less than those of the window's cycles, each queue-free."""
@@ -187,11 +176,19 @@ class Scaling(Online):
             for column, task in enumerate(pipeline.tasks)
         ]
         sent = [
-            self._sent_ms(flow, self._messages[:, column], active, placement)
+            self._sent_ms(
+                message_of(flow.source, flow.target, placement),
+                message_of(flow.source, flow.target, active),
+                self._messages[:, column],
+            )
             for column, flow in enumerate(pipeline.flows)
         ]
+        known = [times for times in executed if times is not None]
+        on_the_way = [times for times in sent if times is not None]
+        if len(known) < len(executed) or len(on_the_way) < len(sent):
+            return qos
         # To whole nanoseconds, as everything is timed.
-        latency_ms = np.round(longest_path(self._steps, executed, sent), 6)
+        latency_ms = np.round(longest_path(self._steps, known, on_the_way), 6)
         missed = int(np.count_nonzero(latency_ms > pipeline.deadline_ms)) / len(latency_ms)
         bound_ms = order_statistic(latency_ms)
         return replace(
@@ -201,46 +198,31 @@ class Scaling(Online):
             cut_from_ms=max(qos.uncut_l95_ms, bound_ms),
         )
 
-    def _executed(self, column: int, task: str, active: Placement, placement: Placement) -> Floats:
-        """Bound the time of a task's job in each cycle."""
+    def _executed(
+        self, column: int, task: str, active: Placement, placement: Placement
+    ) -> Floats | None:
+        """Bound the time of a task's job in each cycle; None where there is no bound."""
         here, there, alone_ms = active[task], placement[task], self._jobs[:, column]
         if here == there:
             return alone_ms
-        ratio = self._ratio(task, here, there)
-        if ratio in (0.0, math.inf):  # whatever it took here
-            return np.full(len(alone_ms), ratio)
-        return alone_ms * ratio
+        ratio = self._ratios.get((task, here, there))
+        return None if ratio is None else alone_ms * ratio
 
     def _sent_ms(
-        self, flow: Flow, taken_ms: Floats, active: Placement, placement: Placement
-    ) -> Floats | float:
-        """Bound the time of a flow's message in each cycle."""
-        part = message_of(flow.source, flow.target, placement)
+        self, part: Message | None, active: Message | None, taken_ms: Floats
+    ) -> Floats | float | None:
+        """Bound the time of a flow's message in each cycle; None where there is no bound."""
         if part is None:
             return 0.0
-        bound_ms = self._bound_ms(part) + self._meter.sending_ms(part)
-        if part == message_of(flow.source, flow.target, active):
-            return np.where(np.isnan(taken_ms), bound_ms, taken_ms)
-        return bound_ms
-
-    def _ratio(self, task: str, here: str, there: str) -> float:
-        """Compute time there over that here; infinite where there is none here."""
-        key = (task, here, there)
-        if key not in self._ratios:
-            usual = self._references[Site(task, here)].usual
-            values = self._references[Site(task, there)].values
-            longest = order_statistic(values) if len(values) else math.inf
-            none = math.inf if longest > 0 else 0.0
-            self._ratios[key] = longest / usual if 0 < usual < math.inf else none
-        return self._ratios[key]
-
-    def _bound_ms(self, part: Message) -> float:
-        """Longest delay of a message on a link that its flow does not use now."""
-        if part.link in self._bounds:
-            return self._bounds[part.link]
-        times = self._references[part].values
-        finite = times[np.isfinite(times)]
-        return float(finite.max()) if len(finite) else math.inf
+        bound_ms = self._bounds.get(part.link)
+        if bound_ms is not None:
+            bound_ms += self._meter.sending_ms(part)
+        if part != active:
+            return bound_ms
+        known = taken_ms[np.isfinite(taken_ms)]
+        # Of what has not been sent by then it is not known; others took so long at most.
+        most = bound_ms if bound_ms is not None else float(known.max()) if len(known) else math.inf
+        return np.where(np.isnan(taken_ms), most, taken_ms)
 
 
 def _unknown_ratios(

@@ -71,7 +71,7 @@ class Cusum(PricingPolicy):
         objective: Objective,
         threshold: float = 0.4,
         slack: float = 0.05,
-        memory: float = 0.7,
+        memory: float = 1.0,
     ) -> None:
         super().__init__(candidates=candidates, initial=initial, objective=objective)
         self.threshold = check_parameter("threshold", threshold, MIN_IMPROVEMENT)
