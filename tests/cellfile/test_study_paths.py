@@ -10,6 +10,7 @@ from dwell.cellfile.study_paths import put, steps_of, with_settings
 from dwell.errors import ProblemError
 from dwell.model import Problem
 from tests.cellfile.test_cell import EXAMPLE
+from tests.cells.many import many
 
 DOCUMENT: dict[str, Any] = {
     "name": "cell",
