@@ -133,7 +133,7 @@ def _scatter(
             *ends,
         ],
         "encoding": {"x": across, "y": up, "color": colour},
-        "layer": [*bars, layer("point", {"tooltip": about}, filled=True, size=45, opacity=0.9)],
+        "layer": [*bars, layer("point", {"tooltip": about}, filled=True, size=26, opacity=0.9)],
     }
     both = {"x": {**across, "field": "at"}, "y": {**up, "field": "at"}}
     diagonal = {
