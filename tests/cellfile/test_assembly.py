@@ -9,6 +9,7 @@ import pytest
 from dwell.cellfile import from_document
 from dwell.errors import ProblemError
 from tests.cellfile.faulty import DOCUMENT, faults_of_document
+from tests.cells.many import document_of
 
 
 def test_a_link_stands_once() -> None:
@@ -78,3 +79,11 @@ def test_a_fault_in_episodes_is_no_difference_to_what_shares_their_name() -> Non
         from_document(document)
     (fault,) = caught.value.faults
     assert fault.path == "scenarios.x[1].episodes.for_s.exponential.mean"
+
+
+def test_only_a_shadow_fraction_that_is_given_can_be_too_large() -> None:
+    assert from_document(document_of(21, shadow_fraction=0.05))
+    assert from_document(document_of(22))
+    (fault,) = faults_of_document(document_of(22, shadow_fraction=0.05))
+    assert fault.path == "controller.shadow_fraction"
+    assert "0.05 of the cycles through each of 21 alternatives" in fault.message

@@ -10,6 +10,7 @@ from dwell.cellfile.study_paths import put, steps_of, with_settings
 from dwell.errors import ProblemError
 from dwell.model import Problem
 from tests.cellfile.test_cell import EXAMPLE
+from tests.cells.many import many
 
 DOCUMENT: dict[str, Any] = {
     "name": "cell",
@@ -92,3 +93,12 @@ def test_settings_that_are_wrong_are_told_at_once(problem: Problem) -> None:
         "controller.min_dwell",
         "objective.weights.egde",
     }
+
+
+def test_settings_of_a_cell_of_many_candidates_leave_its_shadows_what_they_are() -> None:
+    problem = many(22)
+    assert with_settings(problem, {"controller.min_dwell": 7}).shadow_fraction == 1 / 21
+    given = with_settings(problem, {"controller.shadow_fraction": 0.01})
+    assert given.shadow_fraction == 0.01
+    with pytest.raises(ProblemError, match="each of 21 alternatives"):
+        with_settings(problem, {"controller.shadow_fraction": 0.05})

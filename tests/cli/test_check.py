@@ -10,6 +10,7 @@ import yaml
 
 import dwell
 from dwell.model.document import to_document
+from tests.cells.many import document_of
 from tests.cli.small_cell import CANONICAL, SMALL, assert_refused, call, read_json
 
 
@@ -179,3 +180,15 @@ def test_check_warns_of_stages_and_links_that_cannot_keep_up(
     result = call("check", cell)
     assert result.exit_code == 0
     assert words in result.stderr
+
+
+def test_every_one_of_many_candidates_is_priced(tmp_path: Path) -> None:
+    cell = tmp_path / "many.yaml"
+    cell.write_text(yaml.safe_dump(document_of(100), sort_keys=False), encoding="utf-8")
+    result = call("check", cell)
+    assert (result.exit_code, result.stderr) == (0, "")
+    rows = [line.split() for line in result.stdout.splitlines()]
+    (head,) = (place for place, row in enumerate(rows) if row[:1] == ["candidate"])
+    names = list(document_of(100)["candidates"])
+    assert [row[0] for row in rows[head + 1 :]] == names
+    assert list(read_json(call("check", cell, "--json"))["candidates"]) == names

@@ -7,11 +7,13 @@ import shutil
 from pathlib import Path
 
 import pytest
+import yaml
 
 import dwell
 from dwell.errors import RunError
 from dwell.model import Constant
 from dwell.record import Run
+from tests.cells.many import document_of
 from tests.cli.small_cell import SMALL, assert_refused, call, read_json
 
 
@@ -309,3 +311,18 @@ def test_a_cell_whose_name_is_none_is_refused(cell: Path, name: str) -> None:
     for command in ("check", "run", "live run", "live status --cell"):
         assert_refused(call(*command.split(), cell), f"name: '{name}' is not a name")
     assert sorted(path.name for path in cell.parent.iterdir()) == [cell.name]
+
+
+def test_a_cell_of_many_candidates_is_run_and_its_record_opens(tmp_path: Path) -> None:
+    cell, folder = tmp_path / "many.yaml", tmp_path / "run"
+    cell.write_text(yaml.safe_dump(document_of(100), sort_keys=False), encoding="utf-8")
+    result = call("run", cell, "--windows", "2", "--out", folder)
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert "windows by placement           R-R-R 100%\n" in result.stdout
+    assert dwell.open_run(folder).problem.shadow_fraction == 1 / 99
+    given = ("--windows", "2", "--out", tmp_path / "given", "--set")
+    assert call("run", cell, *given, "controller.shadow_fraction=0.01").exit_code == 0
+    assert dwell.open_run(tmp_path / "given").problem.shadow_fraction == 0.01
+    refused = call("run", cell, *given, "controller.shadow_fraction=0.05")
+    assert refused.exit_code == 2
+    assert "each of 99 alternatives is more than all cycles" in refused.stderr

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import dwell
+from dwell.study.predicted_moves import predicted_moves
 from tests.cli.small_cell import call, read_json
 
 CALIBRATED = "small.yaml"
@@ -45,6 +46,18 @@ def test_json(folder: Path) -> None:
         "sum_of_means",
     }
     assert told["figures"][0]["metric"] == "l95_ms"
+    assert told["moves"] == []
+
+
+@pytest.mark.usefixtures("folder")
+def test_json_has_the_predicted_moves() -> None:
+    problem = dwell.load(CALIBRATED)
+    run = dwell.simulate(problem, scenario="stress", policy="dtp", seed=9, windows=40)
+    run.save("dtp")
+    told = read_json(call("validate", "dtp", "--cell", CALIBRATED, "--seeds", "2", "--json"))
+    assert told["moves"]
+    labels = {"scenario": "stress", "policy": "dtp+profile", "run": "dtp"}
+    assert told["moves"] == [labels | row for row in predicted_moves(run).to_dicts()]
 
 
 def refused(*arguments: str) -> str:

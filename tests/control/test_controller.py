@@ -14,6 +14,7 @@ from dwell.errors import DwellError, MetricError, ProblemError
 from dwell.estimators import Corrected, Learner, Scaling, Shadow, Support
 from dwell.model import Problem, QoS
 from tests.cells.deterministic import MOVES, cell
+from tests.cells.many import many
 
 SETTINGS = {"profile": 0.0, "shadow": 0.1, "scaling": 0.0, "corrected": 0.1}
 
@@ -170,3 +171,13 @@ def test_the_incumbents_estimate_is_what_was_observed() -> None:
     run = dwell.simulate(problem, scenario="disturbed", policy="OFF", seed=1, windows=3)
     shown = run.decisions.select("est_l95_ms_OFF", "est_violation_rate_OFF").rows()
     assert shown == run.windows.select("seen_l95_ms", "seen_violation_rate").rows()
+
+
+@pytest.mark.parametrize("estimator", [Shadow, Corrected])
+def test_of_many_candidates_only_a_fraction_that_is_given_is_refused(
+    estimator: type[Shadow] | type[Corrected],
+) -> None:
+    problem = many(22)
+    assert Controller(problem, estimator=estimator(problem)).shadow_fraction == 1 / 21
+    with pytest.raises(ProblemError, match="each of 21 alternatives is more than all cycles"):
+        Controller(problem, estimator=estimator(problem, 0.05))

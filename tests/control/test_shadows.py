@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -47,3 +48,25 @@ def test_the_same_cycles_are_sent_whatever_they_run_under(
     expected = np.flatnonzero(stamps >= 0)
     plan = ShadowPlan(0, 500, candidates, percent / 100)
     np.testing.assert_array_equal(plan.sent, expected)
+
+
+@pytest.mark.parametrize("candidates", [22, 100])
+@pytest.mark.parametrize("first", [0, 10**6, 2**32 - 20_001])
+def test_an_even_share_sends_every_cycle_through_one_alternative(
+    candidates: int, first: int
+) -> None:
+    """Up to the last cycle of the longest run, where the stamps have the fewest digits left."""
+    stamps = shadow_stamps(first, first + 20_000, 7, candidates, 1 / (candidates - 1))
+    counts = np.bincount(stamps, minlength=candidates)
+    assert counts[7] == 0
+    assert np.abs(np.delete(counts, 7) - 20_000 / (candidates - 1)).max() <= 4
+
+
+def test_rounding_up_sends_a_cycle_through_none() -> None:
+    """Cycle 0 is the first alternative's; no cycle is beyond the last."""
+    for candidates in range(2, 200):
+        plan = ShadowPlan(0, 5_000, candidates, 1 / (candidates - 1))
+        stamps = plan.stamps(0, 5_000, 0)
+        assert stamps[0] == 1
+        assert stamps.max() == candidates - 1
+        assert (stamps < 0).sum() == 0

@@ -31,6 +31,7 @@ from dwell.model import (
     Weights,
 )
 from dwell.model.document import digest, to_document
+from tests.cells.many import many
 from tests.cells.strategies import problems
 
 SLOW = [HealthCheck.too_slow, HealthCheck.data_too_large]
@@ -116,3 +117,11 @@ def test_a_digest_tells_values_groups_and_instants(
     assert digest_of() != digest_of(begin_ms=1)
     if len(values) > 1:
         assert digest_of() != digest_of(start=1)
+
+
+@pytest.mark.parametrize("candidates", [3, 21, 22, 100])
+def test_a_problem_read_again_sends_as_many_shadows(candidates: int) -> None:
+    problem = many(candidates)
+    again = from_document(json.loads(json.dumps(to_document(problem))))
+    assert again == problem
+    assert again.shadow_fraction == problem.shadow_fraction

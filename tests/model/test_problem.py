@@ -35,6 +35,7 @@ from dwell.model import (
     Task,
     Weights,
 )
+from tests.cells.many import many
 from tests.cells.strategies import problems
 
 EXECUTION = Execution(Constant(1.0))
@@ -262,3 +263,20 @@ def test_a_placement_that_never_moves_begins_on_itself(problem: Problem) -> None
         assert problem.under(name).initial == name
         assert problem.under(name).controller.policy == name
     assert problem.under("atp").initial == problem.initial
+
+
+@pytest.mark.parametrize(
+    ("candidates", "fraction"), [(2, 0.05), (21, 0.05), (22, 1 / 21), (100, 1 / 99)]
+)
+def test_all_alternatives_together_are_sent_every_cycle_at_most(
+    candidates: int, fraction: float
+) -> None:
+    problem = many(candidates)
+    assert problem.controller.shadow_fraction is None
+    assert problem.shadow_fraction == fraction
+    given = replace(problem, controller=replace(problem.controller, shadow_fraction=0.001))
+    assert given.shadow_fraction == 0.001
+
+
+def test_a_lone_candidate_has_a_shadow_fraction_too() -> None:
+    assert many(1).shadow_fraction == 0.05

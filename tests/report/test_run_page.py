@@ -14,8 +14,10 @@ from dwell.model import Episodes, Exponential, LinkDisturbance, NodeDisturbance
 from dwell.report import run_html
 from dwell.report.figure import svg
 from dwell.report.run_page import run_page
+from dwell.study.predicted_moves import predicted_moves
+from tests.cells.many import many
 from tests.cells.small import make_problem
-from tests.report.pages import Page, facts_of, small_run, table_of
+from tests.report.pages import Page, facts_of, figure_of, small_run, table_of
 
 
 @pytest.fixture(scope="module")
@@ -146,3 +148,34 @@ def test_final_l95_in_tables_and_l95_as_seen_in_the_figure_have_names_of_their_o
     figure = next(page.figures)
     assert "L95 seen (ms)" in svg(figure)
     assert "L95 seen" in figure.caption
+
+
+def test_moves_are_predicted_then_seen() -> None:
+    run, page = small_run(), run_page(small_run())
+    expected = predicted_moves(run)
+    assert not expected.is_empty()
+    section = next(one for one in page.sections if one.title == "Predicted, then seen")
+    figure, table = section.blocks
+    assert table is table_of(page, "predicted-moves")
+    assert [row["window"] for row in table_of(page, "predicted-moves").rows] == list(
+        expected["window"]
+    )
+    assert figure is figure_of(page, "predicted")
+    shown = figure_of(page, "predicted").frames["rows"]
+    rates = (100 * expected["seen_violation_rate"]).to_list()
+    assert shown["seen_violation_rate"].to_list() == pytest.approx(rates, nan_ok=True)
+
+
+def test_a_run_without_moves_has_nothing_predicted_to_show() -> None:
+    titles = [section.title for section in run_page(small_run("LOC")).sections]
+    assert "Decisions" in titles
+    assert "Predicted, then seen" not in titles
+
+
+def test_phases_have_the_placements_that_some_phase_was_on() -> None:
+    many_cell = many(30)
+    stressed = (NodeDisturbance("R", stress_threads=3, at_s=4.0),)
+    problem = replace(many_cell, scenarios={"stress": stressed})
+    page = run_page(simulate(problem, scenario="stress", policy="R-R-R", seed=1, windows=8))
+    columns = [one.column for one in table_of(page, "phases").columns]
+    assert [one for one in columns if one.startswith("share")] == ["share R-R-R"]

@@ -9,7 +9,7 @@ from dwell import Run, simulate
 from dwell.report.validation_page import validation_html, validation_page, validation_text
 from dwell.study.validation import Validation, validate
 from tests.cells.small import make_problem
-from tests.report.pages import Page, table_of
+from tests.report.pages import Page, figure_of, table_of
 from tests.study.test_validation import slower
 
 
@@ -39,7 +39,7 @@ def test_page_is_whole_and_needs_nothing_else() -> None:
     assert page().outside == []
     assert "script" not in page().tags
     assert len(page().ids) == len(set(page().ids))
-    assert page().tags.count("svg") == 3
+    assert page().tags.count("svg") == 4
 
 
 def test_goals_stand_first_with_their_counts() -> None:
@@ -95,3 +95,15 @@ def test_group_without_a_finished_cycle() -> None:
     assert found.verdict("l95_ms") in ("met", "open")
     assert Page(validation_html(found, static=True)).outside == []
     assert "∞" in validation_text(found)
+
+
+def test_moves_of_the_measured_runs_stand_under_their_scenarios() -> None:
+    shown, moves = validation_page(validation()), validation().moves
+    table = table_of(shown, "predicted-moves")
+    told = [(row["run"], row["window"]) for row in table.rows]
+    assert told == moves.select("run", "window").rows()
+    assert set(moves["run"]) == {"baseline-work-function", "network-impairment-dtp"}
+    assert [heading for heading, _ in table.groups()] == ["Baseline", "Network impairment"]
+    assert figure_of(shown, "predicted").frames["rows"].height == moves.height
+    still = replace(validation(), moves=moves.clear())
+    assert "predicted" not in [one.slug for one in validation_page(still).figures]

@@ -45,6 +45,7 @@ from dwell.model import (
     Uniform,
 )
 from tests.cells.generated import MS, Scheduler, make_problem, make_realisation
+from tests.cells.many import many
 from tests.reference.simulator import ITSELF, SHADOW, shadow_stamp, simulate
 from tests.reference.test_against import (
     EXAMPLES,
@@ -955,3 +956,15 @@ def _check(
             assert (evidence.shadows.ready_ns[row] < 0).all()
             assert (evidence.shadows.arrived_ns[row] < 0).all()
     return unknown
+
+
+@pytest.mark.parametrize("candidates", [21, 22, 100])
+def test_of_many_candidates_every_one_is_measured(candidates: int) -> None:
+    problem = many(candidates)
+    run = dwell.simulate(problem, policy="dtp", seed=1, windows=4)
+    names = list(problem.candidates)
+    assert run.windows["shadow_cycles"].to_list() == [candidates] * 4
+    last = run.decisions.row(-1, named=True)
+    assert all(last[f"est_l95_ms_{name}"] > 0 for name in names)
+    assert all(last[f"est_samples_{name}"] > 0 for name in names)
+    assert all(last[f"est_age_windows_{name}"] < 4 for name in names)

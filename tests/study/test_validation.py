@@ -20,6 +20,7 @@ from dwell.model import (
     Problem,
 )
 from dwell.study.measured_run import read_measured
+from dwell.study.predicted_moves import predicted_moves
 from dwell.study.validation import GOALS, Validation, validate
 from tests.cells.small import make_problem
 from tests.report.live_runs import live_run
@@ -290,3 +291,18 @@ class TestBadInput:
         run = simulate(problem, policy="LOC", seed=1, windows=6)
         with pytest.raises(RunError, match="seeds is 1"):
             validate([run], problem, seeds=1)
+
+
+def test_moves_are_those_of_the_measured_runs_that_count() -> None:
+    problem = make_problem(window_cycles=40)
+    runs = measured(problem, "network-impairment", "dtp", 101, 102)
+    found = validate(runs, problem, seeds=2).moves
+    for name, run in runs.items():
+        mine = found.filter(run=name)
+        assert set(mine["policy"]) == {"dtp+profile"}
+        assert mine.drop("scenario", "policy", "run").equals(predicted_moves(run))
+    assert set(found["run"]) == set(runs)
+    first = found.row(0, named=True)
+    left_out = with_meta(runs[first["run"]], excluded_windows=[first["window"]])
+    fewer = validate({first["run"]: left_out}, problem, seeds=2).moves
+    assert first["window"] not in fewer["window"]

@@ -607,7 +607,7 @@ class ControllerEntry(Entry):
     )
     shadow_fraction: Annotated[float, Number(bounds.SHADOW_FRACTION)] | None = optional(
         "Share of cycles that are also sent through each alternative, where the estimator uses "
-        "shadow jobs; default 0.05."
+        "shadow jobs; default 0.05, or 1/(alternatives) where that is less."
     )
     half_life_windows: Annotated[float, Number(bounds.HALF_LIFE_WINDOWS)] | None = optional(
         "Windows after which a measurement counts half; default 2."

@@ -158,7 +158,7 @@ def _summary(
     )
     if row is None:
         return f"{title}, none after the {warmup} of warm-up: nothing to sum up; ask for more"
-    shares = (f"{name} {row[f'share_{name}']:.0%}" for name in problem.candidates)
+    shares = {name: float(row[f"share_{name}"]) for name in problem.candidates}
     used = (f"{name} {row[f'node_{name}']:.0%}" for name in problem.fabric.resources)
     lines = (
         ("missed deadlines (V_D)", f"{float(row['violation_rate']) * 100:.2f} %"),
@@ -172,7 +172,10 @@ def _summary(
         *_control(row),
         ("migrations", f"{row['migrations']}"),
         *([("moves of the guard", f"{row['guard_moves']}")] if row["guard_moves"] else []),
-        ("windows by placement", ", ".join(shares)),
+        (
+            "windows by placement",
+            ", ".join(f"{name} {share:.0%}" for name, share in shares.items() if share),
+        ),
         ("utilisation", ", ".join(used)),
     )
     width = max(len(name) for name, _ in lines)

@@ -144,4 +144,5 @@ def _document(validation: Validation) -> dict[str, Any]:
         ],
         "figures": validation.table.to_dicts(),
         "jobs": validation.jobs.to_dicts(),
+        "moves": validation.moves.to_dicts(),
     }

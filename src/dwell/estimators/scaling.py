@@ -161,7 +161,7 @@ class Scaling(Learning):
     def estimate(
         self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
     ) -> dict[str, QoS]:
-        """Estimate every candidate's metrics (see `Estimator`); before any window by the profile."""
+        """Estimate every candidate's metrics (see `Estimator`); first by the profile."""
         estimates = super().estimate(observed=observed, incumbent=incumbent, own=own)
         if self._active is not None and len(self._jobs):
             for name, placement in self.problem.candidates.items():

@@ -34,6 +34,8 @@ from dwell.model.semantics import CellParts, find_faults, nearest_of
 from dwell.model.servo import Servo
 
 MIGRATIONS = ("warm", "cold")
+#: Share of the cycles for each alternative where none is given, and not all together are too many.
+SHADOWED = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,9 +57,10 @@ class ControllerSettings:
         Delta_min, in units of J.
     escape : bool
         Whether an incumbent over a cap may leave before the hysteresis is met.
-    shadow_fraction : float
+    shadow_fraction : float, optional
         Share of the cycles that are also sent through each alternative, where the estimator
-        measures it with shadow jobs.
+        measures it with shadow jobs; by the number of alternatives where None
+        (`Problem.shadow_fraction`).
     half_life_windows : float
         Age at which what an estimator has measured counts half.
     migration : str
@@ -86,7 +89,7 @@ class ControllerSettings:
     min_improvement: float = 0.05
     escape: bool = False
     estimator: str = "profile"
-    shadow_fraction: float = 0.05
+    shadow_fraction: float | None = None
     half_life_windows: float = 2.0
     migration: str = "warm"
     guard_cycles: int = 3
@@ -105,7 +108,8 @@ class ControllerSettings:
         TIME_MS.check("order_delay_ms", self.order_delay_ms)
         TIME_MS.check("close_grace_ms", self.close_grace_ms)
         object.__setattr__(self, "fallbacks", tuple(self.fallbacks))
-        SHADOW_FRACTION.check("shadow_fraction", self.shadow_fraction)
+        if self.shadow_fraction is not None:
+            SHADOW_FRACTION.check("shadow_fraction", self.shadow_fraction)
         HALF_LIFE_WINDOWS.check("half_life_windows", self.half_life_windows)
         bound = f"one of {', '.join(MIGRATIONS)}"
         require(self.migration in MIGRATIONS, "migration", self.migration, bound)
@@ -270,6 +274,17 @@ class Problem(Displayed):
         pipeline, cap_ms = self.pipeline, self.objective.caps.latency_ms
         bound_ms = max(4 * pipeline.deadline_ms, 2 * pipeline.period_ms)
         return max(bound_ms, cap_ms) if math.isfinite(cap_ms) else bound_ms
+
+    @property
+    def shadow_fraction(self) -> float:
+        """Share of the cycles also sent through each alternative, of an estimator with shadows.
+
+        Where none is given 0.05, or all cycles over the number of alternatives where that is less.
+        """
+        given = self.controller.shadow_fraction
+        if given is not None:
+            return given
+        return min(SHADOWED, 1 / max(len(self.candidates) - 1, 1))
 
     @property
     def controller_node(self) -> str:

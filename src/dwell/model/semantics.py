@@ -439,7 +439,8 @@ def _columns(parts: CellParts) -> Iterator[Fault]:
 
 
 def _shadow_budget(settings: ControllerSettings, candidates: int) -> Iterator[Fault]:
-    message = too_many_shadows(settings.shadow_fraction, candidates)
+    given = settings.shadow_fraction
+    message = "" if given is None else too_many_shadows(given, candidates)
     if message:
         yield Fault("controller.shadow_fraction", message)
 

@@ -38,13 +38,15 @@ from dwell.report.formatting import (
     write_ms,
     write_number,
 )
+from dwell.report.move_blocks import move_blocks
 from dwell.report.page import Definitions, Fact, Page, Section, page_html
 from dwell.report.palette import BAD, Palette
 from dwell.report.phases import phase_rows
 from dwell.report.policy_blocks import COST, L95, RATE
 from dwell.report.run_header import RunHeader
-from dwell.report.table import Columns, Table, Text
+from dwell.report.table import MOST_ROWS, Columns, Table, Text
 from dwell.report.timeline import begins_by_number, resources_in, run_timeline
+from dwell.study.predicted_moves import predicted_moves
 from dwell.study.summary import Counted, count_in, latency_ms, longest_streak, order_statistic
 
 if TYPE_CHECKING:
@@ -54,7 +56,6 @@ if TYPE_CHECKING:
 
 #: Of the latencies that cycles had in the end.
 FINAL_L95 = L95._replace(name="L95 final")
-MOST_ROWS = 200
 WORST = 10
 #: Share of a deadline that clocks may be off by, where a window's latencies are proven.
 PROVEN_SHARE = 0.2
@@ -153,6 +154,9 @@ class _RunPage:
         yield Section("Latency", self._latencies())
         yield Section("Cycles and placements", [self._outcomes(), self._shares()])
         yield Section("Decisions", list(self._decisions()))
+        moves = predicted_moves(self.run)
+        if blocks := move_blocks(moves, self.palette, self.header.deadline_ms):
+            yield Section("Predicted, then seen", blocks)
         if self.header.live:
             yield Section("How well this is known", [self._known()])
         yield Section("What this is", [self._about()])
@@ -188,7 +192,8 @@ class _RunPage:
         rows = phase_rows(self.run, self.header)
         if len(rows) < 2:
             return
-        names = tuple(self.palette.placements)
+        used = {name for row in rows for name in row.shares}
+        names = [name for name in self.palette.placements if name in used]
         columns: Columns = [
             Text("name", "phase"),
             Measure("begin_s", "from", "s", decimals=0),

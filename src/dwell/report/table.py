@@ -26,6 +26,8 @@ Kind: TypeAlias = Literal["text", "policy", "placement", "scenario", "word"]
 
 #: Width of sentences in text.
 PROSE = 100
+#: Rows of a table of what a run may have any number of.
+MOST_ROWS = 200
 #: What the words of verdicts mean for who waits for them; all others are open.
 WORDS: Mapping[str, Literal["good", "bad"]] = {
     "under": "good",

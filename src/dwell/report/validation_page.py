@@ -27,6 +27,7 @@ from dwell.report.charts import (
 from dwell.report.figure import Figure, Spec
 from dwell.report.formatting import Measure, percent, shown_contender, shown_scenario, write_number
 from dwell.report.method import cell_definitions
+from dwell.report.move_blocks import move_blocks
 from dwell.report.page import Definitions, Page, Section, page_html
 from dwell.report.palette import DASHES, INK, MUTED, SHADE, Palette, Style
 from dwell.report.policy_blocks import named
@@ -92,6 +93,10 @@ def _sections(validation: Validation) -> Iterator[Section]:
     yield Section("Verdicts", [_verdicts(validation)])
     yield Section("Latencies", [_latencies(validation), _rates(validation)])
     yield Section("Where the time goes", [_split(validation), _parts(validation)])
+    deadline_ms, palette = validation.problem.pipeline.deadline_ms, _palette(validation)
+    about = (POLICY, Text("run", "run"))
+    if moves := move_blocks(validation.moves, palette, deadline_ms, about, SCENARIO):
+        yield Section("Moves of the runs: predicted, then seen", moves)
     if not validation.jobs.is_empty():
         yield Section("Jobs", [_jobs(validation)], folded=True)
     used = [f"u_{name}" for name in validation.problem.fabric.resources]
@@ -103,7 +108,7 @@ def _sections(validation: Validation) -> Iterator[Section]:
     yield Section("More figures", [one for one in others if one.rows])
     names = [name for group in validation.groups for name in group.runs]
     allowed = f"{percent(L95_ALLOWED)} of L95, {100 * POINTS_ALLOWED:g} points of V_D, "
-    about = {
+    terms = {
         "met, missed": "the whole interval of the error is within what is allowed, or beyond it; "
         "else open",
         "allowed": f"{allowed}{100 * USE_ALLOWED:g} points of U",
@@ -116,7 +121,7 @@ def _sections(validation: Validation) -> Iterator[Section]:
         "runs": ", ".join(names),
         "versions": ", ".join(f"{name} {one}" for name, one in validation.versions.items()),
     }
-    yield Section("What this is", [Definitions({**cell_definitions(validation.problem), **about})])
+    yield Section("What this is", [Definitions({**cell_definitions(validation.problem), **terms})])
 
 
 def _palette(validation: Validation) -> Palette:

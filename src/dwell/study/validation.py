@@ -31,6 +31,7 @@ from dwell.model.bounds import counted
 from dwell.study.job_times import finished_jobs, job_times
 from dwell.study.judged_prediction import GroupJudge, Judged, Outcome, worst
 from dwell.study.measured_run import MeasuredRun, Simulated, Simulator, Unit, read_measured
+from dwell.study.predicted_moves import predicted_moves
 from dwell.study.qos_sample import Piece, QosSample, piece_of
 from dwell.study.software import versions
 from dwell.study.sum_of_means import sum_of_means, sums_of_shares
@@ -128,6 +129,9 @@ class Validation(Displayed):
         time from start to end (``measured_ms``, ``measured_p95_ms``, ``predicted_ms``,
         ``predicted_p95_ms``), the core time where the runs know it (``core_ms``,
         ``core_p95_ms``), and what the cell says it is (``cell_ms``, ``cell_p95_ms``).
+    moves : DataFrame
+        One row a move of the measured runs: ``scenario``, ``policy``, ``run``, and what their
+        estimators said of it beside what was then seen, as of `predicted_moves`.
     versions : mapping of str to str
         Versions of the software that simulated, by package.
     """
@@ -137,6 +141,7 @@ class Validation(Displayed):
     seeds: int
     table: pl.DataFrame
     jobs: pl.DataFrame
+    moves: pl.DataFrame
     versions: Mapping[str, str]
 
     def __repr__(self) -> str:
@@ -234,6 +239,7 @@ def validate(
         seeds=seeds,
         table=pl.DataFrame(list(_rows(judged)), infer_schema_length=None),
         jobs=pl.concat(jobs),
+        moves=pl.concat([_moves(one, named[one.name]) for group in groups for one in group]),
         versions=versions(),
     )
 
@@ -308,6 +314,15 @@ def _group(
         [one.jobs for one in simulated if one.jobs is not None],
     )
     return group, jobs
+
+
+def _moves(one: MeasuredRun, run: Run) -> pl.DataFrame:
+    """Return the predicted moves of a run, behind what it is a run of."""
+    import polars as pl
+
+    labels = {"scenario": one.scenario, "policy": one.contender, "run": one.name}
+    moves = predicted_moves(run, one.excluded)
+    return moves.select(*(pl.lit(text).alias(name) for name, text in labels.items()), pl.all())
 
 
 def _sums(

@@ -1,0 +1,196 @@
+"""Predicted moves in a page: a figure and a table of what was estimated, and what was then seen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from dwell.report.charts import (
+    NO_LIMIT,
+    Limit,
+    coloured,
+    layer,
+    limit_rule,
+    names,
+    quantity,
+)
+from dwell.report.figure import Figure, Spec
+from dwell.report.formatting import Measure
+from dwell.report.palette import MUTED, Palette
+from dwell.report.table import MOST_ROWS, Columns, Row, Table, Text
+
+if TYPE_CHECKING:
+    import polars as pl
+
+#: What is predicted of a move: its column, its standard error's, its name, unit and factor.
+PREDICTED = (
+    ("l95_ms", "l95_error_ms", "L95", "ms", 1.0),
+    ("violation_rate", "violation_error", "V_D", "%", 100.0),
+)
+#: Room beside the two panels, and the largest side of one, pixels.
+BESIDE_PX, SIDE_PX = 230, 300
+#: Share of the range that is free at each end of an axis.
+MARGIN = 0.06
+
+
+def move_blocks(
+    moves: pl.DataFrame,
+    palette: Palette,
+    deadline_ms: float,
+    about: Sequence[Text] = (),
+    group: Text | None = None,
+) -> list[Figure | Table]:
+    """Return a figure and a table of predicted moves; nothing where there are none.
+
+    Parameters
+    ----------
+    moves : DataFrame
+        As of `dwell.study.predicted_moves.predicted_moves`, with the columns of `about`.
+    palette : Palette
+        Colours of the candidates.
+    about : sequence of Text
+        First columns of the table.
+    group : Text, optional
+        Column of whose values each has a heading in the table.
+    """
+    if moves.is_empty():
+        return []
+    return [_figure(moves, palette, deadline_ms), _table(moves, palette, about, group)]
+
+
+def _figure(moves: pl.DataFrame, palette: Palette, deadline_ms: float) -> Figure:
+    import polars as pl
+
+    frame = moves.with_columns(
+        pl.col(f"{when}_{name}") * factor
+        for column, error, *_, factor in PREDICTED
+        for when in ("predicted", "seen")
+        for name in (column, error)
+    )
+    used = set(frame["to"])
+    colours = {name: colour for name, colour in palette.placements.items() if name in used}
+    limits = (Limit(deadline_ms, "deadline"), NO_LIMIT)
+    return Figure(
+        "predicted",
+        "Predicted over seen, by the placement moved to",
+        {"rows": frame},
+        lambda width: {
+            "hconcat": [
+                _scatter(frame, column, error, f"{name} ({unit})", limit, colours, width)
+                for (column, error, name, unit, _), limit in zip(PREDICTED, limits, strict=True)
+            ],
+        },
+        "A mark is a move: up, the estimate of the placement at the close at which it was chosen; "
+        "across, the mean of what its windows showed at their closes until the next move, without "
+        "the first where there are others. Bars: a standard error to each side. Line: seen as "
+        "predicted. Dashed: deadline.",
+    )
+
+
+def _scatter(
+    frame: pl.DataFrame,
+    column: str,
+    error: str,
+    title: str,
+    limit: Limit,
+    colours: dict[str, str],
+    width: float,
+) -> Spec:
+    side = min((width - BESIDE_PX) / 2, SIDE_PX)
+    low, high = _range(frame, column, error)
+    scale = {"domain": [low, high], "nice": False, "zero": False}
+    across = quantity(f"seen_{column}", f"{title}, seen", scale=scale, axis={"tickCount": 5})
+    up = quantity(f"predicted_{column}", f"{title}, predicted", scale=scale, axis={"tickCount": 5})
+    about = names(*(name for name in ("scenario", "policy", "run") if name in frame.columns))
+    about += [quantity("window", "after window"), *names("from", "to")]
+    for when in ("predicted", "seen"):
+        about += [
+            quantity(f"{when}_{column}", f"{when}, {title}"),
+            quantity(f"{when}_{error}", "standard error"),
+        ]
+    ends = [
+        {"calculate": f"datum.{when}_{column} {sign} datum.{when}_{error}", "as": f"{when}_{end}"}
+        for when in ("predicted", "seen")
+        for end, sign in (("low", "-"), ("high", "+"))
+    ]
+    bars = [
+        layer(
+            "rule",
+            {axis: {"field": f"{when}_low"}, f"{axis}2": {"field": f"{when}_high"}},
+            where=[f"isValid(datum.{when}_{error})"],
+            strokeWidth=1.3,
+            opacity=0.6,
+            clip=True,
+        )
+        for axis, when in (("x", "seen"), ("y", "predicted"))
+    ]
+    colour = coloured("to", colours, legend={"symbolOpacity": 1})
+    moves = {
+        "data": {"name": "rows"},
+        "transform": [
+            {"filter": f"isValid(datum.predicted_{column}) && isValid(datum.seen_{column})"},
+            *ends,
+        ],
+        "encoding": {"x": across, "y": up, "color": colour},
+        "layer": [*bars, layer("point", {"tooltip": about}, filled=True, size=26, opacity=0.9)],
+    }
+    both = {"x": {**across, "field": "at"}, "y": {**up, "field": "at"}}
+    diagonal = {
+        "data": {"values": [{"at": low}, {"at": high}]},
+        **layer("line", both, color=MUTED, strokeWidth=1),
+    }
+    rules = [rule for axis in ("x", "y") for rule in limit_rule(axis, *limit)]
+    inside = rules if low <= limit.value <= high else []
+    return {"width": side, "height": side, "layer": [diagonal, *inside, moves]}
+
+
+def _range(frame: pl.DataFrame, column: str, error: str) -> tuple[float, float]:
+    """Return the ends of both axes: of all values with their bars, and some room."""
+    ends = [
+        value + sign * (off or 0.0)
+        for when in ("predicted", "seen")
+        for value, off in frame.select(f"{when}_{column}", f"{when}_{error}").rows()
+        if value is not None
+        for sign in (-1, 1)
+    ]
+    known = [end for end in ends if math.isfinite(end)] or [0.0]
+    low, high = min(known), max(known)
+    room = MARGIN * (high - low) or 1.0
+    return max(low - room, 0.0), high + room
+
+
+def _table(
+    moves: pl.DataFrame, palette: Palette, about: Sequence[Text], group: Text | None
+) -> Table:
+    rows: list[Row] = []
+    for move in moves.head(MOST_ROWS).iter_rows(named=True):
+        row = dict(move)
+        for column, error, *_ in PREDICTED:
+            for when in ("predicted", "seen"):
+                value, off = move[f"{when}_{column}"], move[f"{when}_{error}"]
+                if value is not None and off is not None:
+                    row[f"{when}_{column}_low"] = value - off
+                    row[f"{when}_{column}_high"] = value + off
+        rows.append(row)
+    columns: Columns = [
+        *about,
+        Text("window", "after window"),
+        Text("from", "from", "placement"),
+        Text("to", "to", "placement"),
+        *(
+            Measure(f"{when}_{column}", f"{name} {when}", unit, factor)
+            for column, _, name, unit, factor in PREDICTED
+            for when in ("predicted", "seen")
+        ),
+        Measure("windows", "windows seen", decimals=0),
+    ]
+    return Table(
+        "predicted-moves",
+        f"Moves ({len(rows)} of {moves.height})",
+        columns,
+        rows,
+        group,
+        "±: standard error, where it is known; of what was seen, between windows.",
+        palette,
+    )
