@@ -56,7 +56,7 @@ class Learning(Online):
         seed: int = SEED,
     ) -> None:
         settings = problem.controller
-        given = settings.shadow_fraction if shadow_fraction is None else shadow_fraction
+        given = problem.shadow_fraction if shadow_fraction is None else shadow_fraction
         self.shadow_fraction = given
         half_life = settings.half_life_windows if half_life_windows is None else half_life_windows
         HALF_LIFE_WINDOWS.check("half_life_windows", half_life)

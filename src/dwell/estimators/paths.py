@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias
 
@@ -111,43 +110,3 @@ def order_statistic(values: Floats) -> float:
 def l95_rank(count: int) -> int:
     """Return ceil(0.95 n), in integers: 0.95 * n is not exact."""
     return (19 * count + 19) // 20
-
-
-def seen_windows(
-    latency_ms: Floats, window_cycles: int, age_ms: Floats, censor_ms: float
-) -> tuple[float, float]:
-    """Mean over windows of the L95 that a controller would see.
-
-    The mean of a window's 95th percentile is not the 95th percentile of all cycles: where a few
-    percent of the cycles are lost, a window with more of them than usual decides the mean.
-
-    Parameters
-    ----------
-    latency_ms : float64 array, shape (windows * W,)
-        Infinite where a cycle is lost.
-    window_cycles : int
-        W.
-    age_ms : float64 array, shape (windows * W,)
-        Latency that a lost cycle counts with: its age when the window closes.
-    censor_ms : float
-        No window counts for more.
-
-    Returns
-    -------
-    l95_ms, uncut_ms : float
-        The mean, and the mean without `censor_ms`; this one is infinite where the L95 of all cycles
-        together is lost.
-    """
-    lost = np.isinf(latency_ms)
-    losses = int(np.count_nonzero(lost))
-    seen = np.where(lost, age_ms, latency_ms) if losses else latency_ms.copy()
-    by_window = seen.reshape(-1, window_cycles)
-    by_window.sort(axis=1)
-    # Censoring is monotone, so censoring the order statistic is censoring every latency.
-    l95_ms = by_window[:, l95_rank(window_cycles) - 1]
-    mean_ms = cut_ms = float(np.add.reduce(l95_ms)) / len(l95_ms)
-    if max(l95_ms.tolist()) > censor_ms:
-        cut_ms = float(np.minimum(l95_ms, censor_ms).sum()) / len(l95_ms)
-    if losses > len(latency_ms) - l95_rank(len(latency_ms)):
-        return cut_ms, math.inf
-    return cut_ms, mean_ms

@@ -18,7 +18,6 @@ estimates.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable, Mapping
 from typing import Any, TypeAlias
 
@@ -29,12 +28,10 @@ from dwell.cost import SATURATED
 from dwell.errors import MetricError
 from dwell.estimators.prices import SEED, Price, prices_of
 from dwell.model.bounds import require
-from dwell.model.fabric import Link, Node
 from dwell.model.frozen import FrozenDict
-from dwell.model.pipeline import Execution, Flow, Pipeline, Task
-from dwell.model.placement import Placement
+from dwell.model.pipeline import Execution, Pipeline, Task
 from dwell.model.problem import Problem
-from dwell.model.process import Process, Trace
+from dwell.model.process import Trace
 from dwell.model.qos import QoS, unchecked_qos
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -178,76 +175,6 @@ def _each(prices: Mapping[str, Price], what: str) -> Mapping[str, Any]:
     return FrozenDict({name: getattr(price, what) for name, price in prices.items()})
 
 
-class SampleCycles:
-    """Draws of every process that some candidate needs, for the same `samples` cycles."""
-
-    def __init__(self, problem: Problem, samples: int, seed: int) -> None:
-        self.problem = problem
-        self.samples = samples
-        self.seed = seed
-        self._rows: dict[str, NDArray[np.int64]] = {}
-        self._exec: dict[tuple[str, str], Floats] = {}
-        self._message: dict[tuple[Flow, str], Floats] = {}
-
-    def executed(self, task_name: str, node_name: str) -> Floats:
-        """Execution times of a task on a node that runs nothing else."""
-        key = (task_name, node_name)
-        if key not in self._exec:
-            task = self.problem.pipeline.tasks[task_name]
-            node, execution = self.problem.fabric.nodes[node_name], task.on[node_name]
-            times = self._draw(execution.exec_ms, f"exec/{task_name}/{node_name}")
-            if task.scale is not None:
-                scale = self.problem.pipeline.scales[task.scale]
-                times = times * self._draw(scale, f"scale/{task.scale}")
-            if execution.accelerator is None:
-                times = _throttled(times * _stretch(execution, node), execution, node)
-            self._exec[key] = times
-        return self._exec[key]
-
-    def sent(self, flow: Flow, placement: Placement) -> Floats:
-        """Times between a flow's output and input; infinite where the message is lost."""
-        source, target = placement[flow.source], placement[flow.target]
-        if source == target:
-            return np.zeros(self.samples)
-        link = self.problem.fabric.links[f"{source}->{target}"]
-        key = (flow, link.name)
-        if key not in self._message:
-            hop = f"{flow.source}->{flow.target}/{link.name}"
-            delay = self._draw(link.delay_ms, f"delay/{hop}")
-            self._message[key] = delay + self._transmitted(flow, link, hop)
-        return self._message[key]
-
-    def _transmitted(self, flow: Flow, link: Link, hop: str) -> Floats:
-        """Times on the sending side, repeated attempts included."""
-        once_ms = 8 * flow.payload_bytes / (link.rate_mbps * 1e3)
-        times = np.full(self.samples, once_ms)
-        if link.loss > 0:
-            rng = self._stream(f"loss/{hop}")
-            if link.retransmit_ms is None:
-                times[rng.random(self.samples) < link.loss] = np.inf
-            else:
-                failures = rng.geometric(1 - link.loss, self.samples) - 1
-                times += failures * (once_ms + link.retransmit_ms)
-        return times
-
-    def _draw(self, process: Process, name: str) -> Floats:
-        if not isinstance(process, Trace):
-            return process.marginal(self._stream(name), self.samples)
-        table = process.table
-        if table.file not in self._rows:
-            rng = self._stream(f"trace/{table.stream}")
-            self._rows[table.file] = rng.integers(table.rows, size=self.samples)
-        # Two tables of one file may differ in rows (one drops some): the draw is folded then.
-        values: Floats = process.values[self._rows[table.file] % table.rows]
-        return values
-
-    def _stream(self, name: str) -> np.random.Generator:
-        # Its own prefix: the same seed must not repeat the draws of a simulated run.
-        digest = hashlib.blake2b(f"profile/{name}".encode(), digest_size=16).digest()
-        words = tuple(int.from_bytes(digest[i : i + 4], "little") for i in range(0, 16, 4))
-        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=words))
-
-
 def mean_ms(pipeline: Pipeline, task: Task, execution: Execution) -> float:
     """Mean execution time of a task, scale included, without sampling error, milliseconds."""
     process = execution.exec_ms
@@ -257,31 +184,3 @@ def mean_ms(pipeline: Pipeline, task: Task, execution: Execution) -> float:
     if isinstance(process, Trace) and isinstance(scale, Trace) and process.table is scale.table:
         return float((process.values * scale.values).mean())
     return process.expectation * scale.expectation
-
-
-def _stretch(execution: Execution, node: Node) -> float:
-    """Factor by which a CPU job takes longer where the node has fewer cores than it has threads.
-
-    What the background takes of the cores comes on top. A `fair` node has others use the cores that
-    a job leaves first; elsewhere it slows every job.
-    """
-    if node.scheduler != "fair":
-        return max(execution.threads, node.cores) / node.spare
-    return max(1.0, execution.threads / node.spare)
-
-
-def _throttled(times: Floats, execution: Execution, node: Node) -> Floats:
-    """Time a job takes under the node's quota, from a full bucket at the begin of a period.
-
-    It runs until the bucket is empty, and waits for the next period, as often as it has to.
-    """
-    quota = node.quota
-    if quota is None:
-        return times
-    rate = min(execution.threads, node.cores)
-    full_ms = node.budget_ms / rate
-    if full_ms >= quota.period_ms:
-        return times
-    # A job that just fills its last bucket must not wait for another one by a rounding error.
-    waits: Floats = np.maximum(np.ceil(np.round(times / full_ms, 9)) - 1, 0)
-    return times + waits * (quota.period_ms - full_ms)

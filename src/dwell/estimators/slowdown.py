@@ -1,4 +1,4 @@
-"""Slowdown of a job on the CPU by foreign threads, and the threads that explain a slowdown.
+"""Slowdown of a job on the CPU by foreign threads.
 
 The slowdown is over a job alone on its node, as the profile has it. On a `fair` node a job of k
 threads beside s foreign threads runs at min(1, c / (k + s)) of its speed, c being the cores that
@@ -15,12 +15,3 @@ def slowdown(node: Node, job_threads: int, foreign_threads: float) -> float:
     if node.scheduler != "fair":
         return (node.cores + foreign_threads) / node.cores
     return max(1.0, (job_threads + foreign_threads) / max(job_threads, node.spare))
-
-
-def explaining_threads(node: Node, job_threads: int, slowed: float) -> float:
-    """Return the fewest foreign threads beside which a job takes `slowed` times as long."""
-    if slowed <= 1.0:
-        return 0.0
-    if node.scheduler != "fair":
-        return (slowed - 1.0) * node.cores
-    return slowed * max(job_threads, node.spare) - job_threads
