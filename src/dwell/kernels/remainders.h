@@ -114,7 +114,6 @@ bool take_off(S& s, Server& server, const Site& site, i64 key, i64 now) {
     tick(s, server, now);
     s.own_ns[site.own] += progress(s, server, at).received_ns;
     if (runs) {
-      note_beside(s, server, running_of(s, server)[row]);
       pop(running_of(s, server), server.n_run--, row);
       server.used -= site.need;
       server.next_key = -1;

@@ -84,7 +84,7 @@ using Times = const i64*;
 // row of `quotas`, -1 for none. Shadow jobs run on a server of their own, `below` that of the own
 // jobs, which is `above` it; -1 for none. To it `stress`, `is_down` and `is_stopped` are copied,
 // `cores` and `spare` are what is left to it, and it adds `lent` busy cores and `background` to
-// those above. `beside_ns` is what of `virtual_ns` went by beside foreign threads.
+// those above. `beside_ns` is what of `virtual_ns` went by beside foreign threads that interfere.
 #define DWELL_SERVER(field)                                                                      \
   field(f64, virtual_ns) field(f64, beside_ns) field(f64, speed)                                 \
   field(i64, last_ns) field(i64, next_ns) field(i64, next_key)                                   \

@@ -132,12 +132,18 @@ i64 account(S& s, Server& server, i64 now) {
   return elapsed;
 }
 
+// Whether it is counted what jobs do beside foreign threads, which takes them more core time.
+template <class S>
+bool counts_beside(const S&, const Server& server) {
+  return !S::kPlain && server.beside != 1.0;
+}
+
 // Lets a time pass on a server's virtual clock.
 template <class S>
-void advance_clock(S&, Server& server, i64 elapsed) {
+void advance_clock(S& s, Server& server, i64 elapsed) {
   const f64 advanced = static_cast<f64>(elapsed) * server.speed;
   server.virtual_ns += advanced;
-  if (!S::kPlain && server.stress > 0) server.beside_ns += advanced;
+  if (counts_beside(s, server) && server.stress > 0) server.beside_ns += advanced;
 }
 
 // Brings a server's virtual clock and busy time up to now.
@@ -211,14 +217,14 @@ template <class S>
 void run(S& s, Server& server, i64 key, Job& job, f64 left, i64 now) {
   if (server.n_run == 0) server.virtual_ns = server.beside_ns = 0.0;
   if (job.started_ns < 0) note_start(s, key, job, now);
-  if (!S::kPlain) job.beside_ns -= server.beside_ns;
+  if (counts_beside(s, server)) job.beside_ns -= server.beside_ns;
   push(running_of(s, server), server.n_run++, Running{server.virtual_ns + left, key});
 }
 
 // Notes what a job that stops running did beside foreign threads; the clock must be up to date.
 template <class S>
 void note_beside(S& s, const Server& server, const Running& row) {
-  if (S::kPlain) return;
+  if (!counts_beside(s, server)) return;
   // What the clock is past its end, which comes at a whole nanosecond, is not its work.
   const f64 past = server.stress > 0 ? std::min(row.finish_ns - server.virtual_ns, 0.0) : 0.0;
   s.job(row.key).beside_ns += server.beside_ns + past;
@@ -306,7 +312,7 @@ void leave(S& s, Server& server, const Site& site, i64 now) {
   const i64 elapsed = account(s, server, now);
   const i64 n = server.n_run;
   // The virtual clock of an empty server starts anew.
-  if (!S::kPlain || n > 1) advance_clock(s, server, elapsed);
+  if (n > 1 || counts_beside(s, server)) advance_clock(s, server, elapsed);
   note_beside(s, server, *running_of(s, server));
   pop(running_of(s, server), n);
   server.n_run -= 1;
