@@ -10,7 +10,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dwell.cost import cost, excess, hamming, price, tier_nodes, tier_utilisation
+from dwell.cost import (
+    cost,
+    cost_error,
+    excess,
+    hamming,
+    margin,
+    price,
+    tier_nodes,
+    tier_utilisation,
+)
 from dwell.errors import MetricError, PlacementError
 from dwell.model import Caps, Objective, Placement, QoS, Targets, Weights
 
@@ -211,3 +220,25 @@ def test_excess_is_positive_exactly_above_the_cap(cap: float, steps: int) -> Non
         value = math.nextafter(value, math.inf if steps > 0 else 0.0)
     objective = replace(OBJECTIVE, caps=Caps(latency_ms=cap))
     assert (excess(QoS(value, 0.0, {}), objective) > 0) == (value > cap)
+
+
+@given(metrics, st.floats(-1, 1), st.floats(-1, 1))
+def test_no_errors_of_one_estimate_make_more_of_j_than_their_sum(
+    window: QoS, late: float, missed: float
+) -> None:
+    """L95 and V_D are off by up to their errors, each in its own direction."""
+    error = (5.0, 0.05)
+    off = replace(
+        window,
+        l95_ms=max(window.l95_ms + late * error[0], 0.0),
+        violation_rate=min(max(window.violation_rate + missed * error[1], 0.0), 1.0),
+    )
+    difference = cost(off, LOC, LOC, OBJECTIVE) - cost(window, LOC, LOC, OBJECTIVE)
+    assert abs(difference) <= cost_error(error, OBJECTIVE) + 1e-9
+
+
+def test_errors_by_hand() -> None:
+    assert cost_error(None, OBJECTIVE) == cost_error((0.0, 0.0), APART) == 0.0
+    assert cost_error((4.0, 0.1), OBJECTIVE) == pytest.approx(4 / 40 + 3 * 0.1)
+    assert margin(0.0, 0.0) == 0.0
+    assert margin(3.0, 4.0) == margin(4.0, 3.0) == 5.0

@@ -166,11 +166,97 @@ def test_neither_own_jobs_nor_shadow_jobs_are_foreign() -> None:
     assert seen == [{"R": 4 / 80, "E": 4 / 80}]
 
 
-def test_the_incumbents_estimate_is_what_was_observed() -> None:
-    problem = replace(cell(estimator="corrected"), window_cycles=20)
-    run = dwell.simulate(problem, scenario="disturbed", policy="OFF", seed=1, windows=3)
+class Stubborn(Copycat):
+    """A learner that expects the same of every candidate, whatever it sees."""
+
+    QOS = QoS(33.0, 0.25, {"R": 0.5, "E": 0.125}, error=(2.5, 0.0625))
+
+    def estimate(
+        self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
+    ) -> Mapping[str, QoS]:
+        """Expect it."""
+        return dict.fromkeys(MOVES, self.QOS)
+
+
+class Keeper:
+    """A policy of a user's that stays, and keeps what it was shown."""
+
+    initial = "OFF"
+
+    def __init__(self) -> None:
+        self.shown: list[tuple[QoS, QoS]] = []
+
+    def __deepcopy__(self, memo: object) -> Keeper:
+        return self
+
+    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
+        """Stay."""
+        self.shown.append((observed, estimates["OFF"]))
+        return "OFF"
+
+
+ERRORS = ("est_l95_error_ms", "est_violation_error")
+
+
+@pytest.mark.parametrize("policy", ["OFF", "keeper"])
+def test_without_learning_the_incumbents_estimate_is_what_was_observed(policy: str) -> None:
+    """The kernel decides for the one, the controller for the other."""
+    keeper = Keeper()
+    problem = replace(cell(estimator="profile"), window_cycles=20)
+    run = dwell.simulate(
+        problem,
+        scenario="disturbed",
+        policy=keeper if policy == "keeper" else policy,
+        seed=1,
+        windows=3,
+    )
     shown = run.decisions.select("est_l95_ms_OFF", "est_violation_rate_OFF").rows()
     assert shown == run.windows.select("seen_l95_ms", "seen_violation_rate").rows()
+    assert all(observed is estimate for observed, estimate in keeper.shown)
+    for name in MOVES:
+        assert all(run.decisions[f"{column}_{name}"].to_list() == [0.0] * 3 for column in ERRORS)
+
+
+def test_a_learners_estimate_of_the_incumbent_is_its_own() -> None:
+    keeper = Keeper()
+    problem = replace(cell(), window_cycles=20)
+    run = dwell.simulate(
+        problem, scenario="disturbed", policy=keeper, estimator=Stubborn(), seed=1, windows=3
+    )
+    assert [estimate for _, estimate in keeper.shown] == [Stubborn.QOS] * 3
+    seen = [(observed.l95_ms, observed.violation_rate) for observed, _ in keeper.shown]
+    assert run.windows.select("seen_l95_ms", "seen_violation_rate").rows() == seen
+    for name in MOVES:
+        columns = ("est_l95_ms", "est_violation_rate", *ERRORS)
+        shown = run.decisions.select([f"{column}_{name}" for column in columns]).rows()
+        assert shown == [(33.0, 0.25, 2.5, 0.0625)] * 3
+
+
+@pytest.mark.parametrize("policy", ["dtp", "cusum", "work-function", "latency-first", "atp"])
+def test_what_is_observed_moves_nothing_where_the_estimator_learns(policy: str) -> None:
+    """The same is expected everywhere: whatever the incumbent shows, it is no reason to leave."""
+    problem = dwell.load("examples/canonical.yaml")
+
+    class Even(Copycat):
+        def estimate(
+            self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
+        ) -> Mapping[str, QoS]:
+            used = dict.fromkeys(problem.fabric.nodes, 0.3)
+            return dict.fromkeys(problem.candidates, QoS(30.0, 0.0, used))
+
+        def support(self) -> Mapping[str, Support]:
+            return dict.fromkeys(problem.candidates, Support(1.0, 0.0))
+
+    run = dwell.simulate(
+        problem,
+        scenario="robot-cpu-stress",
+        policy=policy,
+        estimator=Even(),
+        seed=1,
+        windows=20,
+    )
+    assert run.windows["seen_l95_ms"].max() > 60.0  # type: ignore[operator]
+    assert not run.decisions["migrated"].any()
 
 
 @pytest.mark.parametrize("estimator", [Shadow, Corrected])

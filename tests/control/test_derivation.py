@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -269,7 +269,7 @@ class Thresholds(Rule):
         windows = [self.record.windows[row["window"]] for row in self.seen]
         return self.means(windows, "seen_l95_ms", "u_{}")
 
-    def means(self, rows: list[Row], l95_ms: str, used: str) -> tuple[float, float, float]:
+    def means(self, rows: Sequence[Row], l95_ms: str, used: str) -> tuple[float, float, float]:
         def mean(columns: list[str]) -> float:
             largest = [float(max(row[column] for column in columns)) for row in rows]
             return sum(largest) / len(largest)

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dwell.cost import ERRORS
 from dwell.errors import MetricError, PolicyError
 from dwell.model import Problem, QoS
 from dwell.policies import ATP, ATPThresholds, by_name, check_policy
@@ -79,6 +80,27 @@ def test_the_switch_has_its_price() -> None:
         assert share == 0.25
         shown = estimates(qos(SLOW), qos(1.0), qos(l95_ms))
         assert moved.decide(observed=shown["LOC"], estimates=shown).name == name
+
+
+@pytest.mark.parametrize(("error_ms", "name"), [(9.9, "HYB"), (10.1, "LOC")])
+@pytest.mark.parametrize("of", ["LOC", "HYB"])
+def test_it_must_save_more_than_its_error_in_latency(of: str, error_ms: float, name: str) -> None:
+    """Of V_D it does not look at, nor at the error; the switch costs 5 ms."""
+    assert ERRORS == 1.0
+    shown = estimates(qos(SLOW), qos(1.0), qos(SLOW - 15.0))
+    shown[of] = replace(shown[of], error=(error_ms, 1.0))
+    assert play(atp(), [shown]) == [(name, "migrate" if name == "HYB" else "hold")]
+    two = [shown, {**shown, of: replace(shown[of], error=None)}]
+    assert play(atp(window_ms=1000.0), two)[-1] == ("HYB", "migrate")
+
+
+def test_thresholds_are_of_what_was_observed_and_costs_of_what_was_estimated() -> None:
+    policy, fast = atp(), estimates(qos(20.0), qos(1.0), qos(10.0))
+    assert policy.decide(observed=qos(20.0), estimates=fast).name == "LOC"
+    # 10 ms less, of which the switch costs 5.
+    decision = policy.decide(observed=qos(SLOW), estimates=fast)
+    assert decision.name == "HYB"
+    assert decision.delta_j == pytest.approx(0.125)
 
 
 def test_what_moving_saves_is_recorded() -> None:

@@ -10,11 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dwell.cost import ERRORS
 from dwell.errors import MetricError, PolicyError
 from dwell.model import Caps, Decision, Objective, Placement, QoS, Targets, Weights
 from dwell.policies import Cusum, check_policy
 from tests.cells.paper import CANDIDATES, OBJECTIVE, estimates, place, problem, qos
-from tests.reference.algorithm_1 import price, worst
+from tests.reference.algorithm_1 import doubt, price, worst
 
 #: J is L95 in milliseconds, moves are free, and nothing is forbidden.
 BARE = Objective(
@@ -70,10 +71,25 @@ def names(policy: Cusum, shown: Sequence[Mapping[str, QoS]]) -> list[str]:
 # ----------------------------------------------------------------------------------- the rule
 
 
-@given(windows, thresholds, slacks, memories)
+errors = st.none() | st.tuples(st.sampled_from([0.0, 2.0, 40.0]), st.sampled_from([0.0, 0.1]))
+erring = st.builds(lambda one, error: replace(one, error=error), metrics, errors)
+
+
+@given(
+    windows | st.lists(st.fixed_dictionaries(dict.fromkeys(CANDIDATES, erring)), max_size=40),
+    st.none() | metrics,
+    thresholds,
+    slacks,
+    memories,
+)
 def test_it_is_the_rule_as_it_is_written_down(
-    shown: list[dict[str, QoS]], threshold: float, slack: float, memory: float
+    shown: list[dict[str, QoS]],
+    observed: QoS | None,
+    threshold: float,
+    slack: float,
+    memory: float,
 ) -> None:
+    """Whatever was observed: what is compared are estimates."""
     policy = Cusum(
         candidates=CANDIDATES,
         initial="LOC",
@@ -84,19 +100,19 @@ def test_it_is_the_rule_as_it_is_written_down(
     )
     now, dwell, sums = "LOC", 0, dict.fromkeys(CANDIDATES, 0.0)
     for window in shown:
-        decision = policy.decide(observed=window[now], estimates=window)
+        decision = policy.decide(observed=observed or window[now], estimates=window)
         J = {s: price(window[s], CANDIDATES[s], CANDIDATES[now], OBJECTIVE) for s in CANDIDATES}
-        measured = price(window[now], CANDIDATES[now], CANDIDATES[now], OBJECTIVE)
+        stays = price(window[now], CANDIDATES[now], CANDIDATES[now], OBJECTIVE)
         excess = {s: worst(window[s], OBJECTIVE) for s in CANDIDATES}
         within = [s for s in CANDIDATES if excess[s] <= 0]
         allowed = within or [s for s in CANDIDATES if excess[s] <= min(excess.values()) + 1e-6]
         for s in CANDIDATES:
-            gain = measured - J[s] - slack
+            gain = stays - J[s] - (slack + doubt(window[s], window[now], OBJECTIVE))
             sums[s] = max(0.0, memory * sums[s] + gain) if s != now else 0.0
         due = [s for s in allowed if sums[s] > threshold]
         best = min(due, key=J.__getitem__, default=now)
-        moves = best != now and J[best] < measured
-        assert decision.delta_j == (measured - J[best] if due else 0.0)
+        moves = best != now and J[best] < stays
+        assert decision.delta_j == (stays - J[best] if due else 0.0)
         now = best if moves else now
         dwell = 0 if moves else dwell + 1
         if moves:
@@ -189,6 +205,13 @@ def test_a_large_advantage_moves_at_once_however_late_the_last_move_was() -> Non
 def test_an_advantage_below_its_share_never_moves(advantage: float, last: str) -> None:
     policy = bare(threshold=4.0, slack=0.5, memory=0.7)
     assert names(policy, [costs(10 + advantage, 20, 10)] * 1000)[-1] == last
+
+
+@pytest.mark.parametrize(("error", "last"), [(1.9, "HYB"), (2.1, "LOC")])
+def test_an_advantage_within_its_error_never_adds_up(error: float, last: str) -> None:
+    assert ERRORS == 1.0
+    shown = costs(12, 20, 10) | {"HYB": replace(qos(10), error=(error, 0.0))}
+    assert names(bare(threshold=4.0), [shown] * 1000)[-1] == last
 
 
 def test_the_cheapest_of_those_due_is_chosen_not_the_one_with_the_largest_sum() -> None:

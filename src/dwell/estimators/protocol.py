@@ -39,7 +39,8 @@ class Estimator(Protocol):
         observed : QoS
             Metrics of the window.
         incumbent : str
-            The candidate it ran under; its entry is an estimate like the others.
+            The candidate it ran under; its entry is an estimate like the others, which policies
+            are shown if the estimator is a `Learner`: else `observed` takes its place.
         own : mapping of str to float
             Share of each node's cores that the cell's own work took in the window; the rest of
             the observed utilisation is foreign load.
@@ -47,7 +48,7 @@ class Estimator(Protocol):
         Returns
         -------
         mapping of str to QoS
-            One entry for each candidate.
+            One entry for each candidate; with standard errors where they are known.
 
         Raises
         ------
@@ -63,7 +64,8 @@ class Learner(Protocol):
 
     It may have an attribute ``shadow_fraction``, the share of the cycles that it wants sent through
     each alternative as well, and a method ``support()`` that gives a `Support` for each candidate.
-    It is started before a run.
+    It is started before a run. Policies compare its prediction of the incumbent with those of the
+    others, so that an error that all of them share decides nothing.
     """
 
     def start(self, problem: Problem) -> None:

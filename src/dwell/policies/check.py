@@ -12,7 +12,7 @@ import random
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from types import FrameType
 from typing import TYPE_CHECKING, Any, get_args
@@ -292,9 +292,16 @@ def _situations(problem: Problem) -> Iterator[Situation]:
     yield Situation("every candidate over its caps", (alike(over_ms, 1.0, over),) * SHORT)
     yield Situation("ties", (alike(0.8 * deadline, 0.02, 0.4),) * SHORT)
     yield Situation("another candidate is the best in every window", turns)
+    yield Situation("estimates with large errors", tuple(map(_uncertain, turns)))
     yield Situation("a random walk", tuple(_walk(problem, LONG)))
     moves = {k: names[k // 3 % len(names)] for k in range(0, SHORT, 3)}
     yield Situation("a guard moves the cell", turns, moves)
+
+
+def _uncertain(window: Window) -> Window:
+    return {
+        name: replace(qos, error=(qos.l95_ms, qos.violation_rate)) for name, qos in window.items()
+    }
 
 
 def _walk(problem: Problem, windows: int) -> Iterator[Window]:

@@ -29,7 +29,9 @@ class MinimalPolicy(Protocol):
         observed : QoS
             Metrics of the last window, under the incumbent.
         estimates : mapping of str to QoS
-            Estimated metrics of the same window, by candidate; the incumbent's are `observed`.
+            Estimated metrics of the same window, by candidate, with their standard errors where
+            they are known (`QoS.error`); the incumbent's are a prediction, as the others', where
+            the estimator learns, and `observed` where it does not.
 
         Returns
         -------
