@@ -218,14 +218,15 @@ def _level(node: Node, bursts: float, jobs: _Jobs, before: _Jobs | None) -> Leve
         threads = slowed * spare - beside if own is None else _behind(slowed, spare, beside, own)
     # Some jobs leave others room, and take no longer for it: they say only how many there are at
     # most. Each task's jobs since its last change are looked at by themselves.
-    since = [_since_change(jobs, threads, task) for task in np.unique(jobs.task)]
+    since = [_since_change(jobs, threads, task) for task in sorted(set(jobs.task.tolist()))]
     told = [rows for rows in since if float((slowed[rows] > SLOWED).mean()) >= MOST]
-    threads = threads[np.concatenate(told or since)]
+    ordered = np.sort(threads[np.concatenate(told or since)])
     # The middle of what ran beside none of the bursts, which come for less of the time.
     place = (1.0 - bursts) / 2
-    off = math.sqrt(place * (1.0 - place) / len(threads))
-    low, beyond, high = np.quantile(threads, [max(place - off, 0.0), place, min(place + off, 1.0)])
-    return Level(max(float(beyond), 0.0), float(high - low) / 2, bool(told))
+    off = math.sqrt(place * (1.0 - place) / len(ordered))
+    places = (max(place - off, 0.0), place, min(place + off, 1.0))
+    low, beyond, high = (float(ordered[round(one * (len(ordered) - 1))]) for one in places)
+    return Level(max(beyond, 0.0), (high - low) / 2, bool(told))
 
 
 def _since_change(jobs: _Jobs, threads: Floats, task: float) -> Ints:

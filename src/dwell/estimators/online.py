@@ -89,6 +89,12 @@ class Online(ABC):
         self._take_in(self._meter.demands(evidence, self._threads), evidence)
 
     @property
+    def present(self) -> Present:
+        """What is not as the cell declares it."""
+        threads = {name: one.beyond for name, one in self._foreign.items() if one.beyond}
+        return Present(FrozenDict(self._otherwise()), FrozenDict(threads), self._down)
+
+    @property
     def _threads(self) -> dict[str, float]:
         """Foreign threads that each node is thought to have."""
         return {name: foreign.threads for name, foreign in self._foreign.items()}
@@ -190,8 +196,7 @@ class Online(ABC):
         """Play the candidates that are not as declared, anew where the present has changed."""
         names = self._names
         if names:
-            threads = {name: one.beyond for name, one in self._foreign.items() if one.beyond}
-            present = Present(FrozenDict(self._otherwise()), FrozenDict(threads), self._down)
+            present = self.present
             if self._has_changed:
                 self._playing.begin(present)
                 self._playing.go_on(present, names, self.FIRST_STEPS)
