@@ -84,9 +84,8 @@ class Online(ABC):
         return 0.0, 0.0
 
     def learn(self, evidence: Evidence) -> None:
-        """Take in what a window showed of each part."""
+        """Take in a window: what it showed of each part, once it is known of its nodes."""
         self._evidence = evidence
-        self._take_in(self._meter.demands(evidence, self._threads), evidence)
 
     @property
     def present(self) -> Present:
@@ -106,6 +105,7 @@ class Online(ABC):
         evidence, self._evidence = self._evidence, None
         if evidence is not None:
             self._look_at_nodes(evidence, observed, own, incumbent)
+            self._take_in(self._meter.demands(evidence, self._threads), evidence)
             self._play()
         played = {name: self._playing.played(name) for name in self._names}
         prices, work = self.profile.prices, []
