@@ -30,14 +30,24 @@ def beside(start_ns: Floats, end_ns: Floats, others: tuple[Floats, Floats, Float
     others : tuple of float64 array, shape (m,)
         Start, end and cores of jobs.
     """
+    at_ns, used = _used(others)
+    mean: Floats = _during(start_ns, end_ns, at_ns, used) / np.maximum(end_ns - start_ns, 1.0)
+    return mean
+
+
+def _used(others: tuple[Floats, Floats, Floats]) -> tuple[Floats, Floats]:
+    """Instants at which jobs come and go, and the cores that they use from each of them on."""
     begins_ns, ends_ns, cores = others
     at_ns, change = np.concatenate((begins_ns, ends_ns)), np.concatenate((cores, -cores))
     order = np.argsort(at_ns, kind="stable")
-    at_ns, used = at_ns[order], np.cumsum(change[order])
-    area = np.concatenate(([0.0], np.cumsum(used[:-1] * np.diff(at_ns))))
-    between = np.interp(end_ns, at_ns, area) - np.interp(start_ns, at_ns, area)
-    mean: Floats = between / np.maximum(end_ns - start_ns, 1.0)
-    return mean
+    return at_ns[order], np.cumsum(change[order])
+
+
+def _during(start_ns: Floats, end_ns: Floats, at_ns: Floats, rate: Floats) -> Floats:
+    """Integral from start to end of what has a rate from each instant on until the next."""
+    area = np.concatenate(([0.0], np.cumsum(rate[:-1] * np.diff(at_ns))))
+    integral: Floats = np.interp(end_ns, at_ns, area) - np.interp(start_ns, at_ns, area)
+    return integral
 
 
 def alone_with_waits(
@@ -68,14 +78,14 @@ def alone_with_waits(
         return {}
     others = [(start, end, np.full(len(start), cores)) for start, end, _, cores in jobs.values()]
     every = tuple(map(np.concatenate, zip(*others, strict=True)))
+    at_ns, used = _used((every[0], every[1], every[2]))
+    # Cores for each that a job wants: what it would have had, had it waited for nothing.
+    share = np.minimum(node.spare / np.maximum(used + foreign, 1e-9), 1.0)
     for task in longer:
         start_ns, end_ns, alone_ns, _ = jobs[task]
-        load = beside(start_ns, end_ns, (every[0], every[1], every[2])) + foreign
-        # The mean load stretches no less than what each moment's did (Jensen), so that a job that
-        # only shared its cores has not waited.
-        taken_ns = (end_ns - start_ns) / np.maximum(load / node.spare, 1.0)
-        if _is_longer(taken_ns, alone_ns):
-            waiting[task] = np.maximum(taken_ns, alone_ns)
+        had_ns = _during(start_ns, end_ns, at_ns, share)
+        if _is_longer(had_ns, alone_ns):
+            waiting[task] = np.maximum(had_ns, alone_ns)
     return waiting
 
 
