@@ -338,6 +338,10 @@ def test_core_time_that_processes_tell_is_evidence_as_in_the_simulator(
         assert (there.shadows_share, shown.shadows_share) == (True, False)
 
 
+def giving(evidence: Evidence) -> Callable[[], Evidence]:
+    return lambda: evidence
+
+
 @pytest.mark.parametrize("name", ["stressed", "impaired"])
 def test_the_present_of_a_live_cell_is_the_simulators(
     name: str, request: pytest.FixtureRequest
@@ -352,7 +356,7 @@ def test_the_present_of_a_live_cell_is_the_simulators(
         estimator = controller.estimator
         assert isinstance(estimator, Corrected)
         for window, of in zip(windows, shown, strict=False):
-            controller.close(dataclasses.replace(window, evidence=lambda of=of: of))
+            controller.close(dataclasses.replace(window, evidence=giving(of)))
         presents.append(estimator.present)
     live, simulated = presents
     assert live.down == simulated.down == frozenset()
