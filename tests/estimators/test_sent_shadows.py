@@ -11,10 +11,24 @@ import pytest
 import dwell
 from dwell.estimators.measured import Site
 from dwell.estimators.playing import Playing, Present, declared_of
+from dwell.estimators.prices import prices_of
 from dwell.estimators.sent_shadows import SentShadows, hindered, stamps_of
 from dwell.kernels.arrays import lay_out
 from dwell.kernels.random_draws import draw
-from dwell.model import Constant, Execution, Flow, FrozenDict, Link, Node, Problem, Quota, Task
+from dwell.model import (
+    Constant,
+    Execution,
+    Flow,
+    FrozenDict,
+    Link,
+    Node,
+    Problem,
+    Process,
+    Quota,
+    Task,
+    Trace,
+    TraceTable,
+)
 from dwell.model.shadow_plan import shadow_stamps
 from tests.cells.examples import EXAMPLES
 from tests.cells.generated import make_problem
@@ -28,18 +42,16 @@ MOVES = {"LOC": {"B": "R"}, "OFF": {"B": "E"}}
 
 def fork(
     *, kilobytes: int = 1, edge: Node = E, gpu: str | None = None, rate_mbps: float = math.inf,
-    in_order: bool = False, b_ms: float = 1.0,
+    in_order: bool = False, b_ms: Process = Constant(1.0),
 ) -> Problem:  # fmt: skip
     """Return a cell of A, which B and C follow: C is on E always, B under OFF."""
 
-    def on(ms: float, kind: str | None = None) -> Execution:
-        return Execution(Constant(ms), accelerator=kind)
-
+    ms = Constant(1.0)
     tasks: Sequence[Task] = [
-        Task("A", {"R": on(1.0)}),
-        Task("B", {"R": on(1.0), "E": on(b_ms, gpu)}),
-        Task("C", {"E": on(1.0, gpu)}),
-        Task("D", {"R": on(1.0), "E": on(1.0)}),
+        Task("A", {"R": Execution(ms)}),
+        Task("B", {"R": Execution(ms), "E": Execution(b_ms, accelerator=gpu)}),
+        Task("C", {"E": Execution(ms, accelerator=gpu)}),
+        Task("D", {"R": Execution(ms), "E": Execution(ms)}),
     ]
     return make_problem(
         [R, edge],
@@ -142,15 +154,26 @@ def test_only_what_hindered_candidates_show_as_declared_is_different(playing: Pl
         assert slower == (name in hindered(problem))
 
 
+def test_traces_of_shadow_jobs_begin_anew_where_they_end() -> None:
+    edge = Node("E", "edge", 4, accelerators={"gpu": 1})
+    table = TraceTable("rows.csv", {"a": np.array([0.5, 20.0])})
+    problem = fork(edge=edge, gpu="gpu", b_ms=Trace(table, "a"))
+    price = prices_of(problem, shadow_fraction=0.5)["LOC"]
+    assert price.l95_ms > prices_of(problem)["LOC"].l95_ms
+
+
 def test_shadow_jobs_meet_the_present_too() -> None:
     edge = Node("E", "edge", 4, accelerators={"gpu": 1})
     # Declared, B is done before C is due.
-    problem = fork(edge=edge, gpu="gpu", b_ms=0.01)
+    problem = fork(edge=edge, gpu="gpu", b_ms=Constant(0.01))
     playing = Playing(problem, shadow_fraction=0.5)
     alone_ms = playing.prices["LOC"].l95_ms
     playing.begin(Present(FrozenDict({Site("B", "E"): np.array([120.0])})))
     playing.go_on(playing.present, ["LOC"], 3)
     assert playing.played("LOC").l95_ms > alone_ms + 10.0
+    playing.begin(Present())
+    playing.go_on(playing.present, ["LOC"], 1)
+    assert playing.played("LOC").l95_ms == alone_ms
 
 
 def test_dtp_settles_on_the_candidate_that_is_best_with_shadows() -> None:

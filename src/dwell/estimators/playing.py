@@ -271,12 +271,12 @@ class Playing:
         begins = [NodeChange(0, name, 0, False) for name in problem.fabric.nodes]
         changes = NodeChanges.of([*begins, *declared.node_changes])
         self._real = replace(_with_own_demands(declared), node_changes=changes)
-        #: What is declared of the cycles, and of their shadows, with what is played of it.
-        self._played = [(declared, self._real)]
+        #: What is declared of the cycles, and of their shadows, with what is played in its place.
+        self._replaced, sent = [(declared, self._real)], None
         if shadows is not None:
-            self._played.append((shadows.realisation, _with_own_demands(shadows.realisation)))
-        own, *sent = (played for _, played in self._played)
-        self._first = lay_out([(problem, own)], shadows=next(iter(sent), None))
+            sent = _with_own_demands(shadows.realisation)
+            self._replaced.append((shadows.realisation, sent))
+        self._first = lay_out([(problem, self._real)], shadows=sent)
         tables = self._first.tables
         tables.clock[0]["pauses"] = 1
         self._declared_changes = tables.changes
@@ -284,7 +284,7 @@ class Playing:
         self._declared_layers = tables.layers.copy()
         self._nothing_ns = np.zeros(self._real.cycles, np.int64)
         self._rows: dict[Part, list[Ints]] = {}
-        for _, played in self._played:
+        for _, played in self._replaced:
             for site, row in zip(played.sites, played.exec_ns, strict=True):
                 self._rows.setdefault(Site(*site), []).append(row)
             for hop, row in zip(played.hops, played.delay_ns, strict=True):
@@ -294,7 +294,7 @@ class Playing:
 
     def _restore(self) -> None:
         """Go back to what is declared."""
-        for declared, played in self._played:
+        for declared, played in self._replaced:
             np.copyto(played.exec_ns, declared.exec_ns)
             np.copyto(played.delay_ns, declared.delay_ns)
         tables = self._first.tables

@@ -21,7 +21,7 @@ from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.shadow_plan import ShadowPlan
 
-#: Share of D for which a shadow may hold links of own messages and still be in nobody's way.
+#: Share of D for which a shadow may hold links of own messages and still hinder nobody.
 NEGLIGIBLE = 0.002
 
 
@@ -41,15 +41,17 @@ class SentShadows:
 
     def __init__(self, problem: Problem, realisation: Realisation, fraction: float) -> None:
         self._plan = ShadowPlan(0, realisation.cycles, len(problem.candidates), fraction)
-        self._sent = [name in hindered(problem) for name in problem.candidates]
+        self._hindered = [name in hindered(problem) for name in problem.candidates]
         self.realisation = draw_shadows(problem, realisation, self._plan.sent, wraps=True)
 
     def __repr__(self) -> str:
         return f"<SentShadows: {self._plan!r}>"
 
     def stamps(self, index: int) -> NDArray[np.int16] | int:
-        """Return the stamps under a candidate; -1 for none where they are in nobody's way."""
-        return self._plan.stamps(0, self.realisation.cycles, index) if self._sent[index] else -1
+        """Return the stamps under a candidate: none, which is -1, where they do not hinder it."""
+        if not self._hindered[index]:
+            return -1
+        return self._plan.stamps(0, self.realisation.cycles, index)
 
 
 def stamps_of(arrays: Arrays, index: int, shadows: SentShadows | None) -> NDArray[np.int16]:
