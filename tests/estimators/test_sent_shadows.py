@@ -34,6 +34,7 @@ from tests.cells.examples import EXAMPLES
 from tests.cells.generated import make_problem
 from tests.cells.random_dags import random_dag
 
+ONE = Constant(1.0)
 R, E = Node("R", "robot", cores=4), Node("E", "edge", cores=4)
 FRACTION = 0.05
 #: All but OFF have B on R; OFF sends 1 kB from A to B over R->E, as all do from A to C.
@@ -42,16 +43,15 @@ MOVES = {"LOC": {"B": "R"}, "OFF": {"B": "E"}}
 
 def fork(
     *, kilobytes: int = 1, edge: Node = E, gpu: str | None = None, rate_mbps: float = math.inf,
-    in_order: bool = False, b_ms: Process = Constant(1.0),
+    in_order: bool = False, b_ms: Process = ONE,
 ) -> Problem:  # fmt: skip
     """Return a cell of A, which B and C follow: C is on E always, B under OFF."""
 
-    ms = Constant(1.0)
     tasks: Sequence[Task] = [
-        Task("A", {"R": Execution(ms)}),
-        Task("B", {"R": Execution(ms), "E": Execution(b_ms, accelerator=gpu)}),
-        Task("C", {"E": Execution(ms, accelerator=gpu)}),
-        Task("D", {"R": Execution(ms), "E": Execution(ms)}),
+        Task("A", {"R": Execution(ONE)}),
+        Task("B", {"R": Execution(ONE), "E": Execution(b_ms, accelerator=gpu)}),
+        Task("C", {"E": Execution(ONE, accelerator=gpu)}),
+        Task("D", {"R": Execution(ONE), "E": Execution(ONE)}),
     ]
     return make_problem(
         [R, edge],
@@ -156,7 +156,7 @@ def test_only_what_hindered_candidates_show_as_declared_is_different(playing: Pl
 
 def test_traces_of_shadow_jobs_begin_anew_where_they_end() -> None:
     edge = Node("E", "edge", 4, accelerators={"gpu": 1})
-    table = TraceTable("rows.csv", {"a": np.array([0.5, 20.0])})
+    table = TraceTable("rows.csv", {"a": np.array([0.1, 120.0])})
     problem = fork(edge=edge, gpu="gpu", b_ms=Trace(table, "a"))
     price = prices_of(problem, shadow_fraction=0.5)["LOC"]
     assert price.l95_ms > prices_of(problem)["LOC"].l95_ms
