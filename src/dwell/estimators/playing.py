@@ -276,7 +276,7 @@ class Playing:
         if shadows is not None:
             sent = _with_own_demands(shadows.realisation)
             self._replaced.append((shadows.realisation, sent))
-        self._first = lay_out([(problem, self._real)], shadows=sent)
+        self._first = lay_out([(problem, self._real)], shadows=sent).copy()
         tables = self._first.tables
         tables.clock[0]["pauses"] = 1
         self._declared_changes = tables.changes
