@@ -20,6 +20,7 @@ from dwell.estimators.prices import (
     price_of,
     prices_of,
 )
+from dwell.estimators.sent_shadows import SentShadows, hindered
 from dwell.kernels.random_draws import draw
 from dwell.model import (
     Constant,
@@ -181,8 +182,39 @@ def test_a_price_is_the_mean_of_the_windows_of_a_run(seed: int) -> None:
         assert price.violation_rate == counted["seen_violation_rate"].to_numpy().mean()
 
 
+@pytest.mark.parametrize("seed", range(40))
+def test_a_price_with_shadows_is_the_mean_of_the_windows_of_a_run_with_them(seed: int) -> None:
+    problem = make_case(seed, ("fair", "fifo", "priority", "turns")).problem
+    windows, fraction = SETTLING + 3, 0.5 / max(len(problem.candidates) - 1, 1)
+    realisation = draw(problem, scenario="baseline", seed=seed, windows=windows)
+    shadows = SentShadows(problem, realisation, fraction)
+    for name in hindered(problem):
+        price = price_of(problem, realisation, name, shadows)
+        run = dwell.simulate_realisation(
+            problem, realisation, policy=name, estimator=AsSeen(fraction)
+        )
+        counted = run.windows[SETTLING:]
+        assert price.l95_ms == counted["seen_l95_ms"].to_numpy().mean()
+        assert price.violation_rate == counted["seen_violation_rate"].to_numpy().mean()
+
+
+def test_candidates_that_shadows_do_not_hinder_have_the_same_price_with_them() -> None:
+    problem = random_dag(40)
+    plain, with_shadows = prices_of(problem), prices_of(problem, shadow_fraction=0.05)
+    same = {name for name in problem.candidates if with_shadows[name] is plain[name]}
+    assert same == set(problem.candidates) - hindered(problem) == {"LOC"}
+    # Own work is what it is without; shadow jobs are no foreign load.
+    for name, price in with_shadows.items():
+        assert price.own == pytest.approx(plain[name].own, rel=0.01)
+        assert price.foreign == pytest.approx(plain[name].foreign, abs=1e-6)
+    assert with_shadows["C2"].l95_ms > 1.2 * plain["C2"].l95_ms
+
+
 class AsSeen:
     """An estimator that expects of every candidate what the window showed."""
+
+    def __init__(self, shadow_fraction: float = 0.0) -> None:
+        self.shadow_fraction = shadow_fraction
 
     def start(self, problem: Problem) -> None:
         """Remember the candidates."""

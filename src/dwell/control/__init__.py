@@ -11,9 +11,9 @@ from dwell.control.guard import (
     rest_cycles,
 )
 from dwell.control.plain_rule import plain_rule
-from dwell.control.shadows import ShadowPlan, shadow_stamps
 from dwell.control.windows import final_l95_ms
 from dwell.estimators import Estimator, Evidence, Instants
+from dwell.model.shadow_plan import ShadowPlan, shadow_stamps
 from dwell.policies import MinimalPolicy
 
 __all__ = [

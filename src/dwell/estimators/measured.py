@@ -270,13 +270,16 @@ def cores_of(node: Node, execution: Execution) -> float:
 def _cost(problem: Problem, part: Part) -> float:
     """Time of a job alone over its core time; of a message, nanoseconds to send it."""
     if isinstance(part, Message):
-        bytes_of = {
-            (flow.source, flow.target): flow.payload_bytes for flow in problem.pipeline.flows
-        }
-        rate_mbps = problem.fabric.links[part.link].rate_mbps
-        return float(round(8e3 * bytes_of[part.source, part.target] / rate_mbps))
+        return sending_ns(problem, part)
     node = problem.fabric.nodes[part.node]
     return 1.0 / cores_of(node, problem.pipeline.tasks[part.task].on[part.node])
+
+
+def sending_ns(problem: Problem, message: Message) -> float:
+    """Time that the link of a message takes to send it, nanoseconds."""
+    bytes_of = {(flow.source, flow.target): flow.payload_bytes for flow in problem.pipeline.flows}
+    rate_mbps = problem.fabric.links[message.link].rate_mbps
+    return float(round(8e3 * bytes_of[message.source, message.target] / rate_mbps))
 
 
 def groups(codes: NDArray[np.integer]) -> Iterator[tuple[int, Rows]]:

@@ -57,7 +57,7 @@ class Online(ABC):
         self.profile = Profile(problem)
         self.regimes = 0
         self._meter, self._stretches = Meter(problem), Stretches(problem)
-        self._playing = Playing(problem, self.seed)
+        self._playing = Playing(problem, self.seed, self.shadow_fraction)
         self._parts = {
             name: tuple(dict.fromkeys(parts_of(problem.pipeline, placed)))
             for name, placed in problem.candidates.items()
@@ -108,7 +108,7 @@ class Online(ABC):
             self._take_in(self._meter.demands(evidence, self._threads), evidence)
             self._play()
         played = {name: self._playing.played(name) for name in self._names}
-        prices, work = self.profile.prices, []
+        prices, work = self._playing.prices, []
         for name in prices:
             does = played[name].own if name in played else prices[name].own
             sent = self._sent[name]
@@ -132,7 +132,7 @@ class Online(ABC):
         self, evidence: Evidence, observed: QoS, own: Mapping[str, float], incumbent: str
     ) -> None:
         """Take in what a window showed of foreign threads, and of nodes that are down."""
-        price = self.profile.prices[incumbent]
+        price = self._playing.prices[incumbent]
         for name, foreign in self._foreign.items():
             used, mine = observed.utilisation[name], own[name]
             share = max(used - mine, 0.0)

@@ -22,6 +22,7 @@ from dwell.estimators.evidence import Evidence, Instants
 from dwell.estimators.measured import Message, Meter, Part, Site, parts_of
 from dwell.estimators.pool import Reference
 from dwell.estimators.prices import SEED, Question, prices_of, unseen_error
+from dwell.estimators.sent_shadows import SentShadows, hindered, stamps_of
 from dwell.kernels.advance import logged_instants, play
 from dwell.kernels.arrays import Arrays, lay_out, ordered_flows
 from dwell.kernels.random_draws import Drawing
@@ -97,9 +98,9 @@ class _Step(NamedTuple):
 class _Twin:
     """A candidate that is played beside the cell, and the steps that it has shown."""
 
-    def __init__(self, first: Arrays, index: int) -> None:
+    def __init__(self, first: Arrays, index: int, shadows: SentShadows | None) -> None:
         self.arrays = first.copy()
-        self.arrays.replace(stamps=np.full_like(first.tables.stamps, index))
+        self.arrays.replace(stamps=stamps_of(first, index, shadows))
         self.steps: deque[_Step] = deque(maxlen=KEPT)
         self.price: Played | None = None
 
@@ -116,12 +117,15 @@ class Declared:
         The demands of every part, as windows would show them.
     l95_ms, violation_rate : mapping of str to float64 array, shape (windows,)
         What every window shows under each candidate.
+    shadows : SentShadows, optional
+        Shadow jobs that it is played with, where they matter.
     """
 
     realisation: Realisation
     references: Mapping[Part, Reference]
     l95_ms: Mapping[str, Floats]
     violation_rate: Mapping[str, Floats]
+    shadows: SentShadows | None = None
 
     def __repr__(self) -> str:
         return f"<Declared: {self.realisation!r}, {len(self.references)} parts>"
@@ -134,26 +138,30 @@ class Playing:
     ----------
     seed : int
         Seed of what is as declared.
+    shadow_fraction : float
+        Share of the cycles that are also sent through each alternative.
 
     Attributes
     ----------
+    prices : mapping of str to Price
+        What candidates come to as declared.
     cycles : int
         Cycles that have been played of all candidates since the start.
     """
 
-    def __init__(self, problem: Problem, seed: int = SEED) -> None:
-        self.problem, self._seed = problem, seed
-        self.declared = declared_of(problem, seed)
-        self._prices = prices_of(problem)
+    def __init__(self, problem: Problem, seed: int = SEED, shadow_fraction: float = 0.0) -> None:
+        self.problem, self._seed, self._shadow_fraction = problem, seed, shadow_fraction
+        self.declared = declared_of(problem, seed, shadow_fraction)
+        self.prices = prices_of(problem, shadow_fraction=shadow_fraction)
         self._window = min(problem.window_cycles, LONGEST_WINDOW)
         self._names = tuple(problem.candidates)
         self._step = max(STEP // self._window, 1)
         self.cycles = 0
         self._twins: dict[str, _Twin] = {}
 
-    def __reduce__(self) -> tuple[type[Playing], tuple[Problem, int]]:
+    def __reduce__(self) -> tuple[type[Playing], tuple[Problem, int, float]]:
         # The kernel's tables have addresses; a copy begins anew.
-        return Playing, (self.problem, self._seed)
+        return Playing, (self.problem, self._seed, self._shadow_fraction)
 
     def begin(self, present: Present) -> None:
         """Begin another present: what was played before does not count any more."""
@@ -231,7 +239,7 @@ class Playing:
 
     def _price(self, name: str, steps: Collection[_Step]) -> Played:
         l95, declared_l95, uncut, rates, declared_rates, own = zip(*steps, strict=True)
-        known = self._prices[name]
+        known = self.prices[name]
         l95_ms, l95_error_ms = _estimated(
             l95, declared_l95, known.l95_ms, known.l95_error_ms, least=0.0
         )
@@ -258,35 +266,37 @@ class Playing:
 
     def _lay_out(self) -> None:
         problem = _with_short_windows(self.problem)
-        declared = self.declared.realisation
+        declared, shadows = self.declared.realisation, self.declared.shadows
         # Every node has a change to begin with, so that any may be otherwise from then on.
         begins = [NodeChange(0, name, 0, False) for name in problem.fabric.nodes]
         changes = NodeChanges.of([*begins, *declared.node_changes])
-        self._real = replace(
-            declared,
-            exec_ns=declared.exec_ns.copy(),
-            delay_ns=declared.delay_ns.copy(),
-            node_changes=changes,
-        )
-        self._first = lay_out([(problem, self._real)]).copy()
+        self._real = replace(_with_own_demands(declared), node_changes=changes)
+        #: What is declared of the cycles, and of their shadows, with what is played in its place.
+        self._replaced, sent = [(declared, self._real)], None
+        if shadows is not None:
+            sent = _with_own_demands(shadows.realisation)
+            self._replaced.append((shadows.realisation, sent))
+        self._first = lay_out([(problem, self._real)], shadows=sent).copy()
         tables = self._first.tables
         tables.clock[0]["pauses"] = 1
         self._declared_changes = tables.changes
         self._declared_rates, self._declared_segments = tables.rates.copy(), tables.segments.copy()
         self._declared_layers = tables.layers.copy()
         self._nothing_ns = np.zeros(self._real.cycles, np.int64)
-        self._rows: dict[Part, Ints] = {
-            Site(*site): row for site, row in zip(self._real.sites, self._real.exec_ns, strict=True)
-        }
+        self._rows: dict[Part, list[Ints]] = {}
+        for _, played in self._replaced:
+            for site, row in zip(played.sites, played.exec_ns, strict=True):
+                self._rows.setdefault(Site(*site), []).append(row)
+            for hop, row in zip(played.hops, played.delay_ns, strict=True):
+                self._rows.setdefault(Message(*hop), []).append(row)
         self._hops = {Message(*hop): number for number, hop in enumerate(self._real.hops)}
-        for message, number in self._hops.items():
-            self._rows[message] = self._real.delay_ns[number]
-        self._twins = {name: _Twin(self._first, i) for i, name in enumerate(self._names)}
+        self._twins = {name: _Twin(self._first, i, shadows) for i, name in enumerate(self._names)}
 
     def _restore(self) -> None:
         """Go back to what is declared."""
-        np.copyto(self._real.exec_ns, self.declared.realisation.exec_ns)
-        np.copyto(self._real.delay_ns, self.declared.realisation.delay_ns)
+        for declared, played in self._replaced:
+            np.copyto(played.exec_ns, declared.exec_ns)
+            np.copyto(played.delay_ns, declared.delay_ns)
         tables = self._first.tables
         tables.rates[:], tables.segments[:] = self._declared_rates, self._declared_segments
         tables.layers[:] = self._declared_layers
@@ -296,10 +306,12 @@ class Playing:
         begin = since + BEYOND if since else 0
         places = np.arange(begin, self._real.cycles) + self._offset
         for part, values in self.present.demands.items():
-            row = self._rows.get(part)
+            rows = self._rows.get(part, ())
             known = values[np.isfinite(values)]
-            if row is not None and len(known):
-                row[begin:] = np.rint(known * 1e6).astype(np.int64)[places % len(known)]
+            if rows and len(known):
+                demands = np.rint(known * 1e6).astype(np.int64)[places % len(known)]
+                for row in rows:
+                    row[begin:] = demands
 
     def _fill_links(self, present: Present) -> None:
         """Set what links lose, and that measured delays are all that there is."""
@@ -311,7 +323,7 @@ class Playing:
             share = float(np.isinf(values).mean()) if len(values) else 0.0
             lost[part.link] = max(lost.get(part.link, 0.0), share)
             if part in self._hops:
-                layers = tables.layers[self._hops[part]]
+                layers = tables.layers[self._hops[part] :: len(self._hops)]  # shadows' come after
                 layers[layers != 0] = self._nothing_ns.ctypes.data
         for link, share in lost.items():
             row = tables.links[list(links).index(link)]
@@ -407,16 +419,26 @@ def _mean_and_error(values: Sequence[float]) -> tuple[float, float]:
     return mean, math.sqrt(squares / (count * (count - 1)))
 
 
+def _with_own_demands(real: Realisation) -> Realisation:
+    return replace(real, exec_ns=real.exec_ns.copy(), delay_ns=real.delay_ns.copy())
+
+
 def _with_short_windows(problem: Problem) -> Problem:
     if problem.window_cycles <= LONGEST_WINDOW:
         return problem
     return replace(problem, window_cycles=LONGEST_WINDOW)
 
 
-def declared_of(problem: Problem, seed: int = SEED) -> Declared:
+def declared_of(problem: Problem, seed: int = SEED, shadow_fraction: float = 0.0) -> Declared:
     """Return the undisturbed cell; what was asked before is not played again."""
-    question = Question.of(problem, "baseline", seed, DRAWN)
-    known = _known.pop(question, None) or _played_as_declared(_with_short_windows(problem), seed)
+    question = Question.of(problem, "baseline", seed, DRAWN, shadow_fraction)
+    known = _known.pop(question, None)
+    if known is None:
+        short = _with_short_windows(problem)
+        if question.shadow_fraction:
+            known = _with_shadows(short, declared_of(problem, seed), shadow_fraction)
+        else:
+            known = _played_as_declared(short, seed)
     _known[question] = known
     while len(_known) > REMEMBERED:
         del _known[next(iter(_known))]
@@ -435,24 +457,44 @@ def _played_as_declared(problem: Problem, seed: int) -> Declared:
     meter, block = Meter(problem), min(problem.window_cycles, STEP)
     logged, plain = (lay_out([(problem, real)], log_jobs=keeps) for keeps in (True, False))
     references: dict[Part, Reference] = {}
-    shown = {}
+    l95_ms, violation_rate = {}, {}
     for index, (name, placement) in enumerate(problem.candidates.items()):
         missing = set(parts_of(problem.pipeline, placement)) - set(references)
         arrays = (logged if missing else plain).copy()
         arrays.replace(stamps=np.full_like(arrays.tables.stamps, index))
         play(arrays)
-        shown[name] = arrays.tables.seen[0]
+        l95_ms[name], violation_rate[name] = _shown(problem, arrays)
         if missing:
             demands = meter.demands(_evidence_of(problem, real, arrays, index))
             for part in missing:
                 values = np.round(demands.get(part, np.empty(0)), 6)
                 references[part] = Reference(values, block)
-    return Declared(
-        real,
-        FrozenDict(references),
-        FrozenDict({name: seen["l95_ms"].copy() for name, seen in shown.items()}),
-        FrozenDict({name: seen["missed"] / problem.window_cycles for name, seen in shown.items()}),
+    return Declared(real, FrozenDict(references), FrozenDict(l95_ms), FrozenDict(violation_rate))
+
+
+def _with_shadows(problem: Problem, plain: Declared, shadow_fraction: float) -> Declared:
+    """Play again with shadow jobs the candidates that are hindered by them."""
+    shadows = SentShadows(problem, plain.realisation, shadow_fraction)
+    first = lay_out([(problem, plain.realisation)], shadows=shadows.realisation)
+    l95_ms, violation_rate = dict(plain.l95_ms), dict(plain.violation_rate)
+    for index, name in enumerate(problem.candidates):
+        if name in hindered(problem):
+            arrays = first.copy()
+            arrays.replace(stamps=stamps_of(first, index, shadows))
+            play(arrays)
+            l95_ms[name], violation_rate[name] = _shown(problem, arrays)
+    return replace(
+        plain,
+        l95_ms=FrozenDict(l95_ms),
+        violation_rate=FrozenDict(violation_rate),
+        shadows=shadows,
     )
+
+
+def _shown(problem: Problem, arrays: Arrays) -> tuple[Floats, Floats]:
+    """L95 and V_D of every window that has been played."""
+    seen = arrays.tables.seen[0]
+    return seen["l95_ms"].copy(), seen["missed"] / problem.window_cycles
 
 
 def _evidence_of(problem: Problem, real: Realisation, arrays: Arrays, index: int) -> Evidence:

@@ -5,7 +5,7 @@ contention, queues, links and cycles that overlap. All candidates meet the same 
 differ by where their tasks run and not by luck. More is played until the means are known well
 enough (`L95_SHARE`, `RATE`), or `MOST_CYCLES` or `MOST_EVENTS` are reached; how much that is
 depends on counts and values alone, so that a price is a fixed number. Traces begin anew where they
-end.
+end. Shadow jobs are played where they are asked for and matter (`dwell.estimators.sent_shadows`).
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.estimators.paths import l95_rank
+from dwell.estimators.sent_shadows import SentShadows, hindered, stamps_of
 from dwell.kernels.advance import play
 from dwell.kernels.arrays import lay_out
 from dwell.kernels.codes import CycleOutcome
@@ -72,7 +73,8 @@ class Price:
     own : mapping of str to float
         Share of each resource that the cell's jobs take: a node, or a kind of accelerator.
     foreign, foreign_deviation : mapping of str to float
-        Share of each resource that others take, with the standard deviation from window to window.
+        Share of each resource that neither those nor shadow jobs take, with the standard deviation
+        from window to window.
     cycles : int
         How many cycles were played, those at the begin that do not count included.
     """
@@ -114,10 +116,18 @@ class Question:
     name: str
     seed: int
     cycles: int | None
+    shadow_fraction: float
     problem: Problem = field(compare=False, repr=False)
 
     @classmethod
-    def of(cls, problem: Problem, scenario: str, seed: int, cycles: int | None) -> Question:
+    def of(
+        cls,
+        problem: Problem,
+        scenario: str,
+        seed: int,
+        cycles: int | None,
+        shadow_fraction: float = 0.0,
+    ) -> Question:
         """Ask for the prices of a problem (see `prices_of`)."""
         return cls(
             pipeline=problem.pipeline,
@@ -130,6 +140,7 @@ class Question:
             name=scenario,
             seed=seed,
             cycles=cycles,
+            shadow_fraction=shadow_fraction if shadow_fraction and hindered(problem) else 0.0,
             problem=problem,
         )
 
@@ -138,7 +149,12 @@ _known: dict[Question, Mapping[str, Price]] = {}
 
 
 def prices_of(
-    problem: Problem, scenario: str = "baseline", *, seed: int = SEED, cycles: int | None = None
+    problem: Problem,
+    scenario: str = "baseline",
+    *,
+    seed: int = SEED,
+    cycles: int | None = None,
+    shadow_fraction: float = 0.0,
 ) -> Mapping[str, Price]:
     """Return the price of every candidate; what was asked before is not played again.
 
@@ -150,13 +166,15 @@ def prices_of(
         Seed of the draws.
     cycles : int, optional
         How many cycles of each candidate count; as many as are needed where None.
+    shadow_fraction : float
+        Share of the cycles that are also sent through each alternative.
 
     Raises
     ------
     KernelError
         If the compiled kernel cannot be loaded.
     """
-    question = Question.of(problem, scenario, seed, cycles)
+    question = Question.of(problem, scenario, seed, cycles, shadow_fraction)
     known = _known.get(question)
     if known is None:
         known = _answer(question)
@@ -186,10 +204,16 @@ def _answer(question: Question) -> Mapping[str, Price]:
         windows = most
     found: dict[str, Price] = {}
     left = list(problem.candidates)
+    if question.shadow_fraction:
+        found |= prices_of(problem, question.name, seed=question.seed, cycles=question.cycles)
+        left = [name for name in left if name in hindered(problem)]
     while True:
         drawing = Drawing(problem, question.name, seed=question.seed, windows=windows, wraps=True)
         realisation = drawing.take(windows)
-        found |= {name: price_of(problem, realisation, name) for name in left}
+        shadows = None
+        if question.shadow_fraction:
+            shadows = SentShadows(problem, realisation, question.shadow_fraction)
+        found |= {name: price_of(problem, realisation, name, shadows) for name in left}
         left = [name for name in left if not found[name].is_good_enough]
         if not left or windows == most:
             break
@@ -212,10 +236,13 @@ def _most_windows(problem: Problem, cycles: int | None) -> int:
     return max(min(most, longest_run(pipeline.period_ms) // width), 1)
 
 
-def price_of(problem: Problem, realisation: Realisation, name: str) -> Price:
+def price_of(
+    problem: Problem, realisation: Realisation, name: str, shadows: SentShadows | None = None
+) -> Price:
     """Price a candidate by its windows on one realisation."""
-    arrays = lay_out([(problem, realisation)])
-    arrays.tables.stamps[:] = list(problem.candidates).index(name)
+    arrays = lay_out([(problem, realisation)], shadows=shadows.realisation if shadows else None)
+    index = list(problem.candidates).index(name)
+    arrays.replace(stamps=stamps_of(arrays, index, shadows))
     play(arrays)
     tables = arrays.tables  # those that had to grow are others
     first = min(SETTLING, realisation.windows - 1)
@@ -239,8 +266,8 @@ def price_of(problem: Problem, realisation: Realisation, name: str) -> Price:
     open_windows = is_young.reshape(len(seen), -1).any(axis=1)
     if not open_windows.all():
         uncut_ms = uncut_ms[~open_windows]
-    busy, own = tables.shares[0, first:, 0], tables.shares[0, first:, 1]
-    foreign = np.maximum(busy - own, 0.0)
+    busy, own, shadow = np.moveaxis(tables.shares[0, first:], 1, 0)
+    foreign = np.maximum(busy - own - shadow, 0.0)
     by_resource = partial(_by_resource, problem)
     return Price(
         l95_ms=l95_ms,

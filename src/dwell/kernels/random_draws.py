@@ -135,7 +135,12 @@ def draw_changes(
 
 
 def draw_shadows(
-    problem: Problem, realisation: Realisation, sent: Ints | None = None, *, others: bool = False
+    problem: Problem,
+    realisation: Realisation,
+    sent: Ints | None = None,
+    *,
+    others: bool = False,
+    wraps: bool = False,
 ) -> Realisation:
     """Draw what shadow jobs meet in a realisation: times, delays and losses of their own.
 
@@ -149,6 +154,8 @@ def draw_shadows(
         Every cycle where None.
     others : bool
         Whether other cycles than `sent` are drawn, too; these are then drawn as without them.
+    wraps : bool
+        Whether every trace begins anew where it ends, as in the realisation.
     """
 
     def drawing(sent: Ints | None) -> Drawing:
@@ -158,6 +165,7 @@ def draw_shadows(
             seed=realisation.seed or 0,
             windows=realisation.windows,
             shadow=True,
+            wraps=wraps,
         )
         drawing.release_ns, drawing.sent = realisation.release_ns, sent
         return drawing

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dwell.control import ShadowPlan, shadow_stamps
+from dwell.model.shadow_plan import ShadowPlan, shadow_stamps
 
 
 @given(

@@ -1,0 +1,105 @@
+"""Sent shadows: the shadow jobs of a realisation that is played with all cycles on one candidate.
+
+They run on what own jobs leave, so that most candidates come to the same with them and without.
+Where they do not, by what shadows put on links, accelerators and under quotas that own jobs use,
+the candidate is played with them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.estimators.measured import Message, message_of, parts_of, sending_ns
+from dwell.kernels.arrays import Arrays
+from dwell.kernels.random_draws import draw_shadows
+from dwell.kernels.realisation import Realisation
+from dwell.model.placement import Placement
+from dwell.model.problem import Problem
+from dwell.model.shadow_plan import ShadowPlan
+
+#: Share of D for which a shadow may hold links of own messages and still hinder nobody.
+NEGLIGIBLE = 0.002
+
+
+class SentShadows:
+    """What an estimator sends as shadows in a realisation.
+
+    Parameters
+    ----------
+    fraction : float
+        Share of the cycles that each alternative gets.
+
+    Attributes
+    ----------
+    realisation : Realisation
+        What the shadow jobs meet.
+    """
+
+    def __init__(self, problem: Problem, realisation: Realisation, fraction: float) -> None:
+        self._plan = ShadowPlan(0, realisation.cycles, len(problem.candidates), fraction)
+        self._hindered = [name in hindered(problem) for name in problem.candidates]
+        self.realisation = draw_shadows(problem, realisation, self._plan.sent, wraps=True)
+
+    def __repr__(self) -> str:
+        return f"<SentShadows: {self._plan!r}>"
+
+    def stamps(self, index: int) -> NDArray[np.int16] | int:
+        """Return the stamps under a candidate: none, which is -1, where they do not hinder it."""
+        if not self._hindered[index]:
+            return -1
+        return self._plan.stamps(0, self.realisation.cycles, index)
+
+
+def stamps_of(arrays: Arrays, index: int, shadows: SentShadows | None) -> NDArray[np.int16]:
+    """Return the stamps of tables all of whose cycles run under a candidate."""
+    stamps = np.full_like(arrays.tables.stamps, index)
+    if shadows is not None:
+        stamps[1] = shadows.stamps(index)
+    return stamps
+
+
+@lru_cache(maxsize=64)
+def hindered(problem: Problem) -> frozenset[str]:
+    """Return the candidates whose own jobs may have to wait for shadows."""
+    return frozenset(
+        name
+        for name, here in problem.candidates.items()
+        if any(_is_hindered(problem, here, there) for there in problem.candidates.values())
+    )
+
+
+def _is_hindered(problem: Problem, here: Placement, there: Placement) -> bool:
+    """Whether own jobs may wait where cycles are also sent through another candidate.
+
+    They do for a link that own messages use and that keeps messages in order, or that shadow
+    messages hold for longer than is negligible, and for accelerators and quotas of both.
+    """
+    pipeline, links = problem.pipeline, problem.fabric.links
+    apart = pipeline.diverging(here, there)
+    own_links = {part.link for part in parts_of(pipeline, here) if isinstance(part, Message)}
+    held_ns = 0.0
+    for flow in pipeline.flows:
+        message = message_of(flow.source, flow.target, there) if flow.target in apart else None
+        if message is not None and message.link in own_links:
+            if links[message.link].in_order:
+                return True
+            held_ns += sending_ns(problem, message)
+    if held_ns > NEGLIGIBLE * pipeline.deadline_ms * 1e6:
+        return True
+    shadowed = [name for name in apart if pipeline.outputs(name)]
+    return not _scarce(problem, here, pipeline.tasks).isdisjoint(_scarce(problem, there, shadowed))
+
+
+def _scarce(problem: Problem, placement: Placement, tasks: Iterable[str]) -> set[str]:
+    """Accelerators, and CPUs under a quota, that tasks run on."""
+    found = set()
+    for name in tasks:
+        node = problem.fabric.nodes[placement[name]]
+        execution = problem.pipeline.tasks[name].on[node.name]
+        if execution.accelerator is not None or node.quota is not None:
+            found.add(execution.resource(node.name))
+    return found
