@@ -15,7 +15,6 @@ import pytest
 import dwell
 from dwell.errors import ProblemError
 from dwell.estimators import Corrected, Learner, Profile
-from dwell.estimators import corrected as module
 from dwell.estimators.measured import Message, Site
 from dwell.estimators.pool import LARGEST
 from dwell.model import (
@@ -40,12 +39,6 @@ from tests.estimators.windows import Row, window
 
 SEEN = QoS(1.0, 0.0, {"R": 0.0, "E": 0.0})
 NO_WORK = {"R": 0.0, "E": 0.0}
-
-
-@pytest.fixture
-def exact(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let nothing widen with age, so that what is not measured can be compared exactly."""
-    monkeypatch.setattr(module, "WIDENING", 0.0)
 
 
 def decide(
@@ -91,7 +84,6 @@ def test_a_slow_node_and_a_slow_link_seen_by_shadows_alone(scheduler: Scheduler)
     assert set(shown["est_age_windows_OFF"]) == {0.0}
 
 
-@pytest.mark.usefixtures("exact")
 def test_a_sink_that_no_shadow_runs_is_corrected_with_its_node() -> None:
     problem = cell(estimator="corrected")
     shown = decide(problem, "LOC", 4)
@@ -176,7 +168,6 @@ def test_random_processes_get_the_profile_when_nothing_is_wrong() -> None:
 # ------------------------------------------------------------------- what nobody measured
 
 
-@pytest.mark.usefixtures("exact")
 @pytest.mark.parametrize("scheduler", ["fair", "fifo", "priority"])
 @pytest.mark.parametrize("threads", [{}, {"plan": 1, "act": 8}, {"sense": 16, "plan": 2}])
 def test_jobs_of_a_node_are_slowed_by_what_slows_the_one_that_was_measured(
@@ -201,7 +192,6 @@ def test_jobs_of_a_node_are_slowed_by_what_slows_the_one_that_was_measured(
     assert shown["est_l95_ms_LOC"].to_list() == pytest.approx([17.0] + [slowed] * 3, abs=1e-6)
 
 
-@pytest.mark.usefixtures("exact")
 def test_a_single_time_is_no_measurement_of_a_slow_node() -> None:
     """One shadow through OFF runs `plan` on R, where the cycles' own jobs take twice as long."""
     corrected = Corrected(cell(candidates=("LOC", "OFF", "FAR")))
@@ -224,7 +214,6 @@ def test_a_single_time_is_no_measurement_of_a_slow_node() -> None:
     assert estimate(corrected)["LOC"].l95_ms == pytest.approx(4.0 + 16.0 + 12.0 + 2.0)
 
 
-@pytest.mark.usefixtures("exact")
 def test_messages_of_a_link_get_the_delay_and_the_losses_of_the_one_that_was_measured() -> None:
     # FAR sends plan -> control over E -> R, OFF would send act -> plan.
     scenario = [LinkDisturbance("E", "R", at_s=2.0, add_delay_ms=Constant(5.0), loss=0.4)]
@@ -244,7 +233,6 @@ def test_messages_of_a_link_get_the_delay_and_the_losses_of_the_one_that_was_mea
     assert finite["est_l95_ms_OFF"].to_list() == pytest.approx([14.0, 19.0, 19.0], abs=1e-6)
 
 
-@pytest.mark.usefixtures("exact")
 def test_a_node_of_which_nothing_is_measured_is_judged_by_its_load() -> None:
     stress = [NodeDisturbance("E", at_s=4.0, for_s=4.0, stress_threads=8)]
     # 12 threads beside 8 on 16 cores: 1.25 times as long.
@@ -255,7 +243,6 @@ def test_a_node_of_which_nothing_is_measured_is_judged_by_its_load() -> None:
     assert shown["est_l95_ms_OFF"].to_list() == pytest.approx(expected, abs=1e-6)
 
 
-@pytest.mark.usefixtures("exact")
 def test_a_saturated_node_hides_how_much_there_is() -> None:
     problem = cell(
         estimator="corrected",
@@ -268,7 +255,6 @@ def test_a_saturated_node_hides_how_much_there_is() -> None:
     assert truth(problem, "OFF")[0] == pytest.approx(2 + 3 * 52 / 16 + 6 + 1 + 2)
 
 
-@pytest.mark.usefixtures("exact")
 def test_load_says_nothing_where_jobs_were_measured() -> None:
     corrected = Corrected(cell(estimator="corrected"))
     before = estimate(corrected)["OFF"].l95_ms
