@@ -31,13 +31,12 @@ from dwell.model import (
 from dwell.record import Run
 from tests.cells.deterministic import MOVES, cell, truth
 from tests.cells.generated import make_problem
-from tests.estimators.windows import Row, window
+from tests.estimators.windows import GONE, Row, local_row, off_row, seen_window, window
 
 CANONICAL = Path(__file__).parents[2] / "examples" / "canonical.yaml"
 #: Cells of which it is known how often, and where to, the pipeline has to move.
 KNOWN_MOVES = Path(__file__).parents[1] / "cells" / "known_moves"
 NO_WORK = {"R": 0.0, "E": 0.0}
-GONE: Row = ([None] * 4, [None] * 4, [None] * 3)
 
 Kind: TypeAlias = type[Shadow] | type[Scaling] | type[Corrected]
 
@@ -48,27 +47,6 @@ def estimate(
     estimator: Online, used: Mapping[str, float] = NO_WORK, own: Mapping[str, float] = NO_WORK
 ) -> dict[str, QoS]:
     return estimator.estimate(observed=QoS(1.0, 0.0, used), incumbent="LOC", own=own)
-
-
-def local_row(begin_ms: float) -> Row:
-    """A cycle under LOC that takes what is declared."""
-    ends = [begin_ms + ms for ms in (2.0, 10.0, 16.0, 17.0)]
-    return [begin_ms, *ends[:3]], ends, ends[:3]
-
-
-def off_row(begin_ms: float, extra_ms: float) -> Row:
-    """The shadow through OFF of such a cycle, with an extra delay on the way up."""
-    up = begin_ms + 2.0 + 1.0 + extra_ms
-    return [None, up, up + 4.0, None], [None, up + 3.0, up + 10.0, None], [up, up + 4.0, up + 10.0]
-
-
-def seen_window(*, extra_ms: float | None = None, lost: int = 0) -> Evidence:
-    """Ten cycles under LOC; each with a shadow through OFF if there is an extra delay."""
-    starts = [40.0 * i for i in range(10)]
-    sent: list[Row] | None = None
-    if extra_ms is not None:
-        sent = [GONE if i < lost else off_row(at, extra_ms) for i, at in enumerate(starts)]
-    return window([local_row(at) for at in starts], close_ms=400.0, release_ms=starts, shadows=sent)
 
 
 def without_error(qos: QoS) -> tuple[float, float, float]:
