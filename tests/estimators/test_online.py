@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from random import Random
 from typing import TypeAlias
 
+import numpy as np
 import polars as pl
 import pytest
 
@@ -30,7 +32,7 @@ from dwell.model import (
 )
 from dwell.record import Run
 from tests.cells.deterministic import MOVES, cell, truth
-from tests.cells.generated import make_problem
+from tests.cells.generated import make_problem, random_problem, random_stamps
 from tests.estimators.windows import GONE, Row, local_row, off_row, seen_window, window
 
 CANONICAL = Path(__file__).parents[2] / "examples" / "canonical.yaml"
@@ -88,6 +90,15 @@ def test_what_has_nothing_that_is_otherwise_keeps_the_price_of_the_profile(
         else:
             assert shown[name].error is not None
             assert shown[name].l95_ms > profile.l95_ms[name]
+
+
+@every
+def test_what_is_as_declared_is_no_news(kind: Kind) -> None:
+    estimator = kind(cell())
+    for _ in range(20):
+        estimator.learn(seen_window(extra_ms=0.0))
+        estimate(estimator)
+    assert estimator.regimes == 0
 
 
 @every
@@ -368,6 +379,52 @@ def test_a_link_with_a_loss_of_1(kind: Kind, retransmit_ms: float | None) -> Non
         rates = decisions["est_violation_rate_OFF"].to_list()
         assert rates == [0.0] * 2 + [1.0] * 6
         assert set(decisions["est_violation_rate_LOC"]) == {0.0}
+
+
+class Replay:
+    """A policy that decides as it was told."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self.names = names
+
+    def start(self, problem: Problem) -> None:
+        self.next = iter(self.names)
+
+    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
+        return next(self.next)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("estimator", ["shadow", "scaling", "corrected"])
+@pytest.mark.parametrize("seed", range(12))
+def test_any_cell_gets_estimates_that_a_policy_can_use(seed: int, estimator: str) -> None:
+    """Overloaded nodes, links and nodes that are down, orders that take time, cold migrations."""
+    rng = Random(seed)
+    problem = random_problem(rng, orders=True, whole_ms=seed % 3 == 0)
+    windows, W = 12, rng.choice([1, 2, 5, 20])
+    share = rng.choice([0.1, 0.3, 1.0]) / len(problem.candidates)
+    settings = {
+        **{f: getattr(problem.controller, f) for f in ("on", "migration", "order_delay_ms")},
+        "shadow_fraction": share,
+        "half_life_windows": rng.choice([0.01, 2.0, 50.0]),
+    }
+    problem = replace(problem, controller=ControllerSettings(**settings), window_cycles=W)
+    names = [*random_stamps(rng, problem, windows), problem.initial]
+    decisions = dwell.simulate(
+        problem,
+        scenario="disturbed",
+        policy=Replay(names),
+        estimator=estimator,
+        seed=seed,
+        windows=windows,
+    ).decisions
+    for name in problem.candidates:
+        l95_ms = decisions[f"est_l95_ms_{name}"].drop_nulls().to_numpy()
+        missed = decisions[f"est_violation_rate_{name}"].drop_nulls().to_numpy()
+        assert np.isfinite(l95_ms).all()
+        assert (l95_ms >= 0).all()
+        assert (l95_ms <= problem.censor_ms + 1e-6).all()
+        assert ((missed >= 0) & (missed <= 1)).all()
 
 
 # --------------------------------------------------------------------- moves that are known
