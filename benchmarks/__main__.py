@@ -20,6 +20,7 @@ BENCHMARKS = {
     "length": ("canonical", "length"),
     "closing": ("closing", "measure"),
     "deciding": ("deciding", "measure"),
+    "pricing": ("pricing", "measure"),
     "clairvoyant": ("clairvoyant", "measure"),
     "fleet": ("fleet", "measure"),
     "study": ("study", "measure"),

@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 import dwell
 from dwell.control import ClosedWindow, Controller, Evidence
 from dwell.errors import LiveError
-from dwell.estimators import Profile
+from dwell.estimators import Corrected, Profile
 from dwell.live.live_windows import LiveWindows
 from dwell.live.messages import Completion, Hop, Load, Stamp
 from dwell.live.offsets import Offsets
@@ -338,9 +338,35 @@ def test_core_time_that_processes_tell_is_evidence_as_in_the_simulator(
         assert (there.shadows_share, shown.shadows_share) == (True, False)
 
 
+@pytest.mark.parametrize("name", ["stressed", "impaired"])
+def test_the_present_of_a_live_cell_is_the_simulators(
+    name: str, request: pytest.FixtureRequest
+) -> None:
+    """What differs is what nobody can tell live: shadows that have not ended."""
+    played: Played = request.getfixturevalue(name)
+    messages = messages_of(played, Clocks(), work_of(played))
+    _, _, closed, evidence, _ = replay(played, SYNCHRONOUS, messages)
+    presents = []
+    for windows, shown in ((closed, evidence), (played.seen.windows, played.seen.evidence)):
+        controller = Controller(played.problem, "LOC", "corrected")
+        estimator = controller.estimator
+        assert isinstance(estimator, Corrected)
+        for window, of in zip(windows, shown, strict=False):
+            controller.close(dataclasses.replace(window, evidence=lambda of=of: of))
+        presents.append(estimator.present)
+    live, simulated = presents
+    assert live.down == simulated.down == frozenset()
+    assert set(live.demands) == set(simulated.demands)
+    for part, values in live.demands.items():
+        known = simulated.demands[part]
+        assert np.median(values) == pytest.approx(np.median(known), rel=0.1)
+    assert live.threads == pytest.approx(simulated.threads, abs=0.3)
+    assert bool(simulated.threads) == (name == "stressed")
+    assert bool(simulated.demands) == (name == "impaired")
+
+
 def test_the_record_is_the_simulators(stressed: Played, tmp_path: Path) -> None:
-    messages = messages_of(stressed, Clocks(), work_of(stressed))
-    _, controller, _, _, rows = replay(stressed, SYNCHRONOUS, messages)
+    _, controller, _, _, rows = replay(stressed, SYNCHRONOUS, messages_of(stressed, Clocks()))
     live, simulated = recorded(tmp_path, controller, rows), stressed.run
     for table in ("cycles", "windows", "decisions"):
         mine, theirs = getattr(live, table), getattr(simulated, table)
@@ -350,10 +376,7 @@ def test_the_record_is_the_simulators(stressed: Played, tmp_path: Path) -> None:
     count = len(live.windows)
     assert count == len(simulated.windows) - 1
     same = pl.col("window") < count
-    # Of jobs that had not completed, or of a shadow that had not ended, no message tells: estimates
-    # may differ a little.
-    estimated = pl.selectors.starts_with("est_", "j_", "delta_j", "excess_")
-    left = ["shadow_bytes", *pl.selectors.expand_selector(simulated.decisions, estimated)]
+    left = ["shadow_bytes"]
     for mine, theirs in (
         (live.windows, simulated.windows.filter(same)),
         (live.decisions, simulated.decisions.filter(same)),
@@ -361,7 +384,7 @@ def test_the_record_is_the_simulators(stressed: Played, tmp_path: Path) -> None:
         theirs = theirs.drop(left, strict=False)
         # Utilisation goes through whole nanoseconds.
         pl.testing.assert_frame_equal(mine.select(theirs.columns), theirs, abs_tol=1e-6)
-    assert live.decisions["migrated"].any()
+    assert live.decisions["migrated"].sum() >= 2
     # Bytes of shadows that never came to their end are not known.
     assert (live.windows["shadow_bytes"] <= simulated.windows["shadow_bytes"][:count]).all()
     assert live.windows["shadow_bytes"].sum() > 0

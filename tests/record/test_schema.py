@@ -42,7 +42,7 @@ def test_a_simulated_run_has_the_declared_columns_and_types(
 ) -> None:
     run = dwell.simulate(problem, policy=policy, estimator=estimator, seed=1, windows=3, jobs=True)
     shadows: list[Feature] = ["shadows"] if estimator in ("shadow", "corrected") else []
-    support: list[Feature] = ["support"] if estimator != "profile" else []
+    support: list[Feature] = [] if estimator == "profile" else ["support"]
     assert run.cycles.schema == declared("cycles", problem)
     assert run.windows.schema == declared("windows", problem, *shadows)
     assert run.decisions.schema == declared("decisions", problem, *support)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from dwell.estimators.evidence import Evidence, Instants
 from dwell.estimators.measured import groups
 from dwell.estimators.pool import newest
+from dwell.estimators.waits import beside
 from dwell.model.fabric import Node
 from dwell.model.problem import Problem
 
@@ -53,6 +54,11 @@ class _Jobs(NamedTuple):
     alone_ns: Floats
     cores: Floats
     task: Floats
+
+    @property
+    def intervals(self) -> tuple[Floats, Floats, Floats]:
+        """Start, end and cores."""
+        return self.start_ns, self.end_ns, self.cores
 
     @property
     def taken_ns(self) -> Floats:
@@ -213,19 +219,22 @@ def _level(node: Node, bursts: float, jobs: _Jobs, before: _Jobs | None) -> Leve
     if node.scheduler != "fair":
         threads = slowed * spare - node.cores
     else:
-        beside = _beside(jobs, jobs)
-        own = None if before is None else _beside(jobs, before)
-        threads = slowed * spare - beside if own is None else _behind(slowed, spare, beside, own)
+        mine = beside(jobs.start_ns, jobs.end_ns, jobs.intervals)
+        threads = slowed * spare - mine
+        if before is not None:
+            own = beside(jobs.start_ns, jobs.end_ns, before.intervals)
+            threads = _behind(slowed, spare, mine, own)
     # Some jobs leave others room, and take no longer for it: they say only how many there are at
     # most. Each task's jobs since its last change are looked at by themselves.
-    since = [_since_change(jobs, threads, task) for task in np.unique(jobs.task)]
+    since = [_since_change(jobs, threads, task) for task in sorted(set(jobs.task.tolist()))]
     told = [rows for rows in since if float((slowed[rows] > SLOWED).mean()) >= MOST]
-    threads = threads[np.concatenate(told or since)]
+    ordered = np.sort(threads[np.concatenate(told or since)])
     # The middle of what ran beside none of the bursts, which come for less of the time.
     place = (1.0 - bursts) / 2
-    off = math.sqrt(place * (1.0 - place) / len(threads))
-    low, beyond, high = np.quantile(threads, [max(place - off, 0.0), place, min(place + off, 1.0)])
-    return Level(max(float(beyond), 0.0), float(high - low) / 2, bool(told))
+    off = math.sqrt(place * (1.0 - place) / len(ordered))
+    places = (max(place - off, 0.0), place, min(place + off, 1.0))
+    low, beyond, high = (float(ordered[round(one * (len(ordered) - 1))]) for one in places)
+    return Level(max(beyond, 0.0), (high - low) / 2, bool(told))
 
 
 def _since_change(jobs: _Jobs, threads: Floats, task: float) -> Ints:
@@ -235,23 +244,12 @@ def _since_change(jobs: _Jobs, threads: Floats, task: float) -> Ints:
     return mine[newest(threads[mine]) :]
 
 
-def _behind(slowed: Floats, spare: float, beside: Floats, own: Floats) -> Floats:
+def _behind(slowed: Floats, spare: float, mine: Floats, own: Floats) -> Floats:
     """Foreign threads that share with shadow jobs what own jobs leave."""
     left = np.maximum(spare - own, 0.0)
-    threads = np.maximum(slowed * left - beside, 0.0)
+    threads = np.maximum(slowed * left - mine, 0.0)
     for _ in range(2):
         load = own + threads
         left = np.where(load <= spare, spare - own, spare * threads / np.maximum(load, 1e-9))
-        threads = np.maximum(slowed * left - beside, 0.0)
+        threads = np.maximum(slowed * left - mine, 0.0)
     return threads
-
-
-def _beside(jobs: _Jobs, others: _Jobs) -> Floats:
-    """Cores that others used in the mean while each of the jobs ran, its own if it is of them."""
-    at_ns = np.concatenate((others.start_ns, others.end_ns))
-    change = np.concatenate((others.cores, -others.cores))
-    order = np.argsort(at_ns, kind="stable")
-    at_ns, used = at_ns[order], np.cumsum(change[order])
-    area = np.concatenate(([0.0], np.cumsum(used[:-1] * np.diff(at_ns))))
-    between = np.interp(jobs.end_ns, at_ns, area) - np.interp(jobs.start_ns, at_ns, area)
-    return between / jobs.taken_ns

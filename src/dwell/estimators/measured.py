@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from dwell.estimators.evidence import UNKNOWN, Evidence, Instants
 from dwell.estimators.slowdown import slowdown
 from dwell.estimators.spans import patience_ns
+from dwell.estimators.waits import alone_with_waits
 from dwell.kernels.meter import CyclesLayout, PartTimes
 from dwell.model.fabric import Node
 from dwell.model.pipeline import Execution, Pipeline
@@ -77,6 +78,7 @@ class Meter:
         self._cost, self._usual_cost = np.array(costs), np.array(costs)
         self._demands = PartTimes(len(self._parts), self._cost, self._links())
         self._layouts: dict[int, CyclesLayout] = {}
+        self._sharing = [self._sharing_of(placed) for placed in self._placements]
 
     def times(self, evidence: Evidence) -> dict[Part, Floats]:
         """Times of every part that the window has any of, milliseconds, infinite where lost.
@@ -90,7 +92,8 @@ class Meter:
     ) -> dict[Part, Floats]:
         """Demands of every part that the window has any of, milliseconds, infinite where lost.
 
-        The demand of a job is its work: how long it takes alone on its node; of a message its
+        The demand of a job is its work: how long it takes alone on its node, what it waits for
+        that nobody on the node is the cause of included; of a message its
         delay: the time on the way less waiting behind others of the cell, and less their
         transmission at the rate of the link. They are overwritten by those of the next window.
 
@@ -108,6 +111,7 @@ class Meter:
                 self._cost[number] /= self._problem.fabric.nodes[part.node].interference
         cycles, shadows = evidence.cycles, evidence.shadows
         work_ns = self.work_ns(cycles, evidence.placement, foreign)
+        work_ns = self._with_waits(cycles, evidence.placement, work_ns, foreign)
         told = replace(evidence, cycles=replace(cycles, work_ns=work_ns))
         if shadows is not None:
             work_ns = self.work_ns(shadows, evidence.shadow_placement, foreign)
@@ -155,6 +159,49 @@ class Meter:
                 work_ns[rows] = np.rint(taken_ns * cores)
         work_ns[~ended | (begun_ns < 0)] = UNKNOWN
         return work_ns if known_ns is None else np.where(known_ns >= 0, known_ns, work_ns)
+
+    def _with_waits(
+        self,
+        cycles: Instants,
+        placement: NDArray[np.integer],
+        work_ns: Ints,
+        foreign: Mapping[str, float],
+    ) -> Ints:
+        """Add what most jobs of a task waited for to their work (see `dwell.estimators.waits`)."""
+        if cycles.start_ns is None:
+            return work_ns
+        # Most windows are of one placement, and in most of those nobody waits.
+        known = (work_ns > 0) & (cycles.start_ns >= 0) & (cycles.end_ns >= 0)
+        found = work_ns
+        for code, rows in groups(placement):
+            for name, tasks in self._sharing[code].items():
+                node = self._problem.fabric.nodes[name]
+                jobs = {}
+                for task, cores in tasks:
+                    mine = known[rows, task]
+                    if mine.any():
+                        columns = (cycles.start_ns, cycles.end_ns, work_ns)
+                        begun, ended, work = (of[rows, task][mine].astype(float) for of in columns)
+                        jobs[task] = begun, ended, work / cores, cores
+                # Bursts may be on all the while that a job runs.
+                most = foreign.get(name, 0.0) + (node.bursts.threads if node.bursts else 0.0)
+                for task, alone_ns in alone_with_waits(node, most, jobs).items():
+                    found = found.copy() if found is work_ns else found
+                    column = found[rows, task]
+                    column[known[rows, task]] = np.rint(alone_ns * jobs[task][3])
+                    found[rows, task] = column
+        return found
+
+    def _sharing_of(self, placement: Placement) -> dict[str, list[tuple[int, float]]]:
+        """Tasks on the CPU of each node whose jobs share its cores evenly, with their cores."""
+        nodes = self._problem.fabric.nodes
+        sharing: dict[str, list[tuple[int, float]]] = {}
+        for column, (name, task) in enumerate(self._pipeline.tasks.items()):
+            node, execution = nodes[placement[name]], task.on[placement[name]]
+            is_even = node.scheduler == "fair" and node.quota is None
+            if is_even and execution.accelerator is None:
+                sharing.setdefault(node.name, []).append((column, cores_of(node, execution)))
+        return sharing
 
     def _cores_received(self, placement: Placement, foreign: Mapping[str, float]) -> Floats:
         """Cores that the job of each task has in the mean beside foreign threads."""

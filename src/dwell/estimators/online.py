@@ -84,9 +84,14 @@ class Online(ABC):
         return 0.0, 0.0
 
     def learn(self, evidence: Evidence) -> None:
-        """Take in what a window showed of each part."""
+        """Take in a window: what it showed of each part, once it is known of its nodes."""
         self._evidence = evidence
-        self._take_in(self._meter.demands(evidence, self._threads), evidence)
+
+    @property
+    def present(self) -> Present:
+        """What is not as the cell declares it."""
+        threads = {name: one.beyond for name, one in self._foreign.items() if one.beyond}
+        return Present(FrozenDict(self._otherwise()), FrozenDict(threads), self._down)
 
     @property
     def _threads(self) -> dict[str, float]:
@@ -100,6 +105,7 @@ class Online(ABC):
         evidence, self._evidence = self._evidence, None
         if evidence is not None:
             self._look_at_nodes(evidence, observed, own, incumbent)
+            self._take_in(self._meter.demands(evidence, self._threads), evidence)
             self._play()
         played = {name: self._playing.played(name) for name in self._names}
         prices, work = self.profile.prices, []
@@ -190,8 +196,7 @@ class Online(ABC):
         """Play the candidates that are not as declared, anew where the present has changed."""
         names = self._names
         if names:
-            threads = {name: one.beyond for name, one in self._foreign.items() if one.beyond}
-            present = Present(FrozenDict(self._otherwise()), FrozenDict(threads), self._down)
+            present = self.present
             if self._has_changed:
                 self._playing.begin(present)
                 self._playing.go_on(present, names, self.FIRST_STEPS)

@@ -268,7 +268,7 @@ class Playing:
             delay_ns=declared.delay_ns.copy(),
             node_changes=changes,
         )
-        self._first = lay_out([(problem, self._real)])
+        self._first = lay_out([(problem, self._real)]).copy()
         tables = self._first.tables
         tables.clock[0]["pauses"] = 1
         self._declared_changes = tables.changes

@@ -28,6 +28,8 @@ BUDGET = 200_000
 #: What a core draws on the pool of a quota at a time (sched_cfs_bandwidth_slice_us), and the least
 #: run time of a turn (sched_base_slice of two CPUs; eight and more have twice as much), ms.
 DRAWN_MS, LEAST_MS = 5.0, 1.4
+#: Tables of a state that is in one piece begin at multiples of so many bytes.
+LINE = 64
 #: What a quota counts in time of its core (`_counted_ns`).
 COUNTED = "quota_ns", "stressed_ns", "slack_ns", "least_ns", "drawn_ns"
 
@@ -60,6 +62,30 @@ class Arrays:
         self.tables = tables
         self._addresses = tables.addresses()
         self.address = self._addresses.ctypes.data
+        #: The state in one piece of memory, of tables that are a copy.
+        self._state: NDArray[np.uint8] | None = None
+
+    def copy(self) -> Arrays:
+        """Return tables that share what is fixed with these, and have a state of their own."""
+        other = Arrays(self.tables, self.resources, self._behind)
+        other.restart(self)
+        return other
+
+    def restart(self, first: Arrays) -> None:
+        """Go back to the state of tables that have not been played, of which these are a copy."""
+        if self._state is not None and first._state is not None:
+            np.copyto(self._state, first._state)
+            return
+        state, tables = _with_own_state(self.tables, first.tables)
+        self._use(tables)
+        self._state = state
+
+    def replace(self, **tables: NDArray[Any]) -> None:
+        """Use other tables in the place of some that are fixed."""
+        self.tables = self.tables._replace(**tables)
+        for name, table in tables.items():
+            row = self.tables._fields.index(name)
+            self._addresses[row] = table.ctypes.data, table.size
 
     def use_rule(
         self,
@@ -94,18 +120,6 @@ class Arrays:
                 **tables,
             )
         )
-
-    def copy(self) -> Arrays:
-        """Return tables that share what is fixed with these, and have a state of their own."""
-        return Arrays(_with_own_state(self.tables, self.tables), self.resources, self._behind)
-
-    def restart(self, first: Arrays) -> None:
-        """Go back to the state of tables that have not been played."""
-        self._use(_with_own_state(self.tables, first.tables))
-
-    def replace(self, **tables: NDArray[Any]) -> None:
-        """Use other tables in the place of some."""
-        self._use(self.tables._replace(**tables))
 
     def grow_events(self) -> None:
         """Double the room of the queue of events."""
@@ -727,10 +741,19 @@ def _counted_ns(node: Node, quota: Quota) -> list[int]:
     return [*budgets, *(node.wall_ns(ms) for ms in (quota.slack_ms, LEAST_MS, DRAWN_MS))]
 
 
-def _with_own_state(tables: Tables, state: Tables) -> Tables:
-    """Return tables with a copy of the state of others."""
-    changing = ("clock", "cells", "sites", *Tables._fields[Tables._fields.index("sites") + 1 :])
-    return tables._replace(**{name: getattr(state, name).copy() for name in changing})
+def _with_own_state(tables: Tables, first: Tables) -> tuple[NDArray[np.uint8], Tables]:
+    """Return a copy of the state of the first tables in one piece, and tables that have it."""
+    fields = Tables._fields
+    changing = ("clock", "cells", *fields[fields.index("sites") :])
+    old = {name: np.ascontiguousarray(getattr(first, name)) for name in changing}
+    ends = np.cumsum([-(-table.nbytes // LINE) * LINE for table in old.values()])
+    state = np.empty(int(ends[-1]), np.uint8)
+    new = {}
+    for (name, table), end in zip(old.items(), ends.tolist(), strict=True):
+        begin = end - -(-table.nbytes // LINE) * LINE
+        new[name] = state[begin : begin + table.nbytes].view(table.dtype).reshape(table.shape)
+        new[name][...] = table
+    return state, tables._replace(**new)
 
 
 def _table(name: str, rows: Sequence[Mapping[str, Any]], room: int) -> Rows:
