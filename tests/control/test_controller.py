@@ -11,7 +11,7 @@ import pytest
 import dwell
 from dwell.control import ClosedWindow, Controller, Evidence
 from dwell.errors import DwellError, MetricError, ProblemError
-from dwell.estimators import Corrected, Learner, Scaling, Shadow, Support
+from dwell.estimators import Corrected, Learner, Shadow, Support
 from dwell.model import Problem, QoS
 from tests.cells.deterministic import MOVES, cell
 from tests.cells.many import many
@@ -49,7 +49,7 @@ class Copycat:
 def test_who_learns_and_who_wants_shadows(name: str, fraction: float) -> None:
     controller = Controller(cell(estimator=name))
     assert controller.learns == (name != "profile")
-    assert controller.supports == (name in ("shadow", "corrected"))
+    assert controller.supports == controller.learns
     assert controller.shadow_fraction == fraction
 
 
@@ -126,8 +126,7 @@ def test_a_learner_is_started_on_a_copy_and_sees_every_window() -> None:
 
 
 def test_an_estimator_without_support_has_no_columns_of_it() -> None:
-    problem = cell()
-    run = dwell.simulate(problem, policy="LOC", estimator=Scaling(problem), seed=1, windows=2)
+    run = dwell.simulate(cell(), policy="LOC", estimator="profile", seed=1, windows=2)
     assert not [name for name in run.decisions.columns if name.startswith("est_samples")]
     assert [name for name in run.decisions.columns if name.startswith("est_l95_ms")]
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 import dwell
 from dwell.cost import SATURATED
-from dwell.estimators import Corrected, Profile
+from dwell.estimators import Corrected, Evidence, Profile
 from dwell.model import (
     Constant,
     Disturbance,
@@ -22,13 +24,13 @@ from dwell.model import (
     Task,
 )
 from tests.cells.generated import make_problem
-from tests.estimators.windows import Row, window
+from tests.estimators.windows import MS, Row, window
 
 ESTIMATORS = ("profile", "shadow", "scaling", "corrected")
 
 
-def shared(*scenario: Disturbance) -> Problem:
-    """A cell whose second task, on E, takes 4 of 10 cores all the time; on R it takes little."""
+def shared(*scenario: Disturbance, period_ms: float = 10.0) -> Problem:
+    """A cell whose second task, on E, takes 4 of 10 cores for 10 ms; on R it takes little."""
     return make_problem(
         [Node("R", "robot", 8), Node("E", "edge", 10)],
         [
@@ -45,7 +47,7 @@ def shared(*scenario: Disturbance) -> Problem:
         [Flow("sense", "act")],
         links=[Link("R", "E", Constant(0.1))],
         candidates={"LOC": {}, "SO": {"act": "E"}},
-        period_ms=10.0,
+        period_ms=period_ms,
         scenario=scenario,
         window_cycles=50,
     )
@@ -184,10 +186,14 @@ def test_runs_of_one_estimator_do_not_know_of_each_other() -> None:
 # ------------------------------------------------------------------------- corrected: by load
 
 
+def slow() -> Corrected:
+    """An estimator of the cell with a period in which nothing waits."""
+    return Corrected(shared(period_ms=40.0), shadow_fraction=0.0)
+
+
 def local(corrected: Corrected, used: float) -> float:
     """Close a window under LOC, in which nothing of E is measured; L95 of SO."""
-    rows: list[Row] = [([0.0, 1.0], [1.0, 3.0], [1.0])] * 20
-    corrected.learn(window(rows, close_ms=500.0))
+    corrected.learn(cycles(0, 1.0, 3.0, work_ms=2.0))
     seen = QoS(3.0, 0.0, {"R": 0.1, "E": used})
     shown = corrected.estimate(observed=seen, incumbent="LOC", own={"R": 0.1, "E": 0.0})
     return shown["SO"].l95_ms
@@ -195,25 +201,36 @@ def local(corrected: Corrected, used: float) -> float:
 
 def away(corrected: Corrected, used: float, own: float, took_ms: float) -> float:
     """Close a window under SO, whose jobs on E took so long; L95 of SO."""
-    rows: list[Row] = [([0.0, 1.1], [1.0, 1.1 + took_ms], [1.1])] * 20
-    corrected.learn(window(rows, close_ms=500.0, placement=[1] * 20))
+    corrected.learn(cycles(1, 1.1, 1.1 + took_ms, work_ms=40.0))
     seen = QoS(3.0, 0.0, {"R": 0.1, "E": used})
     shown = corrected.estimate(observed=seen, incumbent="SO", own={"R": 0.1, "E": own})
     return shown["SO"].l95_ms
 
 
+def cycles(placement: int, begun_ms: float, ended_ms: float, work_ms: float) -> Evidence:
+    """Ten cycles whose second job begins and ends so long after the release."""
+    starts = [40.0 * i for i in range(10)]
+    rows: list[Row] = [
+        ([at, at + begun_ms], [at + 1.0, at + ended_ms], [at + begun_ms]) for at in starts
+    ]
+    shown = window(rows, close_ms=400.0, release_ms=starts, placement=[placement] * 10)
+    work_ns = np.full_like(shown.cycles.end_ns, [MS, round(work_ms * MS)])
+    known = replace(shown.cycles, start_ns=shown.cycles.ready_ns, work_ns=work_ns)
+    return replace(shown, cycles=known)
+
+
 def test_load_that_is_seen_once_the_cell_has_left_is_no_change() -> None:
-    """What was measured on a full node stays, where its load turns out to be within the bounds."""
-    corrected = Corrected(shared(), shadow_fraction=0.0)
+    """The threads that jobs on a full node told stay, as long as it is full."""
+    corrected = slow()
     measured_ms = away(corrected, 1.0, 0.3, 25.0)
     assert measured_ms == pytest.approx(26.1, rel=0.01)
     # Seen were 0.7 of others; they take all of it now.
-    assert local(corrected, 1.0) == pytest.approx(measured_ms, rel=0.2)
+    assert local(corrected, 1.0) == pytest.approx(measured_ms, rel=0.01)
     assert away(corrected, 1.0, 0.3, 25.0) == pytest.approx(measured_ms, rel=0.01)
 
 
 def test_load_below_the_least_that_was_seen_is_a_change() -> None:
-    corrected = Corrected(shared(), shadow_fraction=0.0)
+    corrected = slow()
     away(corrected, 1.0, 0.3, 25.0)
     assert local(corrected, 0.1) == pytest.approx(11.1, rel=0.1)
 
@@ -221,7 +238,7 @@ def test_load_below_the_least_that_was_seen_is_a_change() -> None:
 @pytest.mark.parametrize("own", [0.0, 0.2])
 def test_a_full_node_of_which_nothing_is_measured_has_a_thread_a_core(own: float) -> None:
     """However much of it the cell's own unfinished jobs took."""
-    corrected = Corrected(shared(), shadow_fraction=0.0)
+    corrected = slow()
     local(corrected, 0.0)
     rows: list[Row] = [([0.0, 1.1], [1.0, None], [1.1])] * 20
     corrected.learn(window(rows, close_ms=10.0, placement=[1] * 20))

@@ -1,4 +1,8 @@
-"""Windows of evidence made by hand: instants in milliseconds, None for one that never came."""
+"""Windows of evidence made by hand: instants in milliseconds, None for one that never came.
+
+Those of the chain of `tests.cells.deterministic` have cycles under LOC that take what is declared,
+and shadows through OFF.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +18,9 @@ MS = 1_000_000
 
 #: Of one cycle: readiness and end of each job, then arrival of each message.
 Row = tuple[Sequence[float | None], Sequence[float | None], Sequence[float | None]]
+
+#: A cycle of the chain, or a shadow, of which nothing ever came.
+GONE: Row = ([None] * 4, [None] * 4, [None] * 3)
 
 
 def instants(rows: Sequence[Row]) -> Instants:
@@ -54,6 +61,28 @@ def window(
             )
         ),
     )
+
+
+def local_row(begin_ms: float) -> Row:
+    """A cycle of the chain under LOC."""
+    ends = [begin_ms + ms for ms in (2.0, 10.0, 16.0, 17.0)]
+    return [begin_ms, *ends[:3]], ends, ends[:3]
+
+
+def off_row(begin_ms: float, extra_ms: float = 0.0) -> Row:
+    """The shadow through OFF of such a cycle, with an extra delay on the way up."""
+    up = begin_ms + 2.0 + 1.0 + extra_ms
+    return [None, up, up + 4.0, None], [None, up + 3.0, up + 10.0, None], [up, up + 4.0, up + 10.0]
+
+
+def seen_window(*, extra_ms: float | None = None, lost: int = 0) -> Evidence:
+    """Ten cycles of the chain; with shadows if there is an extra delay, the first of them lost."""
+    starts = [40.0 * i for i in range(10)]
+    sent: list[Row] | None = None
+    if extra_ms is not None:
+        sent = [GONE if i < lost else off_row(at, extra_ms) for i, at in enumerate(starts)]
+    cycles = [local_row(at) for at in starts]
+    return window(cycles, close_ms=400.0, release_ms=starts, shadows=sent)
 
 
 def _table(rows: Sequence[Sequence[float | None]]) -> NDArray[np.int64]:

@@ -60,23 +60,24 @@ REGISTRY: Mapping[str, EstimatorEntry] = MappingProxyType(
         ),
         "shadow": EstimatorEntry(
             "dwell.estimators.shadow:Shadow",
-            "sends some cycles through the other placements as well, and prices these by what "
-            "the copies took. The copies cost compute time and bandwidth, which are paid for here.",
+            "sends some cycles through the other placements as well, and plays all of them with "
+            "what these copies and active jobs showed to be other than in the profile. The copies "
+            "cost compute time and bandwidth, which are paid for here.",
             style=2,
             shadows=True,
         ),
         "scaling": EstimatorEntry(
             "dwell.estimators.scaling:Scaling",
-            "prices the other placements by upper bounds: what was measured where the pipeline "
-            "runs, times the known ratio of the nodes' compute times, plus the links' declared "
-            "bounds.",
+            "plays the other placements with what the active one shows: a task that takes more "
+            "than in the profile takes as many times as much elsewhere, or what a known ratio of "
+            "the nodes' compute times says.",
             style=3,
         ),
         "corrected": EstimatorEntry(
             "dwell.estimators.corrected:Corrected",
             "keeps the times of every task on every node and of every message on every link, "
-            "begins with the profile's, corrects them by what active and shadow jobs reveal, and "
-            "forgets them with age. It is ours.",
+            "begins with the profile's, corrects them by what active and shadow jobs reveal, "
+            "forgets that with age, and plays the placements with them. It is ours.",
             style=0,
             shadows=True,
         ),

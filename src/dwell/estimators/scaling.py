@@ -136,11 +136,12 @@ class Scaling(Learning):
         return np.where(np.isnan(alone_ms), self._longest[site], alone_ms)
 
     def _correct(self, changed: set[Part], measured: frozenset[Part]) -> None:
-        for part in changed & measured:
-            if isinstance(part, Site):
-                for other, pool in self._pools.items():
-                    if isinstance(other, Site) and other.task == part.task and other != part:
-                        pool.follow(self._pools[part], self._window)
+        sites = [part for part in changed if isinstance(part, Site)]
+        # The surest one has the last word.
+        for site in sorted(sites, key=lambda site: (self._pools[site].measured, site)):
+            for other, pool in self._pools.items():
+                if isinstance(other, Site) and other.task == site.task and other not in measured:
+                    pool.follow(self._pools[site], self._window)
 
     def _otherwise(self) -> dict[Part, Floats]:
         found = super()._otherwise()
