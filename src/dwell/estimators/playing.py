@@ -232,14 +232,14 @@ class Playing:
     def _price(self, name: str, steps: Collection[_Step]) -> Played:
         l95, declared_l95, uncut, rates, declared_rates, own = zip(*steps, strict=True)
         known = self._prices[name]
-        l95_ms, l95_error_ms = _estimated(
-            l95, declared_l95, known.l95_ms, known.l95_error_ms, least=0.0
-        )
-        # Had one cycle more been missed and one more not (Laplace).
+        l95_ms, l95_error_ms = _estimated(l95, declared_l95, known.l95_ms, known.l95_error_ms)
         count = len(steps)
-        least = unseen_error(sum(rates) / count, count * self._step * self._window)
         violation_rate, violation_error = _estimated(
-            rates, declared_rates, known.violation_rate, known.violation_error, least=least
+            rates,
+            declared_rates,
+            known.violation_rate,
+            known.violation_error,
+            cycles=count * self._step * self._window,
         )
         l95_ms, shares = min(l95_ms, self.problem.censor_ms), sum(own) / count
         return Played(
@@ -374,7 +374,7 @@ def _estimated(
     known: float,
     known_error: float,
     *,
-    least: float,
+    cycles: int | None = None,
 ) -> tuple[float, float]:
     """Mean of what steps show, with its standard error.
 
@@ -388,19 +388,25 @@ def _estimated(
         What the same steps show as declared.
     known, known_error : float
         Mean as declared, with its standard error.
-    least : float
-        Standard error of the steps' own mean at least.
+    cycles : int, optional
+        How many there are, where it is a share of them that is estimated.
     """
+    differences = list(map(sub, steps, declared))
     mean, error = _mean_and_error(steps)
-    more, more_error = _mean_and_error(list(map(sub, steps, declared)))
-    error, more_error = max(error, least), math.hypot(more_error, known_error)
+    more, more_error = _mean_and_error(differences)
+    if cycles is not None:
+        error = max(error, unseen_error(mean, cycles))
+        differing = sum(map(abs, differences)) / len(steps)
+        more_error = max(more_error, unseen_error(differing, cycles))
+    more_error = math.hypot(more_error, known_error)
     return (max(known + more, 0.0), more_error) if more_error < error else (mean, error)
 
 
 def _mean_and_error(values: Sequence[float]) -> tuple[float, float]:
     # Of few numbers; an array would take longer.
     count = len(values)
-    mean = sum(values) / count
+    # Of equal values exactly that, and no error.
+    mean = values[0] + sum(value - values[0] for value in values) / count
     if count < 2:
         return mean, abs(mean)
     squares = sum((value - mean) ** 2 for value in values)
