@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.estimators.evidence import Evidence, Instants
-from dwell.estimators.measured import Message, Meter, Part, Site, parts_of
+from dwell.estimators.measured import Message, Meter, Part, Site, cores_of, parts_of
 from dwell.estimators.pool import Reference
 from dwell.estimators.prices import SEED, Question, prices_of, unseen_error
 from dwell.kernels.advance import logged_instants, play
@@ -278,6 +278,9 @@ class Playing:
         self._rows: dict[Part, Ints] = {
             Site(*site): row for site, row in zip(self._real.sites, self._real.exec_ns, strict=True)
         }
+        self._stretched: dict[Part, float] = {
+            Site(*site): _stretched(self.problem, Site(*site)) for site in self._real.sites
+        }
         self._hops = {Message(*hop): number for number, hop in enumerate(self._real.hops)}
         for message, number in self._hops.items():
             self._rows[message] = self._real.delay_ns[number]
@@ -299,7 +302,8 @@ class Playing:
             row = self._rows.get(part)
             known = values[np.isfinite(values)]
             if row is not None and len(known):
-                row[begin:] = np.rint(known * 1e6).astype(np.int64)[places % len(known)]
+                drawn = known * 1e6 / self._stretched.get(part, 1.0)
+                row[begin:] = np.rint(drawn).astype(np.int64)[places % len(known)]
 
     def _fill_links(self, present: Present) -> None:
         """Set what links lose, and that measured delays are all that there is."""
@@ -411,6 +415,14 @@ def _mean_and_error(values: Sequence[float]) -> tuple[float, float]:
         return mean, abs(mean)
     squares = sum((value - mean) ** 2 for value in values)
     return mean, math.sqrt(squares / (count * (count - 1)))
+
+
+def _stretched(problem: Problem, site: Site) -> float:
+    """How many times as long as its threads alone a job takes that has more of them than cores."""
+    execution = problem.pipeline.tasks[site.task].on[site.node]
+    if execution.accelerator is not None:
+        return 1.0
+    return execution.threads / cores_of(problem.fabric.nodes[site.node], execution)
 
 
 def _with_short_windows(problem: Problem) -> Problem:
