@@ -1,10 +1,10 @@
-"""The longest path against all paths, and the order statistics of windows."""
+"""The longest path against all paths, and the rank of L95."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from random import Random
 
 import numpy as np
@@ -15,8 +15,6 @@ from hypothesis import strategies as st
 from dwell.estimators.paths import (
     l95_rank,
     longest_path,
-    order_statistic,
-    seen_windows,
     steps_of,
 )
 from dwell.model import Constant, Execution, Flow, Pipeline, Task
@@ -114,52 +112,3 @@ def test_the_rank_is_that_of_95_percent_and_no_rounding_moves_it(cycles: int) ->
 @pytest.mark.parametrize("n", [1, 2, 19, 20, 21, 40, 100, 101, 10**6])
 def test_the_rank_is_exact(n: int) -> None:
     assert l95_rank(n) == -(-95 * n // 100)
-
-
-# ------------------------------------------------------------------------------------- windows
-
-
-def literal(latency: Sequence[float], W: int, ages: Sequence[float], censor: float) -> float:
-    shown = [min(age if math.isinf(x) else x, censor) for x, age in zip(latency, ages, strict=True)]
-    rows = [sorted(shown[i : i + W]) for i in range(0, len(shown), W)]
-    return sum(row[math.ceil(W * 95 / 100) - 1] for row in rows) / len(rows)
-
-
-@given(
-    st.integers(1, 30).flatmap(
-        lambda W: st.tuples(
-            st.just(W),
-            st.lists(
-                st.tuples(st.integers(0, 99) | st.just(math.inf), st.integers(1, 50)),
-                min_size=3 * W,
-                max_size=3 * W,
-            ),
-        )
-    )
-)
-def test_windows_as_a_controller_sees_them(case: tuple[int, list[tuple[float, int]]]) -> None:
-    W, cycles = case
-    latency, ages = (np.array(x, float) for x in zip(*cycles, strict=True))
-    before: Mapping[str, list[float]] = {"latency": latency.tolist(), "ages": ages.tolist()}
-    shown = seen_windows(latency, W, ages, 60.0)
-    uncut = literal(before["latency"], W, before["ages"], math.inf)
-    if order_statistic(latency) == math.inf:
-        uncut = math.inf
-    assert shown == pytest.approx((literal(before["latency"], W, before["ages"], 60.0), uncut))
-    assert {"latency": latency.tolist(), "ages": ages.tolist()} == before
-
-
-def test_windows_without_losses_leave_the_latencies_as_they_are() -> None:
-    latency = np.array([3.0, 1.0, 2.0, 9.0, 8.0, 7.0])
-    assert seen_windows(latency, 3, np.zeros(6), 60.0) == (6.0, 6.0)
-    assert seen_windows(latency, 3, np.zeros(6), 5.0) == (4.0, 6.0)
-    assert latency.tolist() == [3.0, 1.0, 2.0, 9.0, 8.0, 7.0]
-
-
-def test_a_mean_of_percentiles_is_no_percentile() -> None:
-    # One window of ten has six losses: no 5 % of all cycles, but the 95th of that window.
-    latency = np.full(1000, 10.0)
-    latency[:6] = np.inf
-    ages = np.full(1000, 110.0)
-    assert order_statistic(np.minimum(latency, ages)) == 10.0
-    assert seen_windows(latency, 100, ages, 1000.0) == (20.0, 20.0)

@@ -1,20 +1,35 @@
-"""Times of parts: as a plain loop over cycles and columns finds them."""
+"""Times and demands of parts: as a plain loop over cycles and columns finds them."""
 
 from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from dwell.kernels.meter import CyclesLayout, PartTimes
+from dwell.kernels.meter import CyclesLayout, PartTimes, places
 
 Ints = NDArray[np.int64]
+Floats = NDArray[np.float64]
 
-CANDIDATES, TASKS, PARTS = 3, 4, 9
+CANDIDATES, TASKS, PARTS, LINKS = 3, 4, 9, 2
 LIMIT_NS = 60_000_000
+
+
+class Window(NamedTuple):
+    """Cycles, and maybe their shadows, and what they go through."""
+
+    cycles: list[NDArray[np.integer]]
+    shadows: list[NDArray[np.integer]] | None
+    sources: Ints
+    parts: Ints
+    shared: NDArray[np.bool_]
 
 
 def instants(rng: np.random.Generator, count: int, columns: int) -> Ints:
@@ -23,59 +38,98 @@ def instants(rng: np.random.Generator, count: int, columns: int) -> Ints:
     return np.where(rng.random((count, columns)) < 0.8, known, -1)
 
 
+def random_window(seed: int, flows: int, *, shadows: bool) -> Window:
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(1, 60))
+    shape = (1 + CANDIDATES, TASKS + flows)
+    # No part twice in a row: a cycle goes through each of its parts once.
+    numbers = np.array([rng.permutation(PARTS)[: shape[1]] for _ in range(shape[0])])
+    shared = rng.random((1 + CANDIDATES, flows)) < 0.5
+    shared[0] = False
+    sent: list[list[NDArray[np.integer]]] = [
+        [
+            rng.integers(low, CANDIDATES, count).astype(np.int16),
+            *(instants(rng, count, width) for width in (TASKS, TASKS, flows, TASKS)),
+        ]
+        for low in (0, -1)
+    ]
+    return Window(
+        sent[0],
+        sent[1] if shadows else None,
+        rng.integers(0, TASKS, flows),
+        np.where(rng.random(shape) < 0.7, numbers, -1),
+        shared,
+    )
+
+
 def span(begin_ns: int, end_ns: int) -> float | None:
     if begin_ns >= 0 and end_ns >= 0:
         return (end_ns - begin_ns) / 1e6
     return math.inf if 0 <= begin_ns < LIMIT_NS else None
 
 
+def looped(
+    window: Window, cost: Floats | None = None, link: Sequence[int] = ()
+) -> dict[int, list[float]]:
+    """What is found, by part."""
+    found: dict[int, list[float]] = {}
+    for active in range(CANDIDATES):
+        mine = np.flatnonzero(window.cycles[0] == active)
+        ways = [(0, mine, window.cycles)]
+        if window.shadows is not None:
+            through = window.shadows[0][mine]
+            ways += [(1 + i, mine[through == i], window.shadows) for i in range(CANDIDATES)]
+        crossings: list[tuple[int, int, int, int]] = []
+        for way, rows, of in ways:
+            for column, part in enumerate(window.parts[way].tolist()):
+                for row in rows if part >= 0 else ():
+                    flow = column - TASKS
+                    if flow < 0 and cost is not None:
+                        ended, work_ns = of[2][row, column], of[4][row, column]
+                        ms = work_ns * cost[part] / 1e6 if min(ended, work_ns) >= 0 else None
+                    elif flow < 0:
+                        ms = span(of[1][row, column], of[2][row, column])
+                    else:
+                        sender = window.cycles if window.shared[way, flow] else of
+                        sent_ns = sender[2][row, window.sources[flow]]
+                        ms = span(sent_ns, of[3][row, flow])
+                        if ms is not None and ms < math.inf and cost is not None:
+                            crossings.append((link[part], sent_ns, part, len(found.get(part, ()))))
+                    if ms is not None:
+                        found.setdefault(part, []).append(ms)
+        # Of every link that has a rate the messages in the order in which they were sent.
+        assert cost is not None or not crossings
+        for number in range(LINKS):
+            free_ns = 0.0
+            for _, sent_ns, part, place in sorted(
+                (one for one in crossings if one[0] == number), key=lambda one: one[1]
+            ):
+                assert cost is not None
+                free_ns = max(free_ns, sent_ns) + cost[part]
+                ms = found[part][place] - (free_ns - sent_ns) / 1e6
+                found[part][place] = max(ms, 0.0)
+    return found
+
+
+@pytest.mark.parametrize("shadows", [False, True])
+@pytest.mark.parametrize("demands", [False, True])
 @pytest.mark.parametrize("flows", [0, 3])
 @pytest.mark.parametrize("seed", range(5))
-def test_times_are_those_of_a_plain_loop(seed: int, flows: int) -> None:
+def test_times_and_demands_are_those_of_a_plain_loop(
+    seed: int, flows: int, demands: bool, shadows: bool
+) -> None:
+    window = random_window(seed, flows, shadows=shadows)
     rng = np.random.default_rng(seed)
-    count = int(rng.integers(1, 60))
-    sources = rng.integers(0, TASKS, flows)
-    shape = (1 + CANDIDATES, TASKS + flows)
-    # No part twice in a row: a cycle goes through each of its parts once.
-    numbers = np.array([rng.permutation(PARTS)[: shape[1]] for _ in range(shape[0])])
-    parts = np.where(rng.random(shape) < 0.7, numbers, -1)
-    shared = rng.random((1 + CANDIDATES, flows)) < 0.5
-    shared[0] = False
-    placement = rng.integers(0, CANDIDATES, count).astype(np.int16)
-    through = rng.integers(-1, CANDIDATES, count).astype(np.int16)
-    columns = (TASKS, TASKS, flows)
-    cycles: list[NDArray[np.integer]] = [
-        placement,
-        *(instants(rng, count, width) for width in columns),
-    ]
-    shadows: list[NDArray[np.integer]] = [
-        through,
-        *(instants(rng, count, width) for width in columns),
-    ]
-    for sent in (None, shadows):
-        expected: dict[int, list[float]] = {}
-        times = copy.deepcopy(PartTimes(PARTS))
-        times.begin(cycles, sent, LIMIT_NS)
-        for active in range(CANDIDATES):
-            times.add(active, copy.deepcopy(CyclesLayout(sources, parts, shared)))
-            mine = np.flatnonzero(placement == active)
-            ways = [(0, mine, cycles)]
-            if sent is not None:
-                ways += [(1 + i, mine[through[mine] == i], sent) for i in range(CANDIDATES)]
-            for way, rows, of in ways:
-                for column in range(TASKS + flows):
-                    for row in rows:
-                        if column < TASKS:
-                            found = span(of[1][row, column], of[2][row, column])
-                        else:
-                            flow = column - TASKS
-                            sender = cycles if shared[way, flow] else of
-                            found = span(sender[2][row, sources[flow]], of[3][row, flow])
-                        if found is not None and parts[way, column] >= 0:
-                            expected.setdefault(int(parts[way, column]), []).append(found)
-        found_times = times.by_part()
-        assert {part: values.tolist() for part, values in found_times.items()} == expected
-        assert list(found_times) == list(expected)
+    cost, link = rng.integers(1, 5_000_000, PARTS) / 2.0, rng.integers(-1, LINKS, PARTS)
+    times = copy.deepcopy(PartTimes(PARTS, cost, link) if demands else PartTimes(PARTS))
+    times.begin(window.cycles, window.shadows, LIMIT_NS)
+    layout = CyclesLayout(window.sources, window.parts, window.shared)
+    for active in range(CANDIDATES):
+        times.add(active, copy.deepcopy(layout))
+    found = {part: values.tolist() for part, values in times.by_part().items()}
+    expected = looped(window, cost, link.tolist()) if demands else looped(window)
+    assert found == expected
+    assert list(found) == list(expected)
 
 
 def test_a_window_overwrites_the_one_before() -> None:
@@ -83,6 +137,51 @@ def test_a_window_overwrites_the_one_before() -> None:
     times = PartTimes(1)
     for count, ms in ((3, 1), (1, 2), (5, 3)):
         ready, end = np.zeros((count, 1), np.int64), np.full((count, 1), ms * 1_000_000)
-        times.begin((np.zeros(count, np.int16), ready, end, ready[:, :0]), None, 0)
+        times.begin((np.zeros(count, np.int16), ready, end, ready[:, :0], end), None, 0)
         times.add(0, layout)
         assert times.by_part()[0].tolist() == [ms] * count
+
+
+def crossed(sent_ms: Sequence[float], arrived_ms: Sequence[float]) -> list[float]:
+    """Delays of a flow's messages on a link that takes 4 ms to send one; -1 for what is lost."""
+    layout = CyclesLayout(
+        np.zeros(1, np.int64), np.array([[-1, 0], [-1, -1]]), np.zeros((2, 1), np.bool_)
+    )
+    times = PartTimes(1, np.array([4e6]), np.array([0]))
+    end = np.array([[round(ms * 1e6)] for ms in sent_ms])
+    arrived = np.array([[-1 if ms < 0 else round(ms * 1e6)] for ms in arrived_ms])
+    times.begin((np.zeros(len(end), np.int16), end, end, arrived, end), None, LIMIT_NS)
+    times.add(0, layout)
+    delays: list[float] = times.by_part()[0].tolist()
+    return delays
+
+
+def test_waiting_behind_own_messages_and_their_transmission_are_no_delay() -> None:
+    # The second waits 3 ms for the first, the third none.
+    assert crossed([0.0, 1.0, 20.0], [6.0, 10.0, 27.0]) == [2.0, 2.0, 3.0]
+    # In whatever order they are handed in.
+    assert crossed([1.0, 0.0], [10.0, 6.0]) == [2.0, 2.0]
+
+
+def test_a_message_that_arrives_before_it_can_be_sent_has_no_delay() -> None:
+    assert crossed([0.0], [3.0]) == [0.0]
+
+
+def test_of_a_lost_message_nothing_is_taken_off_and_nothing_waits_behind_it() -> None:
+    assert crossed([0.0, 1.0], [-1, 7.0]) == [math.inf, 2.0]
+
+
+def literal(known: Sequence[float], value: float) -> float:
+    below, ties = sum(x < value for x in known), sum(x == value for x in known)
+    return (below + ties / 2 + 0.5) / (len(known) + 1)
+
+
+numbers = st.integers(0, 5).map(float) | st.just(math.inf)
+
+
+@given(st.lists(numbers, max_size=9), st.lists(numbers, max_size=9))
+def test_places_lie_among_the_known_ones(known: list[float], values: list[float]) -> None:
+    found = places(np.sort(np.array(known, float)), np.array(values, float))
+    shares = [literal(known, value) for value in values]
+    larger, smaller = (-sum(map(math.log, of)) for of in ([1 - p for p in shares], shares))
+    assert found == pytest.approx((larger, smaller, sum(shares)))

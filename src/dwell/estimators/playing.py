@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.estimators.evidence import Evidence, Instants
-from dwell.estimators.measured import Message, Meter, Part, Site, parts_of
+from dwell.estimators.measured import Message, Meter, Part, Site, cores_of, parts_of
 from dwell.estimators.pool import Reference
 from dwell.estimators.prices import SEED, Question, prices_of, unseen_error
 from dwell.estimators.sent_shadows import SentShadows, hindered, stamps_of
@@ -240,14 +240,14 @@ class Playing:
     def _price(self, name: str, steps: Collection[_Step]) -> Played:
         l95, declared_l95, uncut, rates, declared_rates, own = zip(*steps, strict=True)
         known = self.prices[name]
-        l95_ms, l95_error_ms = _estimated(
-            l95, declared_l95, known.l95_ms, known.l95_error_ms, least=0.0
-        )
-        # Had one cycle more been missed and one more not (Laplace).
+        l95_ms, l95_error_ms = _estimated(l95, declared_l95, known.l95_ms, known.l95_error_ms)
         count = len(steps)
-        least = unseen_error(sum(rates) / count, count * self._step * self._window)
         violation_rate, violation_error = _estimated(
-            rates, declared_rates, known.violation_rate, known.violation_error, least=least
+            rates,
+            declared_rates,
+            known.violation_rate,
+            known.violation_error,
+            cycles=count * self._step * self._window,
         )
         l95_ms, shares = min(l95_ms, self.problem.censor_ms), sum(own) / count
         return Played(
@@ -289,6 +289,9 @@ class Playing:
                 self._rows.setdefault(Site(*site), []).append(row)
             for hop, row in zip(played.hops, played.delay_ns, strict=True):
                 self._rows.setdefault(Message(*hop), []).append(row)
+        self._stretched: dict[Part, float] = {
+            Site(*site): _stretched(self.problem, Site(*site)) for site in self._real.sites
+        }
         self._hops = {Message(*hop): number for number, hop in enumerate(self._real.hops)}
         self._twins = {name: _Twin(self._first, i, shadows) for i, name in enumerate(self._names)}
 
@@ -309,7 +312,8 @@ class Playing:
             rows = self._rows.get(part, ())
             known = values[np.isfinite(values)]
             if rows and len(known):
-                demands = np.rint(known * 1e6).astype(np.int64)[places % len(known)]
+                drawn = known * 1e6 / self._stretched.get(part, 1.0)
+                demands = np.rint(drawn).astype(np.int64)[places % len(known)]
                 for row in rows:
                     row[begin:] = demands
 
@@ -386,7 +390,7 @@ def _estimated(
     known: float,
     known_error: float,
     *,
-    least: float,
+    cycles: int | None = None,
 ) -> tuple[float, float]:
     """Mean of what steps show, with its standard error.
 
@@ -400,19 +404,25 @@ def _estimated(
         What the same steps show as declared.
     known, known_error : float
         Mean as declared, with its standard error.
-    least : float
-        Standard error of the steps' own mean at least.
+    cycles : int, optional
+        How many there are, where it is a share of them that is estimated.
     """
+    differences = list(map(sub, steps, declared))
     mean, error = _mean_and_error(steps)
-    more, more_error = _mean_and_error(list(map(sub, steps, declared)))
-    error, more_error = max(error, least), math.hypot(more_error, known_error)
+    more, more_error = _mean_and_error(differences)
+    if cycles is not None:
+        error = max(error, unseen_error(mean, cycles))
+        differing = sum(map(abs, differences)) / len(steps)
+        more_error = max(more_error, unseen_error(differing, cycles))
+    more_error = math.hypot(more_error, known_error)
     return (max(known + more, 0.0), more_error) if more_error < error else (mean, error)
 
 
 def _mean_and_error(values: Sequence[float]) -> tuple[float, float]:
     # Of few numbers; an array would take longer.
     count = len(values)
-    mean = sum(values) / count
+    # Of equal values exactly that, and no error.
+    mean = values[0] + sum(value - values[0] for value in values) / count
     if count < 2:
         return mean, abs(mean)
     squares = sum((value - mean) ** 2 for value in values)
@@ -421,6 +431,14 @@ def _mean_and_error(values: Sequence[float]) -> tuple[float, float]:
 
 def _with_own_demands(real: Realisation) -> Realisation:
     return replace(real, exec_ns=real.exec_ns.copy(), delay_ns=real.delay_ns.copy())
+
+
+def _stretched(problem: Problem, site: Site) -> float:
+    """How many times as long as its threads alone a job takes that has more of them than cores."""
+    execution = problem.pipeline.tasks[site.task].on[site.node]
+    if execution.accelerator is not None:
+        return 1.0
+    return execution.threads / cores_of(problem.fabric.nodes[site.node], execution)
 
 
 def _with_short_windows(problem: Problem) -> Problem:

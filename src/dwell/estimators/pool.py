@@ -155,20 +155,22 @@ class Pool:
         # A copy: they are overwritten by the next window's.
         values = values[:: -(-len(values) // LARGEST)].copy()
         reference = self.reference
+        declared = Shift.among(values, reference.ordered)
         if not len(reference.values):
             # Never came to an end where it is as declared, so that nothing can be told from it.
-            self.is_declared = False
-            self._add(values, Shift.among(values, values), window, memory)
-            return False
-        declared = Shift.among(values, reference.ordered)
+            is_first, self.is_declared = self.is_declared, False
+            self._add(values, declared, window, memory)
+            return is_first
         off = declared.deviations(reference.likeness)
         if self.is_declared:
             if off >= SHIFTED and declared.is_large:
                 self._begin_anew(values, window)
                 return True
             self._add(values, declared, window, memory)
-            self.is_declared = self._off_declared() < SHIFTED
-            return not self.is_declared
+            if self._off_declared() < SHIFTED:
+                return False
+            self.is_declared, self.touched = False, window
+            return True
         apart = Shift.among(values, np.sort(self.held))
         if off < ALIKE and (
             apart.deviations(reference.likeness) >= APART or self._off_declared() < ALIKE

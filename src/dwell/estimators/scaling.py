@@ -39,7 +39,7 @@ from dwell.estimators.evidence import Evidence
 from dwell.estimators.learning import Learning
 from dwell.estimators.measured import Message, Part, Site, cores_of, message_of
 from dwell.estimators.paths import longest_path, order_statistic, steps_of
-from dwell.estimators.spans import spans_of
+from dwell.estimators.spans import NS_PER_MS, spans_ms
 from dwell.model.bounds import VALUE, shown
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
@@ -47,8 +47,6 @@ from dwell.model.qos import QoS
 from dwell.model.semantics import nearest
 
 Floats: TypeAlias = NDArray[np.float64]
-
-NS_PER_MS = 1e6
 
 
 class Scaling(Learning):
@@ -123,7 +121,8 @@ class Scaling(Learning):
             alone_ms[:, column] = self._filled(Site(task, active[task]), alone_ms[:, column])
         limit_ns = evidence.close_ns - self._patience_ns
         self._jobs = alone_ms
-        self._messages = spans_of(cycles, cycles.end_ns[:, self._sources], limit_ns).message_ms
+        sent_ns = cycles.end_ns[:, self._sources]
+        self._messages = spans_ms(sent_ns, cycles.arrived_ns, limit_ns)
 
     def _filled(self, site: Site, alone_ms: Floats) -> Floats:
         """Let work that is not known be the longest that is."""

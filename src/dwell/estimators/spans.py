@@ -1,14 +1,12 @@
-"""Durations of the jobs and messages of a window."""
+"""Durations of a window, and when what has not ended counts as lost."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.estimators.evidence import Instants
 from dwell.model.problem import Problem
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -17,22 +15,6 @@ Ints: TypeAlias = NDArray[np.int64]
 NS_PER_MS = 1e6
 #: Periods after which a job or message that has not ended counts as lost.
 PATIENCE = 2
-
-
-@dataclass(frozen=True, slots=True)
-class Spans:
-    """Durations in milliseconds: NaN where something had not begun, or had begun a moment ago.
-
-    Parameters
-    ----------
-    job_ms : float64 array, shape (n, tasks)
-        From readiness to completion, queueing and contention included; infinite where it was lost.
-    message_ms : float64 array, shape (n, flows)
-        From the completion of the source to the hand-over; infinite where it was lost.
-    """
-
-    job_ms: Floats
-    message_ms: Floats
 
 
 def patience_ns(problem: Problem) -> int:
@@ -45,23 +27,19 @@ def patience_ns(problem: Problem) -> int:
     return round(periods * problem.pipeline.period_ms * NS_PER_MS)
 
 
-def spans_of(instants: Instants, sent_ns: Ints, limit_ns: int) -> Spans:
-    """Return the durations between instants.
+def spans_ms(begin_ns: Ints, end_ns: Ints, limit_ns: int) -> Floats:
+    """Return the durations between instants, milliseconds.
+
+    They are NaN where something had not begun, or had begun a moment ago, and infinite where it was
+    lost.
 
     Parameters
     ----------
-    sent_ns : int64 array, shape (n, flows)
-        When the source of each message completed.
+    begin_ns, end_ns : int64 array, shape (n, columns)
+        -1 for an instant that had not come.
     limit_ns : int
-        A job or message that began before this, and has not ended, counts as lost.
+        What began before this, and has not ended, counts as lost.
     """
-    return Spans(
-        _between(instants.ready_ns, instants.end_ns, limit_ns),
-        _between(sent_ns, instants.arrived_ns, limit_ns),
-    )
-
-
-def _between(begin_ns: Ints, end_ns: Ints, limit_ns: int) -> Floats:
     span: Floats = (end_ns - begin_ns) / NS_PER_MS
     open_ended = np.minimum(begin_ns, end_ns) < 0
     if open_ended.any():
