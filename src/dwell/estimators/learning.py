@@ -105,6 +105,7 @@ class Learning(Online):
 
     def support(self) -> dict[str, Support]:
         """Support of each candidate's estimate: that of its weakest part."""
+        self._take_in_pending()
         return {
             name: Support(
                 min(self._pools[part].measured for part in parts),
@@ -115,6 +116,7 @@ class Learning(Online):
 
     def deviation(self) -> dict[str, float]:
         """Deviation of the logarithm of each candidate's price, by the age of what is known."""
+        self._take_in_pending()
         return {
             name: max(self._widening(self._pools[part]) for part in parts)
             for name, parts in self._parts.items()

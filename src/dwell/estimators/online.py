@@ -66,8 +66,9 @@ class Online(ABC):
         self._down: frozenset[str] = frozenset()
         self._patience_ns = patience_ns(problem)
         self._sent = {name: self._sent_under(name) for name in problem.candidates}
-        #: The window that has been learnt from and not been priced.
+        #: The window that has been learnt from and not been priced, and not been taken in.
         self._evidence: Evidence | None = None
+        self._pending: Evidence | None = None
         #: Whether the present is another one, or has newer values of the same.
         self._has_changed = self._has_grown = False
 
@@ -85,11 +86,19 @@ class Online(ABC):
 
     def learn(self, evidence: Evidence) -> None:
         """Take in a window: what it showed of each part, once it is known of its nodes."""
-        self._evidence = evidence
+        self._take_in_pending()
+        self._evidence = self._pending = evidence
+
+    def _take_in_pending(self) -> None:
+        """Take in the demands of the last window, if they have not been; its nodes come first."""
+        evidence, self._pending = self._pending, None
+        if evidence is not None:
+            self._take_in(self._meter.demands(evidence, self._threads), evidence)
 
     @property
     def present(self) -> Present:
         """What is not as the cell declares it."""
+        self._take_in_pending()
         threads = {name: one.beyond for name, one in self._foreign.items() if one.beyond}
         return Present(FrozenDict(self._otherwise()), FrozenDict(threads), self._down)
 
@@ -105,7 +114,7 @@ class Online(ABC):
         evidence, self._evidence = self._evidence, None
         if evidence is not None:
             self._look_at_nodes(evidence, observed, own, incumbent)
-            self._take_in(self._meter.demands(evidence, self._threads), evidence)
+            self._take_in_pending()
             self._play()
         played = {name: self._playing.played(name) for name in self._names}
         prices, work = self._playing.prices, []
