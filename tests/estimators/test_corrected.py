@@ -256,7 +256,7 @@ def test_load_that_leaves_a_job_its_cores_slows_nothing() -> None:
     corrected.learn(seen_window(extra_ms=0.0))
     # 4 threads beside 11.2 on 16 cores, then beside 14 or 15.
     assert estimate(corrected, {"R": 0.0, "E": 0.7})["OFF"].l95_ms == pytest.approx(14.0)
-    corrected.learn(seen_window(extra_ms=0.0))
+    corrected.learn(seen_window(extra_ms=3.0 * 3 / 16))
     l95_ms = estimate(corrected, {"R": 0.0, "E": 0.9})["OFF"].l95_ms
     assert l95_ms == pytest.approx(11.0 + 3.0 * 19 / 16)
 

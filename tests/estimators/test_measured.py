@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from dwell.estimators import Evidence
 from dwell.estimators.measured import Message, Meter, Part, Site, groups, parts_of
 from dwell.model import Constant, Execution, Flow, Link, Node, Problem, Task
 from tests.cells.generated import make_problem
-from tests.estimators.windows import Row, window
+from tests.estimators.windows import MS, Row, window
 
 ONE = Execution(Constant(1.0))
 CHAIN = ("A", "B", "C", "D")
@@ -174,6 +176,133 @@ def test_a_shadow_in_flight_adds_what_it_has_done() -> None:
     found = times(window([local(900.0)], close_ms=CLOSE_MS, shadows=[half]))
     assert (found[UP], found[Site("B", "E")]) == ([5.0], [7.0])
     assert DOWN not in found
+
+
+# ------------------------------------------------------------------------------------- demands
+
+
+def wide(node: Node, threads: int = 1, accelerator: str | None = None) -> Problem:
+    """A on R sends 100 kB each to B and C on a node, at 20 Mbit/s."""
+    job = Execution(Constant(1.0), threads=threads, accelerator=accelerator)
+    return make_problem(
+        [Node("R", "robot"), node],
+        [Task("A", {"R": ONE}), Task("B", {"E": job}), Task("C", {"E": job})],
+        [Flow("A", "B", 100_000), Flow("A", "C", 100_000)],
+        links=[Link("R", "E", Constant(1.0), rate_mbps=20.0), Link("E", "R", Constant(1.0))],
+        window_cycles=10,
+    )
+
+
+def shown(work_ms: Sequence[float | None], *, start_ms: bool = True, work: bool = True) -> Evidence:
+    """A cycle whose jobs took 10, 12 and 16 ms, with so much core time, None for unknown.
+
+    A's messages arrive 45 and 86 ms after it has ended; jobs start 2 ms after they are ready.
+    """
+    arrived = [55.0, 96.0]
+    ready, end = [0.0, *arrived], [12.0 - 2.0, 55.0 + 14.0, 96.0 + 18.0]
+    evidence = window([(ready, end, arrived)], close_ms=CLOSE_MS)
+    cycles = evidence.cycles
+    start_ns = np.where(cycles.ready_ns > 0, cycles.ready_ns + 2 * MS, cycles.ready_ns)
+    known = [-1 if ms is None else round(ms * MS) for ms in work_ms]
+    return replace(
+        evidence,
+        cycles=replace(
+            cycles,
+            start_ns=start_ns if start_ms else None,
+            work_ns=np.array([known]) if work else None,
+        ),
+    )
+
+
+E4 = Node("E", "edge", 4)
+A, B, C = Site("A", "R"), Site("B", "E"), Site("C", "E")
+TO_B, TO_C = Message("A", "B", "R->E"), Message("A", "C", "R->E")
+
+
+def demands(
+    problem: Problem, evidence: Evidence, foreign: Mapping[str, float] | None = None
+) -> dict[Part, list[float]]:
+    found = copy.deepcopy(Meter(problem)).demands(evidence, foreign)
+    return {part: values.tolist() for part, values in found.items()}
+
+
+@pytest.mark.parametrize(
+    ("threads", "accelerator", "alone_ms"),
+    [(1, None, 12.0), (2, None, 6.0), (4, None, 3.0), (8, None, 3.0), (8, "gpu", 12.0)],
+)
+def test_the_demand_of_a_job_is_its_time_alone(
+    threads: int, accelerator: str | None, alone_ms: float
+) -> None:
+    problem = wide(Node("E", "edge", 4, accelerators={"gpu": 1}), threads, accelerator)
+    found = demands(problem, shown([7.0, 12.0, None]))
+    assert (found[A], found[B]) == ([7.0], [alone_ms])
+
+
+def test_the_demand_of_a_message_is_its_delay() -> None:
+    found = demands(wide(E4), shown([7.0, 12.0, 16.0]))
+    # Each takes 40 ms on the link, and the second waits for the first.
+    assert (found[TO_B], found[TO_C]) == ([5.0], [6.0])
+    assert Meter(wide(E4)).sending_ms(TO_B) == 40.0
+    assert Meter(chain()).sending_ms(UP) == 0.0
+
+
+def test_jobs_beside_foreign_threads_need_more_core_time() -> None:
+    problem = wide(replace(E4, interference=2.0))
+    for threads, of_it in ((0.0, 1.0), (0.4, 1.0), (0.6, 0.5), (9.0, 0.5)):
+        found = demands(problem, shown([7.0, 12.0, 16.0]), {"E": threads})
+        assert (found[A], found[B], found[C]) == ([7.0], [12.0 * of_it], [16.0 * of_it])
+
+
+@pytest.mark.parametrize(
+    ("node", "threads", "foreign", "cores"),
+    [
+        (E4, 1, 0.0, 1.0),
+        (E4, 2, 0.0, 2.0),
+        (E4, 8, 0.0, 4.0),
+        # Three threads leave one core, five take turns on four with the job's own.
+        (E4, 1, 3.0, 1.0),
+        (E4, 1, 7.0, 0.5),
+        (E4, 4, 4.0, 2.0),
+        (replace(E4, scheduler="fifo"), 1, 4.0, 0.5),
+        (replace(E4, scheduler="priority"), 4, 4.0, 2.0),
+    ],
+)
+@pytest.mark.parametrize("start_ms", [True, False])
+def test_work_that_is_not_known_is_told_by_how_long_a_job_took(
+    node: Node, threads: int, foreign: float, cores: float, start_ms: bool
+) -> None:
+    problem = wide(node, threads)
+    # From its start, or from when it was ready where that is not known.
+    taken_ms = [10.0, *((12.0, 16.0) if start_ms else (14.0, 18.0))]
+    for evidence in (
+        shown([None] * 3, start_ms=start_ms),
+        shown([None] * 3, start_ms=start_ms, work=False),
+    ):
+        work_ns = Meter(problem).work_ns(evidence.cycles, evidence.placement, {"E": foreign})
+        assert work_ns.tolist() == [[10 * MS, *(round(ms * cores * MS) for ms in taken_ms[1:])]]
+
+
+def test_work_that_is_known_is_left_as_it_is() -> None:
+    evidence = shown([7.0, None, 3.0])
+    work_ns = Meter(wide(E4)).work_ns(evidence.cycles, evidence.placement, {"E": 12.0})
+    assert work_ns[0, 0] == 7 * MS
+    assert work_ns[0, 2] == 3 * MS
+    assert work_ns[0, 1] == pytest.approx(12 * MS * 4 / 13, abs=1)
+
+
+def test_of_what_has_not_ended_no_work_is_told() -> None:
+    evidence = window([([0.0, 55.0, None], [10.0, None, None], [55.0, None])], close_ms=CLOSE_MS)
+    work_ns = Meter(wide(E4)).work_ns(evidence.cycles, evidence.placement, {})
+    assert work_ns.tolist() == [[10 * MS, -1, -1]]
+    found = demands(wide(E4), evidence)
+    assert found == {A: [10.0], TO_B: [5.0], TO_C: [math.inf]}
+
+
+def test_shadows_add_their_demands() -> None:
+    evidence = window(
+        [local(0.0), local(100.0)], close_ms=CLOSE_MS, shadows=[None, through_off(100.0)]
+    )
+    assert demands(chain(), evidence) == times(evidence)
 
 
 # ----------------------------------------------------------------------------------- any window

@@ -23,8 +23,10 @@ from dwell.estimators.prices import (
 from dwell.estimators.sent_shadows import SentShadows, hindered
 from dwell.kernels.random_draws import draw
 from dwell.model import (
+    Bursts,
     Constant,
     Execution,
+    Exponential,
     Flow,
     Link,
     LinkDisturbance,
@@ -130,6 +132,24 @@ def test_what_cycles_take_in_the_end_is_known_where_windows_close_before() -> No
     price = only(problem)
     assert price.uncut_l95_ms == 140.0
     assert price.l95_ms == problem.censor_ms == 40.0
+
+
+def test_what_others_take_of_a_node() -> None:
+    bursts = Bursts(Exponential(3_000.0), Exponential(1_000.0), threads=1)
+    nodes = [Node("R", "robot", 4, background=1.0), Node("E", "edge", 2, bursts=bursts)]
+    task = Task("A", {"R": on(20.0), "E": on(20.0)})
+    problem = make_problem(
+        nodes, [task], candidates={"LOC": {}, "OFF": {"A": "E"}}, window_cycles=WIDTH
+    )
+    found = prices_of(problem, cycles=20_000)
+    for price in found.values():
+        assert price.foreign["R"] == pytest.approx(0.25)
+        assert price.foreign_deviation["R"] == pytest.approx(0.0, abs=1e-6)
+        # A quarter of the time one of two cores, in windows of 5 s.
+        assert price.foreign["E"] == pytest.approx(0.125, abs=0.02)
+        assert 0.03 < price.foreign_deviation["E"] < 0.25
+    assert found["LOC"].own == {"R": pytest.approx(0.05), "E": 0.0}
+    assert found["OFF"].own == {"R": 0.0, "E": pytest.approx(0.1)}
 
 
 # -------------------------------------------------------------------------------------- overload

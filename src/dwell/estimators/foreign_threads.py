@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.estimators.evidence import Evidence, Instants
-from dwell.estimators.measured import groups
+from dwell.estimators.measured import cores_of, groups
 from dwell.estimators.pool import newest
 from dwell.estimators.waits import beside
 from dwell.model.fabric import Node
@@ -154,7 +154,7 @@ class Stretches:
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
         self._placements = tuple(problem.candidates.values())
-        #: Tasks of a placement on the CPU of a node, with the cores that each may use.
+        #: Tasks of a placement on the CPU of a node, with how many cores each asks for.
         self._on: dict[tuple[int, str], tuple[list[int], Floats]] = {}
 
     def level(self, evidence: Evidence, name: str) -> Level | None:
@@ -192,13 +192,15 @@ class Stretches:
 
     def _tasks_on(self, code: int, name: str) -> tuple[list[int], Floats]:
         if (code, name) not in self._on:
-            columns, cores = [], []
+            columns, cores, node = [], [], self._problem.fabric.nodes[name]
             for column, task in enumerate(self._problem.pipeline.tasks.values()):
                 execution = task.on.get(name)
                 here = code >= 0 and self._placements[code][task.name] == name
                 if here and execution is not None and execution.accelerator is None:
                     columns.append(column)
-                    cores.append(min(execution.threads, self._problem.fabric.nodes[name].cores))
+                    # Of a fair node all threads of a job take turns with others.
+                    fair = node.scheduler == "fair"
+                    cores.append(execution.threads if fair else cores_of(node, execution))
             self._on[code, name] = columns, np.array(cores, float)
         return self._on[code, name]
 
@@ -234,7 +236,8 @@ def _level(node: Node, bursts: float, jobs: _Jobs, before: _Jobs | None) -> Leve
     off = math.sqrt(place * (1.0 - place) / len(ordered))
     places = (max(place - off, 0.0), place, min(place + off, 1.0))
     low, beyond, high = (float(ordered[round(one * (len(ordered) - 1))]) for one in places)
-    return Level(max(beyond, 0.0), (high - low) / 2, bool(told))
+    # Nanoseconds of an instant are none.
+    return Level(max(round(beyond, 3), 0.0), (high - low) / 2, bool(told))
 
 
 def _since_change(jobs: _Jobs, threads: Floats, task: float) -> Ints:

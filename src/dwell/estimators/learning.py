@@ -92,7 +92,7 @@ class Learning(Online):
             if pool.touched and self._window - pool.touched >= max(self.unseen, 1.0):
                 pool.reset()
                 self._has_changed = True
-        self.regimes += len(changed)
+        self._regimes += len(changed)
         if changed:
             self._has_changed = True
             self._correct(changed, frozenset(demands))

@@ -42,8 +42,6 @@ class Online(ABC):
         Share of the cycles sent through each alternative.
     seed : int
         Seed of what is played.
-    regimes : int
-        Changes of regime seen since the start.
     """
 
     shadow_fraction = 0.0
@@ -55,7 +53,7 @@ class Online(ABC):
         """Forget everything but the profile."""
         self.problem = problem
         self.profile = Profile(problem)
-        self.regimes = 0
+        self._regimes = 0
         self._meter, self._stretches = Meter(problem), Stretches(problem)
         self._playing = Playing(problem, self.seed, self.shadow_fraction)
         self._parts = {
@@ -94,6 +92,12 @@ class Online(ABC):
         evidence, self._pending = self._pending, None
         if evidence is not None:
             self._take_in(self._meter.demands(evidence, self._threads), evidence)
+
+    @property
+    def regimes(self) -> int:
+        """Changes of regime seen since the start."""
+        self._take_in_pending()
+        return self._regimes
 
     @property
     def present(self) -> Present:
@@ -151,7 +155,7 @@ class Online(ABC):
             changed = foreign.see(share, usual, deviation, level, is_full=is_full)
             if changed:
                 self._has_changed = True
-                self.regimes += 1
+                self._regimes += 1
         down = frozenset(self._down_nodes(evidence, own))
         if down != self._down:
             self._down, self._has_changed = down, True

@@ -25,9 +25,11 @@ from dwell.estimators.prices import SEED, Question, prices_of, unseen_error
 from dwell.estimators.sent_shadows import SentShadows, hindered, stamps_of
 from dwell.kernels.advance import logged_instants, play
 from dwell.kernels.arrays import Arrays, lay_out, ordered_flows
+from dwell.kernels.codes import LAST_NS
 from dwell.kernels.random_draws import Drawing
 from dwell.kernels.realisation import NodeChange, NodeChanges, Realisation
 from dwell.kernels.rows import Rows
+from dwell.model.fabric import Node
 from dwell.model.frozen import FrozenDict
 from dwell.model.problem import Problem
 
@@ -269,7 +271,13 @@ class Playing:
         declared, shadows = self.declared.realisation, self.declared.shadows
         # Every node has a change to begin with, so that any may be otherwise from then on.
         begins = [NodeChange(0, name, 0, False) for name in problem.fabric.nodes]
-        changes = NodeChanges.of([*begins, *declared.node_changes])
+        # Those whose jobs take turns need room for the most that there may be: later than ever.
+        ends = [
+            NodeChange(LAST_NS, name, _most_threads(node), False)
+            for name, node in problem.fabric.nodes.items()
+            if node.quota is not None and node.quota.tick_ms > 0
+        ]
+        changes = NodeChanges.of([*begins, *declared.node_changes, *ends])
         self._real = replace(_with_own_demands(declared), node_changes=changes)
         #: What is declared of the cycles, and of their shadows, with what is played in its place.
         self._replaced, sent = [(declared, self._real)], None
@@ -279,7 +287,7 @@ class Playing:
         self._first = lay_out([(problem, self._real)], shadows=sent).copy()
         tables = self._first.tables
         tables.clock[0]["pauses"] = 1
-        self._declared_changes = tables.changes
+        self._declared_changes = tables.changes[tables.changes["at_ns"] < LAST_NS]
         self._declared_rates, self._declared_segments = tables.rates.copy(), tables.segments.copy()
         self._declared_layers = tables.layers.copy()
         self._nothing_ns = np.zeros(self._real.cycles, np.int64)
@@ -408,6 +416,8 @@ def _estimated(
         How many there are, where it is a share of them that is estimated.
     """
     differences = list(map(sub, steps, declared))
+    if not any(differences):
+        return known, known_error
     mean, error = _mean_and_error(steps)
     more, more_error = _mean_and_error(differences)
     if cycles is not None:
@@ -431,6 +441,10 @@ def _mean_and_error(values: Sequence[float]) -> tuple[float, float]:
 
 def _with_own_demands(real: Realisation) -> Realisation:
     return replace(real, exec_ns=real.exec_ns.copy(), delay_ns=real.delay_ns.copy())
+
+
+def _most_threads(node: Node) -> int:
+    return MOST_THREADS + (node.bursts.threads if node.bursts is not None else 0)
 
 
 def _stretched(problem: Problem, site: Site) -> float:
