@@ -258,7 +258,8 @@ def test_load_that_leaves_a_job_its_cores_slows_nothing() -> None:
     assert estimate(corrected, {"R": 0.0, "E": 0.7})["OFF"].l95_ms == pytest.approx(14.0)
     corrected.learn(seen_window(extra_ms=3.0 * 3 / 16))
     l95_ms = estimate(corrected, {"R": 0.0, "E": 0.9})["OFF"].l95_ms
-    assert l95_ms == pytest.approx(11.0 + 3.0 * 19 / 16)
+    # What core time it received is not known, but told from the mean of the load.
+    assert l95_ms == pytest.approx(11.0 + 3.0 * 19 / 16, abs=0.15)
 
 
 def test_what_waits_is_no_slow_node() -> None:

@@ -49,7 +49,7 @@ def test_jobs_that_share_a_core_have_not_waited() -> None:
 
 
 def test_jobs_beside_foreign_threads_have_not_waited() -> None:
-    slowed = {0: jobs([0.0, 70.0], [30.0, 30.0], [10.0, 10.0])}
+    slowed = {0: jobs([0.0, 70.0, 140.0], [30.0, 30.0, 30.0], [10.0, 10.0, 10.0])}
     assert alone_with_waits(CORE, 2.0, slowed) == {}
     assert 0 in alone_with_waits(CORE, 1.0, slowed)
 

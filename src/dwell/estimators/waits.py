@@ -17,8 +17,8 @@ from dwell.model.fabric import Node
 
 Floats: TypeAlias = NDArray[np.float64]
 
-#: Share of their time alone by which most jobs of a task must have waited.
-LEAST_WAIT = 0.05
+#: Share of their time alone by which most jobs of a task must have waited, and fewest jobs.
+LEAST_WAIT, JOBS = 0.05, 3
 
 
 def beside(start_ns: Floats, end_ns: Floats, others: tuple[Floats, Floats, Floats]) -> Floats:
@@ -72,7 +72,7 @@ def alone_with_waits(
     longer = [
         task
         for task, (start_ns, end_ns, alone_ns, _) in jobs.items()
-        if _is_longer(end_ns - start_ns, alone_ns)
+        if len(alone_ns) >= JOBS and _is_longer(end_ns - start_ns, alone_ns)
     ]
     if not longer:
         return {}
