@@ -15,7 +15,6 @@ from dwell.estimators.foreign_threads import (
     ForeignThreads,
     Level,
     Stretches,
-    share_of_bursts,
 )
 from dwell.model import (
     Bursts,
@@ -105,11 +104,8 @@ def test_of_a_full_node_without_jobs_a_thread_for_each_core_is_the_least() -> No
 
 
 def test_bursts_are_declared() -> None:
-    assert share_of_bursts(FOUR) == 0.0
-    node = replace(FOUR, bursts=BURSTS)
-    assert share_of_bursts(node) == 0.25
-    foreign = ForeignThreads(node)
-    assert (foreign.usual, foreign.threads) == (0.5, 0.5)
+    foreign = ForeignThreads(replace(FOUR, bursts=BURSTS))
+    assert (foreign.beyond, foreign.threads) == (0.0, 0.5)
     assert not see(foreign, 0.125, usual=0.125)
     assert see(foreign, 0.625, usual=0.125)
     assert (foreign.beyond, foreign.threads) == (2.0, 2.5)

@@ -13,7 +13,7 @@ import pytest
 
 from dwell.estimators import Evidence
 from dwell.estimators.measured import Message, Meter, Part, Site, groups, parts_of
-from dwell.model import Constant, Execution, Flow, Link, Node, Problem, Task
+from dwell.model import Bursts, Constant, Execution, Flow, Link, Node, Problem, Task
 from tests.cells.generated import make_problem
 from tests.estimators.windows import MS, Row, window
 
@@ -251,6 +251,13 @@ def test_jobs_beside_foreign_threads_need_more_core_time() -> None:
     for threads, of_it in ((0.0, 1.0), (0.4, 1.0), (0.6, 0.5), (9.0, 0.5)):
         found = demands(problem, shown([7.0, 12.0, 16.0]), {"E": threads})
         assert (found[A], found[B], found[C]) == ([7.0], [12.0 * of_it], [16.0 * of_it])
+
+
+def test_what_jobs_need_beside_bursts_is_declared() -> None:
+    bursts = Bursts(Constant(300.0), Constant(100.0), threads=4)
+    problem = wide(replace(E4, interference=2.0, bursts=bursts))
+    for threads, of_it in ((1.0, 1.0), (1.4, 1.0), (1.6, 0.5)):
+        assert demands(problem, shown([7.0, 12.0, 16.0]), {"E": threads})[B] == [12.0 * of_it]
 
 
 @pytest.mark.parametrize(

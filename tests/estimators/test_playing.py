@@ -195,10 +195,10 @@ def test_measured_delays_have_those_of_bursts_in_them() -> None:
 
 
 def test_a_link_that_loses_a_share() -> None:
-    # Every tenth of the one and a fifth of the other: a link loses of all alike.
-    lossy = [2.0] * 8 + [math.inf] * 2
+    # A tenth of the one and three of the other: a link loses of all alike.
+    few, many = ([2.0] * (10 - lost) + [math.inf] * lost for lost in (1, 3))
     problem = across(Link("R", "E", Constant(2.0)))
-    found = only(problem, present({TO_B: lossy, TO_C: lossy}))
+    found = only(problem, present({TO_B: few, TO_C: many}))
     assert found.violation_rate == pytest.approx(1 - 0.8**2, abs=4 * found.violation_error)
     assert found.l95_ms == pytest.approx(problem.censor_ms, rel=0.02)
     # What was lost where it is declared to be, and is not any more, is not played.

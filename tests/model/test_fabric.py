@@ -12,6 +12,13 @@ from dwell.model import Bursts, Constant, Fabric, Link, Node, Quota
 BURSTS = Bursts(Constant(1.0), Constant(1.0), threads=1, add_delay_ms=Constant(1.0))
 
 
+def test_bursts_have_a_share_of_the_time_and_threads_in_the_mean() -> None:
+    bursts = Bursts(Constant(300.0), Constant(100.0), threads=2)
+    assert bursts.share == 0.25
+    assert Node("E", "edge", bursts=bursts).burst_threads == 0.5
+    assert Node("E", "edge").burst_threads == 0.0
+
+
 @pytest.mark.parametrize(
     ("make", "path", "words"),
     [

@@ -62,8 +62,7 @@ def test_the_tenants_of_the_edge_are_varied_and_nothing_else() -> None:
     for point in found.study.points:
         bursts = point.problem.fabric.nodes["E"].bursts
         assert bursts is not None
-        every_ms, for_ms = bursts.every_ms.expectation, bursts.for_ms.expectation
-        shares.append(for_ms / (every_ms + for_ms))
+        shares.append(bursts.share)
     assert shares == pytest.approx([0.0, 0.03, 0.0625, 0.1], abs=1e-6)
     assert found.runs.height == 4 * 2 * 3
     canonical = canonical_demo(ROOT / "examples", seeds=1, windows=7, processes=1)

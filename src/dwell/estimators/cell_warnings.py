@@ -144,8 +144,7 @@ def _left_share(problem: Problem, node: Node, placement: Placement) -> float:
         on_cpu = _on_cpu(problem, node, placement)
         threads = sum(execution.threads * execution.workers for _, execution in on_cpu)
     beside = min(1.0, threads / node.cores, threads / max(threads + bursts.threads, 1))
-    on, off = bursts.for_ms.expectation, bursts.every_ms.expectation
-    return left * (1 - on / (on + off) * (1 - beside / node.interference))
+    return left * (1 - bursts.share * (1 - beside / node.interference))
 
 
 def _accelerator_shares(problem: Problem, placement: Placement) -> dict[tuple[str, str], float]:

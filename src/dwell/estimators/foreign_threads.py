@@ -76,8 +76,6 @@ class ForeignThreads:
 
     def __init__(self, node: Node) -> None:
         self.node = node
-        #: Those of its bursts, in the mean.
-        self.usual = share_of_bursts(node) * node.bursts.threads if node.bursts else 0.0
         self.beyond = 0.0
         self._mean, self._windows = 0.0, 0
 
@@ -87,7 +85,7 @@ class ForeignThreads:
     @property
     def threads(self) -> float:
         """All of them, in the mean."""
-        return max(self.usual + self.beyond, 0.0)
+        return max(self.node.burst_threads + self.beyond, 0.0)
 
     def see(
         self,
@@ -126,7 +124,7 @@ class ForeignThreads:
         if self.threads + LEAST_SHARE * capacity >= least and self.beyond > 0.0:
             return False  # what was known before says more
         # A thread for each core is the fewest that fill it.
-        return self._see(max(capacity - self.usual, 0.0), least)
+        return self._see(max(capacity - self.node.burst_threads, 0.0), least)
 
     def _see(self, seen: float, noise: float) -> bool:
         is_jump = abs(seen - self._mean) > noise or (seen == 0.0) != (self._mean == 0.0)
@@ -138,14 +136,6 @@ class ForeignThreads:
             return False
         self.beyond = self._mean
         return True
-
-
-def share_of_bursts(node: Node) -> float:
-    """Share of the time in which a node has the bursts that are declared."""
-    if node.bursts is None:
-        return 0.0
-    on_ms, off_ms = node.bursts.for_ms.expectation, node.bursts.every_ms.expectation
-    return on_ms / (on_ms + off_ms)
 
 
 class Stretches:
@@ -164,7 +154,7 @@ class Stretches:
         with foreign threads as equals.
         """
         node = self._problem.fabric.nodes[name]
-        bursts = share_of_bursts(node)
+        bursts = 0.0 if node.bursts is None else node.bursts.share
         own = self._jobs(evidence.cycles, evidence.placement, name)
         if own is not None and len(own.cores) >= JOBS:
             return _level(node, bursts, own, None)

@@ -101,14 +101,17 @@ class Meter:
         ----------
         foreign : mapping of str to float, optional
             Foreign threads beside which jobs ran, by node; 0 for what is not in it. What core time
-            a job received is divided by the node's `interference` where there are some. Where it
-            is not known, it is told from how long the job took beside them.
+            a job received is divided by the node's `interference` where there are some beyond
+            those of bursts. Where it is not known, it is told from how long the job took.
         """
         foreign = foreign or {}
         self._cost[:] = self._usual_cost
         for number, part in enumerate(self._parts):
-            if isinstance(part, Site) and foreign.get(part.node, 0.0) >= BESIDE:
-                self._cost[number] /= self._problem.fabric.nodes[part.node].interference
+            if isinstance(part, Site):
+                node = self._problem.fabric.nodes[part.node]
+                # What bursts cost is in the declared demands, too.
+                if foreign.get(node.name, 0.0) - node.burst_threads >= BESIDE:
+                    self._cost[number] /= node.interference
         cycles, shadows = evidence.cycles, evidence.shadows
         work_ns = self.work_ns(cycles, evidence.placement, foreign)
         work_ns = self._with_waits(cycles, evidence.placement, work_ns, foreign)

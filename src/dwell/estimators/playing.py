@@ -328,16 +328,16 @@ class Playing:
     def _fill_links(self, present: Present) -> None:
         """Set what links lose, and that measured delays are all that there is."""
         tables, links = self._first.tables, self.problem.fabric.links
-        lost: dict[str, float] = {}
+        lost: dict[str, list[float]] = {}
         for part, values in present.demands.items():
             if not isinstance(part, Message):
                 continue
-            share = float(np.isinf(values).mean()) if len(values) else 0.0
-            lost[part.link] = max(lost.get(part.link, 0.0), share)
+            lost.setdefault(part.link, []).append(float(np.isinf(values).mean()))
             if part in self._hops:
                 layers = tables.layers[self._hops[part] :: len(self._hops)]  # shadows' come after
                 layers[layers != 0] = self._nothing_ns.ctypes.data
-        for link, share in lost.items():
+        for link, shares in lost.items():
+            share = sum(shares) / len(shares)
             row = tables.links[list(links).index(link)]
             mine = slice(row["segment"], row["segment_end"])
             if links[link].retransmit_ms is None:

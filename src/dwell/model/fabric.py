@@ -52,6 +52,12 @@ class Bursts:
             require_mean(BURST_MEAN, path, process)
         FOREIGN_THREADS.check("threads", self.threads)
 
+    @property
+    def share(self) -> float:
+        """Share of the time in which it disturbs."""
+        on_ms, off_ms = self.for_ms.expectation, self.every_ms.expectation
+        return on_ms / (on_ms + off_ms)
+
 
 @dataclass(frozen=True, slots=True)
 class Quota:
@@ -169,6 +175,11 @@ class Node:
     def capacity(self) -> float:
         """Cores' worth of work it can do: what its utilisation is relative to."""
         return min(self.quota.cpu, self.cores) if self.quota is not None else float(self.cores)
+
+    @property
+    def burst_threads(self) -> float:
+        """Foreign threads of its bursts, in the mean."""
+        return self.bursts.share * self.bursts.threads if self.bursts is not None else 0.0
 
     @property
     def spare(self) -> float:

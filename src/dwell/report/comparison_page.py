@@ -23,7 +23,6 @@ from dwell.study.drawn_disturbances import drawn_disturbances
 if TYPE_CHECKING:
     import polars as pl
 
-    from dwell.model import Node
 
 DTP = "dtp"
 #: Scenarios in which perception's time on R1 decides between placements.
@@ -210,12 +209,11 @@ def _tenants(result: StudyResult) -> Figure:
     import polars as pl
 
     (column,) = result.parameters
-    shares = {
-        str(point.values[column.removeprefix("parameter.")]): round(
-            100 * _share_of_bursts(point.problem.fabric.nodes["E"]), 1
-        )
-        for point in result.study.points
-    }
+    shares = {}
+    for point in result.study.points:
+        bursts = point.problem.fabric.nodes["E"].bursts
+        percent = 0.0 if bursts is None else round(100 * bursts.share, 1)
+        shares[str(point.values[column.removeprefix("parameter.")])] = percent
     table = scaled(result.table([RATE.column]), RATE).with_columns(
         at=pl.col(column).cast(pl.String).replace_strict(shares, return_dtype=pl.Float64)
     )
@@ -238,14 +236,6 @@ def _deadlines(rows: pl.DataFrame, blocks: PolicyBlocks) -> Figure:
         "(examples/studies/deadline.yaml)."
     )
     return Figure("deadlines", "", {"rows": frame}, draw, caption)
-
-
-def _share_of_bursts(node: Node) -> float:
-    """Share of the time that a node's bursts last."""
-    if node.bursts is None:
-        return 0.0
-    every_ms, for_ms = node.bursts.every_ms.expectation, node.bursts.for_ms.expectation
-    return for_ms / (every_ms + for_ms)
 
 
 def comparison_text(comparison: Comparison, *, width: int | None = None) -> str:

@@ -113,11 +113,7 @@ def _slow_down(node: Node, on: Iterable[tuple[Disturbance, float]]) -> float:
     threads = sum(
         share * item.stress_threads for item, share in on if isinstance(item, NodeDisturbance)
     )
-    bursts = node.bursts
-    if bursts is not None:
-        on_ms, off_ms = bursts.for_ms.expectation, bursts.every_ms.expectation
-        threads += bursts.threads * on_ms / (on_ms + off_ms)
-    return 1 / min(1.0, node.capacity / (1 + threads))
+    return 1 / min(1.0, node.capacity / (1 + threads + node.burst_threads))
 
 
 def _message_ms(link: Link, size_bytes: int, on: Iterable[tuple[Disturbance, float]]) -> float:
@@ -129,8 +125,6 @@ def _message_ms(link: Link, size_bytes: int, on: Iterable[tuple[Disturbance, flo
             if item.add_delay_ms is not None:
                 mean_ms += share * item.add_delay_ms.expectation
             rate_mbps = min(rate_mbps, item.rate_mbps)
-    bursts = link.bursts
-    if bursts is not None:
-        on_ms, off_ms = bursts.for_ms.expectation, bursts.every_ms.expectation
-        mean_ms += bursts.add_delay_ms.expectation * on_ms / (on_ms + off_ms)
+    if link.bursts is not None:
+        mean_ms += link.bursts.share * link.bursts.add_delay_ms.expectation
     return mean_ms + size_bytes * 8e-3 / rate_mbps
