@@ -9,7 +9,7 @@ import pytest
 
 import dwell
 from dwell.errors import ProblemError
-from dwell.estimators import Corrected, Shadow
+from dwell.estimators import Corrected, Evidence, Shadow
 from dwell.estimators.learning import WIDENING
 from dwell.estimators.pool import LARGEST
 from dwell.model import QoS
@@ -30,8 +30,10 @@ def estimate(estimator: Shadow | Corrected) -> dict[str, QoS]:
     return estimator.estimate(observed=SEEN, incumbent="LOC", own=NO_WORK)
 
 
-def off_ms(estimator: Shadow | Corrected) -> float:
-    return estimate(estimator)["OFF"].l95_ms
+def see(estimator: Shadow | Corrected, evidence: Evidence) -> dict[str, QoS]:
+    """Close a window."""
+    estimator.learn(evidence)
+    return estimate(estimator)
 
 
 # ------------------------------------------------------------------------------------- support
@@ -41,7 +43,7 @@ def off_ms(estimator: Shadow | Corrected) -> float:
 def test_the_support_is_that_of_the_weakest_part(kind: Kind) -> None:
     estimator = kind(cell())
     assert estimator.support() == dict.fromkeys(MOVES, (0, 0))
-    estimator.learn(seen_window(extra_ms=7.0, lost=4))
+    see(estimator, seen_window(extra_ms=7.0, lost=4))
     # Of `plan` and `control` on E nothing has been seen; of OFF six shadows arrived.
     assert estimator.support() == {
         "LOC": (10, 0),
@@ -50,7 +52,7 @@ def test_the_support_is_that_of_the_weakest_part(kind: Kind) -> None:
         "SINK": (0, 1),
         "TWIN": (10, 0),
     }
-    estimator.learn(seen_window())
+    see(estimator, seen_window())
     assert estimator.support()["LOC"] == (20, 0)
     assert estimator.support()["OFF"].age_windows == 1
     assert estimator.support()["FAR"] == (0, 2)
@@ -74,13 +76,14 @@ def test_the_samples_of_a_run_are_in_its_decisions(kind: Kind) -> None:
 def test_a_window_of_two_placements_counts_for_both(kind: Kind) -> None:
     starts = [40.0 * i for i in range(20)]
     estimator = kind(cell())
-    estimator.learn(
+    see(
+        estimator,
         window(
             [local_row(at) for at in starts],
             close_ms=800.0,
             release_ms=starts,
             placement=[0] * 8 + [2] * 12,
-        )
+        ),
     )
     assert estimator.support()["LOC"].samples == 8
     assert estimator.support()["FAR"].samples == 12
@@ -89,19 +92,20 @@ def test_a_window_of_two_placements_counts_for_both(kind: Kind) -> None:
 @both
 def test_twins_share_what_is_seen_of_either(kind: Kind) -> None:
     estimator = kind(cell())
-    estimator.learn(seen_window())
+    see(estimator, seen_window())
     assert estimator.support()["TWIN"] == estimator.support()["LOC"] == (10, 0)
     # A shadow through a twin runs nothing, and counts nothing twice.
     estimator.start(cell())
     starts = [40.0 * i for i in range(20)]
-    estimator.learn(
+    see(
+        estimator,
         window(
             [local_row(at) for at in starts],
             close_ms=800.0,
             release_ms=starts,
             shadows=[GONE] * 20,
             through=[4] * 20,
-        )
+        ),
     )
     assert estimator.support()["TWIN"] == (20, 0)
     assert estimate(estimator)["TWIN"] == estimate(estimator)["LOC"]
@@ -115,7 +119,7 @@ def test_a_value_is_held_for_the_memory(kind: Kind) -> None:
     estimator = kind(cell(), half_life_windows=2.0)
     held = []
     for _ in range(20):
-        estimator.learn(seen_window(extra_ms=7.0))
+        see(estimator, seen_window(extra_ms=7.0))
         held.append(estimator.support()["OFF"].samples)
     most = int(kind.MEMORY * 2.0)
     assert held == [10 * min(k, most) for k in range(1, 21)]
@@ -125,7 +129,7 @@ def test_a_value_is_held_for_the_memory(kind: Kind) -> None:
 def test_no_more_than_so_many_values_are_held(kind: Kind) -> None:
     estimator = kind(cell(), half_life_windows=1e6)
     for _ in range(LARGEST // 10 + 5):
-        estimator.learn(seen_window(extra_ms=7.0))
+        see(estimator, seen_window(extra_ms=7.0))
     assert estimator.support()["OFF"].samples == LARGEST
 
 
@@ -133,8 +137,9 @@ def test_no_more_than_so_many_values_are_held(kind: Kind) -> None:
 def test_a_tiny_half_life_knows_the_last_windows_only(kind: Kind) -> None:
     estimator = kind(cell(), half_life_windows=1e-9)
     for extra_ms in (16.0, 6.0, 9.0):
-        estimator.learn(seen_window(extra_ms=extra_ms))
-        assert off_ms(estimator) == pytest.approx(QUIET_MS + extra_ms)
+        assert see(estimator, seen_window(extra_ms=extra_ms))["OFF"].l95_ms == pytest.approx(
+            QUIET_MS + extra_ms
+        )
 
 
 @both
@@ -143,8 +148,9 @@ def test_another_regime_does_away_with_the_one_before(kind: Kind) -> None:
     # Of the window that shows it to be as declared again nothing is held.
     for number, (extra_ms, windows) in enumerate([(16.0, 3), (6.0, 3), (0.0, 2)]):
         for _ in range(3):
-            estimator.learn(seen_window(extra_ms=extra_ms))
-            assert off_ms(estimator) == pytest.approx(QUIET_MS + extra_ms)
+            assert see(estimator, seen_window(extra_ms=extra_ms))["OFF"].l95_ms == pytest.approx(
+                QUIET_MS + extra_ms
+            )
         assert estimator.regimes == number + 1
         assert estimator.support()["OFF"].samples == 10 * windows
     assert estimate(estimator)["OFF"].error is None
@@ -153,16 +159,15 @@ def test_another_regime_does_away_with_the_one_before(kind: Kind) -> None:
 @both
 def test_what_is_not_measured_is_known_less_and_less_and_forgotten_in_the_end(kind: Kind) -> None:
     estimator = kind(cell(), half_life_windows=0.2)
-    estimator.learn(seen_window(extra_ms=7.0))
+    see(estimator, seen_window(extra_ms=7.0))
     assert estimator.deviation()["OFF"] == estimator.deviation()["LOC"] == 0.0
     last = round(kind.UNSEEN * 0.2)
     errors = [estimate(estimator)["OFF"].error]
     for age in range(1, last):
-        estimator.learn(seen_window())
+        shown = see(estimator, seen_window())
         assert estimator.support()["OFF"].age_windows == age
         assert estimator.deviation()["OFF"] == pytest.approx(WIDENING * math.sqrt(age))
         assert estimator.deviation()["LOC"] == 0.0
-        shown = estimate(estimator)
         assert shown["OFF"].l95_ms == pytest.approx(QUIET_MS + 7.0)
         assert shown["LOC"].error is None
         errors.append(shown["OFF"].error)
@@ -173,9 +178,9 @@ def test_what_is_not_measured_is_known_less_and_less_and_forgotten_in_the_end(ki
     )
     # Then it is as declared.
     for _ in range(3):
-        estimator.learn(seen_window())
-        assert estimate(estimator)["OFF"].l95_ms == QUIET_MS
-        assert estimate(estimator)["OFF"].error is None
+        shown = see(estimator, seen_window())
+        assert shown["OFF"].l95_ms == QUIET_MS
+        assert shown["OFF"].error is None
         assert estimator.deviation()["OFF"] == 0.0
 
 
@@ -187,7 +192,7 @@ def test_messages_that_are_lost_are_a_share(kind: Kind) -> None:
     problem = cell()
     estimator = kind(problem)
     for _ in range(3):
-        estimator.learn(seen_window(extra_ms=0.0, lost=4))
+        see(estimator, seen_window(extra_ms=0.0, lost=4))
     shown = estimate(estimator)["OFF"]
     assert shown.violation_rate == pytest.approx(0.4, abs=0.05)
     assert (shown.l95_ms, shown.uncut_l95_ms) == (problem.censor_ms, math.inf)
@@ -201,8 +206,9 @@ def test_what_is_under_way_says_nothing_yet(kind: Kind) -> None:
     starts = [40.0 * i for i in range(10)]
     sent: list[Row] = [off_row(at) for at in starts]
     sent[-1] = sent[-2] = GONE
-    estimator.learn(
-        window([local_row(at) for at in starts], close_ms=380.0, release_ms=starts, shadows=sent)
+    see(
+        estimator,
+        window([local_row(at) for at in starts], close_ms=380.0, release_ms=starts, shadows=sent),
     )
     assert estimate(estimator)["OFF"].error is None
     assert estimator.support()["OFF"].samples == 8

@@ -262,8 +262,8 @@ def test_a_start_forgets(kind: Kind) -> None:
     estimator = kind(problem)
     before = estimate(estimator)
     estimator.learn(seen_window(extra_ms=7.0))
-    assert estimator.regimes > 0
     assert estimate(estimator, {"R": 0.0, "E": 0.9})["OFF"] != before["OFF"]
+    assert estimator.regimes > 0
     estimator.learn(lost_on_e(0))
     estimator.start(problem)
     assert estimator.regimes == 0
@@ -282,14 +282,15 @@ def test_another_problem_has_its_own_profile(kind: Kind) -> None:
 def test_a_copy_goes_its_own_way_from_where_the_original_is(kind: Kind) -> None:
     estimator = kind(cell())
     estimator.learn(seen_window(extra_ms=7.0))
-    estimate(estimator)
-    twin = copy.deepcopy(estimator)
-    twin.learn(seen_window(extra_ms=3.0))
-    shown = estimate(twin)
-    kept = copy.deepcopy(estimator)
-    for one in (estimator, kept):
-        one.learn(seen_window(extra_ms=3.0))
-        assert estimate(one) == shown
+    busy = {"R": 0.0, "E": 1.0}
+    shown = estimate(estimator, busy)
+    twin, other = copy.deepcopy(estimator), copy.deepcopy(estimator)
+    assert estimate(twin, busy) == shown
+    other.learn(seen_window(extra_ms=3.0))
+    assert estimate(other, busy)["OFF"].l95_ms < shown["OFF"].l95_ms
+    for one in (estimator, twin):
+        one.learn(seen_window(extra_ms=7.0))
+        assert estimate(one, busy)["OFF"].l95_ms == pytest.approx(shown["OFF"].l95_ms)
 
 
 @every

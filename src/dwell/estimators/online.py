@@ -70,6 +70,10 @@ class Online(ABC):
         #: Whether the present is another one, or has newer values of the same.
         self._has_changed = self._has_grown = False
 
+    def __getstate__(self) -> dict[str, object]:
+        # A copy plays its present anew.
+        return {**self.__dict__, "_has_changed": True}
+
     @abstractmethod
     def _take_in(self, demands: Mapping[Part, Floats], evidence: Evidence) -> None:
         """Take in the demands that a window has shown."""
@@ -119,6 +123,7 @@ class Online(ABC):
         if evidence is not None:
             self._look_at_nodes(evidence, observed, own, incumbent)
             self._take_in_pending()
+        if evidence is not None or self._has_changed:
             self._play()
         played = {name: self._playing.played(name) for name in self._names}
         prices, work = self._playing.prices, []
