@@ -357,6 +357,20 @@ def test_newer_values_are_met_and_older_steps_forgotten() -> None:
     assert (playing.played("OFF").l95_ms, playing.played("OFF").l95_error_ms) == (41.0, 0.0)
 
 
+@pytest.mark.parametrize("width", WIDTHS)
+def test_newer_losses_are_met(width: int) -> None:
+    problem = across(Link("R", "E", Constant(2.0)), width)
+    playing = Playing(problem)
+    few, many = (present({TO_B: [2.0] * (10 - lost) + [math.inf] * lost}) for lost in (1, 4))
+    playing.begin(few)
+    playing.go_on(few, ["LOC"], 2)
+    for _ in range(RECENT + 2):
+        playing.go_on(many, ["LOC"], has_grown=True)
+    found = playing.played("LOC")
+    # The other flow has losses of the same link.
+    assert found.violation_rate == pytest.approx(1 - 0.6**2, abs=4 * found.violation_error)
+
+
 # ---------------------------------------------------------- against runs of the same scenario
 
 

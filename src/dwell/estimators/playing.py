@@ -195,6 +195,7 @@ class Playing:
         """
         self.present = present
         if has_grown:
+            self._fill_links(present)
             self._fill(self._cursor)
             for name in names:
                 while len(self._twins[name].steps) >= RECENT:
