@@ -16,9 +16,9 @@ from dwell.estimators.pool import (
     ENOUGH,
     LARGEST,
     LEAST,
+    PlaceSums,
     Pool,
     Reference,
-    Shift,
     middle,
     newest,
 )
@@ -390,8 +390,8 @@ def test_a_follower_that_is_measured_forgets_what_it_followed() -> None:
 @given(st.lists(st.floats(0.1, 9.0), min_size=1), st.lists(st.floats(0.1, 9.0), min_size=1))
 def test_shifts_add_up(first: list[float], second: list[float]) -> None:
     known = np.sort(about(5.0, 100))
-    one, other = (Shift.among(np.array(values), known) for values in (first, second))
-    both = Shift.among(np.array(first + second), known)
+    one, other = (PlaceSums.among(np.array(values), known) for values in (first, second))
+    both = PlaceSums.among(np.array(first + second), known)
     for found, expected in ((one + other, both), (both - other, one)):
         assert found.size == expected.size
         for name in ("larger", "smaller", "places"):
@@ -402,7 +402,7 @@ def test_shifts_add_up(first: list[float], second: list[float]) -> None:
 @pytest.mark.parametrize("deviation", [2.0, 3.0, 4.0])
 def test_deviations_are_those_of_fishers_method(size: int, deviation: float) -> None:
     larger = float(stats.gamma.isf(stats.norm.sf(deviation), size))
-    shift = Shift(size, larger, 0.0, size / 2)
+    shift = PlaceSums(size, larger, 0.0, size / 2)
     assert shift.deviations(0.0) == pytest.approx(deviation, abs=0.1)
     # Values that are all the same count as one; of several windows only those of each are alike.
     assert shift.deviations(1.0) == pytest.approx(shift.deviations(0.0) / math.sqrt(size))
@@ -410,7 +410,7 @@ def test_deviations_are_those_of_fishers_method(size: int, deviation: float) -> 
 
 
 def test_no_values_are_no_deviation() -> None:
-    assert Shift(0, 0.0, 0.0, 0.0).deviations(0.0) == 0.0
+    assert PlaceSums(0, 0.0, 0.0, 0.0).deviations(0.0) == 0.0
 
 
 # ---------------------------------------------------------------------- changes within a window

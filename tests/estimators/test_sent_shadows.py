@@ -10,7 +10,7 @@ import pytest
 
 import dwell
 from dwell.estimators.measured import Site
-from dwell.estimators.playing import Playing, Present, declared_of
+from dwell.estimators.presents import Playing, Present, declared_of
 from dwell.estimators.prices import prices_of
 from dwell.estimators.sent_shadows import SentShadows, hindered, stamps_of
 from dwell.kernels.arrays import lay_out

@@ -22,7 +22,7 @@ from dwell.cost import censored
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.foreign_threads import ForeignThreads, Stretches
 from dwell.estimators.measured import Message, Meter, Part, groups, parts_of
-from dwell.estimators.playing import Played, Playing, Present
+from dwell.estimators.presents import PlayedPrice, Playing, Present
 from dwell.estimators.prices import L95_SHARE, RATE, SEED, Price
 from dwell.estimators.profile import Profile, mean_ms
 from dwell.estimators.spans import patience_ns
@@ -134,7 +134,7 @@ class Online(ABC):
         shares = self.profile.utilisation(observed, incumbent, own, work)
         estimates = {}
         for name in self.problem.candidates:
-            price: Played | Price = played.get(name, prices[name])
+            price: PlayedPrice | Price = played.get(name, prices[name])
             error = None
             if name in played:
                 l95_error_ms, rate_error = self._known_error(name, price.violation_rate)

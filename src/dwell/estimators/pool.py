@@ -30,7 +30,7 @@ SHIFTED, ALIKE, APART = 4.0, 2.0, 2.0
 #: Mean place of a window's values that is another regime; of all that is held, any is.
 MOVED = 0.75
 #: Deviations that are a change within a window, of at least so many values.
-CHANGED, LEAST = 5.0, 16
+CHANGED, LEAST = 5.0, 36
 
 
 class Reference:
@@ -155,7 +155,7 @@ class Pool:
         # A copy: they are overwritten by the next window's.
         values = values[:: -(-len(values) // LARGEST)].copy()
         reference = self.reference
-        declared = Shift.among(values, reference.ordered)
+        declared = PlaceSums.among(values, reference.ordered)
         if not len(reference.values):
             # Never came to an end where it is as declared, so that nothing can be told from it.
             is_first, self.is_declared = self.is_declared, False
@@ -171,7 +171,7 @@ class Pool:
                 return False
             self.is_declared, self.touched = False, window
             return True
-        apart = Shift.among(values, np.sort(self.held))
+        apart = PlaceSums.among(values, np.sort(self.held))
         if off < ALIKE and (
             apart.deviations(reference.likeness) >= APART or self._off_declared() < ALIKE
         ):
@@ -224,15 +224,15 @@ class Pool:
         few = len(values) < ENOUGH and max(new, self.reference.usual) < math.inf
         shape = self.moved(new) if few else np.empty(0)
         self.replace(shape[:: max(len(shape) // ENOUGH, 1)][:ENOUGH], window)
-        self._add(values, Shift.among(values, self.reference.ordered), window, math.inf)
+        self._add(values, PlaceSums.among(values, self.reference.ordered), window, math.inf)
 
     def _begin(self, values: Floats, window: int) -> None:
         self.held = values
-        self._shift = Shift.among(values, self.reference.ordered)
+        self._shift = PlaceSums.among(values, self.reference.ordered)
         self._chunks = deque([_Chunk(window, self._shift)])
         self.measured, self.touched = 0, window
 
-    def _add(self, values: Floats, shift: Shift, window: int, memory: float) -> None:
+    def _add(self, values: Floats, shift: PlaceSums, window: int, memory: float) -> None:
         """Add values, and drop the oldest: what is forgotten, and what is beyond `LARGEST`."""
         chunks = self._chunks
         chunks.append(_Chunk(window, shift))
@@ -249,7 +249,7 @@ class Pool:
 
 
 @dataclass(frozen=True, slots=True)
-class Shift:
+class PlaceSums:
     """How values lie among known ones.
 
     Parameters
@@ -266,18 +266,18 @@ class Shift:
     places: float
 
     @classmethod
-    def among(cls, values: Floats, known: Floats) -> Shift:
+    def among(cls, values: Floats, known: Floats) -> PlaceSums:
         """Compare values with known ones, which ascend."""
         return cls(len(values), *places(known, values))
 
-    def __add__(self, other: Shift) -> Shift:
+    def __add__(self, other: PlaceSums) -> PlaceSums:
         return self._with(other, 1)
 
-    def __sub__(self, other: Shift) -> Shift:
+    def __sub__(self, other: PlaceSums) -> PlaceSums:
         return self._with(other, -1)
 
-    def _with(self, other: Shift, sign: int) -> Shift:
-        return Shift(
+    def _with(self, other: PlaceSums, sign: int) -> PlaceSums:
+        return PlaceSums(
             self.size + sign * other.size,
             self.larger + sign * other.larger,
             self.smaller + sign * other.smaller,
@@ -313,7 +313,7 @@ class _Chunk(NamedTuple):
     """What a window has brought."""
 
     window: int
-    shift: Shift
+    shift: PlaceSums
 
 
 def newest(values: Floats) -> int:

@@ -41,7 +41,7 @@ LONGEST_WINDOW, STEP = 1000, 100
 #: How many cycles are drawn before they are played again, and the fewest windows of them.
 DRAWN, FEWEST = 2400, 4
 #: Steps that a candidate's price is of at most; and while demands of the present change.
-KEPT, RECENT = 30, 6
+KEPT, RECENT = 24, 6
 #: Cycles after those of a step that may have been released when it ends.
 BEYOND = 64
 #: Of a fraction of a thread, what is neither none nor a whole one.
@@ -75,7 +75,7 @@ class Present:
         return f"<Present: {', '.join(what) or 'as declared'}>"
 
 
-class Played(NamedTuple):
+class PlayedPrice(NamedTuple):
     """What a candidate came to, in the mean over windows, with standard errors; see `Price`."""
 
     l95_ms: float
@@ -104,7 +104,7 @@ class _Twin:
         self.arrays = first.copy()
         self.arrays.replace(stamps=stamps_of(first, index, shadows))
         self.steps: deque[_Step] = deque(maxlen=KEPT)
-        self.price: Played | None = None
+        self.price: PlayedPrice | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,14 +233,14 @@ class Playing:
         twin.price = None
         self.cycles += self._step * self._window
 
-    def played(self, name: str) -> Played:
+    def played(self, name: str) -> PlayedPrice:
         """What a candidate has come to under the present."""
         twin = self._twins[name]
         if twin.price is None:
             twin.price = self._price(name, twin.steps)
         return twin.price
 
-    def _price(self, name: str, steps: Collection[_Step]) -> Played:
+    def _price(self, name: str, steps: Collection[_Step]) -> PlayedPrice:
         l95, declared_l95, uncut, rates, declared_rates, own = zip(*steps, strict=True)
         known = self.prices[name]
         l95_ms, l95_error_ms = _estimated(l95, declared_l95, known.l95_ms, known.l95_error_ms)
@@ -253,7 +253,7 @@ class Playing:
             cycles=count * self._step * self._window,
         )
         l95_ms, shares = min(l95_ms, self.problem.censor_ms), sum(own) / count
-        return Played(
+        return PlayedPrice(
             l95_ms,
             l95_error_ms,
             max(sum(uncut) / count, l95_ms),
@@ -437,7 +437,9 @@ def _mean_and_error(values: Sequence[float]) -> tuple[float, float]:
     if count < 2:
         return mean, abs(mean)
     squares = sum((value - mean) ** 2 for value in values)
-    return mean, math.sqrt(squares / (count * (count - 1)))
+    # Of few values the deviation is itself hardly known: about Student's t over 2.
+    few = (count + 1) / (count - 1)
+    return mean, few * math.sqrt(squares / (count * (count - 1)))
 
 
 def _with_own_demands(real: Realisation) -> Realisation:

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from dwell.estimators.measured import Message, Part, Site
-from dwell.estimators.playing import KEPT, RECENT, Played, Playing, Present, declared_of
+from dwell.estimators.presents import KEPT, RECENT, PlayedPrice, Playing, Present, declared_of
 from dwell.estimators.prices import RATE, Price, price_of, prices_of
 from dwell.kernels.random_draws import draw
 from dwell.model import (
@@ -53,14 +53,14 @@ def present(
     return Present(FrozenDict(known), FrozenDict(threads or {}), frozenset(down))
 
 
-def played(problem: Problem, what: Present, steps: int = 10) -> dict[str, Played]:
+def played(problem: Problem, what: Present, steps: int = 10) -> dict[str, PlayedPrice]:
     playing = Playing(problem)
     playing.begin(what)
     playing.go_on(what, list(problem.candidates), steps)
     return {name: playing.played(name) for name in problem.candidates}
 
 
-def only(problem: Problem, what: Present) -> Played:
+def only(problem: Problem, what: Present) -> PlayedPrice:
     (one,) = played(problem, what).values()
     return one
 
@@ -374,7 +374,7 @@ def test_newer_losses_are_met(width: int) -> None:
 # ---------------------------------------------------------- against runs of the same scenario
 
 
-def is_as(one: Played, price: Price) -> None:
+def is_as(one: PlayedPrice, price: Price) -> None:
     """Whether they are the same within four standard errors."""
     l95_error_ms = math.hypot(one.l95_error_ms, price.l95_error_ms)
     assert abs(one.l95_ms - price.l95_ms) <= 4 * l95_error_ms + 1e-6
@@ -411,7 +411,7 @@ def some_scenario(problem: Problem, kind: str, rng: Random) -> tuple[Disturbance
     return disturbance, Present(FrozenDict(demands))
 
 
-def both(problem: Problem, kind: str, seed: int, steps: int) -> Iterator[tuple[Played, Price]]:
+def both(problem: Problem, kind: str, seed: int, steps: int) -> Iterator[tuple[PlayedPrice, Price]]:
     """Every candidate as it is played, and as it is in a long run."""
     disturbance, what = some_scenario(problem, kind, Random(seed))
     disturbed = replace(problem, scenarios={"disturbed": (disturbance,)})
