@@ -172,11 +172,9 @@ class Playing:
         self.present = present
         self._cursor = self._offset = 0
         self._restore()
-        tables = self._first.tables
         changes = self._changes(present)
         self._first.replace(changes=changes)
         self._fill_links(present)
-        del tables
         for twin in self._twins.values():
             twin.steps.clear()
             twin.arrays.replace(changes=changes)
@@ -197,6 +195,7 @@ class Playing:
         if has_grown:
             self._fill_links(present)
             self._fill(self._cursor)
+            self._fill_links(present)
             for name in names:
                 while len(self._twins[name].steps) >= RECENT:
                     self._twins[name].steps.popleft()
