@@ -195,7 +195,6 @@ class Playing:
         if has_grown:
             self._fill_links(present)
             self._fill(self._cursor)
-            self._fill_links(present)
             for name in names:
                 while len(self._twins[name].steps) >= RECENT:
                     self._twins[name].steps.popleft()
