@@ -13,9 +13,9 @@ namespace dwell {
 namespace {
 
 // A row a cycle of a window: the candidate that it went through, when its jobs became ready, when
-// they completed, when its messages arrived, and the core time of its jobs, -1 for what had not come
-// or is not known; then, where there are shadows, the same of its shadow, the candidate being -1
-// where it has none.
+// they completed, when its messages arrived, and the core time of its jobs, -1 for what had not
+// come or is not known; then, where there are shadows, the same of its shadow, the candidate being
+// -1 where it has none.
 struct Window {
   const i64* rows;
   i64 n, width;
@@ -33,9 +33,9 @@ struct Layout {
 
 // The times found: up to `most` of each part, and the parts in the order in which they were found.
 //
-// Where demands are asked for, and not times, there is a `cost` of each part: of a job its time alone
-// over its core time, of a message the nanoseconds that its link takes to send it; and a `link` that
-// has a rate, -1 for none.
+// Where demands are asked for, and not times, there is a `cost` of each part: of a job its time
+// alone over its core time, of a message the nanoseconds that its link takes to send it; and a
+// `link` that has a rate, -1 for none.
 struct Found {
   f64* ms;
   i64* count;
