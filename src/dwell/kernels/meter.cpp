@@ -65,18 +65,19 @@ bool add_span(Found& found, i64 part, i64 begin_ns, i64 end_ns, i64 limit_ns) {
 
 // A message on a link with a rate: when it was sent, how long that takes, and its time so far.
 struct Crossing {
-  i64 link, sent_ns;
+  i64 link, sent_ns, number;  // of those that were found
   f64 cost_ns;
   f64* ms;
 
   bool operator<(const Crossing& other) const {
-    return link != other.link ? link < other.link : sent_ns < other.sent_ns;
+    if (link != other.link) return link < other.link;
+    return sent_ns != other.sent_ns ? sent_ns < other.sent_ns : number < other.number;
   }
 };
 
 // Takes off the time that messages waited behind others of the cell, and that they were sent for.
 void take_off_waits(std::vector<Crossing>& crossings) {
-  std::stable_sort(crossings.begin(), crossings.end());
+  std::sort(crossings.begin(), crossings.end());
   i64 link = -1;
   f64 free_ns = 0.0;
   for (const Crossing& crossing : crossings) {
@@ -139,7 +140,8 @@ DWELL_EXPORT void dwell_meter(const Layout* layout, const Window* window, i64 ac
           // Of what is lost nobody knows whether it was sent.
           if (!has_come) continue;
           f64* ms = found->ms + part * found->most + found->count[part] - 1;
-          crossings.push_back({found->link[part], sent_ns, found->cost[part], ms});
+          const i64 number = static_cast<i64>(crossings.size());
+          crossings.push_back({found->link[part], sent_ns, number, found->cost[part], ms});
         }
       }
     }
