@@ -119,6 +119,7 @@ class Online(ABC):
         self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
     ) -> dict[str, QoS]:
         """Estimate every candidate's metrics, the incumbent's too (see `Estimator`)."""
+        self.profile.utilisation(observed, incumbent, own, ())  # refuses what has a node missing
         evidence, self._evidence = self._evidence, None
         if evidence is not None:
             self._look_at_nodes(evidence, observed, own, incumbent)
