@@ -55,14 +55,11 @@ class Corrected(Learning):
 
     def _correct(self, changed: set[Part], measured: frozenset[Part]) -> None:
         for place in {_place(part) for part in changed}:
-            here = [part for part in self._pools if _place(part) == place]
-            witnesses = [part for part in here if part in measured]
-            surest = max(witnesses, key=lambda part: self._pools[part].measured)
-            for part in here:
-                if part not in measured and isinstance(part, Message) == isinstance(
-                    surest, Message
-                ):
-                    self._pools[part].follow(self._pools[surest], self._window)
+            here = [part for part in changed if _place(part) == place]
+            surest = self._pools[max(here, key=lambda part: self._pools[part].measured)]
+            for part, pool in self._pools.items():
+                if part not in measured and _place(part) == place:
+                    pool.follow(surest, self._window)
 
 
 def _place(part: Part) -> str:
