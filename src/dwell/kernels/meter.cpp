@@ -3,7 +3,6 @@
 
 #include <algorithm>
 #include <limits>
-#include <vector>
 
 #include "elementary.h"
 #include "export.h"
@@ -31,6 +30,18 @@ struct Layout {
   const i8* shared;
 };
 
+// A message on a link with a rate: when it was sent, how long that takes, and its time so far.
+struct Crossing {
+  i64 link, sent_ns, number;  // of those that were found
+  f64 cost_ns;
+  f64* ms;
+
+  bool operator<(const Crossing& other) const {
+    if (link != other.link) return link < other.link;
+    return sent_ns != other.sent_ns ? sent_ns < other.sent_ns : number < other.number;
+  }
+};
+
 // The times found: up to `most` of each part, and the parts in the order in which they were found.
 //
 // Where demands are asked for, and not times, there is a `cost` of each part: of a job its time
@@ -43,6 +54,8 @@ struct Found {
   i64 most, n_parts;
   const f64* cost;
   const i64* link;
+  Crossing* crossings;
+  i64 n_crossings;
 };
 
 void add(Found& found, i64 part, f64 ms) {
@@ -63,24 +76,13 @@ bool add_span(Found& found, i64 part, i64 begin_ns, i64 end_ns, i64 limit_ns) {
   return false;
 }
 
-// A message on a link with a rate: when it was sent, how long that takes, and its time so far.
-struct Crossing {
-  i64 link, sent_ns, number;  // of those that were found
-  f64 cost_ns;
-  f64* ms;
-
-  bool operator<(const Crossing& other) const {
-    if (link != other.link) return link < other.link;
-    return sent_ns != other.sent_ns ? sent_ns < other.sent_ns : number < other.number;
-  }
-};
-
 // Takes off the time that messages waited behind others of the cell, and that they were sent for.
-void take_off_waits(std::vector<Crossing>& crossings) {
-  std::sort(crossings.begin(), crossings.end());
+void take_off_waits(const Found& found) {
+  std::sort(found.crossings, found.crossings + found.n_crossings);
   i64 link = -1;
   f64 free_ns = 0.0;
-  for (const Crossing& crossing : crossings) {
+  for (i64 i = 0; i < found.n_crossings; ++i) {
+    const Crossing& crossing = found.crossings[i];
     const f64 sent_ns = static_cast<f64>(crossing.sent_ns);
     if (crossing.link != link) free_ns = sent_ns;
     link = crossing.link;
@@ -112,7 +114,7 @@ DWELL_EXPORT void dwell_meter(const Layout* layout, const Window* window, i64 ac
                               Found* found) noexcept {
   const i64 n_tasks = layout->n_tasks, n_flows = layout->n_flows, n_parts = n_tasks + n_flows;
   const i64 shadow = 1 + 3 * n_tasks + n_flows;  // where its columns begin
-  std::vector<Crossing> crossings;
+  found->n_crossings = 0;
   i64 other = -1;
   do {
     const i64 begin = other < 0 ? 0 : shadow;
@@ -140,14 +142,14 @@ DWELL_EXPORT void dwell_meter(const Layout* layout, const Window* window, i64 ac
           // Of what is lost nobody knows whether it was sent.
           if (!has_come) continue;
           f64* ms = found->ms + part * found->most + found->count[part] - 1;
-          const i64 number = static_cast<i64>(crossings.size());
-          crossings.push_back({found->link[part], sent_ns, number, found->cost[part], ms});
+          const i64 number = found->n_crossings++;
+          found->crossings[number] = {found->link[part], sent_ns, number, found->cost[part], ms};
         }
       }
     }
     other = window->width > shadow ? next_other(*window, shadow, active, other) : -1;
   } while (other >= 0);
-  take_off_waits(crossings);
+  take_off_waits(*found);
 }
 
 // Adds up where `n` values lie among `n_known` ascending ones, each at a place p between 0 and 1:

@@ -42,6 +42,8 @@ class _Found(ctypes.Structure):
         ("n_parts", c_int64),
         ("cost", c_void_p),
         ("link", c_void_p),
+        ("crossings", c_void_p),
+        ("n_crossings", c_int64),
     )
 
 
@@ -98,7 +100,7 @@ class PartTimes:
         self._found = _Found(None, self._count.ctypes.data, self._order.ctypes.data)
         if cost is not None and link is not None:
             self._found.cost, self._found.link = cost.ctypes.data, link.ctypes.data
-        self._ms = np.empty((parts, 0))
+        self._ms, self._crossings = np.empty((parts, 0)), np.empty(0, np.int64)
 
     def __reduce__(self) -> tuple[type[PartTimes], tuple[int, Floats | None, Ints | None]]:
         # As in a copy of `CyclesLayout`; what has been found stays here.
@@ -133,6 +135,12 @@ class PartTimes:
         if self._ms.shape[1] < 2 * count:
             self._ms = np.empty((len(self._count), 2 * count))
             self._found.ms, self._found.most = self._ms.ctypes.data, self._ms.shape[1]
+        if self._cost is not None:
+            # Of every cycle and its shadow the messages, five numbers each (`Crossing`).
+            room = 2 * count * cycles[3].shape[1] * 5
+            if len(self._crossings) < room:
+                self._crossings = np.empty(room, np.int64)
+                self._found.crossings = self._crossings.ctypes.data
         self._count[:] = 0
         self._found.n_parts = 0
 
