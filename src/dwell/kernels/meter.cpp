@@ -172,8 +172,8 @@ DWELL_EXPORT void dwell_places(const f64* known, i64 n_known, const f64* values,
     below *= p;
     out[2] += p;
     if (i % kTogether == kTogether - 1 || i == n - 1) {
-      out[0] -= log(beyond);
-      out[1] -= log(below);
+      out[0] -= dwell::log(beyond);
+      out[1] -= dwell::log(below);
       beyond = below = 1.0;
     }
   }
