@@ -241,13 +241,20 @@ class Playing:
     def _price(self, name: str, steps: Collection[_Step]) -> PlayedPrice:
         l95, declared_l95, uncut, rates, declared_rates, own = zip(*steps, strict=True)
         known = self.prices[name]
-        l95_ms, l95_error_ms = _estimated(l95, declared_l95, known.l95_ms, known.l95_error_ms)
+        l95_ms, l95_error_ms = _estimated(
+            l95,
+            declared_l95,
+            known.l95_ms,
+            known.l95_error_ms,
+            usual=self._deviation(self.declared.l95_ms[name]),
+        )
         count = len(steps)
         violation_rate, violation_error = _estimated(
             rates,
             declared_rates,
             known.violation_rate,
             known.violation_error,
+            usual=self._deviation(self.declared.violation_rate[name]),
             cycles=count * self._step * self._window,
         )
         l95_ms, shares = min(l95_ms, self.problem.censor_ms), sum(own) / count
@@ -259,6 +266,10 @@ class Playing:
             violation_error,
             FrozenDict(zip(self.problem.fabric.resources, shares.tolist(), strict=True)),
         )
+
+    def _deviation(self, windows: Floats) -> float:
+        """Standard deviation of what steps show as declared."""
+        return float(windows[1:].std()) / math.sqrt(self._step)
 
     def is_full(self, name: str) -> bool:
         """Whether the price of a candidate is of as many windows as it ever is."""
@@ -397,6 +408,7 @@ def _estimated(
     known: float,
     known_error: float,
     *,
+    usual: float,
     cycles: int | None = None,
 ) -> tuple[float, float]:
     """Mean of what steps show, with its standard error.
@@ -411,6 +423,8 @@ def _estimated(
         What the same steps show as declared.
     known, known_error : float
         Mean as declared, with its standard error.
+    usual : float
+        Standard deviation of a step as declared: few steps may have seen less than there is.
     cycles : int, optional
         How many there are, where it is a share of them that is estimated.
     """
@@ -424,7 +438,8 @@ def _estimated(
         differing = sum(map(abs, differences)) / len(steps)
         more_error = max(more_error, unseen_error(differing, cycles))
     more_error = math.hypot(more_error, known_error)
-    return (max(known + more, 0.0), more_error) if more_error < error else (mean, error)
+    is_better = more_error < max(error, usual / math.sqrt(len(steps)))
+    return (max(known + more, 0.0), more_error) if is_better else (mean, error)
 
 
 def _mean_and_error(values: Sequence[float]) -> tuple[float, float]:
