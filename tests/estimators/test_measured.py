@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from dwell.estimators import Evidence
-from dwell.estimators.measured import Message, Meter, Part, Site, groups, parts_of
+from dwell.estimators.measured import Message, Meter, Part, Site, groups, parts_of, sending_ns
 from dwell.model import Bursts, Constant, Execution, Flow, Link, Node, Problem, Task
 from tests.cells.generated import make_problem
 from tests.estimators.windows import MS, Row, window
@@ -242,8 +242,8 @@ def test_the_demand_of_a_message_is_its_delay() -> None:
     found = demands(wide(E4), shown([7.0, 12.0, 16.0]))
     # Each takes 40 ms on the link, and the second waits for the first.
     assert (found[TO_B], found[TO_C]) == ([5.0], [6.0])
-    assert Meter(wide(E4)).sending_ms(TO_B) == 40.0
-    assert Meter(chain()).sending_ms(UP) == 0.0
+    assert sending_ns(wide(E4), TO_B) == 40e6
+    assert sending_ns(chain(), UP) == 0.0
 
 
 def test_jobs_beside_foreign_threads_need_more_core_time() -> None:

@@ -77,6 +77,13 @@ class Meter:
         costs = [_cost(problem, part) for part in self._parts]
         self._cost, self._usual_cost = np.array(costs), np.array(costs)
         self._demands = PartTimes(len(self._parts), self._cost, self._links())
+        nodes = problem.fabric.nodes
+        #: Parts whose jobs need more of the core beside foreign threads, with their nodes.
+        self._interfered = [
+            (number, nodes[part.node])
+            for number, part in enumerate(self._parts)
+            if isinstance(part, Site) and nodes[part.node].interference > 1.0
+        ]
         self._layouts: dict[int, CyclesLayout] = {}
         self._sharing = [self._sharing_of(placed) for placed in self._placements]
 
@@ -106,12 +113,10 @@ class Meter:
         """
         foreign = foreign or {}
         self._cost[:] = self._usual_cost
-        for number, part in enumerate(self._parts):
-            if isinstance(part, Site):
-                node = self._problem.fabric.nodes[part.node]
-                # What bursts cost is in the declared demands, too.
-                if foreign.get(node.name, 0.0) - node.burst_threads >= BESIDE:
-                    self._cost[number] /= node.interference
+        for number, node in self._interfered:
+            # What bursts cost is in the declared demands, too.
+            if foreign.get(node.name, 0.0) - node.burst_threads >= BESIDE:
+                self._cost[number] /= node.interference
         cycles, shadows = evidence.cycles, evidence.shadows
         work_ns = self.work_ns(cycles, evidence.placement, foreign)
         work_ns = self._with_waits(cycles, evidence.placement, work_ns, foreign)
@@ -216,10 +221,6 @@ class Meter:
                 cores /= slowdown(node, execution.threads, foreign.get(node.name, 0.0))
             received.append(cores)
         return np.array(received)
-
-    def sending_ms(self, message: Message) -> float:
-        """Time that the link of a message takes to send it."""
-        return float(self._usual_cost[self._parts.index(message)]) / 1e6
 
     def _links(self) -> Ints:
         """Number of each part's link, if it is a message on one that has a rate; else -1."""

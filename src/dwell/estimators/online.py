@@ -13,24 +13,26 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from functools import partial
-from typing import ClassVar, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.cost import censored
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.foreign_threads import ForeignThreads, Stretches
 from dwell.estimators.measured import Message, Meter, Part, groups, parts_of
 from dwell.estimators.presents import PlayedPrice, Playing, Present
 from dwell.estimators.prices import L95_SHARE, RATE, SEED, Price
-from dwell.estimators.profile import Profile, mean_ms
+from dwell.estimators.profile import Foreign, Profile, mean_ms
 from dwell.estimators.spans import patience_ns
 from dwell.model.frozen import FrozenDict
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS
 
 Floats: TypeAlias = NDArray[np.float64]
+
+#: Steps that are played when the present changes, the first of which settles queues.
+FIRST_STEPS = 4
 
 
 class Online(ABC):
@@ -46,8 +48,6 @@ class Online(ABC):
 
     shadow_fraction = 0.0
     seed = SEED
-    #: Steps that are played when the present changes, the first of which settles queues.
-    FIRST_STEPS: ClassVar[int] = 4
 
     def start(self, problem: Problem) -> None:
         """Forget everything but the profile."""
@@ -119,20 +119,21 @@ class Online(ABC):
         self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
     ) -> dict[str, QoS]:
         """Estimate every candidate's metrics, the incumbent's too (see `Estimator`)."""
-        self.profile.utilisation(observed, incumbent, own, ())  # refuses what has a node missing
+        foreign = self.profile.see(observed, incumbent, own)
         evidence, self._evidence = self._evidence, None
         if evidence is not None:
-            self._look_at_nodes(evidence, observed, own, incumbent)
+            self._look_at_nodes(evidence, foreign, own, incumbent)
             self._take_in_pending()
+        names = self._names
         if evidence is not None or self._has_changed:
-            self._play()
-        played = {name: self._playing.played(name) for name in self._names}
+            self._play(names)
+        played = {name: self._playing.played(name) for name in names}
         prices, work = self._playing.prices, []
         for name in prices:
             does = played[name].own if name in played else prices[name].own
             sent = self._sent[name]
             work.append((name, [(one, share + sent[one]) for one, share in does.items()]))
-        shares = self.profile.utilisation(observed, incumbent, own, work)
+        shares = self.profile.with_work(foreign, work)
         estimates = {}
         for name in self.problem.candidates:
             price: PlayedPrice | Price = played.get(name, prices[name])
@@ -148,17 +149,16 @@ class Online(ABC):
         return estimates
 
     def _look_at_nodes(
-        self, evidence: Evidence, observed: QoS, own: Mapping[str, float], incumbent: str
+        self, evidence: Evidence, seen: Foreign, own: Mapping[str, float], incumbent: str
     ) -> None:
         """Take in what a window showed of foreign threads, and of nodes that are down."""
         price = self._playing.prices[incumbent]
         for name, foreign in self._foreign.items():
-            used, mine = observed.utilisation[name], own[name]
-            share = max(used - mine, 0.0)
             usual, deviation = price.foreign[name], price.foreign_deviation[name]
             level = partial(self._stretches.level, evidence, name)
-            is_full = bool(censored(used, mine))
-            changed = foreign.see(share, usual, deviation, level, is_full=is_full)
+            changed = foreign.see(
+                seen.shares[name], usual, deviation, level, is_full=name in seen.full
+            )
             if changed:
                 self._has_changed = True
                 self._regimes += 1
@@ -211,14 +211,13 @@ class Online(ABC):
             )
         ]
 
-    def _play(self) -> None:
+    def _play(self, names: list[str]) -> None:
         """Play the candidates that are not as declared, anew where the present has changed."""
-        names = self._names
         if names:
             present = self.present
             if self._has_changed:
                 self._playing.begin(present)
-                self._playing.go_on(present, names, self.FIRST_STEPS)
+                self._playing.go_on(present, names, FIRST_STEPS)
             elif self._has_grown or not all(map(self._is_sure, names)):
                 self._playing.go_on(present, names, has_grown=self._has_grown)
         self._has_changed = self._has_grown = False

@@ -38,7 +38,7 @@ class Reference:
 
     Parameters
     ----------
-    blocks : float64 array, shape (n,)
+    values : float64 array, shape (n,)
         In the order of cycles, `block` of them from each stretch; infinite where lost.
     block : int
         Cycles of a stretch, whose values may be alike.

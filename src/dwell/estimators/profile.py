@@ -19,7 +19,7 @@ estimates.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,22 @@ from dwell.model.process import Trace
 from dwell.model.qos import QoS, unchecked_qos
 
 Floats: TypeAlias = NDArray[np.float64]
+
+
+class Foreign(NamedTuple):
+    """What others took of resources in a window.
+
+    Parameters
+    ----------
+    shares : mapping of str to float
+        Share of each resource that was measured.
+    full : mapping of str to mapping
+        Resources of which nothing was left and others had a part, with what each showed under the
+        candidates that it was seen under since.
+    """
+
+    shares: Mapping[str, float]
+    full: Mapping[str, Mapping[str, float]]
 
 
 class Profile:
@@ -133,9 +149,19 @@ class Profile:
         MetricError
             If a node's utilisation is missing.
         """
+        return self.with_work(self.see(observed, incumbent, own), work)
+
+    def see(self, observed: QoS, incumbent: str, own: Mapping[str, float]) -> Foreign:
+        """Tell what others took of every resource in a window, and remember what a full one showed.
+
+        Raises
+        ------
+        MetricError
+            If a node's utilisation is missing.
+        """
         # Conditions and not min() and max(): this runs at the close of every window.
         used = observed.utilisation
-        foreign, full = {}, {}
+        shares, full = {}, {}
         unmeasured = {one for one in self._accelerators if one not in used or one not in own}
         try:
             for node, shown in self._shown.items():
@@ -143,7 +169,7 @@ class Profile:
                     continue
                 busy, mine = used[node], own[node]
                 load = busy - mine
-                foreign[node] = load if load > 0.0 else 0.0
+                shares[node] = load if load > 0.0 else 0.0
                 if busy < SATURATED:
                     shown.clear()
                     shown[incumbent] = busy
@@ -157,15 +183,21 @@ class Profile:
                 f"{what} has nothing for node {error.args[0]}; it must hold each of "
                 f"{', '.join(one for one in self._resources if one not in self._accelerators)}"
             ) from None
+        return Foreign(shares, full)
+
+    def with_work(
+        self, foreign: Foreign, work: Iterable[tuple[str, Iterable[tuple[str, float]]]]
+    ) -> dict[str, FrozenDict[str, float]]:
+        """Add the cell's own work under each candidate to what others take (see `utilisation`)."""
         estimated = {}
         for name, takes in work:
             utilisation = {}
             for node, share in takes:
-                if node in unmeasured:
+                if node not in foreign.shares:
                     continue
-                busy = foreign[node] + share
+                busy = foreign.shares[node] + share
                 utilisation[node] = busy if busy < 1.0 else 1.0
-            for node, shown in full.items():
+            for node, shown in foreign.full.items():
                 utilisation[node] = shown.get(name, 1.0)
             estimated[name] = FrozenDict(utilisation)
         return estimated

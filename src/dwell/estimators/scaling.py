@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 from dwell.errors import Fault, ProblemError
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.learning import Learning
-from dwell.estimators.measured import Message, Part, Site, cores_of, message_of
+from dwell.estimators.measured import Message, Part, Site, cores_of, message_of, sending_ns
 from dwell.estimators.paths import longest_path, order_statistic, steps_of
 from dwell.estimators.spans import NS_PER_MS, spans_ms
 from dwell.model.bounds import VALUE, shown
@@ -216,7 +216,7 @@ class Scaling(Learning):
             return 0.0
         bound_ms = self._bounds.get(part.link)
         if bound_ms is not None:
-            bound_ms += self._meter.sending_ms(part)
+            bound_ms += sending_ns(self.problem, part) / NS_PER_MS
         if part != active:
             return bound_ms
         known = taken_ms[np.isfinite(taken_ms)]

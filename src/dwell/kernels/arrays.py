@@ -718,6 +718,12 @@ def ordered_flows(pipeline: Pipeline) -> list[Flow]:
     return sorted(pipeline.flows, key=lambda flow: names.index(flow.target))
 
 
+def flow_rows(pipeline: Pipeline) -> Ints:
+    """Return where each flow of a pipeline is among the kernel's (see `ordered_flows`)."""
+    order = ordered_flows(pipeline)
+    return np.array([order.index(flow) for flow in pipeline.flows], np.int64)
+
+
 def shadow_parts(pipeline: Pipeline, active: Placement, other: Placement) -> list[ShadowPart]:
     """Role of each task for the shadow, sent through `other`, of a cycle that runs under `active`.
 

@@ -21,7 +21,7 @@ from dwell.control import (
 )
 from dwell.errors import SimulationError
 from dwell.kernels.advance import logged_instants, play
-from dwell.kernels.arrays import Arrays, lay_out, ordered_flows
+from dwell.kernels.arrays import Arrays, flow_rows, lay_out
 from dwell.kernels.codes import BuiltInPolicy, EventKind, Status, Tier, kind_of
 from dwell.kernels.random_draws import draw, draw_shadows
 from dwell.kernels.realisation import NodeChanges, Realisation
@@ -433,8 +433,7 @@ def _evidence(
     problem: Problem, realisation: Realisation, arrays: Arrays
 ) -> Callable[[int, int, int], Evidence]:
     """Return the function that cuts a window's evidence out of the logs."""
-    order = ordered_flows(problem.pipeline)
-    flows = np.array([order.index(flow) for flow in problem.pipeline.flows], np.int64)
+    flows = flow_rows(problem.pipeline)
     shadowed, stamps = len(arrays.tables.cells) > 1, arrays.tables.stamps
 
     def cut(first: int, last: int, close_ns: int) -> Evidence:
