@@ -15,6 +15,7 @@ import polars as pl
 import pytest
 
 import dwell
+from dwell.cost import cost_error
 from dwell.estimators import Corrected, Evidence, Profile, Scaling, Shadow
 from dwell.estimators.online import Online
 from dwell.model import (
@@ -24,6 +25,7 @@ from dwell.model import (
     Flow,
     Link,
     LinkDisturbance,
+    LogNormal,
     Node,
     NodeDisturbance,
     Problem,
@@ -426,6 +428,69 @@ def test_any_cell_gets_estimates_that_a_policy_can_use(seed: int, estimator: str
         assert (l95_ms >= 0).all()
         assert (l95_ms <= problem.censor_ms + 1e-6).all()
         assert ((missed >= 0) & (missed <= 1)).all()
+
+
+# ------------------------------------------------------------------------ how much is played
+
+
+def beside_threads(off_ms: float, min_improvement: float) -> Run:
+    """A run under LOC of one task on R or E, each of one core with a foreign thread."""
+    problem = make_problem(
+        [Node("R", "robot", 1), Node("E", "edge", 1)],
+        [Task("work", on={"R": noisy_ms(10.0), "E": noisy_ms(off_ms)})],
+        candidates={"LOC": {"work": "R"}, "OFF": {"work": "E"}},
+        deadline_ms=25.0,
+        window_cycles=50,
+        scenario=[NodeDisturbance(name, stress_threads=1) for name in ("R", "E")],
+        controller=ControllerSettings(min_improvement=min_improvement),
+    )
+    return run(problem, "LOC", "scaling", windows=15, scenario="disturbed")
+
+
+def noisy_ms(median_ms: float) -> Execution:
+    return Execution(LogNormal(median_ms, 0.3))
+
+
+def errors_of_j(played: Run) -> list[float]:
+    """Standard error of the difference in J, at every close but the first two."""
+    estimates = played.decisions[2:]
+    found = []
+    for row in estimates.iter_rows(named=True):
+        both = [
+            cost_error(
+                (row[f"est_l95_error_ms_{name}"], row[f"est_violation_error_{name}"]),
+                played.problem.objective,
+            )
+            for name in played.problem.candidates
+        ]
+        found.append(math.hypot(*both))
+    return found
+
+
+def test_what_cannot_be_better_is_played_no_more() -> None:
+    errors = errors_of_j(beside_threads(off_ms=30.0, min_improvement=0.03))
+    assert errors[0] > 0.03 / 3
+    assert set(errors) == {errors[0]}
+
+
+def test_what_is_better_by_far_is_played_no_more() -> None:
+    errors = errors_of_j(beside_threads(off_ms=1.0, min_improvement=0.03))
+    assert errors[0] > 0.03 / 3
+    assert set(errors) == {errors[0]}
+
+
+@pytest.mark.parametrize("min_improvement", [0.4, 0.9])
+def test_what_may_be_better_is_played_until_it_is_known(min_improvement: float) -> None:
+    errors = errors_of_j(beside_threads(off_ms=8.5, min_improvement=min_improvement))
+    assert errors[-1] <= min_improvement / 3
+    known = next(i for i, error in enumerate(errors) if error <= min_improvement / 3)
+    assert set(errors[known:]) == {errors[known]}
+
+
+def test_where_any_gain_is_enough_all_is_played_that_ever_is() -> None:
+    errors = errors_of_j(beside_threads(off_ms=9.5, min_improvement=0.0))
+    assert errors[0] > errors[1] > errors[2]
+    assert set(errors[2:]) == {errors[2]}
 
 
 # --------------------------------------------------------------------- moves that are known

@@ -321,6 +321,20 @@ def test_a_price_is_a_fixed_number_in_whatever_order_candidates_are_asked_for(wi
     assert one.cycles == 2 * alone.cycles
 
 
+def test_a_candidate_that_is_played_less_often_goes_on_from_where_it_was() -> None:
+    problem = noisy()
+    playing, whole = Playing(problem), Playing(problem)
+    for one in (playing, whole):
+        one.begin(SLOW)
+    playing.go_on(SLOW, ["LOC"], 5)
+    playing.go_on(SLOW, ["OFF"], 3)
+    playing.go_on(SLOW, ["LOC", "OFF"], 2)
+    whole.go_on(SLOW, ["LOC", "OFF"], 5)
+    assert playing.played("OFF") == whole.played("OFF")
+    whole.go_on(SLOW, ["LOC"], 2)
+    assert playing.played("LOC") == whole.played("LOC")
+
+
 def test_a_copy_begins_anew() -> None:
     playing = Playing(noisy())
     playing.begin(SLOW)

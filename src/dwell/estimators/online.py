@@ -3,8 +3,8 @@
 They keep a *present*: of every part of a cycle the demands, of every node the foreign threads, and
 which nodes are down; all of it as the cell declares it until there is evidence that it is
 otherwise. A candidate that has nothing of what is otherwise is priced as by the profile. The others
-are played by the kernel (see `Playing`): some windows when the present changes, then another one at
-every close, until the price is as sure as it has to be.
+are played by the kernel (see `Playing`): some windows when the present changes, another one when
+more is known of it, and more of those on which a move may depend, until their prices tell.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.cost import cost, cost_error, hamming
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.foreign_threads import ForeignThreads, Stretches
 from dwell.estimators.measured import Message, Meter, Part, groups, parts_of
 from dwell.estimators.presents import PlayedPrice, Playing, Present
-from dwell.estimators.prices import L95_SHARE, RATE, SEED, Price
+from dwell.estimators.prices import SEED, Price
 from dwell.estimators.profile import Foreign, Profile, mean_ms
 from dwell.estimators.spans import patience_ns
 from dwell.model.frozen import FrozenDict
@@ -33,6 +34,10 @@ Floats: TypeAlias = NDArray[np.float64]
 
 #: Steps that are played when the present changes, the first of which settles queues.
 FIRST_STEPS = 4
+#: How often a close goes on with candidates that it is not sure of, and how many steps each time.
+ROUNDS, STEPS = 2, 2
+#: How many standard errors a difference of two prices must be from what would decide otherwise.
+BAND = 2.0
 
 
 class Online(ABC):
@@ -125,8 +130,20 @@ class Online(ABC):
             self._look_at_nodes(evidence, foreign, own, incumbent)
             self._take_in_pending()
         names = self._names
-        if evidence is not None or self._has_changed:
+        if names and (evidence is not None or self._has_changed):
             self._play(names)
+        estimates = self._priced(names, foreign)
+        if evidence is not None:
+            for _ in range(ROUNDS):
+                unsure = self._unsure(names, estimates, incumbent)
+                if not unsure:
+                    break
+                self._playing.go_on(self._playing.present, unsure, STEPS)
+                estimates = self._priced(names, foreign)
+        return estimates
+
+    def _priced(self, names: list[str], foreign: Foreign) -> dict[str, QoS]:
+        """Every candidate's metrics; of those that are played by what they have come to."""
         played = {name: self._playing.played(name) for name in names}
         prices, work = self._playing.prices, []
         for name in prices:
@@ -147,6 +164,38 @@ class Online(ABC):
             l95_ms, rate, uncut_ms = price.l95_ms, price.violation_rate, price.uncut_l95_ms
             estimates[name] = QoS(l95_ms, rate, shares[name], uncut_ms, error)
         return estimates
+
+    def _unsure(self, names: list[str], estimates: Mapping[str, QoS], incumbent: str) -> list[str]:
+        """Of candidates that are played, those that more has to be played of.
+
+        They are those that may be better than the incumbent, but not surely by more than a move is
+        asked for, where the sampling error of the difference in J is more than a third of that; and
+        the incumbent itself beside them.
+        """
+        problem, least = self.problem, self.problem.controller.min_improvement
+        objective, here = problem.objective, problem.candidates[incumbent]
+        errors = {name: self._sampled(name) for name in names}
+        price = cost(estimates[incumbent], here, here, objective)
+        unsure = set()
+        for name, there in problem.candidates.items():
+            error = math.hypot(errors.get(name, 0.0), errors.get(incumbent, 0.0))
+            if name == incumbent or error <= least / 3:
+                continue
+            gain = price - cost(estimates[name], here, here, objective)
+            asked = least + objective.weights.switching * hamming(there, here)
+            if -BAND * error < gain < asked + BAND * error:
+                unsure |= {name, incumbent}
+        return [
+            name
+            for name in names
+            if name in unsure and errors[name] and not self._playing.is_full(name)
+        ]
+
+    def _sampled(self, name: str) -> float:
+        """Standard error of a candidate's J by how few cycles have been played."""
+        played = self._playing.played(name)
+        error = (played.l95_error_ms, played.violation_error)
+        return cost_error(error, self.problem.objective)
 
     def _look_at_nodes(
         self, evidence: Evidence, seen: Foreign, own: Mapping[str, float], incumbent: str
@@ -213,21 +262,13 @@ class Online(ABC):
 
     def _play(self, names: list[str]) -> None:
         """Play the candidates that are not as declared, anew where the present has changed."""
-        if names:
-            present = self.present
-            if self._has_changed:
-                self._playing.begin(present)
-                self._playing.go_on(present, names, FIRST_STEPS)
-            elif self._has_grown or not all(map(self._is_sure, names)):
-                self._playing.go_on(present, names, has_grown=self._has_grown)
+        present = self.present
+        if self._has_changed:
+            self._playing.begin(present)
+            self._playing.go_on(present, names, FIRST_STEPS)
+        elif self._has_grown:
+            self._playing.go_on(present, names, has_grown=True)
         self._has_changed = self._has_grown = False
-
-    def _is_sure(self, name: str) -> bool:
-        played = self._playing.played(name)
-        if self._playing.is_full(name):
-            return True
-        sure_ms = L95_SHARE * played.l95_ms
-        return played.l95_error_ms <= sure_ms and played.violation_error <= RATE
 
     def _sent_under(self, name: str) -> Mapping[str, float]:
         """Share of each resource that shadow jobs take while the cell is on a candidate."""

@@ -103,6 +103,8 @@ class _Twin:
     def __init__(self, first: Arrays, index: int, shadows: SentShadows | None) -> None:
         self.arrays = first.copy()
         self.arrays.replace(stamps=stamps_of(first, index, shadows))
+        #: The cycle that it goes on from.
+        self.cursor = 0
         self.steps: deque[_Step] = deque(maxlen=KEPT)
         self.price: PlayedPrice | None = None
 
@@ -170,7 +172,7 @@ class Playing:
         if not self._twins:
             self._lay_out()
         self.present = present
-        self._cursor = self._offset = 0
+        self._offset = 0
         self._restore()
         changes = self._changes(present)
         self._first.replace(changes=changes)
@@ -178,8 +180,7 @@ class Playing:
         for twin in self._twins.values():
             twin.steps.clear()
             twin.arrays.replace(changes=changes)
-            twin.arrays.restart(self._first)
-        self._fill(0)
+        self._restart()
 
     def go_on(
         self, present: Present, names: Collection[str], steps: int = 1, *, has_grown: bool = False
@@ -194,24 +195,28 @@ class Playing:
         self.present = present
         if has_grown:
             self._fill_links(present)
-            self._fill(self._cursor)
+            self._fill(max(twin.cursor for twin in self._twins.values()))
             for name in names:
                 while len(self._twins[name].steps) >= RECENT:
                     self._twins[name].steps.popleft()
         for _ in range(steps):
-            if self._cursor + self._step * self._window > self._real.cycles:
-                for twin in self._twins.values():
-                    twin.arrays.restart(self._first)
-                self._cursor = 0
+            last = max(self._twins[name].cursor for name in names)
+            if last + self._step * self._window > self._real.cycles:
                 self._offset += self._real.cycles
-                self._fill(0)
+                self._restart()
             for name in names:
                 self._play(self._twins[name], name)
-            self._cursor += self._step * self._window
+
+    def _restart(self) -> None:
+        for twin in self._twins.values():
+            twin.arrays.restart(self._first)
+            twin.cursor = 0
+        self._fill(0)
 
     def _play(self, twin: _Twin, name: str) -> None:
-        first = self._cursor // self._window
+        first = twin.cursor // self._window
         last = first + self._step
+        twin.cursor += self._step * self._window
         for _ in range(self._step):
             play(twin.arrays)
         first = max(first, 1)  # in the first window queues have not settled
