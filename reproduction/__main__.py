@@ -12,6 +12,7 @@ from pathlib import Path
 import dwell
 from dwell.report import study_html
 from dwell.study import Study, StudyResult, open_study, run_study
+from reproduction.answers import found, page_of, write
 from reproduction.cell import paper_cell
 from reproduction.page import Question, page
 from reproduction.questions import QUESTIONS, Run
@@ -47,7 +48,15 @@ def main(words: list[str]) -> int:
     names = asked.only or [name for name in QUESTIONS if name != REAL or asked.real]
     try:
         done = [_ask(name, scale, run, asked.real, out) for name in names]
-        text = page(done, scale=asked.scale, version=dwell.__version__, pictures=drawn)
+        answers = found({one.name: one.answer.verdicts for one in done})
+        write(answers, out / "answers")
+        text = page(
+            done,
+            answers=page_of(answers),
+            scale=asked.scale,
+            version=dwell.__version__,
+            pictures=drawn,
+        )
         (out / "report.html").write_text(text, encoding="utf-8")
     except (dwell.DwellError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)

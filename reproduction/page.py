@@ -35,9 +35,22 @@ class Question(NamedTuple):
 
 
 def page(
-    questions: list[Question], *, scale: str, version: str, pictures: Sequence[str] = ()
+    questions: list[Question],
+    *,
+    answers: str,
+    scale: str,
+    version: str,
+    pictures: Sequence[str] = (),
 ) -> str:
-    """Return the page; `pictures` are studies that have figures, ``runs/STUDY/report.html``."""
+    """Return the page.
+
+    Parameters
+    ----------
+    answers : str
+        What it begins with, as HTML.
+    pictures : sequence of str
+        Studies that have figures, ``runs/STUDY/report.html``.
+    """
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -57,7 +70,12 @@ def page(
     once = {"sign": UNTOLD, "words": untold(words), "of": len(words)}
     template = environment.get_template("page.html")
     return template.render(
-        questions=shown, scale=scale, version=version, pictures=pictures, untold=once
+        answers=answers,
+        questions=shown,
+        scale=scale,
+        version=version,
+        pictures=pictures,
+        untold=once,
     )
 
 
