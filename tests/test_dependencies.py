@@ -25,8 +25,6 @@ DISTRIBUTIONS = packages_distributions()
 
 #: Tools that are run, not imported.
 NOT_IMPORTED = {"ipykernel", "pytest-xdist"}
-#: Parts of others, which pin them.
-PARTS = {"pydantic-core"}
 #: What imports by name; its first argument is a module.
 BY_NAME = {"import_module", "importorskip"}
 
@@ -40,7 +38,7 @@ def imported(*folders: str) -> set[str]:
         for name in modules(ast.parse(path.read_text(encoding="utf-8")))
     }
     others = names - sys.stdlib_module_names - {"dwell", "tests", "benchmarks", "examples"}
-    return {plain(found) for name in others for found in DISTRIBUTIONS.get(name, [])} - PARTS
+    return {plain(found) for name in others for found in DISTRIBUTIONS.get(name, [])}
 
 
 def modules(tree: ast.AST) -> Iterator[str]:

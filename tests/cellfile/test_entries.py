@@ -357,7 +357,7 @@ VALUES: list[tuple[tuple[str | int, ...], object, str, tuple[str, ...]]] = [
     (("controller", "order_delay_ms"), 1e10, "controller.order_delay_ms", ("10000000000", "1e9")),
     (("controller", "order_lead_cycles"), 0.5, "controller.order_lead_cycles", ("0.5", "whole")),
     (("controller", "close_grace_ms"), math.nan, "controller.close_grace_ms", ("NaN", "from 0")),
-    (("servo",), [], "servo", ("a list", "a mapping of plant, gain, damping, target")),
+    (("servo",), [], "servo", ("a list", "a mapping of plant, gain, target, damping")),
     (("servo",), {"gain": 1, "target": TARGET}, "servo.plant", ("missing",)),
     (("servo",), {"plant": "integrator", "gain": 1}, "servo.target", ("missing",)),
     (("servo", "plant"), "integrater", "servo.plant", ("integrater", "'integrator'?")),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import get_args
 
 from hypothesis import strategies as st
 
@@ -42,8 +43,7 @@ from dwell.model import (
 )
 from dwell.model.fabric import Scheduler, accelerator_tiers
 from dwell.model.objective import TIERS
-from dwell.model.problem import MIGRATIONS
-from dwell.model.servo import PLANTS
+from dwell.model.servo import Plant
 from dwell.policies.registry import REGISTRY as POLICIES
 
 # Names that YAML 1.1, numbers or paths might trip over.
@@ -243,7 +243,7 @@ def _controller(draw: st.DrawFn, nodes: list[str], candidates: list[str]) -> Con
         estimator=draw(st.sampled_from(list(ESTIMATORS))),
         shadow_fraction=draw(_reals(0, most)),
         half_life_windows=draw(_reals(0, 1e6, exclude_min=True)),
-        migration=draw(st.sampled_from(MIGRATIONS)),
+        migration=draw(st.sampled_from(("warm", "cold"))),
         guard_cycles=draw(_whole(2, 1_000_000)),
         probe_cycles=draw(_whole(1, 1_000_000)),
         fallbacks=tuple(draw(st.lists(some, max_size=2))),
@@ -255,7 +255,7 @@ def _controller(draw: st.DrawFn, nodes: list[str], candidates: list[str]) -> Con
 
 @st.composite
 def _servo(draw: st.DrawFn, period_ms: float) -> Servo:
-    plant = draw(st.sampled_from(PLANTS))
+    plant = draw(st.sampled_from(get_args(Plant)))
     damping = draw(_reals(1e-9, 1e6)) if plant == "double-integrator" else 0.0
     period_s = draw(_reals(max(2 * period_ms / 1e3, 1e-5), 1e9))
     return Servo(

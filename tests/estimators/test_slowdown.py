@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from dwell.estimators.slowdown import slowdown
 from dwell.model import Node
-from dwell.model.fabric import SCHEDULERS
+from dwell.model.fabric import Scheduler
 
 nodes = st.builds(
-    Node, st.just("E"), st.just("edge"), st.integers(1, 64), st.sampled_from(SCHEDULERS)
+    Node, st.just("E"), st.just("edge"), st.integers(1, 64), st.sampled_from(get_args(Scheduler))
 )
 
 

@@ -2,45 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar, cast
 
+from dwell.cellfile.cell_form import LINK_KEYS, NODE_KEYS, OBJECTIVE, STAND_IN, TRACE
 from dwell.cellfile.document_faults import Faults
-from dwell.cellfile.entries import (
-    BurstsEntry,
-    CellEntry,
-    ControllerEntry,
-    DisturbanceEntry,
-    Entry,
-    EpisodesEntry,
-    HostEntry,
-    LinkEntry,
-    LiveEntry,
-    NodeEntry,
-    ObjectiveEntry,
-    ProcessEntry,
-    ServoEntry,
-    TaskEntry,
-)
+from dwell.cellfile.forms import Entry
 from dwell.cellfile.traces import Source, Tables
 from dwell.estimators import registry as estimators
 from dwell.model import (
-    Bursts,
     Caps,
-    Constant,
     ControllerSettings,
     Disturbance,
-    Endpoint,
-    Episodes,
     Execution,
     Fabric,
     Flow,
-    Host,
     Link,
     LinkDisturbance,
     LiveSettings,
-    MovingTarget,
     Node,
     NodeDisturbance,
     Objective,
@@ -48,7 +28,6 @@ from dwell.model import (
     Placement,
     Problem,
     Process,
-    Quota,
     Servo,
     Targets,
     Task,
@@ -58,16 +37,17 @@ from dwell.model import (
 from dwell.model.bounds import require
 from dwell.model.fabric import accelerator_tiers
 from dwell.model.frozen import FrozenDict
+from dwell.model.keys import within
 from dwell.model.process import DRAWN, UnreadTrace
 from dwell.model.semantics import CellParts, find_faults
 from dwell.policies import registry as policies
 
-# Keys of a disturbance that belong to one kind of it.
-NODE_KEYS = ("stress_threads",)
-LINK_KEYS = ("both_ways", "add_delay_ms", "loss", "rate_mbps")
+T = TypeVar("T")
 
-# Stands for a process at fault; it passes every check of meaning.
-STAND_IN = Constant(1.0)
+#: Keys of the whole cell that a Problem has by their names.
+WINDOWS = ("window_cycles", "warmup_windows")
+#: Classes that a process at fault is of.
+PROCESSES = frozenset(DRAWN.values())
 
 
 @dataclass(slots=True)
@@ -76,8 +56,8 @@ class Assembly:
 
     Parameters
     ----------
-    entry : CellEntry
-        Less what is at fault.
+    entry : Entry
+        Of a cell, less what is at fault.
     tables : dict of Source to TraceTable, optional
         Less the sources at fault; where None, traces are named and not read.
     faults : Faults
@@ -91,7 +71,7 @@ class Assembly:
         `Problem.folder`.
     """
 
-    entry: CellEntry
+    entry: Entry
     tables: Tables | None
     faults: Faults
     anchored: bool = False
@@ -119,16 +99,16 @@ class Assembly:
     def _problem(self, name: str) -> Problem | None:
         """Return the problem, or None beside at least one fault."""
         entry = self.entry
-        nodes = {name: self._node(name, node) for name, node in entry.nodes.items()}
+        nodes = {name: self._made(node, name) for name, node in entry.nodes.items()}
         tasks = {name: self._task(name, task) for name, task in entry.tasks.items()}
         links, flows = list(self._links()), list(self._flows())
         timing = self._timing()
-        objective = self._objective(entry.objective or ObjectiveEntry(), nodes)
-        controller = self._controller(entry.controller or ControllerEntry())
-        servo = self._servo(entry.servo)
-        live = self._live(entry.live or LiveEntry())
+        objective = self._objective(nodes)
+        controller = self._section("controller", ControllerSettings)
+        servo = self._servo()
+        live = self._section("live", LiveSettings)
         scenarios = {
-            name: list(self._disturbances(name, items or ()))
+            name: list(self._disturbances(items or ()))
             for name, items in (entry.scenarios or {}).items()
         }
         candidates = {name: moves for name, moves in entry.candidates.items() if moves is not None}
@@ -183,189 +163,149 @@ class Assembly:
             servo=servo,
             live=live,
             folder=self.home,
-            **_present(window_cycles=entry.window_cycles, warmup_windows=entry.warmup_windows),
+            **{name: entry.values[name] for name in WINDOWS if name in entry.values},
         )
 
-    # ------------------------------------------------------------- arguments and processes
+    # ------------------------------------------------------------------ entries and values
 
-    def _given(self, path: str, entry: Entry | None, *but: str, **made: object) -> dict[str, Any]:
-        """Return the arguments that an entry gives, processes made of theirs, and what is `made`.
+    def _made(self, entry: Entry | None, *first: object, **further: object) -> Any:
+        """Return the object of the model that an entry is of, or None beside a fault.
 
-        The model knows the defaults of what is absent.
-
-        Parameters
-        ----------
-        but : str
-            Fields of the entry that are no arguments.
+        The model knows the defaults of what is absent; `further` takes the place of what is given.
         """
-        values: dict[str, object] = {}
-        for name in type(entry).model_fields if entry is not None else ():
-            if name not in but and name not in made:
-                value = getattr(entry, name)
-                process = isinstance(value, ProcessEntry)
-                values[name] = self._process(value, f"{path}.{name}") if process else value
-        return _present(**values, **made)
-
-    def _process(self, entry: ProcessEntry, path: str) -> Process:
-        if entry.constant is not None:
-            return Constant(entry.constant)
-        if entry.trace is not None:
-            if self.tables is None:
-                return UnreadTrace(FrozenDict(entry.trace.model_dump(exclude_none=True)))
-            table = self.tables.get(Source.of(entry.trace))
-            return Trace(table, entry.trace.column) if table is not None else STAND_IN
-        for name, kind in DRAWN.items():
-            values: Entry | None = getattr(entry, name)
-            if values is not None:
-                return self.faults.attempt(path, kind, **self._given(path, values)) or STAND_IN
-        return STAND_IN
-
-    # ---------------------------------------------------------------------------- fabric
-
-    def _bursts(self, path: str, entry: BurstsEntry | None) -> Bursts | None:
         if entry is None:
             return None
-        return self.faults.attempt(path, Bursts, **self._given(path, entry))
+        return self._make(entry, entry.shape.kind, *first, **{**entry.values, **further})
 
-    def _node(self, name: str, entry: NodeEntry | None) -> Node | None:
-        if entry is None:
-            return None
-        path = f"nodes.{name}"
-        bursts = self._bursts(f"{path}.bursts", entry.bursts)
-        quota = entry.quota and self.faults.attempt(path, Quota, **self._given(path, entry.quota))
-        given = self._given(path, entry, bursts=bursts, quota=quota)
-        return self.faults.attempt(path, Node, name, **given)
+    def _make(
+        self, entry: Entry, kind: Callable[..., T], *first: object, **values: object
+    ) -> T | None:
+        given = {name: self._value(value) for name, value in values.items()}
+        given = {name: value for name, value in given.items() if value is not None}
+        return self.faults.attempt(_around(entry), kind, *first, **given)
+
+    def _value(self, value: object) -> Any:
+        """Return what a value that was read is in the model."""
+        if isinstance(value, Entry):
+            if value.shape is TRACE:
+                return self._trace(value)
+            made = self._made(value)
+            return STAND_IN if made is None and value.shape.kind in PROCESSES else made
+        if isinstance(value, dict):
+            return {name: self._value(item) for name, item in value.items()}
+        return value
+
+    def _trace(self, entry: Entry) -> Process:
+        if self.tables is None:
+            return UnreadTrace(FrozenDict(entry.values))
+        table = self.tables.get(Source.of(entry))
+        return Trace(table, entry.column) if table is not None else STAND_IN
+
+    def _section(self, name: str, kind: Any) -> Any:
+        entry = self.entry.values.get(name)
+        return kind() if entry is None else self._made(entry)
+
+    # ----------------------------------------------------------------- fabric and pipeline
 
     def _links(self) -> Iterator[tuple[str, Link]]:
-        for index, entry in enumerate(self.entry.links or ()):
-            path = f"links[{index}]"
-            link = self._link(path, entry) if entry is not None else None
-            if entry is not None and link is not None:
-                yield path, link
+        for entry in self.entry.links or ():
+            further = entry and {"both_ways": None}
+            link = self._made(entry, **further) if entry is not None else None
+            if link is not None:
+                yield entry.path, link
                 if entry.both_ways:
-                    yield path, replace(link, source=link.target, target=link.source)
+                    yield entry.path, replace(link, source=link.target, target=link.source)
 
-    def _link(self, path: str, entry: LinkEntry) -> Link | None:
-        retransmit_ms = entry.on_loss.retransmit_ms if entry.on_loss else None
-        bursts = self._bursts(f"{path}.bursts", entry.bursts)
-        given = self._given(
-            path, entry, "both_ways", "on_loss", retransmit_ms=retransmit_ms, bursts=bursts
-        )
-        return self.faults.attempt(path, Link, **given)
-
-    # -------------------------------------------------------------------------- pipeline
-
-    def _task(self, name: str, entry: TaskEntry | None) -> Task | None:
+    def _task(self, name: str, entry: Entry | None) -> Task | None:
         if entry is None:
             return None
-        path = f"tasks.{name}"
-        on = {node: self._execution(f"{path}.on.{node}", entry, node) for node in entry.on}
-        depth = entry.input.depth if entry.input else None
-        given = self._given(path, entry, "input", "workers", on=on, depth=depth)
-        return self.faults.attempt(path, Task, name, **given)
+        on = {node: self._execution(entry, execution) for node, execution in entry.on.items()}
+        return cast(Task | None, self._made(entry, name, on=on, workers=None))
 
-    def _execution(self, path: str, task: TaskEntry, node: str) -> Execution:
-        entry = task.on[node]
+    def _execution(self, task: Entry, entry: Entry | None) -> Execution:
         if entry is None:  # at fault; the task may run there all the same
             return Execution(STAND_IN)
         workers = entry.workers if entry.workers is not None else task.workers
-        return Execution(**self._given(path, entry, workers=workers))
+        return self._made(entry, workers=workers) or Execution(STAND_IN)
 
     def _flows(self) -> Iterator[tuple[str, Flow]]:
-        for index, entry in enumerate(self.entry.flows or ()):
-            if entry is not None:
-                path = f"flows[{index}]"
-                yield path, Flow(**self._given(path, entry))
+        for entry in self.entry.flows or ():
+            if entry is not None and (flow := self._made(entry)) is not None:
+                yield entry.path, flow
 
     def _timing(self) -> Pipeline | None:
         """Return the pipeline without its tasks and flows."""
         entry = self.entry
-        period_ms, deadline_ms = entry.period_ms, entry.deadline_ms
-        jitter = entry.release_jitter_ms
-        jitter_ms = self._process(jitter, "release_jitter_ms") if jitter is not None else None
         scales = {
-            name: self._process(scale, f"scales.{name}") if scale is not None else STAND_IN
+            name: STAND_IN if scale is None else scale
             for name, scale in (entry.scales or {}).items()
         }
-        return self.faults.attempt(
-            "",
+        deadline_ms = entry.period_ms if entry.deadline_ms is None else entry.deadline_ms
+        return self._make(
+            entry,
             Pipeline,
             tasks={},
             flows=(),
-            period_ms=period_ms,
-            deadline_ms=period_ms if deadline_ms is None else deadline_ms,
+            period_ms=entry.period_ms,
+            deadline_ms=deadline_ms,
             scales=scales,
-            **_present(release_jitter_ms=jitter_ms),
+            release_jitter_ms=entry.release_jitter_ms,
         )
 
     # --------------------------------------------------- scenarios, objective, controller
 
-    def _disturbances(
-        self, scenario: str, entries: Sequence[DisturbanceEntry | None]
-    ) -> Iterator[tuple[str, Disturbance]]:
-        for index, entry in enumerate(entries):
+    def _disturbances(self, entries: Sequence[Entry | None]) -> Iterator[tuple[str, Disturbance]]:
+        for entry in entries:
             if entry is None:
                 continue
-            path = f"scenarios.{scenario}[{index}]"
             if (entry.node is None) == (entry.link is None):
-                if not self.faults.touches(path):
+                if not self.faults.touches(entry.path):
                     has = "neither" if entry.node is None else "both"
-                    self.faults.add(path, f"needs `node` or `link` and has {has}; give one of them")
+                    message = f"needs `node` or `link` and has {has}; give one of them"
+                    self.faults.add(entry.path, message)
                 continue
-            self._only(path, entry, LINK_KEYS if entry.link is None else NODE_KEYS)
-            first = self.faults.attempt(path, self._disturbance, path, entry)
+            self._only(entry, LINK_KEYS if entry.link is None else NODE_KEYS)
+            first = self.faults.attempt(entry.path, self._disturbance, entry)
             if first is None:
                 continue
-            yield path, first
+            yield entry.path, first
             if isinstance(first, LinkDisturbance) and entry.both_ways:
-                yield path, replace(first, source=first.target, target=first.source)
+                yield entry.path, replace(first, source=first.target, target=first.source)
 
-    def _only(self, path: str, entry: DisturbanceEntry, others: Sequence[str]) -> None:
+    def _only(self, entry: Entry, others: Sequence[str]) -> None:
         what = "links" if entry.link is None else "nodes"
         for key in others:
-            if getattr(entry, key) is not None:
-                self.faults.add(f"{path}.{key}", f"belongs to a disturbance of {what}; remove it")
+            if entry.values.get(key) is not None:
+                path = f"{entry.path}.{key}"
+                self.faults.add(path, f"belongs to a disturbance of {what}; remove it")
 
-    def _episodes(self, entry: EpisodesEntry | None, path: str) -> Episodes | None:
+    def _disturbance(self, entry: Entry) -> Disturbance | None:
         # What is at fault must not be said to differ from what shares its name, too.
-        if entry is None or self.faults.touches(path):
-            return None
-        return Episodes(**self._given(path, entry))
-
-    def _disturbance(self, path: str, entry: DisturbanceEntry) -> Disturbance:
+        doubtful = entry.episodes is not None and self.faults.touches(entry.episodes.path)
+        given: dict[str, object] = {"episodes": None} if doubtful else {}
+        others = (*LINK_KEYS, "link") if entry.link is None else ("both_ways", *NODE_KEYS, "link")
+        values = {**entry.values, **dict.fromkeys(others), **given}
         if entry.link is None:
-            episodes = self._episodes(entry.episodes, f"{path}.episodes")
-            return NodeDisturbance(**self._given(path, entry, *LINK_KEYS, episodes=episodes))
+            return self._make(entry, NodeDisturbance, **values)
         source, arrow, target = entry.link.partition("->")
         good = bool(arrow and source.strip() and target.strip())
         require(good, "link", entry.link, "two node names and an arrow, as `R1->E`")
-        given = self._given(
-            path,
-            entry,
-            *("link", "both_ways", *NODE_KEYS),
-            source=source.strip(),
-            target=target.strip(),
-            episodes=self._episodes(entry.episodes, f"{path}.episodes"),
-        )
-        return LinkDisturbance(**given)
+        ends = {"source": source.strip(), "target": target.strip()}
+        return self._make(entry, LinkDisturbance, **values, **ends)
 
-    def _objective(
-        self, entry: ObjectiveEntry, nodes: Mapping[str, Node | None]
-    ) -> Objective | None:
+    def _objective(self, nodes: Mapping[str, Node | None]) -> Objective | None:
+        entry = self.entry.objective or Entry(OBJECTIVE, "objective", {})
         deadline_ms = self.entry.deadline_ms or self.entry.period_ms
         tiers = entry.tiers
         if tiers is None:
             tiers = {name: node.tier for name, node in nodes.items() if node is not None}
-        values = {"latency_ms": deadline_ms, **self._given("objective", entry.targets)}
-        weights = self.faults.attempt(
-            "objective", Weights, **self._given("objective", entry.weights)
-        )
-        targets = self.faults.attempt("objective", Targets, **values)
-        caps = self.faults.attempt("objective", Caps, **self._given("objective", entry.caps))
+        given = entry.targets.values if entry.targets is not None else {}
+        targets = self._make(entry, Targets, **{"latency_ms": deadline_ms, **given})
+        weights, caps = self._made(entry.weights), self._made(entry.caps)
         if targets is None:
             return None
-        return self.faults.attempt(
-            "objective",
+        return self._make(
+            entry,
             Objective,
             weights=weights or Weights(),
             targets=targets,
@@ -374,30 +314,11 @@ class Assembly:
             accelerators=accelerator_tiers(nodes, tiers) if entry.accelerators else {},
         )
 
-    def _controller(self, entry: ControllerEntry) -> ControllerSettings | None:
-        given = self._given("controller", entry)
-        return self.faults.attempt("controller", ControllerSettings, **given)
-
-    def _servo(self, entry: ServoEntry | None) -> Servo | None:
-        if entry is None:
-            return None
-        target = MovingTarget(**self._given("servo.target", entry.target))
-        given = self._given("servo", entry, target=target)
-        servo = self.faults.attempt("servo", Servo, **given)
+    def _servo(self) -> Servo | None:
+        servo: Servo | None = self._made(self.entry.servo)
         if servo is not None and not self.faults.at("period_ms"):
             self.faults.attempt("", servo.require_seen, self.entry.period_ms)
         return servo
-
-    def _live(self, entry: LiveEntry) -> LiveSettings | None:
-        hosts = {name: self._host(host) for name, host in (entry.hosts or {}).items()}
-        return self.faults.attempt("", LiveSettings, **self._given("live", entry, hosts=hosts))
-
-    def _host(self, entry: HostEntry) -> Host:
-        seen_from = {
-            node: Endpoint(**self._given("", seen))
-            for node, seen in (entry.seen_from or {}).items()
-        }
-        return Host(**self._given("", entry, seen_from=seen_from))
 
     # --------------------------------------------------------------------------- meaning
 
@@ -472,6 +393,8 @@ def _complete(moves: Mapping[str, str], tasks: Mapping[str, Task]) -> Placement:
     return Placement((name, moves.get(name) or next(iter(task.on))) for name, task in tasks.items())
 
 
-def _present(**values: object) -> dict[str, Any]:
-    """Leave out what is absent."""
-    return {name: value for name, value in values.items() if value is not None}
+def _around(entry: Entry) -> str:
+    """Return the path that the faults of an entry's class are beneath: some name its key, too."""
+    if within(entry.shape.kind):
+        return entry.path.rpartition(".")[0]
+    return entry.path

@@ -177,15 +177,15 @@ def read_problem(
         With every fault found.
     """
     from dwell.cellfile.assembly import Assembly
-    from dwell.cellfile.document_faults import dotted
-    from dwell.cellfile.structure import CELL, read_structure
+    from dwell.cellfile.cell_form import CELL
+    from dwell.cellfile.structure import read_structure
     from dwell.cellfile.traces import declared_traces, read_traces
 
     entry = read_structure(document, faults, CELL)
     tables: Tables | None = None
     if folder is not None:
         known = {} if known is None else known
-        declared = tuple((dotted(steps), trace) for steps, trace in declared_traces(entry, ()))
+        declared = tuple((path, *trace.values.items()) for path, trace in declared_traces(entry))
         if declared not in known:
             known[declared] = read_traces(entry, folder, faults)
         tables = known[declared]

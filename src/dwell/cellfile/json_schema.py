@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from pydantic_core.core_schema import NullableSchema
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 
 def schema() -> dict[str, Any]:
@@ -19,30 +18,9 @@ def schema() -> dict[str, Any]:
     dict
         Ready for `json.dumps`.
     """
-    from pydantic.json_schema import GenerateJsonSchema
+    from dwell.cellfile.cell_form import CELL
 
-    from dwell.cellfile.entries import CellEntry
-
-    class Generator(GenerateJsonSchema):
-        """Optional parts are left out of a file, never null."""
-
-        def nullable_schema(self, schema: NullableSchema) -> dict[str, Any]:
-            return self.generate_inner(schema["schema"])
-
-    result = CellEntry.model_json_schema(by_alias=True, schema_generator=Generator)
-    head = {"$schema": GenerateJsonSchema.schema_dialect, "title": "Dwell cell"}
-    return {**head, **{key: value for key, value in _pruned(result).items() if key != "title"}}
-
-
-def _pruned(value: Any) -> Any:
-    """Leave out what says nothing to a reader: made-up titles, and defaults of null."""
-    if isinstance(value, list):
-        return [_pruned(item) for item in value]
-    if not isinstance(value, dict):
-        return value
-    return {
-        key: _pruned(item)
-        for key, item in value.items()
-        # A property may have these names; what describes it is then a mapping.
-        if not (key == "title" and isinstance(item, str)) and (key, item) != ("default", None)
-    }
+    definitions: dict[str, Any] = {}
+    cell = CELL.shape.definition(definitions)
+    head = {"$schema": DIALECT, "title": "Dwell cell"}
+    return {**head, **cell, "$defs": dict(sorted(definitions.items()))}

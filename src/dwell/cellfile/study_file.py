@@ -27,7 +27,7 @@ from dwell.model.user_classes import is_class_path
 from dwell.policies.registry import names as policy_names
 
 if TYPE_CHECKING:
-    from dwell.cellfile.study_entries import StudyEntry
+    from dwell.cellfile.forms import Entry
 
 WINDOWS = 300
 SEEDS = tuple(range(1, 21))
@@ -86,7 +86,7 @@ def read_study(path: str | PathLike[str], *, references: Collection[str] = ()) -
         at ``cell``.
     """
     from dwell.cellfile.structure import read_structure
-    from dwell.cellfile.study_entries import STUDY
+    from dwell.cellfile.study_form import STUDY
     from dwell.cellfile.yaml_text import read_yaml
 
     source = fspath(path)
@@ -107,7 +107,7 @@ def read_study(path: str | PathLike[str], *, references: Collection[str] = ()) -
 class _Reading:
     """One study file on its way from its entry to what it declares."""
 
-    entry: StudyEntry
+    entry: Entry
     path: Path
     faults: Faults
     reserved: Collection[str]

@@ -129,7 +129,8 @@ def with_settings(problem: Problem, settings: Mapping[str, object]) -> Problem:
         With every fault found; a path that begins with something else is one.
     """
     from dwell.cellfile.assembly import Assembly
-    from dwell.cellfile.structure import CELL, read_structure
+    from dwell.cellfile.cell_form import CELL
+    from dwell.cellfile.structure import read_structure
 
     faults = Faults()
     document = to_document(problem)

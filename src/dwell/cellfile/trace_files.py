@@ -21,7 +21,7 @@ from dwell.cellfile.columns import (
     read_columns,
 )
 from dwell.cellfile.document_faults import Faults
-from dwell.cellfile.entries import TraceEntry
+from dwell.cellfile.forms import Entry
 from dwell.cellfile.traces import Source
 from dwell.errors import TraceError
 from dwell.model import Trace, TraceTable
@@ -46,7 +46,7 @@ class Reading:
 
     Parameters
     ----------
-    uses : sequence of (str, TraceEntry)
+    uses : sequence of (str, Entry)
         The declarations that share it, with their places in the cell file.
     folder : Path
         Where relative file names start.
@@ -55,7 +55,7 @@ class Reading:
     """
 
     source: Source
-    uses: Sequence[tuple[str, TraceEntry]]
+    uses: Sequence[tuple[str, Entry]]
     folder: Path
     faults: Faults
     failed: bool = field(default=False, init=False)

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
 
-from dwell.cellfile.document_faults import Faults, Step, dotted
-from dwell.cellfile.entries import CellEntry, Entry, TraceEntry
+from dwell.cellfile.cell_form import TRACE
+from dwell.cellfile.document_faults import Faults
+from dwell.cellfile.forms import Entry, entries_of
 from dwell.model import TraceTable
 
 DEFAULT_TIME = "sent_ms"
@@ -30,11 +31,11 @@ class Source:
     wrap: bool
 
     @classmethod
-    def of(cls, entry: TraceEntry) -> Source:
+    def of(cls, entry: Entry) -> Source:
         """Return the source that a declaration names, defaults filled in."""
-        by = entry.by or "row"
+        by: Literal["row", "time"] = entry.by or "row"
         time = entry.time or DEFAULT_TIME if by == "time" else None
-        on_negative = entry.on_negative or "error"
+        on_negative: Literal["error", "drop", "clip"] = entry.on_negative or "error"
         return cls(entry.file, by, entry.group, time, on_negative, bool(entry.wrap))
 
     @property
@@ -48,7 +49,7 @@ class Source:
 Tables: TypeAlias = dict[Source, TraceTable]
 
 
-def read_traces(entry: CellEntry, folder: Path, faults: Faults) -> Tables:
+def read_traces(entry: Entry, folder: Path, faults: Faults) -> Tables:
     """Read every trace that a cell names.
 
     Parameters
@@ -63,10 +64,10 @@ def read_traces(entry: CellEntry, folder: Path, faults: Faults) -> Tables:
     dict of Source to TraceTable
         Less the sources at fault.
     """
-    uses: dict[Source, list[tuple[str, TraceEntry]]] = {}
+    uses: dict[Source, list[tuple[str, Entry]]] = {}
     doubtful: set[Source] = set()
-    for steps, trace in declared_traces(entry, ()):
-        path, source = dotted(steps), Source.of(trace)
+    for path, trace in declared_traces(entry):
+        source = Source.of(trace)
         uses.setdefault(source, []).append((path, trace))
         if faults.touches(path):
             doubtful.add(source)
@@ -88,18 +89,8 @@ def read_traces(entry: CellEntry, folder: Path, faults: Faults) -> Tables:
     return tables
 
 
-def declared_traces(
-    value: object, steps: tuple[Step, ...]
-) -> Iterator[tuple[tuple[Step, ...], TraceEntry]]:
+def declared_traces(entry: Entry) -> Iterator[tuple[str, Entry]]:
     """Yield every trace declared in an entry, with its place in the file."""
-    if isinstance(value, TraceEntry):
-        yield steps, value
-    elif isinstance(value, Entry):
-        for name, info in type(value).model_fields.items():
-            yield from declared_traces(getattr(value, name), (*steps, info.alias or name))
-    elif isinstance(value, dict):
-        for key, item in value.items():
-            yield from declared_traces(item, (*steps, key))
-    elif isinstance(value, list):
-        for index, item in enumerate(value):
-            yield from declared_traces(item, (*steps, index))
+    for one in entries_of(entry):
+        if one.shape is TRACE:
+            yield one.path, one

@@ -18,7 +18,7 @@ from dwell.errors import Fault, MetricError, PolicyError, ProblemError
 from dwell.estimators import Estimator, Evidence, Learner, Support
 from dwell.estimators import by_name as estimator_by_name
 from dwell.model import Caps, Decision, FrozenDict, Objective, Problem, QoS
-from dwell.model.bounds import SHADOW_FRACTION
+from dwell.model.problem import SHADOW_FRACTION
 from dwell.model.qos import NO_ERROR
 from dwell.model.semantics import too_many_shadows
 from dwell.model.table_columns import DECISIONS, Feature, columns_of, those_with

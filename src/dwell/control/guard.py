@@ -12,8 +12,9 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import TypeAlias
 
 from dwell.model import FrozenDict, Problem
-from dwell.model.bounds import GUARD_CYCLES, PROBE_CYCLES, require
+from dwell.model.bounds import require
 from dwell.model.instants import EVIDENCE_NS
+from dwell.model.problem import GUARD_CYCLES, PROBE_CYCLES
 
 #: However often a cell relapses, no more than this many times as many.
 MOST_DOUBLINGS = 5

@@ -15,8 +15,7 @@ from dwell.estimators.online import Online
 from dwell.estimators.pool import Pool
 from dwell.estimators.prices import SEED, unseen_error
 from dwell.estimators.protocol import Support
-from dwell.model.bounds import HALF_LIFE_WINDOWS
-from dwell.model.problem import Problem
+from dwell.model.problem import HALF_LIFE_WINDOWS, Problem
 
 Floats: TypeAlias = NDArray[np.float64]
 

@@ -92,68 +92,18 @@ def short(value: float) -> str:
     return f"{value:g}".replace("e+0", "e").replace("e+", "e").replace("e-0", "e-")
 
 
-# Values of processes: milliseconds, or bare factors.
+# Bounds that several keys share, or that others than the model check by.
 VALUE = Bound(0, LARGEST)
-MEAN = Bound(0, LARGEST, above=True)
-REAL = Bound(-LARGEST, LARGEST)
-CV = Bound(0, 100)
-GAMMA_CV = Bound(1e-6, 100)
-RHO = Bound(-1, 1, above=True, below=True)
-BURST_MEAN = Bound(0.01, LARGEST)
-
-# Pipeline.
+TIME_MS = Bound(0, LARGEST)
 PERIOD_MS = Bound(1e-3, LARGEST)
 EVERY_MS = Bound(0, LARGEST, above=True)
-DEADLINE_MS = Bound(1e-6, LARGEST)
-TIME_MS = Bound(0, LARGEST)
-THREADS = Bound(1, MAX_COUNT, whole=True)
-WORKERS = Bound(1, MAX_COUNT, whole=True)
-DEPTH = Bound(0, MAX_COUNT, whole=True)
-PRIORITY = Bound(-1000, 1000, whole=True)
-BYTES = Bound(0, 1e12, whole=True)
-STATE_BYTES = Bound(0, 1e15, whole=True)
-
-# Fabric. The quota's period is the kernel's own bound.
-CORES = Bound(1, 4096, whole=True)
-ACCELERATORS = Bound(1, 4096, whole=True)
+BURST_MEAN = Bound(0.01, LARGEST)
 FOREIGN_THREADS = Bound(0, MAX_COUNT, whole=True)
-QUOTA_CPU = Bound(1e-3, 4096)
-QUOTA_PERIOD_MS = Bound(1, 1000)
-QUOTA_SLACK_MS = Bound(0, 1000)
-QUOTA_TICK_MS = Bound(0, 1000)
-BACKGROUND = Bound(0, 4096)
 BACKGROUND_HZ = Bound(0, 100_000)
-INTERFERENCE = Bound(1, 100)
 CONTENTION = Bound(0, 0.9)
 RATE_MBPS = Bound(1e-4)
-LOSS = Bound(0, 1, below=True)
-RETRANSMIT_MS = Bound(1e-3, LARGEST)
-
-# Scenario.
-AT_S = Bound(0, LARGEST, below=True)
-FOR_S = Bound(0, above=True)
-RAMP_S = Bound(0, LARGEST)
-EPISODE_MEAN_S = Bound(1e-5, LARGEST)
-ADDED_LOSS = Bound(0, 1)
-
-# Objective: bounded so that J is finite whatever a window shows.
-WEIGHT = Bound(0, LARGEST)
-TARGET = Bound(1e-9, LARGEST)
-CAP = Bound(0, above=True)
-
-# Servo.
-SERVO_GAIN = Bound(0, MAX_COUNT, above=True)
-DAMPING = Bound(0, MAX_COUNT)
-AMPLITUDE_MM = Bound(1e-6, MAX_COUNT)
-TARGET_PERIOD_S = Bound(1e-5, LARGEST)
-
-# Live runtime. Each process of a node takes three ports.
-PORT = Bound(1024, 65_000, whole=True)
-AGE_MS = Bound(0, LARGEST, above=True)
-CHECKPOINT_CYCLES = Bound(0, MAX_COUNT, whole=True)
-DEGRADED_AT = Bound(0, 1)
-STANDBY = Bound(0, 1, whole=True)
-HANDED_MS = Bound(0, 1e6)
+MIN_DWELL = Bound(0, MAX_COUNT, whole=True)
+MIN_IMPROVEMENT = Bound(0, LARGEST)
 
 # Length of a run: the cycles that an event of the simulator counts, and the seconds that 64 bits of
 # nanoseconds hold.
@@ -162,15 +112,3 @@ LENGTH_S = Bound(0, 9.2e9)
 
 # Seeds of a study are 1 to N.
 SEEDS = Bound(1, 100_000, whole=True)
-
-# Controller and windows.
-WINDOW_CYCLES = Bound(1, MAX_COUNT, whole=True)
-WARMUP_WINDOWS = Bound(0, MAX_COUNT, whole=True)
-MIN_DWELL = Bound(0, MAX_COUNT, whole=True)
-MIN_IMPROVEMENT = Bound(0, LARGEST)
-GUARD_CYCLES = Bound(2, MAX_COUNT, whole=True)
-PROBE_CYCLES = Bound(1, MAX_COUNT, whole=True)
-LEAD_CYCLES = Bound(0, MAX_COUNT, whole=True)
-SHADOW_FRACTION = Bound(0, 1)
-HALF_LIFE_WINDOWS = Bound(0, MAX_COUNT, above=True)
-CUSUM_MEMORY = Bound(0, 1, above=True)

@@ -12,9 +12,10 @@ from typing import Any, TypeAlias
 
 from dwell.errors import Fault, ProblemError
 from dwell.model.fabric import Link, Node
+from dwell.model.keys import declared_fields
 from dwell.model.live import LiveSettings
 from dwell.model.objective import Objective
-from dwell.model.pipeline import Flow, Task
+from dwell.model.pipeline import Task
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.process import DRAWN, Constant, Process, Trace, UnreadTrace
@@ -27,12 +28,6 @@ Document: TypeAlias = dict[str, Any]
 
 NAMES: dict[type, str] = {kind: name for name, kind in DRAWN.items()}
 
-#: Keys that are no names of fields.
-KEYS: Mapping[type, Mapping[str, str]] = {
-    Flow: {"source": "from", "target": "to", "payload_bytes": "bytes"},
-    Link: {"source": "from", "target": "to"},
-    Task: {"depth": "input"},
-}
 #: Fields that a document has only where they say something else than their default.
 UNLESS_USUAL = frozenset(
     {
@@ -131,7 +126,7 @@ def _part(path: str, part: Any, *but: str, **more: object) -> Document:
 @lru_cache(maxsize=64)
 def _fields(kind: type) -> tuple[tuple[str, str, object], ...]:
     """Return name, key and, where a document leaves that out, default of every field."""
-    keys = KEYS.get(kind, {})
+    keys = {one.name: one.named for one in declared_fields(kind)}
     declared: list[tuple[str, str, object]] = []
     for item in fields(kind):
         made = item.default if item.default_factory is MISSING else item.default_factory()

@@ -8,49 +8,43 @@ from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, TypeAlias
 
 from dwell.model.bounds import (
-    ACCELERATORS,
-    BACKGROUND,
     BACKGROUND_HZ,
     BURST_MEAN,
     CONTENTION,
-    CORES,
     FOREIGN_THREADS,
-    INTERFERENCE,
-    LOSS,
-    QUOTA_CPU,
-    QUOTA_PERIOD_MS,
-    QUOTA_SLACK_MS,
-    QUOTA_TICK_MS,
+    LARGEST,
     RATE_MBPS,
-    RETRANSMIT_MS,
+    Bound,
     counted,
     require,
 )
 from dwell.model.frozen import FrozenDict, require_names, shortened
-from dwell.model.objective import TIERS, Tier
+from dwell.model.keys import declared, key
+from dwell.model.objective import Tier
 from dwell.model.process import Constant, Process, require_mean
 
 Scheduler: TypeAlias = Literal["fair", "fifo", "priority"]
-SCHEDULERS: tuple[Scheduler, ...] = ("fair", "fifo", "priority")
 
 
-@dataclass(frozen=True, slots=True)
+@declared()
 class Bursts:
-    """An alternating renewal process: quiet for `every_ms`, then disturbed for `for_ms`.
+    """Episodes that come and go in every scenario: quiet for `every_ms`, then disturbed.
 
     What the disturbance does belongs to what it is declared on: `threads` of foreign work on a
     node, `add_delay_ms` to every message on a link.
     """
 
-    every_ms: Process
-    for_ms: Process
-    threads: int = 0
-    add_delay_ms: Process = field(default_factory=lambda: Constant(0.0))
+    every_ms: Process = key("Quiet time between bursts, ms; mean above 0.01.")
+    for_ms: Process = key("Duration of a burst, ms; mean above 0.01.")
+    threads: int = key("Threads of foreign work during a burst.", FOREIGN_THREADS, default=0)
+    add_delay_ms: Process = key(
+        "Added to the delay of every message during a burst, ms.",
+        default_factory=lambda: Constant(0.0),
+    )
 
     def __post_init__(self) -> None:
         for path, process in (("every_ms", self.every_ms), ("for_ms", self.for_ms)):
             require_mean(BURST_MEAN, path, process)
-        FOREIGN_THREADS.check("threads", self.threads)
 
     @property
     def share(self) -> float:
@@ -59,94 +53,90 @@ class Bursts:
         return on_ms / (on_ms + off_ms)
 
 
-@dataclass(frozen=True, slots=True)
+@declared("quota")
 class Quota:
-    """CPU bandwidth control: `cpu` cores' worth of run time in every `period_ms`.
+    """CPU bandwidth control of the kernel (cgroup), on the cell's own work."""
 
-    Parameters
-    ----------
-    slack_ms : float
-        Run time that a core has drawn and keeps, beyond the end of a period, when it goes idle.
-        Linux keeps 1 ms.
-    tick_ms : float
-        Time between the ticks at which the kernel notices that the quota is used up, and lets
-        threads take turns; 0 for a kernel that notices at once and shares evenly. Linux: 1000 / HZ.
-    """
-
-    cpu: float
-    period_ms: float
-    slack_ms: float = 0.0
-    tick_ms: float = 0.0
+    cpu: float = key("Cores' worth of run time in every period.", Bound(1e-3, 4096))
+    period_ms: float = key("Period after which the budget is filled again, ms.", Bound(1, 1000))
+    slack_ms: float = key(
+        "Run time that a core has drawn and keeps, beyond the end of a period, when it goes idle, "
+        "ms. Linux keeps 1.",
+        Bound(0, 1000),
+        default=0.0,
+    )
+    tick_ms: float = key(
+        "Time between the ticks at which a used-up budget is noticed and threads take turns, ms; "
+        "0: at once, and threads share evenly. Linux: 1000 / HZ. One core, `fair`.",
+        Bound(0, 1000),
+        default=0.0,
+    )
 
     def __post_init__(self) -> None:
-        QUOTA_CPU.check("quota.cpu", self.cpu)
-        QUOTA_PERIOD_MS.check("quota.period_ms", self.period_ms)
-        QUOTA_SLACK_MS.check("quota.slack_ms", self.slack_ms)
-        QUOTA_TICK_MS.check("quota.tick_ms", self.tick_ms)
         # In nanoseconds it must not be none.
         require(not 0 < self.tick_ms < 0.001, "quota.tick_ms", self.tick_ms, "0, or 0.001 at least")
 
 
-@dataclass(frozen=True, slots=True)
+@declared()
 class Node:
-    """A computer.
-
-    Parameters
-    ----------
-    scheduler : {"fair", "fifo", "priority"}
-        How jobs share the cores.
-    accelerators : mapping of str to int
-        How many of each kind it has.
-    bursts : Bursts, optional
-        Foreign work of other tenants, in every scenario.
-    quota : Quota, optional
-        CPU bandwidth limit on everything that runs there.
-    background : float
-        Cores that are always taken, in small pieces, by others than the jobs; less than
-        `capacity`.
-    background_beside : float, optional
-        What of it is taken while jobs run and no foreign thread does; all of it if left out. Only
-        of a node with a quota.
-    background_hz : float
-        How often in a second something of it wakes, in the mean: what the kernel looks at the quota
-        for, and picks anew who runs. Only of a node whose quota has ticks.
-    interference : float
-        How many times as much core time jobs take while foreign threads run, whose data take the
-        place of theirs in the caches; at least 1.
-    contention : float
-        Share of a CPU's time that others take from what runs there, and that no quota counts: what
-        else a machine does whose CPUs the node has not for itself. Only of a node with a quota.
-    contention_stressed : mapping of str to float
-        The same while another node, by name, has foreign threads: one that has the same CPUs. Of
-        several the largest counts.
-    """
+    """A computer."""
 
     name: str
-    tier: Tier
-    cores: int = 1
-    scheduler: Scheduler = "fair"
-    accelerators: Mapping[str, int] = field(default_factory=FrozenDict)
-    bursts: Bursts | None = None
-    quota: Quota | None = None
-    background: float = 0.0
-    background_beside: float | None = None
-    background_hz: float = 0.0
-    interference: float = 1.0
-    contention: float = 0.0
-    contention_stressed: Mapping[str, float] = field(default_factory=FrozenDict)
+    tier: Tier = key("Kind of computer.")
+    cores: int = key("Cores of its CPU.", Bound(1, 4096, whole=True), default=1)
+    scheduler: Scheduler = key(
+        "How jobs share the cores: `fair` (processor sharing), `fifo` (one after another) or "
+        "`priority` (preemptive, by the tasks' `priority`).",
+        default="fair",
+    )
+    accelerators: Mapping[str, int] = key(
+        "How many accelerators of each kind it has, as `{gpu: 1}`.",
+        Bound(1, 4096, whole=True),
+        default_factory=FrozenDict,
+    )
+    bursts: Bursts | None = key("Foreign work of other tenants, in every scenario.", default=None)
+    quota: Quota | None = key("CPU bandwidth limit on everything that runs there.", default=None)
+    background: float = key(
+        "Cores that others than the jobs always take, in small pieces; less than the node can do.",
+        Bound(0, 4096),
+        default=0.0,
+    )
+    background_beside: float | None = key(
+        "What of `background` is taken while jobs run and no foreign thread does, on a node with "
+        "a quota.",
+        Bound(0, 4096),
+        default=None,
+        usual="all of it",
+    )
+    background_hz: float = key(
+        "How often in a second something of `background` wakes, in the mean, on a node whose "
+        "quota has `tick_ms`: the kernel looks at the quota then, too, and picks anew who runs.",
+        BACKGROUND_HZ,
+        default=0.0,
+    )
+    interference: float = key(
+        "How many times as much core time jobs take while foreign threads run, whose data take "
+        "the place of theirs in the caches.",
+        Bound(1, 100),
+        default=1.0,
+    )
+    contention: float = key(
+        "Share of a CPU's time that others take from what runs there, and that the node's quota "
+        "does not count. Only of a node with a quota.",
+        CONTENTION,
+        default=0.0,
+    )
+    contention_stressed: Mapping[str, float] = key(
+        "What `contention` is while another node, on the same CPUs, has foreign threads, as "
+        "`{R1: 0.4}`; of several the largest counts.",
+        CONTENTION,
+        default_factory=FrozenDict,
+    )
 
     def __post_init__(self) -> None:
-        require(self.tier in TIERS, "tier", self.tier, f"one of {', '.join(TIERS)}")
-        bound = f"one of {', '.join(SCHEDULERS)}"
-        require(self.scheduler in SCHEDULERS, "scheduler", self.scheduler, bound)
-        CORES.check("cores", self.cores)
-        for kind, count in self.accelerators.items():
-            ACCELERATORS.check(f"accelerators.{kind}", count)
         if self.bursts is not None and self.bursts.add_delay_ms != Constant(0.0):
             delay = self.bursts.add_delay_ms
             require(False, "bursts.add_delay_ms", delay, "left out: only a link adds a delay")
-        INTERFERENCE.check("interference", self.interference)
-        BACKGROUND.check("background", self.background)
         bound = f"less than {self.capacity:g}, what the node can do"
         require(self.background < self.capacity, "background", self.background, bound)
         if self.background_beside is not None:
@@ -154,7 +144,6 @@ class Node:
             require(0.0 <= beside <= self.background, "background_beside", beside, bound)
             bound = "left out: only a quota gives others something to wait for"
             require(self.quota is not None, "background_beside", beside, bound)
-        BACKGROUND_HZ.check("background_hz", self.background_hz)
         if self.background_hz > 0.0:
             ticks = self.quota is not None and self.quota.tick_ms > 0
             bound = "0 where there is no `quota` with `tick_ms`; elsewhere it is looked at any time"
@@ -162,14 +151,11 @@ class Node:
         stressed = self.contention_stressed.items()
         shares = {f"contention_stressed.{name}": share for name, share in stressed}
         for path, share in {"contention": self.contention, **shares}.items():
-            CONTENTION.check(path, share)
             bound = "0 where there is no quota; elsewhere it is `background`"
             require(self.quota is not None or share == 0.0, path, share, bound)
         if self.quota is not None and self.quota.tick_ms > 0:
             tick_ms, bound = self.quota.tick_ms, "0 where a node has several cores, or is not fair"
             require(self.cores == 1 and self.scheduler == "fair", "quota.tick_ms", tick_ms, bound)
-        object.__setattr__(self, "accelerators", FrozenDict(self.accelerators))
-        object.__setattr__(self, "contention_stressed", FrozenDict(self.contention_stressed))
 
     @property
     def capacity(self) -> float:
@@ -267,43 +253,38 @@ def accelerator_name(node: str, kind: str) -> str:
     return f"{node}.{kind}"
 
 
-@dataclass(frozen=True, slots=True)
+@declared()
 class Link:
-    """A directed connection.
+    """A directed connection between two nodes."""
 
-    Parameters
-    ----------
-    source, target : str
-        Node names.
-    delay_ms : Process
-        Propagation delay, one value a message.
-    rate_mbps : float
-        Serialisation rate, megabits a second; infinite where messages do not queue.
-    loss : float
-        Probability that an attempt to send a message is lost, in [0, 1).
-    retransmit_ms : float, optional
-        Timeout after which a lost attempt is repeated; None drops the message.
-    in_order : bool
-        Whether a message waits for those sent before it.
-    bursts : Bursts, optional
-        Episodes of extra delay, in every scenario.
-    """
-
-    source: str
-    target: str
-    delay_ms: Process
-    rate_mbps: float = math.inf
-    loss: float = 0.0
-    retransmit_ms: float | None = None
-    in_order: bool = False
-    bursts: Bursts | None = None
+    source: str = key("Node that sends.", named="from")
+    target: str = key("Node that receives.", named="to")
+    delay_ms: Process = key("Propagation delay of a message, ms.")
+    rate_mbps: float = key(
+        "Serialisation rate, megabits a second; messages do not queue where there is none.",
+        RATE_MBPS,
+        default=math.inf,
+        usual="unlimited",
+    )
+    loss: float = key(
+        "Probability that an attempt to send a message is lost.",
+        Bound(0, 1, below=True),
+        default=0.0,
+    )
+    retransmit_ms: float | None = key(
+        "Time after which a lost message is sent again, ms; dropped where there is none.",
+        Bound(1e-3, LARGEST),
+        default=None,
+        named="on_loss.retransmit_ms",
+    )
+    in_order: bool = key(
+        "Whether a message waits for those sent before it, so that none overtakes another.",
+        default=False,
+    )
+    bursts: Bursts | None = key("Episodes of extra delay, in every scenario.", default=None)
 
     def __post_init__(self) -> None:
         require(self.source != self.target, "to", self.target, "another node than `from`")
-        RATE_MBPS.check("rate_mbps", self.rate_mbps)
-        LOSS.check("loss", self.loss)
-        if self.retransmit_ms is not None:
-            RETRANSMIT_MS.check("on_loss.retransmit_ms", self.retransmit_ms)
         if self.bursts is not None:
             threads = self.bursts.threads
             require(threads == 0, "bursts.threads", threads, "left out: only a node has threads")

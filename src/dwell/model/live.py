@@ -3,113 +3,104 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from typing import Literal
 
-from dwell.model.bounds import AGE_MS, CHECKPOINT_CYCLES, DEGRADED_AT, PORT, require
+from dwell.model.bounds import LARGEST, MAX_COUNT, Bound, require
 from dwell.model.frozen import FrozenDict
+from dwell.model.keys import declared, key
 
-RELEASES = ("timer", "frames")
-CLOCKS = ("estimated", "system")
-MODES = ("control", "advise")
-SILENCES = ("hold", "zero")
+PORT = Bound(1024, 65_000, whole=True)
 
 
-@dataclass(frozen=True, slots=True)
+@declared()
 class Endpoint:
     """An address and the first of the ports behind it."""
 
-    address: str
-    port: int
+    address: str = key("Name or address of the host.")
+    port: int = key("First port.", PORT)
 
     def __post_init__(self) -> None:
         require(bool(self.address.strip()), "address", self.address, "a host's name or address")
-        PORT.check("port", self.port)
 
 
-@dataclass(frozen=True, slots=True)
+@declared()
 class Host:
-    """Address and ports of a node's processes.
+    """Where a node's processes listen."""
 
-    Parameters
-    ----------
-    port : int
-        First port; each process of the node takes three.
-    seen_from : mapping of str to Endpoint
-        Where it is reached from those nodes that do not reach it there: behind a translation of
-        addresses, a tunnel, or the links of a demonstration.
-    """
-
-    address: str = "127.0.0.1"
-    port: int = 7450
-    seen_from: Mapping[str, Endpoint] = field(default_factory=FrozenDict)
+    address: str = key("Name or address of the host.", default="127.0.0.1")
+    port: int = key("First port; each process of the node takes three.", PORT, default=7450)
+    seen_from: Mapping[str, Endpoint] = key(
+        "Where it is reached from nodes that do not reach it there: behind a translation of "
+        "addresses, a tunnel, or the links of a demonstration.",
+        default_factory=FrozenDict,
+    )
 
     def __post_init__(self) -> None:
         Endpoint(self.address, self.port)
-        object.__setattr__(self, "seen_from", FrozenDict(self.seen_from))
 
     def endpoint(self, node: str) -> Endpoint:
         """Address and port by which another node reaches it."""
         return self.seen_from.get(node) or Endpoint(self.address, self.port)
 
 
-@dataclass(frozen=True, slots=True)
+@declared("live")
 class LiveSettings:
-    """Settings of the live runtime, beside the problem.
+    """What the live runtime needs to know beside the problem."""
 
-    Parameters
-    ----------
-    hosts : mapping of str to Host
-        By node.
-    release : {"timer", "frames"}
-        Whether a cycle begins by the clock, or when the first source has a frame.
-    clock : {"estimated", "system"}
-        Whether clocks are compared by messages, or taken for synchronous (PTP, chrony).
-    mode : {"control", "advise"}
-        Whether decisions are carried out, or recorded only.
-    relay : str, optional
-        Node that carries small messages where a direct link fails; the controller's where None.
-    max_age_ms : float, optional
-        Age from which a command is not applied; two periods where None.
-    silence : {"hold", "zero"}
-        What the actuator is told when no command comes.
-    checkpoint_cycles : int
-        Cycles between two copies of a task's state to its fallback; 0 for none.
-    degraded_at : float
-        Share of the cycles of the last windows that may miss before the cell is degraded.
-    actuators : mapping of str to str
-        ``module:Name`` of what applies the commands of each sink task.
-    observer : str, optional
-        ``module:Name`` of what looks on, where `dwell live run` runs the cell: at the error of what
-        it controls, say.
-    """
-
-    hosts: Mapping[str, Host] = field(default_factory=FrozenDict)
-    release: str = "timer"
-    clock: str = "estimated"
-    mode: str = "control"
-    relay: str | None = None
-    max_age_ms: float | None = None
-    silence: str = "hold"
-    checkpoint_cycles: int = 25
-    degraded_at: float = 0.1
-    actuators: Mapping[str, str] = field(default_factory=FrozenDict)
-    observer: str | None = None
+    hosts: Mapping[str, Host] = key(
+        "Where each node is reached.", default_factory=FrozenDict, usual="all are this machine"
+    )
+    release: Literal["timer", "frames"] = key(
+        "Whether a cycle begins by the clock (`timer`), or when the first source has a picture "
+        "(`frames`).",
+        default="timer",
+    )
+    clock: Literal["estimated", "system"] = key(
+        "Whether clocks are compared by messages (`estimated`), or taken for synchronous "
+        "(`system`: PTP, chrony).",
+        default="estimated",
+    )
+    mode: Literal["control", "advise"] = key(
+        "Whether decisions are carried out (`control`) or recorded (`advise`).", default="control"
+    )
+    relay: str | None = key(
+        "Node that carries small messages where a direct link fails.",
+        default=None,
+        usual="the controller's",
+    )
+    max_age_ms: float | None = key(
+        "Age from which a command is not applied, ms.",
+        Bound(0, LARGEST, above=True),
+        default=None,
+        usual="two periods",
+    )
+    silence: Literal["hold", "zero"] = key(
+        "What the actuator is told without commands.", default="hold"
+    )
+    checkpoint_cycles: int = key(
+        "Cycles between copies of a task's state to its fallback; 0: none.",
+        Bound(0, MAX_COUNT, whole=True),
+        default=25,
+    )
+    degraded_at: float = key(
+        "Share of missed cycles in the last three windows above which the cell is degraded.",
+        Bound(0, 1),
+        default=0.1,
+    )
+    actuators: Mapping[str, str] = key(
+        "What applies the commands of a sink task, as `package.module:Name`.",
+        default_factory=FrozenDict,
+    )
+    observer: str | None = key(
+        "What looks on where `dwell live run` runs the cell, as `package.module:Name`.",
+        default=None,
+    )
 
     def __post_init__(self) -> None:
-        words = (("release", RELEASES), ("clock", CLOCKS), ("mode", MODES), ("silence", SILENCES))
-        for name, known in words:
-            value = getattr(self, name)
-            require(value in known, f"live.{name}", value, f"one of {', '.join(known)}")
-        if self.max_age_ms is not None:
-            AGE_MS.check("live.max_age_ms", self.max_age_ms)
-        CHECKPOINT_CYCLES.check("live.checkpoint_cycles", self.checkpoint_cycles)
-        DEGRADED_AT.check("live.degraded_at", self.degraded_at)
         for task, name in self.actuators.items():
             require_callable_name(f"live.actuators.{task}", name)
         if self.observer is not None:
             require_callable_name("live.observer", self.observer)
-        object.__setattr__(self, "hosts", FrozenDict(self.hosts))
-        object.__setattr__(self, "actuators", FrozenDict(self.actuators))
 
 
 def require_callable_name(path: str, name: str) -> None:

@@ -4,105 +4,90 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
 from dwell.errors import Fault, ProblemError
-from dwell.model.bounds import CAP, TARGET, WEIGHT, require
+from dwell.model.bounds import LARGEST, Bound
 from dwell.model.frozen import FrozenDict
+from dwell.model.keys import declared, key
 
 Tier: TypeAlias = Literal["robot", "edge", "cloud"]
 TIERS: tuple[Tier, ...] = ("robot", "edge", "cloud")
 
 
-@dataclass(frozen=True, slots=True)
+#: Bounded so that J is finite whatever a window shows.
+WEIGHT, TARGET, CAP = Bound(0, LARGEST), Bound(1e-9, LARGEST), Bound(0, above=True)
+
+
+@declared("weights")
 class Weights:
-    """Weights of the terms of J: from 0 to 1e9, not all 0.
+    """Weights of the terms of the cost J; at least one above 0."""
 
-    `cloud` is None where cloud nodes count as edge nodes (the default).
-    """
-
-    latency: float = 1.0
-    violations: float = 3.0
-    robot: float = 0.5
-    edge: float = 0.3
-    switching: float = 0.5
-    cloud: float | None = None
+    latency: float = key("Of L95 / target.", WEIGHT, default=1.0)
+    violations: float = key("Of the violation rate.", WEIGHT, default=3.0)
+    robot: float = key("Of robot utilisation / target.", WEIGHT, default=0.5)
+    edge: float = key("Of edge utilisation / target.", WEIGHT, default=0.3)
+    switching: float = key("Of the share of moved tasks.", WEIGHT, default=0.5)
+    cloud: float | None = key(
+        "Of cloud utilisation / target.",
+        WEIGHT,
+        default=None,
+        usual="cloud nodes count as edge nodes",
+    )
 
     def __post_init__(self) -> None:
-        weights = {
-            "latency": self.latency,
-            "violations": self.violations,
-            "robot": self.robot,
-            "edge": self.edge,
-            "switching": self.switching,
-        }
-        if self.cloud is not None:
-            weights["cloud"] = self.cloud
-        for name, value in weights.items():
-            WEIGHT.check(f"weights.{name}", value)
-        if not any(weights.values()):
+        values = (self.latency, self.violations, self.robot, self.edge, self.switching, self.cloud)
+        if not any(values):
             raise ProblemError(
                 [Fault("weights", "all weights are 0; at least one must be above 0")]
             )
 
 
-@dataclass(frozen=True, slots=True)
+@declared("targets")
 class Targets:
-    """Design targets that normalise latency and utilisation (paper, eq. 5): from 1e-9 to 1e9."""
+    """Design targets that normalise latency and utilisation (paper, eq. 5)."""
 
-    latency_ms: float
-    robot: float = 0.7
-    edge: float = 0.7
-    cloud: float | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("latency_ms", "robot", "edge", "cloud"):
-            value = getattr(self, name)
-            if value is not None:
-                TARGET.check(f"targets.{name}", value)
+    latency_ms: float = key("Of L95, ms.", TARGET, usual="the deadline")
+    robot: float = key("Of robot utilisation.", TARGET, default=0.7)
+    edge: float = key("Of edge utilisation.", TARGET, default=0.7)
+    cloud: float | None = key(
+        "Of cloud utilisation; needed where `weights` has `cloud`.", TARGET, default=None
+    )
 
 
-@dataclass(frozen=True, slots=True)
+@declared("caps")
 class Caps:
-    """Hard caps on L95 (ms) and on the utilisation of every resource; infinite for none."""
+    """Hard caps; a candidate above one is not eligible."""
 
-    latency_ms: float = math.inf
-    utilisation: float = math.inf
+    latency_ms: float = key("On L95, ms.", CAP, default=math.inf, usual="none")
+    utilisation: float = key(
+        "On the utilisation of every node and accelerator, as 0.98.",
+        CAP,
+        default=math.inf,
+        usual="none",
+    )
 
-    def __post_init__(self) -> None:
-        CAP.check("caps.latency_ms", self.latency_ms)
-        CAP.check("caps.utilisation", self.utilisation)
 
-
-@dataclass(frozen=True, slots=True)
+@declared()
 class Objective:
-    """Everything that J and its constraints need besides the metrics.
+    """What makes one placement better than another: all that J needs besides the metrics."""
 
-    Parameters
-    ----------
-    weights, targets, caps
-        See the classes.
-    tiers : mapping of str to {"robot", "edge", "cloud"}
-        Tier of every node whose utilisation counts.
-    accelerators : mapping of str to {"robot", "edge", "cloud"}
-        Tier of every kind of accelerators that counts in J beside the nodes, by the name of the
-        resource (``E.gpu``): those of all nodes of `tiers`, or none, as in the paper. J does
-        without those that a QoS does not have.
-    """
-
-    weights: Weights
-    targets: Targets
-    caps: Caps = field(default_factory=Caps)
-    tiers: Mapping[str, Tier] = field(default_factory=FrozenDict)
-    accelerators: Mapping[str, Tier] = field(default_factory=FrozenDict)
+    weights: Weights = key("Weights of the terms of J.")
+    targets: Targets = key("Design targets.")
+    caps: Caps = key("Hard caps.", default_factory=Caps)
+    tiers: Mapping[str, Tier] = key(
+        "Nodes whose utilisation counts, and as which tier.",
+        default_factory=FrozenDict,
+        usual="all, as their own tier",
+    )
+    accelerators: Mapping[str, Tier] = key(
+        "Tier of every kind of accelerators that counts in J beside the nodes, by the name of the "
+        "resource (``E.gpu``): those of all nodes of `tiers`, or none, as in the paper. J does "
+        "without those that a QoS does not have.",
+        default_factory=FrozenDict,
+    )
 
     def __post_init__(self) -> None:
-        for key in ("tiers", "accelerators"):
-            of = getattr(self, key)
-            for name, tier in of.items():
-                require(tier in TIERS, f"{key}.{name}", tier, f"one of {', '.join(TIERS)}")
-            object.__setattr__(self, key, FrozenDict(of))
         if self.weights.cloud is not None and self.targets.cloud is None:
             raise ProblemError(
                 [Fault("targets.cloud", "missing; weights.cloud weighs cloud nodes apart")]

@@ -3,115 +3,98 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 
-from dwell.model.bounds import (
-    BYTES,
-    DEADLINE_MS,
-    DEPTH,
-    HANDED_MS,
-    PERIOD_MS,
-    PRIORITY,
-    STANDBY,
-    STATE_BYTES,
-    THREADS,
-    TIME_MS,
-    WORKERS,
-    require,
-)
+from dwell.model.bounds import LARGEST, MAX_COUNT, PERIOD_MS, TIME_MS, Bound, require
 from dwell.model.fabric import accelerator_name
 from dwell.model.frozen import FrozenDict, require_names, shortened
+from dwell.model.keys import declared, key
 from dwell.model.live import require_callable_name
 from dwell.model.process import Constant, Process
 
+#: Of a task on a node, where it says nothing, and of each of its nodes.
+WORKERS = Bound(1, MAX_COUNT, whole=True)
+STANDBY = Bound(0, 1, whole=True)
+HANDED_MS = Bound(0, 1e6)
 
-@dataclass(frozen=True, slots=True)
+
+@declared()
 class Execution:
-    """A task on one of its feasible nodes: execution time, threads and workers.
+    """How a task runs on one of its feasible nodes."""
 
-    Parameters
-    ----------
-    exec_ms : Process
-        Time one job needs there when nothing disturbs it, milliseconds.
-    threads : int
-        Cores the job can use at once; `exec_ms` is the time with all of them, and on a node with
-        fewer it takes so many times as long.
-    workers : int
-        Jobs of this task that may run there at the same time.
-    accelerator : str, optional
-        Kind of accelerator the job runs on instead of the CPU.
-    standby : int
-        Further workers that a live node keeps, to take over when the first is silent.
-    before_ms, after_ms : float
-        What of `exec_ms` other threads of its worker do before and after its own. Only where
-        threads take turns (`Quota.tick_ms`) does it matter: each of them waits for its own.
-    """
-
-    exec_ms: Process
-    threads: int = 1
-    workers: int = 1
-    accelerator: str | None = None
-    standby: int = 0
-    before_ms: float = 0.0
-    after_ms: float = 0.0
-
-    def __post_init__(self) -> None:
-        HANDED_MS.check("before_ms", self.before_ms)
-        HANDED_MS.check("after_ms", self.after_ms)
-        STANDBY.check("standby", self.standby)
-        THREADS.check("threads", self.threads)
-        WORKERS.check("workers", self.workers)
+    exec_ms: Process = key(
+        "Time that one job needs when nothing disturbs it, with all its threads, ms."
+    )
+    threads: int = key(
+        "Cores that one job can use at once; on a node with fewer it takes so many times as long.",
+        Bound(1, MAX_COUNT, whole=True),
+        default=1,
+    )
+    workers: int = key(
+        "Jobs of this task that may run there at a time.", WORKERS, default=1, usual="the task's"
+    )
+    accelerator: str | None = key(
+        "Kind of accelerator that it runs on instead of the CPU.", default=None
+    )
+    standby: int = key(
+        "Further workers that a live node keeps, to take over when the first is silent.",
+        STANDBY,
+        default=0,
+    )
+    before_ms: float = key(
+        "What of `exec_ms` another thread of its worker does before it, ms; it waits for its own "
+        "turn where threads take turns (`quota.tick_ms`).",
+        HANDED_MS,
+        default=0.0,
+    )
+    after_ms: float = key(
+        "What of `exec_ms` another thread of its worker does after it, ms.", HANDED_MS, default=0.0
+    )
 
     def resource(self, node: str) -> str:
         """Name of what it works on, on a node: the node's, for its CPU, or that of a kind."""
         return node if self.accelerator is None else accelerator_name(node, self.accelerator)
 
 
-@dataclass(frozen=True, slots=True)
+@declared()
 class Task:
-    """A static stage of the pipeline, a vertex of the DAG.
-
-    Parameters
-    ----------
-    on : mapping of str to Execution
-        Feasible nodes (N_v); one makes the task anchored, more make it relocatable.
-    depth : int
-        How many complete input sets may wait for a worker: 0 is no bound (``input: queue``), 1 is
-        ``input: latest``; beyond it the oldest cycle is replaced.
-    priority : int
-        Larger runs first on a ``priority`` node.
-    scale : str, optional
-        Name of the per-cycle process that multiplies the execution time on every node.
-    offset_ms : float
-        Start of a source after the cycle's release; 0 for any other task.
-    start_ms : float
-        Time a new worker needs before its first job.
-    state_bytes : int
-        State that a cold migration carries over the link.
-    run : str, optional
-        ``module:Name`` of the class or function that a live worker runs.
-    """
+    """A static stage of the pipeline, a vertex of the DAG."""
 
     name: str
-    on: Mapping[str, Execution]
-    depth: int = 0
-    priority: int = 0
-    scale: str | None = None
-    offset_ms: float = 0.0
-    start_ms: float = 0.0
-    state_bytes: int = 0
-    run: str | None = None
+    on: Mapping[str, Execution] = key(
+        "Nodes it can run on (N_v), and how; one anchors it, more make it relocatable."
+    )
+    depth: int = key(
+        "Complete input sets that may wait for a worker, 0 without a bound; beyond it the oldest "
+        "cycle is replaced.",
+        Bound(0, MAX_COUNT, whole=True),
+        default=0,
+        named="input",
+    )
+    priority: int = key(
+        "Larger runs first on a node with the priority scheduler.",
+        Bound(-1000, 1000, whole=True),
+        default=0,
+    )
+    scale: str | None = key(
+        "Name under `scales` of what multiplies its execution times on every node.", default=None
+    )
+    offset_ms: float = key("Start of a source after the cycle's release, ms.", TIME_MS, default=0.0)
+    start_ms: float = key(
+        "Time that a new worker needs before its first job, ms.", TIME_MS, default=0.0
+    )
+    state_bytes: int = key(
+        "State that a cold migration carries over the link, bytes.",
+        Bound(0, 1e15, whole=True),
+        default=0,
+    )
+    run: str | None = key(
+        "Class or function of a live worker, as `package.module:Name`.", default=None
+    )
 
     def __post_init__(self) -> None:
         if self.run is not None:
             require_callable_name("run", self.run)
         require(len(self.on) > 0, "on", dict(self.on), "at least one node")
-        DEPTH.check("input", self.depth)
-        PRIORITY.check("priority", self.priority)
-        TIME_MS.check("offset_ms", self.offset_ms)
-        TIME_MS.check("start_ms", self.start_ms)
-        STATE_BYTES.check("state_bytes", self.state_bytes)
-        object.__setattr__(self, "on", FrozenDict(self.on))
 
     @property
     def anchored(self) -> bool:
@@ -119,52 +102,41 @@ class Task:
         return len(self.on) == 1
 
 
-@dataclass(frozen=True, slots=True)
+@declared()
 class Flow:
-    """A precedence edge with the payload that travels along it."""
+    """A precedence edge: what one task sends to another."""
 
-    source: str
-    target: str
-    payload_bytes: int = 0
+    source: str = key("Task that sends.", named="from")
+    target: str = key("Task that receives.", named="to")
+    payload_bytes: int = key(
+        "Payload of a message, bytes.", Bound(0, 1e12, whole=True), default=0, named="bytes"
+    )
 
-    def __post_init__(self) -> None:
-        BYTES.check("bytes", self.payload_bytes)
 
-
-@dataclass(frozen=True, slots=True)
+@declared()
 class Pipeline:
-    """Tasks and flows of a control loop with its timing.
+    """Tasks and flows of a control loop with its timing."""
 
-    Parameters
-    ----------
-    tasks : mapping of str to Task
-        In the file's order.
-    flows : tuple of Flow
-        Any directed acyclic graph.
-    period_ms, deadline_ms : float
-        P and D, with D at most P.
-    release_jitter_ms : Process
-        Added to every nominal release instant.
-    scales : mapping of str to Process
-        Per-cycle factors that tasks may name.
-    """
-
-    tasks: Mapping[str, Task]
-    flows: tuple[Flow, ...]
-    period_ms: float
-    deadline_ms: float
-    release_jitter_ms: Process = field(default_factory=lambda: Constant(0.0))
-    scales: Mapping[str, Process] = field(default_factory=FrozenDict)
+    tasks: Mapping[str, Task] = key("Stages of the pipeline by name, in the file's order.")
+    flows: tuple[Flow, ...] = key("What tasks send to one another: a directed acyclic graph.")
+    period_ms: float = key("Time between two releases (P), ms.", PERIOD_MS)
+    deadline_ms: float = key(
+        "Latency beyond which a cycle is missed (D, at most P), ms.",
+        Bound(1e-6, LARGEST),
+        usual="P",
+    )
+    release_jitter_ms: Process = key(
+        "Added to the instant of every release, ms.", default_factory=lambda: Constant(0.0)
+    )
+    scales: Mapping[str, Process] = key(
+        "Factors, one a cycle, that tasks may name, as the scene's complexity.",
+        default_factory=FrozenDict,
+    )
 
     def __post_init__(self) -> None:
-        PERIOD_MS.check("period_ms", self.period_ms)
-        DEADLINE_MS.check("deadline_ms", self.deadline_ms)
         bound = f"at most period_ms = {self.period_ms:g}"
         require(self.deadline_ms <= self.period_ms, "deadline_ms", self.deadline_ms, bound)
         require_names("tasks", self.tasks)
-        object.__setattr__(self, "tasks", FrozenDict(self.tasks))
-        object.__setattr__(self, "flows", tuple(self.flows))
-        object.__setattr__(self, "scales", FrozenDict(self.scales))
 
     def __repr__(self) -> str:
         chains = [shortened(chain, " -> ") for chain in self.chains()]

@@ -4,27 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
+from typing import Literal
 
 from dwell.display import Displayed
 from dwell.errors import Fault, ProblemError
-from dwell.model.bounds import (
-    GUARD_CYCLES,
-    HALF_LIFE_WINDOWS,
-    LEAD_CYCLES,
-    MIN_DWELL,
-    MIN_IMPROVEMENT,
-    PROBE_CYCLES,
-    SHADOW_FRACTION,
-    TIME_MS,
-    WARMUP_WINDOWS,
-    WINDOW_CYCLES,
-    counted,
-    require,
-)
+from dwell.model.bounds import MAX_COUNT, MIN_DWELL, MIN_IMPROVEMENT, TIME_MS, Bound, counted
 from dwell.model.fabric import Fabric
 from dwell.model.frozen import FrozenDict, shortened
 from dwell.model.instants import require_length
+from dwell.model.keys import declared, key
 from dwell.model.live import LiveSettings
 from dwell.model.objective import Objective
 from dwell.model.pipeline import Pipeline
@@ -33,86 +22,81 @@ from dwell.model.scenario import Scenario
 from dwell.model.semantics import CellParts, find_faults, nearest_of
 from dwell.model.servo import Servo
 
-MIGRATIONS = ("warm", "cold")
+GUARD_CYCLES = Bound(2, MAX_COUNT, whole=True)
+PROBE_CYCLES = Bound(1, MAX_COUNT, whole=True)
+HALF_LIFE_WINDOWS = Bound(0, MAX_COUNT, above=True)
+SHADOW_FRACTION = Bound(0, 1)
 #: Share of the cycles for each alternative where none is given, and not all together are too many.
 SHADOWED = 0.05
 
 
-@dataclass(frozen=True, slots=True)
+@declared()
 class ControllerSettings:
-    """The controller: its node, its policy and estimator, and the delays of its orders.
+    """The controller: where it sits, what it runs, and how its orders travel."""
 
-    Parameters
-    ----------
-    on : str, optional
-        Node; the first edge node, else the first node, where None.
-    policy : str
-        A policy's name, ``package.module:Class`` of one, or a candidate's for the placement that
-        never moves.
-    initial : str, optional
-        Candidate to start with; the first where None.
-    min_dwell : int
-        N_min, windows.
-    min_improvement : float
-        Delta_min, in units of J.
-    escape : bool
-        Whether an incumbent over a cap may leave before the hysteresis is met.
-    shadow_fraction : float, optional
-        Share of the cycles that are also sent through each alternative, where the estimator
-        measures it with shadow jobs; by the number of alternatives where None
-        (`Problem.shadow_fraction`).
-    half_life_windows : float
-        Age at which what an estimator has measured counts half.
-    migration : str
-        ``warm``: a moved task is ready at once; ``cold``: after its ``start_ms`` and the transfer
-        of its ``state_bytes``.
-    guard_cycles : int
-        Periods without a completion after which the guard on the robot moves to a fallback.
-    probe_cycles : int
-        Cycles that must complete through another placement, too, before the guard's is left for it,
-        and that the guard rests for after its own move.
-    fallbacks : tuple of str
-        Candidates the guard may move to, best first; none switches the guard off.
-    order_delay_ms : float
-        Time an order travels to the stamper.
-    order_lead_cycles : int
-        Cycles between the close of a window and the first one its order may stamp.
-    close_grace_ms : float
-        Time a window stays open after the release of the first cycle beyond it; it stays open until
-        the last deadline of its cycles, too.
-    """
-
-    on: str | None = None
-    policy: str = "dtp"
-    initial: str | None = None
-    min_dwell: int = 3
-    min_improvement: float = 0.05
-    escape: bool = False
-    estimator: str = "profile"
-    shadow_fraction: float | None = None
-    half_life_windows: float = 2.0
-    migration: str = "warm"
-    guard_cycles: int = 3
-    probe_cycles: int = 30
-    fallbacks: tuple[str, ...] = ()
-    order_delay_ms: float = 0.0
-    order_lead_cycles: int = 0
-    close_grace_ms: float = 0.0
-
-    def __post_init__(self) -> None:
-        MIN_DWELL.check("min_dwell", self.min_dwell)
-        MIN_IMPROVEMENT.check("min_improvement", self.min_improvement)
-        GUARD_CYCLES.check("guard_cycles", self.guard_cycles)
-        PROBE_CYCLES.check("probe_cycles", self.probe_cycles)
-        LEAD_CYCLES.check("order_lead_cycles", self.order_lead_cycles)
-        TIME_MS.check("order_delay_ms", self.order_delay_ms)
-        TIME_MS.check("close_grace_ms", self.close_grace_ms)
-        object.__setattr__(self, "fallbacks", tuple(self.fallbacks))
-        if self.shadow_fraction is not None:
-            SHADOW_FRACTION.check("shadow_fraction", self.shadow_fraction)
-        HALF_LIFE_WINDOWS.check("half_life_windows", self.half_life_windows)
-        bound = f"one of {', '.join(MIGRATIONS)}"
-        require(self.migration in MIGRATIONS, "migration", self.migration, bound)
+    on: str | None = key(
+        "Node it sits on.", default=None, usual="the first edge node, else the first node"
+    )
+    policy: str = key(
+        "A policy, `package.module:Class` of your own, or a candidate: the placement that never "
+        "moves.",
+        default="dtp",
+    )
+    initial: str | None = key("Candidate to start with.", default=None, usual="the first")
+    min_dwell: int = key("Windows that a placement stays at least (N_min).", MIN_DWELL, default=3)
+    min_improvement: float = key(
+        "Improvement of J that a migration must promise (Delta_min).",
+        MIN_IMPROVEMENT,
+        default=0.05,
+    )
+    escape: bool = key(
+        "Whether an incumbent over a cap may leave before the hysteresis is met.", default=False
+    )
+    estimator: str = key(
+        "How the QoS of candidates is estimated; also `package.module:Class` of your own.",
+        default="profile",
+    )
+    shadow_fraction: float | None = key(
+        "Share of cycles that are also sent through each alternative, where the estimator uses "
+        "shadow jobs.",
+        SHADOW_FRACTION,
+        default=None,
+        usual="0.05, or 1/(alternatives) where that is less",
+    )
+    half_life_windows: float = key(
+        "Windows after which a measurement counts half.", HALF_LIFE_WINDOWS, default=2.0
+    )
+    migration: Literal["warm", "cold"] = key(
+        "`warm`: a moved task is ready at once; `cold`: after its `start_ms` and the transfer of "
+        "its `state_bytes`.",
+        default="warm",
+    )
+    guard_cycles: int = key(
+        "Periods without a completion after which the guard on the robot moves to a fallback.",
+        GUARD_CYCLES,
+        default=3,
+    )
+    probe_cycles: int = key(
+        "Cycles that must complete through another placement, too, before the guard's is left for "
+        "it, and that the guard rests for after its own move.",
+        PROBE_CYCLES,
+        default=30,
+    )
+    fallbacks: tuple[str, ...] = key(
+        "Candidates that the guard may move to, best first; none: no guard.", default=()
+    )
+    order_delay_ms: float = key("Time that an order travels, ms.", TIME_MS, default=0.0)
+    order_lead_cycles: int = key(
+        "Cycles between a window's close and the first one its order may stamp.",
+        Bound(0, MAX_COUNT, whole=True),
+        default=0,
+    )
+    close_grace_ms: float = key(
+        "Time that a window stays open for stragglers after the release of the first cycle beyond "
+        "it, ms. No window closes before the last deadline of its cycles.",
+        TIME_MS,
+        default=0.0,
+    )
 
     @property
     def failures_in_a_row(self) -> int:
@@ -120,27 +104,9 @@ class ControllerSettings:
         return self.guard_cycles + 1
 
 
-@dataclass(frozen=True, slots=True)
+@declared()
 class Problem(Displayed):
     """A cell, checked as a whole: one that exists is valid.
-
-    Parameters
-    ----------
-    candidates : mapping of str to Placement
-        Pi_cand; each covers every task.
-    scenarios : mapping of str to tuple of disturbances
-        `baseline`, the empty one, is added where it is missing.
-    window_cycles : int
-        W.
-    warmup_windows : int
-        First windows of a run, recorded but left out of statistics.
-    servo : Servo, optional
-        Loop that every run's commands are tried on; none, and no tracking error, where None.
-    live : LiveSettings
-        For the live runtime.
-    folder : str, optional
-        Where classes that are named ``package.module:Class`` are looked for first: the cell file's.
-        No part of what the cell is.
 
     Raises
     ------
@@ -148,29 +114,41 @@ class Problem(Displayed):
         With every fault found.
     """
 
-    name: str
+    name: str = key("Name of the cell.", usual="the file's")
     pipeline: Pipeline
     fabric: Fabric
-    candidates: Mapping[str, Placement]
-    objective: Objective
-    scenarios: Mapping[str, Scenario] = field(default_factory=FrozenDict)
-    controller: ControllerSettings = field(default_factory=ControllerSettings)
-    window_cycles: int = 50
-    warmup_windows: int = 0
-    servo: Servo | None = None
-    live: LiveSettings = field(default_factory=LiveSettings)
+    candidates: Mapping[str, Placement] = key(
+        "Placements the policy may choose (Pi_cand), by name: relocatable task to node; anchored "
+        "tasks follow."
+    )
+    objective: Objective = key("Cost, targets and caps.")
+    scenarios: Mapping[str, Scenario] = key(
+        "What happens to the cell, by name: a list of disturbances. `baseline: []` exists always.",
+        default_factory=FrozenDict,
+    )
+    controller: ControllerSettings = key("Policy and protocol.", default_factory=ControllerSettings)
+    window_cycles: int = key("Cycles of a window (W).", Bound(1, MAX_COUNT, whole=True), default=50)
+    warmup_windows: int = key(
+        "First windows of a run, recorded but left out of statistics.",
+        Bound(0, MAX_COUNT, whole=True),
+        default=0,
+    )
+    servo: Servo | None = key(
+        "Loop that every run's commands are tried on; without one there is no tracking error.",
+        default=None,
+    )
+    live: LiveSettings = key("Hosts and habits of the live runtime.", default_factory=LiveSettings)
+    #: Where classes that are named ``package.module:Class`` are looked for first: the cell file's.
+    #: No part of what the cell is.
     folder: str | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        WINDOW_CYCLES.check("window_cycles", self.window_cycles)
-        WARMUP_WINDOWS.check("warmup_windows", self.warmup_windows)
         require_length(1, self.window_cycles, self.pipeline.period_ms, "window_cycles")
         if self.servo is not None:
             self.servo.require_seen(self.pipeline.period_ms)
         declared = {name: tuple(items) for name, items in self.scenarios.items()}
         scenarios = {"baseline": (), **declared}
         object.__setattr__(self, "scenarios", FrozenDict(scenarios))
-        object.__setattr__(self, "candidates", FrozenDict(self.candidates))
         faults = [*find_faults(self._parts()), *self._unplaced()]
         if faults:
             raise ProblemError(faults)

@@ -13,8 +13,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias, runtime_checkable
 
 from dwell.errors import Fault, TraceError
-from dwell.model.bounds import CV, GAMMA_CV, MEAN, REAL, RHO, VALUE, Bound, counted, require
+from dwell.model.bounds import LARGEST, VALUE, Bound, counted, require
 from dwell.model.frozen import shortened
+from dwell.model.keys import declared, key
 
 if TYPE_CHECKING:
     import numpy as np
@@ -24,6 +25,9 @@ Floats: TypeAlias = "NDArray[np.float64]"
 
 # One nanosecond, in milliseconds.
 NS = 1e-6
+
+MEAN, CV = Bound(0, LARGEST, above=True), Bound(0, 100)
+SPREAD = "Coefficient of variation: standard deviation / mean."
 
 
 @runtime_checkable
@@ -40,14 +44,11 @@ class Process(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
+@declared()
 class Constant:
     """Always the same value."""
 
-    value: float
-
-    def __post_init__(self) -> None:
-        VALUE.check("constant", self.value)
+    value: float = key("Always this value.", VALUE, named="constant")
 
     @property
     def expectation(self) -> float:
@@ -61,16 +62,14 @@ class Constant:
         return np.full(size, self.value)
 
 
-@dataclass(frozen=True, slots=True)
+@declared("uniform")
 class Uniform:
     """Uniform on [low, high]."""
 
-    low: float
-    high: float
+    low: float = key("Smallest value.", VALUE)
+    high: float = key("Largest value, at least `low`.", VALUE)
 
     def __post_init__(self) -> None:
-        VALUE.check("uniform.low", self.low)
-        VALUE.check("uniform.high", self.high)
         require(self.high >= self.low, "uniform.high", self.high, f"at least low = {self.low:g}")
 
     @property
@@ -83,18 +82,13 @@ class Uniform:
         return rng.uniform(self.low, self.high, size)
 
 
-@dataclass(frozen=True, slots=True)
+@declared("normal")
 class Normal:
     """Gaussian, clipped from below at `min` (the clipped mass sits on `min`)."""
 
-    mean: float
-    std: float
-    min: float = 0.0
-
-    def __post_init__(self) -> None:
-        REAL.check("normal.mean", self.mean)
-        VALUE.check("normal.std", self.std)
-        VALUE.check("normal.min", self.min)
+    mean: float = key("Mean before clipping.", Bound(-LARGEST, LARGEST))
+    std: float = key("Standard deviation before clipping.", VALUE)
+    min: float = key("What smaller values are raised to.", VALUE, default=0.0)
 
     @property
     def expectation(self) -> float:
@@ -128,16 +122,12 @@ class _ByMean:
         return self.mean
 
 
-@dataclass(frozen=True, slots=True)
+@declared("lognormal")
 class LogNormal(_ByMean):
     """Lognormal with the mean and coefficient of variation of the value itself, not of its log."""
 
-    mean: float
-    cv: float
-
-    def __post_init__(self) -> None:
-        MEAN.check("lognormal.mean", self.mean)
-        CV.check("lognormal.cv", self.cv)
+    mean: float = key("Mean.", MEAN)
+    cv: float = key(SPREAD, CV)
 
     @property
     def log_parameters(self) -> tuple[float, float]:
@@ -156,16 +146,12 @@ class LogNormal(_ByMean):
         return np.exp(values, out=values)
 
 
-@dataclass(frozen=True, slots=True)
+@declared("gamma")
 class Gamma(_ByMean):
     """Gamma with the given mean and coefficient of variation."""
 
-    mean: float
-    cv: float
-
-    def __post_init__(self) -> None:
-        MEAN.check("gamma.mean", self.mean)
-        GAMMA_CV.check("gamma.cv", self.cv)
+    mean: float = key("Mean.", MEAN)
+    cv: float = key(SPREAD, Bound(1e-6, 100))
 
     def marginal(self, rng: np.random.Generator, size: int) -> Floats:
         """Draw `size` independent values."""
@@ -173,21 +159,18 @@ class Gamma(_ByMean):
         return rng.gamma(shape, self.mean / shape, size)
 
 
-@dataclass(frozen=True, slots=True)
+@declared("exponential")
 class Exponential(_ByMean):
     """Exponential with the given mean."""
 
-    mean: float
-
-    def __post_init__(self) -> None:
-        MEAN.check("exponential.mean", self.mean)
+    mean: float = key("Mean.", MEAN)
 
     def marginal(self, rng: np.random.Generator, size: int) -> Floats:
         """Draw `size` independent values."""
         return rng.exponential(self.mean, size)
 
 
-@dataclass(frozen=True, slots=True)
+@declared("ar1")
 class AR1(_ByMean):
     """Positive first-order autoregression: lognormal marginal, lag-1 correlation `rho`.
 
@@ -197,14 +180,14 @@ class AR1(_ByMean):
     r = log(1 + rho cv^2) / s^2 with s^2 = log(1 + cv^2).
     """
 
-    mean: float
-    cv: float
-    rho: float
+    mean: float = key("Mean.", MEAN)
+    cv: float = key(SPREAD, CV)
+    rho: float = key(
+        "Correlation of a cycle's value with the one before.",
+        Bound(-1, 1, above=True, below=True),
+    )
 
     def __post_init__(self) -> None:
-        MEAN.check("ar1.mean", self.mean)
-        CV.check("ar1.cv", self.cv)
-        RHO.check("ar1.rho", self.rho)
         reachable = 1 + self.rho * self.cv**2 > 0 and abs(self.log_correlation) < 1
         require(
             reachable, "ar1.rho", self.rho, f"reachable by a positive process of cv {self.cv:g}"

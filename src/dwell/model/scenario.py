@@ -7,19 +7,10 @@ and falling along a ramp of `ramp_s`.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
-from dwell.model.bounds import (
-    ADDED_LOSS,
-    AT_S,
-    EPISODE_MEAN_S,
-    FOR_S,
-    FOREIGN_THREADS,
-    RAMP_S,
-    RATE_MBPS,
-    require,
-)
+from dwell.model.bounds import FOREIGN_THREADS, LARGEST, RATE_MBPS, Bound, require
+from dwell.model.keys import declared, key
 from dwell.model.process import Process, require_mean
 
 # Equal steps in which a ramp reaches its full strength. Their number has that many binary digits,
@@ -30,55 +21,70 @@ RAMP_STEPS = 2**RAMP_LAYERS - 1
 MAX_LAYERS = 63
 
 
-@dataclass(frozen=True, slots=True)
+EPISODE_MEAN_S, ADDED_LOSS = Bound(1e-5, LARGEST), Bound(0, 1)
+
+
+@declared("episodes")
 class Episodes:
-    """An alternating renewal process: off for `every_s` seconds, then on for `for_s`, and so on.
+    """Episodes that come and go: off for `every_s` seconds, then on for `for_s`, and so on."""
 
-    Parameters
-    ----------
-    name : str
-        Name of the random streams; disturbances of one scenario whose episodes have the same name
-        come and go together.
-    every_s, for_s : Process
-        Seconds, independent of each other; their means are above 1e-5.
-    """
-
-    name: str
-    every_s: Process
-    for_s: Process
+    name: str = key(
+        "Name of the episodes, and of their random streams; what shares it in a scenario comes and "
+        "goes together."
+    )
+    every_s: Process = key("Time between episodes, s; mean above 1e-5.")
+    for_s: Process = key("Duration of an episode, s; mean above 1e-5.")
 
     def __post_init__(self) -> None:
         for path, process in (("every_s", self.every_s), ("for_s", self.for_s)):
             require_mean(EPISODE_MEAN_S, f"episodes.{path}", process)
 
 
-@dataclass(frozen=True, slots=True)
+def _at_s() -> Any:
+    return key(
+        "Begin, seconds from the start of the run.", Bound(0, LARGEST, below=True), default=0.0
+    )
+
+
+def _for_s() -> Any:
+    return key("Duration, seconds.", Bound(0, above=True), default=math.inf, usual="to the end")
+
+
+def _down() -> Any:
+    return key("Whether the node or the link is down meanwhile.", default=False)
+
+
+def _episodes() -> Any:
+    return key("When it is on within that time.", default=None, usual="all the time")
+
+
+def _ramp_s() -> Any:
+    return key(
+        "Time in which it grows from nothing, and in which it falls again at its end, in 31 equal "
+        "steps each, seconds.",
+        Bound(0, LARGEST),
+        default=0.0,
+    )
+
+
+@declared()
 class NodeDisturbance:
-    """Foreign CPU load on a node, or the node down.
+    """Foreign CPU load on a node, or the node down."""
 
-    Parameters
-    ----------
-    at_s, for_s : float
-        Begin and duration, seconds.
-    stress_threads : int
-        Foreign threads; along a ramp, rounded to whole ones.
-    episodes : Episodes, optional
-        When it is on within that time; all the time where None.
-    ramp_s : float
-        Time in which it grows to its full strength, and in which it falls to nothing at its end.
-    """
-
-    node: str
-    at_s: float = 0.0
-    for_s: float = math.inf
-    stress_threads: int = 0
-    down: bool = False
-    episodes: Episodes | None = None
-    ramp_s: float = 0.0
+    node: str = key("Node that it happens to.")
+    at_s: float = _at_s()
+    for_s: float = _for_s()
+    stress_threads: int = key(
+        "Foreign threads on the node; along a ramp, rounded to whole ones.",
+        FOREIGN_THREADS,
+        default=0,
+    )
+    down: bool = _down()
+    episodes: Episodes | None = _episodes()
+    ramp_s: float = _ramp_s()
 
     def __post_init__(self) -> None:
         _check_time(self)
-        FOREIGN_THREADS.check("stress_threads", self.stress_threads)
 
     @property
     def end_s(self) -> float:
@@ -91,31 +97,36 @@ class NodeDisturbance:
         return self.node
 
 
-@dataclass(frozen=True, slots=True)
+@declared()
 class LinkDisturbance:
     """Extra delay, loss or another rate on a directed link, or the link down.
 
     Loss probabilities of disturbances at the same time, and the link's own, combine as
-    independent; extra delays add up; the lowest rate counts. Time, episodes and ramp are those of
-    `NodeDisturbance`; along a ramp the extra delay, the loss, and the time that a bit takes at
-    `rate_mbps` beyond what it takes at the link's own rate are what grows.
+    independent; extra delays add up; the lowest rate counts. Along a ramp the extra delay, the
+    loss, and the time that a bit takes at `rate_mbps` beyond what it takes at the link's own rate
+    are what grows.
     """
 
     source: str
     target: str
-    at_s: float = 0.0
-    for_s: float = math.inf
-    add_delay_ms: Process | None = None
-    loss: float = 0.0
-    rate_mbps: float = math.inf
-    down: bool = False
-    episodes: Episodes | None = None
-    ramp_s: float = 0.0
+    at_s: float = _at_s()
+    for_s: float = _for_s()
+    add_delay_ms: Process | None = key(
+        "Added to the delay of every message on the link, ms.", default=None
+    )
+    loss: float = key("Probability of loss on the link, besides its own.", ADDED_LOSS, default=0.0)
+    rate_mbps: float = key(
+        "Rate of the link meanwhile, where its own is not lower, Mbit/s.",
+        RATE_MBPS,
+        default=math.inf,
+        usual="the link's",
+    )
+    down: bool = _down()
+    episodes: Episodes | None = _episodes()
+    ramp_s: float = _ramp_s()
 
     def __post_init__(self) -> None:
         _check_time(self)
-        ADDED_LOSS.check("loss", self.loss)
-        RATE_MBPS.check("rate_mbps", self.rate_mbps)
 
     @property
     def end_s(self) -> float:
@@ -151,9 +162,6 @@ def is_always_on(item: Disturbance) -> bool:
 
 
 def _check_time(item: Disturbance) -> None:
-    AT_S.check("at_s", item.at_s)
-    FOR_S.check("for_s", item.for_s)
-    RAMP_S.check("ramp_s", item.ramp_s)
     if item.ramp_s == 0:
         return
     half = f"at most half of for_s = {item.for_s:g}: it grows, and it falls"

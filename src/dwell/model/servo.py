@@ -3,31 +3,24 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from dwell.model.bounds import AMPLITUDE_MM, DAMPING, SERVO_GAIN, TARGET_PERIOD_S, require
+from dwell.model.bounds import LARGEST, MAX_COUNT, Bound, require
+from dwell.model.keys import declared, key
 
 Plant: TypeAlias = Literal["integrator", "double-integrator"]
-PLANTS: tuple[Plant, ...] = ("integrator", "double-integrator")
 
 
-@dataclass(frozen=True, slots=True)
+@declared("target")
 class MovingTarget:
-    """Moving target: r(t) = amplitude · sin(2 pi t / period), t from the first release.
+    """What the robot follows: r(t) = amplitude · sin(2 pi t / period), t from the first release."""
 
-    Parameters
-    ----------
-    amplitude_mm : float
-        All errors are proportional to it.
-    """
-
-    amplitude_mm: float
-    period_s: float
-
-    def __post_init__(self) -> None:
-        AMPLITUDE_MM.check("target.amplitude_mm", self.amplitude_mm)
-        TARGET_PERIOD_S.check("target.period_s", self.period_s)
+    amplitude_mm: float = key(
+        "Amplitude, mm; errors are proportional to it.", Bound(1e-6, MAX_COUNT)
+    )
+    period_s: float = key(
+        "Duration of one swing, s; at least two periods of the cell.", Bound(1e-5, LARGEST)
+    )
 
     @property
     def omega(self) -> float:
@@ -35,30 +28,24 @@ class MovingTarget:
         return 2 * math.pi / self.period_s
 
 
-@dataclass(frozen=True, slots=True)
+@declared()
 class Servo:
-    """One axis of a robot that follows a moving target by what the camera saw.
+    """One axis of a robot that follows a moving target by what the camera saw."""
 
-    Parameters
-    ----------
-    plant : {"integrator", "double-integrator"}
-        The command is a velocity, or an acceleration.
-    gain : float
-        Command for an error of 1: 1/s for the integrator, 1/s² for the double integrator.
-    damping : float
-        Command for an error that grows by 1 a second, 1/s; above 0 for the double integrator, 0 for
-        the integrator.
-    """
-
-    plant: Plant
-    gain: float
-    target: MovingTarget
-    damping: float = 0.0
+    plant: Plant = key("What a command sets: the velocity (`integrator`), or the acceleration.")
+    gain: float = key(
+        "Command for an error of 1: 1/s, for a `double-integrator` 1/s².",
+        Bound(0, MAX_COUNT, above=True),
+    )
+    target: MovingTarget = key("What the robot follows.")
+    damping: float = key(
+        "Command for an error that grows by 1 a second, 1/s; for a `double-integrator`, which "
+        "needs it.",
+        Bound(0, MAX_COUNT),
+        default=0.0,
+    )
 
     def __post_init__(self) -> None:
-        require(self.plant in PLANTS, "plant", self.plant, f"one of {', '.join(PLANTS)}")
-        SERVO_GAIN.check("gain", self.gain)
-        DAMPING.check("damping", self.damping)
         if self.plant == "double-integrator":
             bound = "above 0 with a double-integrator, which swings without end otherwise"
             require(self.damping > 0, "damping", self.damping, bound)

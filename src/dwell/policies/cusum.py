@@ -26,7 +26,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from dwell.model.bounds import CUSUM_MEMORY, MIN_IMPROVEMENT
+from dwell.model.bounds import MIN_IMPROVEMENT, Bound
 from dwell.model.objective import Objective
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
@@ -76,7 +76,7 @@ class Cusum(PricingPolicy):
         super().__init__(candidates=candidates, initial=initial, objective=objective)
         self.threshold = check_parameter("threshold", threshold, MIN_IMPROVEMENT)
         self.slack = check_parameter("slack", slack, MIN_IMPROVEMENT)
-        self.memory = check_parameter("memory", memory, CUSUM_MEMORY)
+        self.memory = check_parameter("memory", memory, Bound(0, 1, above=True))
         self._sums = dict.fromkeys(self.candidates, 0.0)
 
     def __repr__(self) -> str:

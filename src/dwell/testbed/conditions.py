@@ -23,6 +23,7 @@ from dwell.model.process import (
     Trace,
     TraceTable,
 )
+from dwell.model.scenario import ADDED_LOSS
 
 #: `drop`: data is lost; `hold`: it waits, as in the sender's buffers; either way nothing passes.
 Cut: TypeAlias = Literal["drop", "hold"]
@@ -75,7 +76,7 @@ class Conditions:
         good = len(self.shares) == len(self.add_delays_ms) and all(0 <= s <= 1 for s in self.shares)
         bounds.require(good, "shares", self.shares, "one from 0 to 1 for each of add_delays_ms")
         bounds.RATE_MBPS.check("rate_mbps", self.rate_mbps)
-        bounds.ADDED_LOSS.check("loss", self.loss)
+        ADDED_LOSS.check("loss", self.loss)
         known = self.cut is None or self.cut in CUTS
         bounds.require(known, "cut", self.cut, f"one of {', '.join(CUTS)}, or none")
 

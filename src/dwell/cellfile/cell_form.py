@@ -1,0 +1,458 @@
+"""The form of a cell file: what the model declares, and what a file says in other words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from dwell.cellfile.document_faults import Faults
+from dwell.cellfile.forms import (
+    FAULTY,
+    Choice,
+    Definitions,
+    Entry,
+    Flag,
+    Form,
+    Items,
+    JsonSchema,
+    Key,
+    Names,
+    Number,
+    Shape,
+    Text,
+    Written,
+    form_of,
+    key_of,
+    refused,
+    shape_of,
+    unquoted,
+)
+from dwell.cellfile.rendering import as_read
+from dwell.cellfile.structure import FileKind
+from dwell.estimators.registry import REGISTRY as ESTIMATORS
+from dwell.model import (
+    Bursts,
+    Caps,
+    Constant,
+    ControllerSettings,
+    Endpoint,
+    Episodes,
+    Execution,
+    Flow,
+    Host,
+    Link,
+    LinkDisturbance,
+    LiveSettings,
+    MovingTarget,
+    Node,
+    NodeDisturbance,
+    Objective,
+    Pipeline,
+    Problem,
+    Process,
+    Quota,
+    Servo,
+    Targets,
+    Task,
+    Weights,
+)
+from dwell.model.bounds import LARGEST, MAX_COUNT, VALUE, Bound
+from dwell.model.document import VERSION
+from dwell.model.keys import DeclaredField, declared_fields
+from dwell.model.pipeline import WORKERS
+from dwell.model.process import DRAWN
+from dwell.policies.registry import REGISTRY as POLICIES
+
+NAME = Text()
+
+# ------------------------------------------------------------------------------- processes
+
+
+def _columns(value: Any) -> str | tuple[str, ...]:
+    if isinstance(value, str):
+        return value
+    if isinstance(value, list) and value and all(isinstance(name, str) for name in value):
+        return tuple(value)
+    has = as_read(value)
+    raise ValueError(f"{has} is not allowed; it must be a column name, or a list of them")
+
+
+def _optional(name: str, form: Form, says: str, usual: str = "") -> Key:
+    return Key(name, name, form, says, False, usual)
+
+
+def _required(name: str, form: Form, says: str, stand_in: Any = FAULTY) -> Key:
+    return Key(name, name, form, says, True, "", stand_in)
+
+
+TRACE = Shape(
+    "Trace",
+    "A recorded column, replayed in order; columns of one file share their rows.",
+    (
+        _required(
+            "file",
+            Text(may_be_empty=False),
+            "A .parquet or .csv file, relative to the cell file's folder.",
+        ),
+        _required("column", NAME, "Column with the values: milliseconds, or bare factors."),
+        _optional(
+            "by",
+            Choice(("row", "time")),
+            "`row`: each cycle takes the next row. `time`: each cycle takes the latest row sent at "
+            "or before its release.",
+            "row",
+        ),
+        _optional(
+            "time",
+            NAME,
+            "Column with the instant of each row, ms; only with `by: time`.",
+            "sent_ms",
+        ),
+        _optional(
+            "group",
+            Written(
+                _columns,
+                {
+                    "anyOf": [
+                        {"type": "string"},
+                        {"type": "array", "items": {"type": "string"}, "minItems": 1},
+                    ]
+                },
+            ),
+            "Column, or columns, whose values tell recordings apart; a run without `wrap` stays "
+            "within one.",
+            "none",
+        ),
+        _optional(
+            "on_negative",
+            Choice(("error", "drop", "clip")),
+            "What to do with rows whose value is negative, missing or not finite: `error`, `drop` "
+            "the row for all columns, or `clip` negative values to 0.",
+            "error",
+        ),
+        _optional("wrap", Flag(), "Whether to go on at the beginning when the rows end.", "false"),
+        _optional(
+            "sha256",
+            Text(pattern="[0-9a-f]{64}", of="64 hexadecimal digits, as they were recorded"),
+            "Digest of the data that a recorded problem used; other data are refused.",
+        ),
+    ),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class ProcessForm(Form):
+    """A number, or one named random process: an `Entry` of it, or its `Constant`."""
+
+    shape: Shape
+
+    def read(self, value: Any, path: str, faults: Faults) -> Any:
+        """Return a `Constant`, or the entry of the one process that is named."""
+        if isinstance(value, dict):
+            entry = self.shape.read(value, path, faults)
+            if len(value) != 1 and not faults.touches(path):
+                has = f"{len(value)} of them ({', '.join(value)})" if value else "none"
+                names = ", ".join(self.shape.names)
+                faults.add(path, f"needs exactly one process and has {has}; choose one of {names}")
+            if len(entry.values) != 1 or len(value) != 1:
+                return FAULTY
+            (found,) = entry.values.values()
+            return found if isinstance(found, Entry) else Constant(found)
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            number = Number(VALUE).read(value, path, faults)
+            return FAULTY if number is FAULTY else Constant(number)
+        names = ", ".join(self.shape.names)
+        remedy = f"a number from 0 to 1e9, or one of {names} with its values"
+        quoted = unquoted(value) if isinstance(value, str) else ""
+        if isinstance(value, str) and value in self.shape.names:
+            remedy = f"written with its values, as `{{{value}: {{...}}}}`"
+        return refused(value, f"{remedy}{quoted}", path, faults)
+
+    def schema(self, definitions: Definitions) -> JsonSchema:
+        """Return a number or a mapping of one key."""
+        if "Process" not in definitions:
+            definitions["Process"] = {}
+            mapping = self.shape.definition(definitions)
+            says = mapping.pop("description")
+            either = [
+                Number(VALUE).schema(definitions),
+                {**mapping, "minProperties": 1, "maxProperties": 1},
+            ]
+            definitions["Process"] = {"description": says, "anyOf": either}
+        return {"$ref": "#/$defs/Process"}
+
+
+(CONSTANT,) = declared_fields(Constant)
+PROCESS = ProcessForm(
+    Shape(
+        "Process",
+        "A number, or one named random process.",
+        (
+            _optional("constant", Number(VALUE), CONSTANT.key.says),
+            *(
+                _optional(name, shape_of(kind, {}), (kind.__doc__ or "").partition("\n")[0])
+                for name, kind in DRAWN.items()
+            ),
+            _optional("trace", TRACE, TRACE.says),
+        ),
+    )
+)
+#: What stands for a process at fault; it passes every check of meaning.
+STAND_IN = Constant(1.0)
+PROCESSES: Mapping[Any, Form] = {Process: PROCESS}
+
+
+def _field(kind: type, name: str) -> DeclaredField:
+    return next(one for one in declared_fields(kind) if one.name == name)
+
+
+def _with_stand_in(kind: type, name: str, stand_in: object) -> Key:
+    one = _field(kind, name)
+    return key_of(one, form_of(one, PROCESSES), stand_in=stand_in)
+
+
+# ---------------------------------------------------------------------------------- fabric
+
+NODE_BURSTS = shape_of(
+    Bursts,
+    PROCESSES,
+    title="NodeBursts",
+    without=("add_delay_ms",),
+    says="Foreign work on a node, of other tenants.",
+)
+LINK_BURSTS = shape_of(
+    Bursts,
+    PROCESSES,
+    title="LinkBursts",
+    without=("threads",),
+    says="Episodes of extra delay on a link.",
+)
+_ACCELERATORS = _field(Node, "accelerators")
+NODE = shape_of(
+    Node,
+    {Quota: shape_of(Quota, {}), Bursts: NODE_BURSTS},
+    instead={
+        "tier": _with_stand_in(Node, "tier", "robot"),
+        # A node without its accelerators, as if tasks named unknown ones.
+        "accelerators": key_of(_ACCELERATORS, form_of(_ACCELERATORS, {}), breaks=True),
+    },
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Words(Form):
+    """One of some words, or a mapping that says more.
+
+    Parameters
+    ----------
+    words : mapping of str to object
+        What each of them means.
+    shape : Shape
+        Of one key, whose value is meant.
+    remedy : str
+        What a value must be.
+    """
+
+    words: Mapping[str, Any]
+    shape: Shape
+    remedy: str
+
+    def read(self, value: Any, path: str, faults: Faults) -> Any:
+        """Return what is meant."""
+        if isinstance(value, str) and value in self.words:
+            return self.words[value]
+        if not isinstance(value, dict):
+            return refused(value, self.remedy, path, faults)
+        entry = self.shape.read(value, path, faults)
+        return entry if entry is FAULTY else entry.values.get(self.shape.keys[0].name)
+
+    def schema(self, definitions: Definitions) -> JsonSchema:
+        """Return the words or the mapping."""
+        names = list(self.words)
+        word = {"const": names[0]} if len(names) == 1 else {"enum": names}
+        return {"anyOf": [word, self.shape.schema(definitions)]}
+
+
+_RETRANSMIT = _field(Link, "retransmit_ms")
+ON_LOSS = Words(
+    {"drop": None},
+    Shape(
+        "Retransmit",
+        "How long after a lost attempt the next one follows.",
+        (_required("retransmit_ms", Number(_RETRANSMIT.key.bound or VALUE), _RETRANSMIT.key.says),),
+    ),
+    "`drop` (default) or `{retransmit_ms: 20}`",
+)
+LINK = shape_of(
+    Link,
+    {**PROCESSES, Bursts: LINK_BURSTS},
+    instead={
+        "delay_ms": _with_stand_in(Link, "delay_ms", STAND_IN),
+        "retransmit_ms": Key(
+            "retransmit_ms",
+            "on_loss",
+            ON_LOSS,
+            "What happens to a lost message: `drop` or retransmission.",
+            False,
+            "drop",
+        ),
+    },
+    further=(
+        _optional(
+            "both_ways",
+            Flag(),
+            "Whether there is the same link back too, drawn independently.",
+            "false",
+        ),
+    ),
+)
+
+# -------------------------------------------------------------------------------- pipeline
+
+EXECUTION = shape_of(
+    Execution,
+    PROCESSES,
+    instead={"exec_ms": _with_stand_in(Execution, "exec_ms", STAND_IN)},
+)
+_DEPTH = _field(Task, "depth")
+INPUT = Words(
+    {"queue": 0, "latest": 1},
+    Shape(
+        "Input",
+        "How many complete input sets may wait.",
+        (
+            Key(
+                "depth",
+                "queue",
+                Number(Bound(1, MAX_COUNT, whole=True)),
+                "Input sets that may wait; beyond it the oldest is replaced.",
+                True,
+            ),
+        ),
+    ),
+    "`queue` (default), `latest` or `{queue: 8}`",
+)
+TASK = shape_of(
+    Task,
+    {},
+    instead={
+        "on": Key(
+            "on", "on", Names(EXECUTION, keeps=True, least=1), _field(Task, "on").key.says, True
+        ),
+        "depth": Key(
+            "depth",
+            "input",
+            INPUT,
+            "What waits for a worker: `queue` without a bound, `latest` only, or a bounded queue.",
+            False,
+            "queue",
+        ),
+    },
+    further=(
+        _optional(
+            "workers",
+            Number(WORKERS),
+            "Jobs that may run at a time on each node that does not say.",
+            "1",
+        ),
+    ),
+)
+FLOW = shape_of(Flow, {})
+
+# ------------------------------------------------------------- scenarios, objective, control
+
+TIMED = {**PROCESSES, Episodes: shape_of(Episodes, PROCESSES)}
+#: Keys of a disturbance that belong to one kind of it.
+NODE_KEYS = ("stress_threads",)
+LINK_KEYS = ("both_ways", "add_delay_ms", "loss", "rate_mbps")
+
+
+def _disturbance() -> Shape:
+    node = shape_of(NodeDisturbance, TIMED)
+    link = shape_of(LinkDisturbance, TIMED)
+    known = {key.name: key for key in (*node.keys, *link.keys)}
+    first = _optional("node", NAME, known.pop("node").says)
+    further = (
+        _optional("link", NAME, "Link that it happens to, as `R1->E`."),
+        _optional("both_ways", Flag(), "Whether it happens to the link back as well.", "false"),
+    )
+    return Shape(
+        "Disturbance",
+        "One thing that happens to a node or to a link for a while.",
+        (first, *further, *known.values()),
+        extra={"oneOf": [{"required": ["node"]}, {"required": ["link"]}]},
+    )
+
+
+DISTURBANCE = _disturbance()
+_TARGETS = shape_of(Targets, {})
+OBJECTIVE = shape_of(
+    Objective,
+    {},
+    instead={
+        "weights": _optional("weights", shape_of(Weights, {}), "Weights of the terms of J."),
+        "targets": _optional("targets", _TARGETS, "Design targets."),
+        "caps": _optional("caps", shape_of(Caps, {}), "Hard caps."),
+        "accelerators": _optional(
+            "accelerators",
+            Flag(),
+            "Whether accelerators of these nodes count in their tiers, too.",
+            "false",
+        ),
+    },
+)
+_POLICY, _ESTIMATOR = _field(ControllerSettings, "policy"), _field(ControllerSettings, "estimator")
+CONTROLLER = shape_of(
+    ControllerSettings,
+    {},
+    title="Controller",
+    instead={
+        "policy": key_of(_POLICY, Text(examples=tuple(POLICIES))),
+        "estimator": key_of(_ESTIMATOR, Text(examples=tuple(ESTIMATORS))),
+    },
+)
+SERVO = shape_of(Servo, {MovingTarget: shape_of(MovingTarget, {})})
+_ADDRESS = Text(may_be_empty=False)
+ENDPOINT = shape_of(Endpoint, {}, instead={"address": _ADDRESS})
+HOST = shape_of(Host, {Endpoint: ENDPOINT}, instead={"address": _ADDRESS})
+LIVE = shape_of(LiveSettings, {Host: HOST}, title="Live")
+
+# ------------------------------------------------------------------------------------ cell
+
+_TIMING = {one.name: key_of(one, form_of(one, PROCESSES)) for one in declared_fields(Pipeline)}
+_WHOLE = {one.name: key_of(one, form_of(one, {})) for one in declared_fields(Problem)}
+
+
+def _section(name: str, form: Form, stand_in: object = FAULTY) -> Key:
+    """A section of the file, with what the model says of it."""
+    says = {**_TIMING, **_WHOLE}[name].says
+    return Key(name, name, form, says, stand_in is not FAULTY, "", stand_in)
+
+
+CELL_SHAPE = Shape(
+    "Cell",
+    "A pipeline on its robots: tasks, flows, nodes, links, candidates, scenarios, objective.",
+    (
+        _required("dwell", Choice((VERSION,)), "Version of this format.", VERSION),
+        _WHOLE["name"],
+        key_of(_field(Pipeline, "period_ms"), _TIMING["period_ms"].form, stand_in=LARGEST),
+        _TIMING["deadline_ms"],
+        _TIMING["release_jitter_ms"],
+        _WHOLE["window_cycles"],
+        _WHOLE["warmup_windows"],
+        _required("nodes", Names(NODE, keeps=True, least=1), "Computers by name.", {}),
+        _optional("links", Items(LINK, keeps=True), "Connections between nodes.", "none"),
+        _section("tasks", Names(TASK, keeps=True, least=1), {}),
+        _optional("flows", Items(FLOW, keeps=True), _TIMING["flows"].says, "none"),
+        _section("scales", Names(PROCESS, keeps=True)),
+        _section("candidates", Names(Names(NAME), keeps=True, least=1), {}),
+        _section("scenarios", Names(Items(DISTURBANCE, keeps=True), keeps=True)),
+        _section("objective", OBJECTIVE),
+        _section("controller", CONTROLLER),
+        _section("servo", SERVO),
+        _section("live", LIVE),
+    ),
+)
+
+CELL = FileKind(CELL_SHAPE, "cell", "dwell", VERSION)

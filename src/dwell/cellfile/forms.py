@@ -1,0 +1,541 @@
+"""Forms: what may stand at a place of a file, how it is read, and its JSON Schema.
+
+A form reads a value into what the file says with it, or records what is wrong and returns `FAULTY`.
+Reading goes on beside a fault: an optional key at fault counts as left out, one that has to be
+there gets a stand-in where there is a harmless one, and takes its mapping with it elsewhere.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import MISSING, dataclass, field
+from typing import Any, ClassVar, Final, TypeAlias, get_args, get_origin
+
+from dwell.cellfile.document_faults import Faults, Step
+from dwell.cellfile.rendering import as_read
+from dwell.model.bounds import Bound
+from dwell.model.keys import DeclaredField, declared_fields
+from dwell.model.semantics import closest, nearest
+
+JsonSchema: TypeAlias = dict[str, Any]
+#: Schemas of the forms that have a name, by it.
+Definitions: TypeAlias = dict[str, JsonSchema]
+
+#: What a form returns of a value that is at fault.
+FAULTY: Final = object()
+# How like a required key an unknown one has to be to stand for it: `teir` for `tier`.
+MISSPELT = 0.7
+
+
+def beneath(path: str, step: Step) -> str:
+    """Return the path of what stands at a key or an index."""
+    if isinstance(step, int):
+        return f"{path}[{step}]"
+    name = step or "''"
+    return f"{path}.{name}" if path else name
+
+
+class Form(ABC):
+    """What may stand at a place."""
+
+    #: Whether a key or an item at fault is kept as a bare name or place, None.
+    is_kept: ClassVar[bool] = False
+
+    @abstractmethod
+    def read(self, value: Any, path: str, faults: Faults) -> Any:
+        """Return what a value says, or `FAULTY` beside a fault."""
+
+    @abstractmethod
+    def schema(self, definitions: Definitions) -> JsonSchema:
+        """Return the JSON Schema; what has a name is put into the definitions."""
+
+
+def refused(value: object, bound: str, path: str, faults: Faults) -> Any:
+    """Record that a value is not allowed."""
+    faults.add(path, f"{as_read(value)} is not allowed; it must be {bound}")
+    return FAULTY
+
+
+# ------------------------------------------------------------------------------ single values
+
+
+@dataclass(frozen=True, slots=True)
+class Number(Form):
+    """A finite number within a bound."""
+
+    bound: Bound
+
+    def read(self, value: Any, path: str, faults: Faults) -> Any:
+        """Return the number, a float where the bound is none of whole numbers."""
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            remedy = unquoted(value) if isinstance(value, str) else ""
+            return refused(value, f"{self.bound}{remedy}", path, faults)
+        if abs(value) > sys.float_info.max and self.bound.high == math.inf:
+            message = f"{as_read(value)} is not allowed; leave the key out for no limit"
+            faults.add(path, message)
+            return FAULTY
+        # A whole number may be written 6e4; JSON Schema says the same of its integers.
+        if self.bound.whole and isinstance(value, float) and value.is_integer():
+            value = int(value)
+        if not self.bound.holds(value):
+            return refused(value, str(self.bound), path, faults)
+        return value if self.bound.whole else float(value)
+
+    def schema(self, definitions: Definitions) -> JsonSchema:
+        """Return its type and its bounds."""
+        bound = self.bound
+        result: JsonSchema = {"type": "integer" if bound.whole else "number"}
+        plain = int if bound.whole else float
+        result["exclusiveMinimum" if bound.above else "minimum"] = plain(bound.low)
+        if bound.high != math.inf:
+            result["exclusiveMaximum" if bound.below else "maximum"] = plain(bound.high)
+        return result
+
+
+def unquoted(text: str) -> str:
+    """Return a remedy for a text that was meant as a number."""
+    try:
+        number = float(text)
+    except ValueError:
+        return ""
+    return f"; write {text.replace('_', '')} without quotes" if math.isfinite(number) else ""
+
+
+@dataclass(frozen=True, slots=True)
+class Text(Form):
+    """A text.
+
+    Parameters
+    ----------
+    pattern : str
+        Regular expression of the whole, with what it means in `of`.
+    examples : tuple of str
+        For editors.
+    """
+
+    may_be_empty: bool = True
+    pattern: str = ""
+    of: str = ""
+    examples: tuple[str, ...] = ()
+
+    def read(self, value: Any, path: str, faults: Faults) -> Any:
+        """Return the text; that of a key which is no text, where it stands for one."""
+        if not isinstance(value, str):
+            what = "a text" if isinstance(value, dict | list) else "a text; put it in quotes"
+            return refused(value, what, path, faults)
+        if not value and not self.may_be_empty:
+            return refused(value, "a text that is not empty", path, faults)
+        if self.pattern and re.fullmatch(self.pattern, value) is None:
+            return refused(value, self.of, path, faults)
+        return value
+
+    def schema(self, definitions: Definitions) -> JsonSchema:
+        """Return its type."""
+        result: JsonSchema = {"type": "string"}
+        if not self.may_be_empty:
+            result["minLength"] = 1
+        if self.pattern:
+            result["pattern"] = f"^{self.pattern}$"
+        return {**result, "examples": list(self.examples)} if self.examples else result
+
+
+@dataclass(frozen=True, slots=True)
+class Flag(Form):
+    """A truth value."""
+
+    def read(self, value: Any, path: str, faults: Faults) -> Any:
+        """Return the truth value."""
+        return value if isinstance(value, bool) else refused(value, "true or false", path, faults)
+
+    def schema(self, definitions: Definitions) -> JsonSchema:
+        """Return its type."""
+        return {"type": "boolean"}
+
+
+@dataclass(frozen=True, slots=True)
+class Choice(Form):
+    """One of some values."""
+
+    choices: tuple[Any, ...]
+
+    def read(self, value: Any, path: str, faults: Faults) -> Any:
+        """Return the value."""
+        if type(value) in (str, int) and value in self.choices:
+            return value
+        names = [str(choice) for choice in self.choices]
+        hint = nearest(value, names) if isinstance(value, str) else ""
+        bound = f"one of {', '.join(names)}"
+        return refused(value, f"{bound}; {hint}" if hint.startswith("did") else bound, path, faults)
+
+    def schema(self, definitions: Definitions) -> JsonSchema:
+        """Return the values."""
+        if len(self.choices) == 1:
+            return {"const": self.choices[0]}
+        return {"enum": list(self.choices), "type": "string"}
+
+
+@dataclass(frozen=True, slots=True)
+class Written(Form):
+    """A value that may be written in several ways.
+
+    Parameters
+    ----------
+    reader : callable
+        Returns what the value says; raises a ValueError with what is wrong.
+    shown : mapping
+        JSON Schema.
+    """
+
+    reader: Callable[[Any], Any]
+    shown: Mapping[str, Any] = field(default_factory=dict)
+
+    def read(self, value: Any, path: str, faults: Faults) -> Any:
+        """Return what the reader makes of the value."""
+        try:
+            return self.reader(value)
+        except ValueError as error:
+            faults.add(path, str(error))
+            return FAULTY
+
+    def schema(self, definitions: Definitions) -> JsonSchema:
+        """Return the schema as given."""
+        return dict(self.shown)
+
+
+# ------------------------------------------------------------------------------- containers
+
+
+def take(form: Form, value: Any, path: str, faults: Faults, remedy: str) -> Any:
+    """Return what a value says, or `FAULTY`; nothing at all is a fault, too.
+
+    Parameters
+    ----------
+    remedy : str
+        What to do where nothing is given.
+    """
+    if isinstance(form, Text) and (text := faults.unquoted(value)) is not None:
+        value = text
+    if value is None:
+        if not faults.at(path):
+            faults.add(path, f"nothing is given; {remedy}")
+        return FAULTY
+    return form.read(value, path, faults)
+
+
+@dataclass(frozen=True, slots=True)
+class Names(Form):
+    """Values of one form by name.
+
+    Parameters
+    ----------
+    keeps : bool
+        Whether the name of one at fault is kept, with None; elsewhere it takes all with it.
+    least : int
+        How many there have to be, for editors.
+    """
+
+    form: Form
+    keeps: bool = False
+    least: int = 0
+
+    def read(self, value: Any, path: str, faults: Faults) -> Any:
+        """Return a dict of what they say."""
+        if not isinstance(value, dict):
+            return refused(value, "a mapping", path, faults)
+        found = {
+            name: take(
+                self.form,
+                item,
+                beneath(path, name),
+                faults,
+                f"give a value, or remove the key {name!r}",
+            )
+            for name, item in value.items()
+        }
+        if self.keeps:
+            return {name: None if item is FAULTY else item for name, item in found.items()}
+        return FAULTY if FAULTY in found.values() else found
+
+    def schema(self, definitions: Definitions) -> JsonSchema:
+        """Return the schema of a mapping."""
+        result: JsonSchema = {
+            "type": "object",
+            "additionalProperties": self.form.schema(definitions),
+        }
+        return {**result, "minProperties": self.least} if self.least else result
+
+
+@dataclass(frozen=True, slots=True)
+class Items(Form):
+    """A list of values of one form; see `Names`."""
+
+    form: Form
+    keeps: bool = False
+
+    def read(self, value: Any, path: str, faults: Faults) -> Any:
+        """Return a list of what they say."""
+        if not isinstance(value, list):
+            return refused(value, "a list; for none, write []", path, faults)
+        remedy = "give a value, or remove the item"
+        found = [
+            take(self.form, item, beneath(path, index), faults, remedy)
+            for index, item in enumerate(value)
+        ]
+        if self.keeps:
+            return [None if item is FAULTY else item for item in found]
+        return FAULTY if FAULTY in found else found
+
+    def schema(self, definitions: Definitions) -> JsonSchema:
+        """Return the schema of a list."""
+        return {"type": "array", "items": self.form.schema(definitions)}
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """A key of a mapping.
+
+    Parameters
+    ----------
+    name : str
+        Field or argument that it is read for.
+    named : str
+        The key itself.
+    says : str
+        One sentence.
+    usual : str
+        What holds where it is left out, in words.
+    stand_in : object
+        Stands for a value at fault where the key is required; `FAULTY`: the mapping goes.
+    breaks : bool
+        Whether a value at fault takes the mapping with it though the key is optional.
+    """
+
+    name: str
+    named: str
+    form: Form
+    says: str
+    is_required: bool = False
+    usual: str = ""
+    stand_in: Any = FAULTY
+    breaks: bool = False
+
+    @property
+    def described(self) -> str:
+        """The sentence, with what is usual."""
+        return f"{self.says[:-1]}; default: {self.usual}." if self.usual else self.says
+
+
+class Entry:
+    """What a mapping says: its values by the names of fields, None for what is left out.
+
+    Parameters
+    ----------
+    shape : Shape
+        What it is read by.
+    path : str
+        Where it is.
+    values : mapping of str to object
+        What is given.
+    """
+
+    __slots__ = ("path", "shape", "values")
+
+    def __init__(self, shape: Shape, path: str, values: Mapping[str, Any]) -> None:
+        self.shape, self.path, self.values = shape, path, values
+
+    def __repr__(self) -> str:
+        return (
+            f"<Entry of {self.shape.title} at {self.path or 'the top'}: {', '.join(self.values)}>"
+        )
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return self.values.get(name)
+
+
+@dataclass(frozen=True, eq=False)
+class Shape(Form):
+    """A mapping of known keys.
+
+    Parameters
+    ----------
+    title : str
+        Its name in the JSON Schema.
+    says : str
+        One sentence.
+    keys : tuple of Key
+        In their order.
+    kind : type, optional
+        Class of the model that its values are the arguments of.
+    extra : mapping
+        What its JSON Schema has besides.
+    """
+
+    title: str
+    says: str
+    keys: tuple[Key, ...]
+    kind: Any = None
+    extra: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def names(self) -> list[str]:
+        """Its keys."""
+        return [key.named for key in self.keys]
+
+    def read(self, value: Any, path: str, faults: Faults) -> Any:
+        """Return an `Entry` with what is given."""
+        if not isinstance(value, dict):
+            return refused(value, f"a mapping of {', '.join(self.names)}", path, faults)
+        missing = [key.named for key in self.keys if key.is_required and key.named not in value]
+        for name in value:
+            if name not in self.names:
+                here = beneath(path, name)
+                faults.add(here, f"unknown key {name!r}; {nearest(name, self.names)}")
+                meant = closest(name, self.names, MISSPELT)
+                if meant in missing:
+                    faults.excuse(beneath(path, meant))
+        values = {}
+        is_broken = False
+        for key in self.keys:
+            read = self._read_key(key, value, beneath(path, key.named), faults)
+            if read is not FAULTY:
+                values[key.name] = read
+            elif key.is_required and key.stand_in is not FAULTY:
+                values[key.name] = key.stand_in
+            else:
+                is_broken |= key.is_required or (key.breaks and key.named in value)
+        return FAULTY if is_broken else Entry(self, path, values)
+
+    def _read_key(self, key: Key, value: Mapping[str, Any], path: str, faults: Faults) -> Any:
+        says = key.says[:1].lower() + key.says[1:].rstrip(".")
+        if key.named not in value:
+            if key.is_required and not faults.at(path):
+                faults.add(path, f"missing; add it: {says}")
+            return FAULTY
+        remedy = f"give a value, or remove the key {key.named!r}"
+        if key.is_required:
+            remedy = f"give a value: {says}"
+        return take(key.form, value[key.named], path, faults, remedy)
+
+    def schema(self, definitions: Definitions) -> JsonSchema:
+        """Return a reference to its definition."""
+        if self.title not in definitions:
+            definitions[self.title] = {}
+            definitions[self.title] = self.definition(definitions)
+        return {"$ref": f"#/$defs/{self.title}"}
+
+    def definition(self, definitions: Definitions) -> JsonSchema:
+        """Return its schema itself."""
+        properties = {
+            key.named: {**key.form.schema(definitions), "description": key.described}
+            for key in self.keys
+        }
+        result: JsonSchema = {
+            "type": "object",
+            "description": self.says,
+            "additionalProperties": False,
+            "properties": properties,
+        }
+        required = [key.named for key in self.keys if key.is_required]
+        return {**result, **({"required": required} if required else {}), **self.extra}
+
+
+# ------------------------------------------------------------------------ of declared classes
+
+
+def key_of(one: DeclaredField, form: Form, *, stand_in: Any = FAULTY, breaks: bool = False) -> Key:
+    """Return the key of a field that the model declares."""
+    required = one.default is MISSING and one.key.usual is None
+    usual = one.key.usual or ("" if required else _shown(one.default))
+    return Key(one.name, one.named, form, one.key.says, required, usual, stand_in, breaks)
+
+
+def _shown(default: Any) -> str:
+    """Return a default in words."""
+    if isinstance(default, bool):
+        return "true" if default else "false"
+    if default in (None, (), {}):
+        return "none"
+    value = getattr(default, "value", default)
+    if isinstance(value, int | float):
+        return f"{value:g}"
+    return value if isinstance(value, str) else ""
+
+
+def form_of(one: DeclaredField, forms: Mapping[Any, Form]) -> Form:
+    """Return the form of a field: that of its type in `forms`, else what the type says."""
+    if one.kind in forms:
+        return forms[one.kind]
+    origin, inner = get_origin(one.kind), get_args(one.kind)
+    if one.is_mapping:
+        form = forms.get(inner[1])
+        return Names(form or _single(inner[1], one), keeps=False)
+    if origin is tuple:
+        return Items(forms.get(inner[0]) or _single(inner[0], one))
+    return _single(one.kind, one)
+
+
+def _single(kind: Any, one: DeclaredField) -> Form:
+    if one.choices:
+        return Choice(one.choices)
+    if one.key.bound is not None:
+        return Number(one.key.bound)
+    return Flag() if kind is bool else Text()
+
+
+def shape_of(
+    kind: type,
+    forms: Mapping[Any, Form],
+    *,
+    title: str = "",
+    without: tuple[str, ...] = (),
+    instead: Mapping[str, Form | Key] | None = None,
+    further: tuple[Key, ...] = (),
+    says: str = "",
+    extra: Mapping[str, Any] | None = None,
+) -> Shape:
+    """Return the shape of a class of the model.
+
+    Parameters
+    ----------
+    forms : mapping
+        Forms of types that are no single values.
+    without : tuple of str
+        Fields that are no keys.
+    instead : mapping of str to Form or Key
+        What fields have in place of the form of their type.
+    further : tuple of Key
+        Keys that are no fields; they come last.
+    says : str
+        The first line of the class's docstring where empty.
+    """
+    keys = []
+    for one in declared_fields(kind):
+        if one.name in without:
+            continue
+        given = (instead or {}).get(one.name)
+        if isinstance(given, Key):
+            keys.append(given)
+        else:
+            keys.append(key_of(one, given or form_of(one, forms)))
+    first = (kind.__doc__ or "").partition("\n")[0]
+    return Shape(title or kind.__name__, says or first, (*keys, *further), kind, extra or {})
+
+
+def entries_of(value: Any) -> Iterator[Entry]:
+    """Yield every entry within what was read, the outer ones first."""
+    if isinstance(value, Entry):
+        yield value
+        for inner in value.values.values():
+            yield from entries_of(inner)
+    elif isinstance(value, dict):
+        for inner in value.values():
+            yield from entries_of(inner)
+    elif isinstance(value, list | tuple):
+        for inner in value:
+            yield from entries_of(inner)

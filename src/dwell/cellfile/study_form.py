@@ -1,0 +1,181 @@
+"""The form of a study file: its keys, their types and bounds."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from dwell.cellfile.forms import Choice, Flag, Items, Key, Names, Number, Shape, Text, Written
+from dwell.cellfile.rendering import as_read
+from dwell.cellfile.structure import FileKind
+from dwell.model.bounds import MAX_COUNT, SEEDS, Bound
+
+VERSION = 1
+
+WINDOWS = Bound(1, MAX_COUNT, whole=True)
+SEED = Bound(0, 10**15, whole=True)
+
+
+def _number(value: object, bound: Bound) -> int:
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    if not bound.holds(value):
+        raise ValueError(f"{as_read(value)} is not allowed; it must be {bound}")
+    return int(value)  # type: ignore[call-overload, no-any-return]
+
+
+def _seeds(value: Any) -> tuple[int, ...]:
+    """Return the seeds of ``20`` (1 to 20), of a list, or of ``{from: 101, count: 20}``."""
+    if isinstance(value, dict):
+        return _seeds_from(value)
+    if isinstance(value, list):
+        if not value:
+            raise ValueError("the list is empty; name at least one seed")
+        return tuple(_each_once([_number(seed, SEED) for seed in value]))
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        ways = "a number of seeds, a list of seeds, or {from: 101, count: 20}"
+        raise ValueError(f"{as_read(value)} is not allowed; it must be {ways}")
+    return tuple(range(1, _number(value, SEEDS) + 1))
+
+
+def _seeds_from(value: dict[str, object]) -> tuple[int, ...]:
+    unknown = [key for key in value if key not in ("from", "count")]
+    if unknown:
+        raise ValueError(f"unknown key {unknown[0]!r}; known: from, count")
+    missing = [key for key in ("from", "count") if value.get(key) is None]
+    if missing:
+        raise ValueError(f"`{missing[0]}` is missing; write it as {{from: 101, count: 20}}")
+    first, count = _number(value["from"], SEED), _number(value["count"], SEEDS)
+    return tuple(range(first, first + count))
+
+
+def _each_once(values: list[Any]) -> list[Any]:
+    seen: set[Any] = set()
+    for value in values:
+        if value in seen:
+            raise ValueError(f"{as_read(value)} is given twice; name each once")
+        seen.add(value)
+    return values
+
+
+def _names(value: object, what: str) -> list[str]:
+    """Return a list of names, each given once."""
+    if not isinstance(value, list) or not all(isinstance(name, str) and name for name in value):
+        has = as_read(value)
+        raise ValueError(f"{has} is not allowed; it must be a list of {what}, or a mapping")
+    if not value:
+        raise ValueError(f"the list is empty; name at least one of {what}")
+    return _each_once(value)
+
+
+def _scenarios(value: object) -> dict[str, object]:
+    """Return what each scenario is: a list of disturbances, or None for the cell's own."""
+    if isinstance(value, dict):
+        if not value:
+            raise ValueError("the mapping is empty; name at least one scenario")
+        return value
+    return dict.fromkeys(_names(value, "scenarios"))
+
+
+def _policies(value: object) -> dict[str, object]:
+    """Return what each policy is: its name, or a mapping of what it is."""
+    if isinstance(value, dict):
+        return value
+    return {name: name for name in _names(value, "policies")}
+
+
+def _parameters(value: object) -> dict[str, object]:
+    """Return a mapping of paths."""
+    if isinstance(value, dict):
+        return value
+    raise ValueError(
+        f"{as_read(value)} is not allowed; it must be a mapping of paths in the cell to lists of "
+        "values"
+    )
+
+
+NAME, NO_TEXT = Text(), Text(may_be_empty=False)
+STUDY = FileKind(
+    Shape(
+        "Study",
+        "Scenarios, policies, parameters and seeds, of which every combination is simulated.",
+        (
+            Key(
+                "version",
+                "dwell-study",
+                Choice((VERSION,)),
+                "Version of this format.",
+                is_required=True,
+                stand_in=VERSION,
+            ),
+            Key("name", "name", NAME, "Name of the study.", usual="the file's"),
+            Key(
+                "cell",
+                "cell",
+                NAME,
+                "The cell file, relative to this file's folder.",
+                is_required=True,
+                stand_in="",
+            ),
+            Key(
+                "traces",
+                "traces",
+                NO_TEXT,
+                "Folder where the cell's trace files are, relative to this file's.",
+                usual="the cell's",
+            ),
+            Key(
+                "scenarios",
+                "scenarios",
+                Written(_scenarios),
+                "Scenarios of the cell, or a mapping of names to disturbances.",
+                usual="all of the cell's",
+            ),
+            Key(
+                "windows",
+                "windows",
+                Number(WINDOWS),
+                "Length of every run, the warm-up included.",
+                usual="300",
+            ),
+            Key("seeds", "seeds", Written(_seeds), "A number of seeds, or which.", usual="20"),
+            Key(
+                "references",
+                "references",
+                Flag(),
+                "Whether to play the references in hindsight as well.",
+                usual="false",
+            ),
+            Key(
+                "policies",
+                "policies",
+                Written(_policies),
+                "Policies and candidates, or a mapping of names to what they are.",
+                is_required=True,
+                stand_in={},
+            ),
+            Key(
+                "parameters",
+                "parameters",
+                Written(_parameters),
+                "Values by their path in the cell; every combination is a point.",
+            ),
+            Key(
+                "zip",
+                "zip",
+                Items(Items(NAME)),
+                "Groups of parameters whose values go together, the first with the first.",
+                usual="none",
+            ),
+            Key(
+                "labels",
+                "labels",
+                Names(NO_TEXT),
+                "Names of parameters in figures and tables, by their paths.",
+                usual="the paths",
+            ),
+        ),
+    ),
+    "study",
+    "dwell-study",
+    VERSION,
+)

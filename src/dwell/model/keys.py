@@ -1,0 +1,211 @@
+"""Keys: what a field of the model says of itself, once: type, bound, default and one sentence.
+
+Whoever makes, reads, writes or describes a cell takes it from there: constructors check the bounds,
+`dwell.cellfile` reads files and writes their JSON Schema, the docs have their tables of it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import MISSING, dataclass
+from functools import cache
+from typing import (
+    Any,
+    Literal,
+    NamedTuple,
+    TypeVar,
+    Union,
+    dataclass_transform,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+from dwell.model.bounds import Bound, require
+from dwell.model.frozen import FrozenDict
+
+T = TypeVar("T")
+
+#: Where a field keeps its `Key`, and a class the name of the mapping that holds its keys.
+KEY = "dwell"
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """What a field is, beside its type and default.
+
+    Parameters
+    ----------
+    says : str
+        One sentence, its unit in it.
+    bound : Bound, optional
+        Of a number, or of every number of a mapping.
+    named : str, optional
+        Its name in a cell file, and in messages, where that is another than the field's.
+    usual : str, optional
+        What holds where it is not given, in words, where that follows from others.
+    """
+
+    says: str
+    bound: Bound | None = None
+    named: str | None = None
+    usual: str | None = None
+
+
+def key(
+    says: str,
+    bound: Bound | None = None,
+    *,
+    default: Any = MISSING,
+    default_factory: Any = MISSING,
+    named: str | None = None,
+    usual: str | None = None,
+) -> Any:
+    """Declare a field of a class that is `declared` (see `Key`)."""
+    about = {KEY: Key(says, bound, named, usual)}
+    if default_factory is not MISSING:
+        return dataclasses.field(default_factory=default_factory, metadata=about)
+    return dataclasses.field(default=default, metadata=about)
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(key, dataclasses.field))
+def declared(section: str = "") -> Callable[[type[T]], type[T]]:
+    """Make a frozen dataclass, with slots, whose fields are checked by what they declare.
+
+    Mappings become immutable, sequences tuples. What a class has as `__post_init__` runs after
+    that, and checks values against each other.
+
+    Parameters
+    ----------
+    section : str
+        Key of a cell file that holds those of the class, where messages name it.
+    """
+
+    def make(cls: type[T]) -> type[T]:
+        further = cls.__dict__.get("__post_init__")
+
+        def check(self: Any) -> None:
+            _check(self, section)
+            if further is not None:
+                further(self)
+
+        cls.__post_init__ = check  # type: ignore[attr-defined]
+        made = dataclass(frozen=True, slots=True)(cls)
+        _sections[made] = section
+        made.__doc__ = f"{cls.__doc__}\n\n{_described(made)}"
+        return made
+
+    return make
+
+
+_sections: dict[type, str] = {}
+
+
+def within(kind: type) -> str:
+    """Return the key that the messages of a declared class begin with, or nothing."""
+    return _sections.get(kind, "")
+
+
+class DeclaredField(NamedTuple):
+    """A field of a declared class.
+
+    Parameters
+    ----------
+    name : str
+        The field's.
+    kind : object
+        Its type, without None.
+    choices : tuple of str
+        What a text must be one of, or the texts of a mapping; empty where any is right.
+    default : object
+        `dataclasses.MISSING` where it is required.
+    key : Key
+        What else it declares.
+    """
+
+    name: str
+    kind: Any
+    choices: tuple[str, ...]
+    default: Any
+    key: Key
+
+    @property
+    def named(self) -> str:
+        """Its name in a cell file."""
+        return self.key.named or self.name
+
+    @property
+    def is_mapping(self) -> bool:
+        """Whether it holds values by name."""
+        return get_origin(self.kind) is Mapping
+
+
+@cache
+def declared_fields(kind: Any) -> tuple[DeclaredField, ...]:
+    """Return the fields of a declared class that are keys, in their order."""
+    hints = get_type_hints(kind)
+    return tuple(
+        DeclaredField(
+            one.name,
+            bare(hints[one.name]),
+            _choices(bare(hints[one.name])),
+            one.default if one.default_factory is MISSING else one.default_factory(),
+            one.metadata[KEY],
+        )
+        for one in dataclasses.fields(kind)
+        if KEY in one.metadata
+    )
+
+
+def bare(annotation: Any) -> Any:
+    """Return a type without ``| None``."""
+    if get_origin(annotation) in (Union, types.UnionType):
+        kinds = [one for one in get_args(annotation) if one is not type(None)]
+        return kinds[0] if len(kinds) == 1 else annotation
+    return annotation
+
+
+def _choices(kind: Any) -> tuple[str, ...]:
+    if get_origin(kind) is Mapping:
+        return _choices(get_args(kind)[1])
+    return get_args(kind) if get_origin(kind) is Literal else ()
+
+
+def _check(made: Any, section: str) -> None:
+    for one in declared_fields(type(made)):
+        value = getattr(made, one.name)
+        if value is None and one.default is None:
+            continue
+        path = f"{section}.{one.named}" if section else one.named
+        for place, single in _values(path, value):
+            if one.key.bound is not None:
+                one.key.bound.check(place, single)
+            if one.choices:
+                require(single in one.choices, place, single, f"one of {', '.join(one.choices)}")
+        if one.is_mapping:
+            object.__setattr__(made, one.name, FrozenDict(value))
+        elif get_origin(one.kind) is tuple:
+            object.__setattr__(made, one.name, tuple(value))
+
+
+def _values(path: str, value: Any) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, Mapping):
+        for name, item in value.items():
+            yield f"{path}.{name}", item
+    else:
+        yield path, value
+
+
+def _described(kind: Any) -> str:
+    """Return the parameters of a class for its docstring."""
+    lines = ["Parameters", "----------"]
+    for one in dataclasses.fields(kind):
+        about = one.metadata.get(KEY)
+        optional = "" if one.default is MISSING and one.default_factory is MISSING else ", optional"
+        lines.append(f"{one.name} : {one.type}{optional}")
+        if about is not None:
+            bound = f" ({about.bound})" if about.bound is not None else ""
+            lines.append(f"    {about.says}{bound}")
+    return "\n".join(lines)
