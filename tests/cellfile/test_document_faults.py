@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from dwell.cellfile.document_faults import Faults, dotted
+from dwell.cellfile.document_faults import Faults
 from dwell.errors import Fault, ProblemError, TraceError
+from dwell.model.paths import dotted
 
 
 @pytest.mark.parametrize(

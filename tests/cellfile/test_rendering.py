@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from dwell.cellfile.rendering import as_read
+from dwell.model.bounds import as_read
 
 
 @pytest.mark.parametrize(

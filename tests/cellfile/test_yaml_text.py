@@ -11,9 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dwell.cellfile.document_faults import Faults, dotted
+from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.yaml_text import read_value, read_yaml
 from dwell.errors import Fault
+from dwell.model.paths import dotted
 
 
 def _read(path: Path, text: str | bytes) -> tuple[object, list[Fault]]:

@@ -261,3 +261,16 @@ def test_a_trace_draws_from_what_was_recorded() -> None:
     trace = Trace(_table(5), "a")
     assert trace.expectation == 2
     assert set(trace.marginal(np.random.default_rng(0), 100)) == {0, 1, 2, 3, 4}
+
+
+def test_traces_are_equal_by_what_they_hold() -> None:
+    def table(*values: float, wrap: bool = False) -> TraceTable:
+        return TraceTable("t.csv", {"a": np.array(values)}, wrap=wrap)
+
+    assert Trace(table(1.0, 2.0), "a") == Trace(table(1.0, 2.0), "a")
+    assert hash(Trace(table(1.0, 2.0), "a")) == hash(Trace(table(1.0, 2.0), "a"))
+    for other in (table(1.0, 3.0), table(1.0), table(1.0, 2.0, wrap=True)):
+        assert Trace(table(1.0, 2.0), "a") != Trace(other, "a")
+    timed = TraceTable("t.csv", {"a": np.ones(2)}, time_ms=np.array([0.0, 1.0]))
+    assert timed != TraceTable("t.csv", {"a": np.ones(2)}, time_ms=np.array([0.0, 2.0]))
+    assert timed != TraceTable("t.csv", {"a": np.ones(2)})

@@ -10,6 +10,7 @@ from dwell.cellfile.cell_form import LINK_KEYS, NODE_KEYS, OBJECTIVE, STAND_IN, 
 from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.forms import Entry
 from dwell.cellfile.traces import Source, Tables
+from dwell.errors import Fault, ProblemError
 from dwell.estimators import registry as estimators
 from dwell.model import (
     Caps,
@@ -37,9 +38,9 @@ from dwell.model import (
 from dwell.model.bounds import require
 from dwell.model.fabric import accelerator_tiers
 from dwell.model.frozen import FrozenDict
-from dwell.model.keys import within
+from dwell.model.keys import within_path
 from dwell.model.process import DRAWN, UnreadTrace
-from dwell.model.semantics import CellParts, find_faults
+from dwell.model.semantics import CellParts, find_faults, find_unregistered
 from dwell.policies import registry as policies
 
 T = TypeVar("T")
@@ -114,7 +115,6 @@ class Assembly:
         candidates = {name: moves for name, moves in entry.candidates.items() if moves is not None}
         called = name if entry.name is None else entry.name
         parts = CellParts(
-            name=called if self.judged else None,
             nodes=nodes,
             links=links,
             links_complete=len(dict(links)) == len(entry.links or ()),
@@ -126,17 +126,15 @@ class Assembly:
             scenarios=scenarios,
             controller=controller,
             tiers=objective.tiers if objective is not None else {},
-            policies=policies.names() if self.judged else None,
-            estimators=estimators.names() if self.judged else None,
-            shadowing=estimators.shadowing() if self.judged else (),
             live=live,
         )
         if not self.anchored:
             self._refuse_anchored(candidates, tasks)
+        self._assume(parts)
+        if self.judged:
+            self._add(unregistered(parts, called))
         self._judge(parts)
-        if timing is None or objective is None or controller is None or live is None:
-            return None
-        if self.faults:
+        if self.faults or timing is None or objective is None or controller is None or live is None:
             return None
         whole = {name: task for name, task in tasks.items() if task is not None}
         fabric = self.faults.attempt(
@@ -182,7 +180,14 @@ class Assembly:
     ) -> T | None:
         given = {name: self._value(value) for name, value in values.items()}
         given = {name: value for name, value in given.items() if value is not None}
-        return self.faults.attempt(_around(entry), kind, *first, **given)
+        try:
+            return kind(*first, **given)
+        except ProblemError as error:
+            for fault in error.faults:
+                path = within_path(entry.path, entry.shape.kind, fault.path)
+                if not self.faults.at(path):
+                    self.faults.add(path, fault.message)
+            return None
 
     def _value(self, value: object) -> Any:
         """Return what a value that was read is in the model."""
@@ -337,14 +342,16 @@ class Assembly:
 
     def _judge(self, parts: CellParts) -> None:
         """Add the faults of meaning, but for those that other faults cause."""
-        self._assume(parts)
         known = all(
             link.source in parts.nodes and link.target in parts.nodes for _, link in parts.links
         )
         # Only where every link is good can one be said to be missing.
         parts.links_complete = parts.links_complete and known and not self.faults.at("links")
         parts.links = _forward(parts.links, parts.nodes)
-        for fault in find_faults(parts):
+        self._add(find_faults(parts))
+
+    def _add(self, faults: Iterable[Fault]) -> None:
+        for fault in faults:
             if not self.faults.at(fault.path):
                 self.faults.add(fault.path, fault.message)
 
@@ -376,6 +383,13 @@ class Assembly:
             parts.broken_candidates = names
 
 
+def unregistered(parts: CellParts, name: str) -> list[Fault]:
+    """Return the faults of what a cell names: policies, estimators, columns, itself."""
+    return find_unregistered(
+        parts, name, policies.names(), estimators.names(), estimators.shadowing()
+    )
+
+
 def _forward(
     links: Iterable[tuple[str, Link]], nodes: Mapping[str, object]
 ) -> list[tuple[str, Link]]:
@@ -391,10 +405,3 @@ def _forward(
 def _complete(moves: Mapping[str, str], tasks: Mapping[str, Task]) -> Placement:
     """Return the placement of every task: an anchored one follows its anchor."""
     return Placement((name, moves.get(name) or next(iter(task.on))) for name, task in tasks.items())
-
-
-def _around(entry: Entry) -> str:
-    """Return the path that the faults of an entry's class are beneath: some name its key, too."""
-    if within(entry.shape.kind):
-        return entry.path.rpartition(".")[0]
-    return entry.path

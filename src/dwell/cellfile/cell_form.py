@@ -28,7 +28,6 @@ from dwell.cellfile.forms import (
     shape_of,
     unquoted,
 )
-from dwell.cellfile.rendering import as_read
 from dwell.cellfile.structure import FileKind
 from dwell.estimators.registry import REGISTRY as ESTIMATORS
 from dwell.model import (
@@ -39,6 +38,7 @@ from dwell.model import (
     Endpoint,
     Episodes,
     Execution,
+    Fabric,
     Flow,
     Host,
     Link,
@@ -57,7 +57,7 @@ from dwell.model import (
     Task,
     Weights,
 )
-from dwell.model.bounds import LARGEST, MAX_COUNT, VALUE, Bound
+from dwell.model.bounds import LARGEST, MAX_COUNT, VALUE, Bound, as_read
 from dwell.model.document import VERSION
 from dwell.model.keys import DeclaredField, declared_fields
 from dwell.model.pipeline import WORKERS
@@ -421,12 +421,13 @@ LIVE = shape_of(LiveSettings, {Host: HOST}, title="Live")
 # ------------------------------------------------------------------------------------ cell
 
 _TIMING = {one.name: key_of(one, form_of(one, PROCESSES)) for one in declared_fields(Pipeline)}
+_PLACES = {one.name: key_of(one, form_of(one, {})) for one in declared_fields(Fabric)}
 _WHOLE = {one.name: key_of(one, form_of(one, {})) for one in declared_fields(Problem)}
 
 
 def _section(name: str, form: Form, stand_in: object = FAULTY) -> Key:
     """A section of the file, with what the model says of it."""
-    says = {**_TIMING, **_WHOLE}[name].says
+    says = {**_TIMING, **_PLACES, **_WHOLE}[name].says
     return Key(name, name, form, says, stand_in is not FAULTY, "", stand_in)
 
 
@@ -441,10 +442,10 @@ CELL_SHAPE = Shape(
         _TIMING["release_jitter_ms"],
         _WHOLE["window_cycles"],
         _WHOLE["warmup_windows"],
-        _required("nodes", Names(NODE, keeps=True, least=1), "Computers by name.", {}),
-        _optional("links", Items(LINK, keeps=True), "Connections between nodes.", "none"),
+        _section("nodes", Names(NODE, keeps=True, least=1), {}),
+        _section("links", Items(LINK, keeps=True)),
         _section("tasks", Names(TASK, keeps=True, least=1), {}),
-        _optional("flows", Items(FLOW, keeps=True), _TIMING["flows"].says, "none"),
+        _section("flows", Items(FLOW, keeps=True)),
         _section("scales", Names(PROCESS, keeps=True)),
         _section("candidates", Names(Names(NAME), keeps=True, least=1), {}),
         _section("scenarios", Names(Items(DISTURBANCE, keeps=True), keeps=True)),

@@ -2,26 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from typing import NoReturn, ParamSpec, TypeAlias, TypeVar
+from collections.abc import Callable
+from typing import NoReturn, ParamSpec, TypeVar
 
 from dwell.errors import Fault, ProblemError, TraceError
 
 P = ParamSpec("P")
 T = TypeVar("T")
-Step: TypeAlias = str | int
-
-
-def dotted(steps: Iterable[Step]) -> str:
-    """Return ``links[0].from`` for ("links", 0, "from")."""
-    path = ""
-    for step in steps:
-        if isinstance(step, int):
-            path += f"[{step}]"
-        else:
-            key = step or "''"
-            path += f".{key}" if path else key
-    return path
 
 
 class Faults:

@@ -15,10 +15,10 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, field
 from typing import Any, ClassVar, Final, TypeAlias, get_args, get_origin
 
-from dwell.cellfile.document_faults import Faults, Step
-from dwell.cellfile.rendering import as_read
-from dwell.model.bounds import Bound
+from dwell.cellfile.document_faults import Faults
+from dwell.model.bounds import Bound, as_read
 from dwell.model.keys import DeclaredField, declared_fields
+from dwell.model.paths import Step
 from dwell.model.semantics import closest, nearest
 
 JsonSchema: TypeAlias = dict[str, Any]

@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dwell.cellfile.cell import read_document, read_problem
-from dwell.cellfile.document_faults import Faults, Step, dotted
-from dwell.cellfile.study_paths import put, steps_of
+from dwell.cellfile.document_faults import Faults
+from dwell.cellfile.study_paths import put
 from dwell.errors import ProblemError
 from dwell.model import Problem
+from dwell.model.paths import Step, dotted, steps_of
 
 if TYPE_CHECKING:
     from dwell.cellfile.traces import Tables

@@ -9,10 +9,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from dwell.cellfile.document_faults import Faults, Step, dotted
+from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.forms import Entry, Shape
-from dwell.cellfile.rendering import as_read
-from dwell.model.bounds import shown
+from dwell.model.bounds import as_read, shown
+from dwell.model.paths import Step, dotted
 
 MAX_DEPTH = 40
 

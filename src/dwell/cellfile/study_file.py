@@ -15,13 +15,14 @@ from os import PathLike, fspath
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from dwell.cellfile.document_faults import Faults, Step
+from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.overrides import OpenCell, Override, check_apart, open_cell
-from dwell.cellfile.rendering import as_read
-from dwell.cellfile.study_paths import SETTINGS, steps_of
+from dwell.cellfile.study_paths import SETTINGS
 from dwell.errors import ProblemError
 from dwell.estimators.registry import names as estimator_names
 from dwell.model import Problem
+from dwell.model.bounds import as_read
+from dwell.model.paths import Step, steps_of
 from dwell.model.semantics import bad_name, nearest, nearest_of
 from dwell.model.user_classes import is_class_path
 from dwell.policies.registry import names as policy_names

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from dwell.cellfile.forms import Choice, Flag, Items, Key, Names, Number, Shape, Text, Written
-from dwell.cellfile.rendering import as_read
 from dwell.cellfile.structure import FileKind
-from dwell.model.bounds import MAX_COUNT, SEEDS, Bound
+from dwell.model.bounds import MAX_COUNT, SEEDS, Bound, as_read
 
 VERSION = 1
 

@@ -15,9 +15,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from dwell.cellfile.rendering import as_read
 from dwell.errors import RunError, SimulationError
 from dwell.files import write_whole
+from dwell.model.bounds import as_read
 
 # How many differences from other work are listed.
 LISTED = 4

@@ -1,5 +1,6 @@
 """The frozen domain objects: a pipeline on a fabric, its candidates, and what a window shows."""
 
+from dwell.model.evolve import evolve
 from dwell.model.fabric import Bursts, Fabric, Link, Node, Quota
 from dwell.model.frozen import FrozenDict
 from dwell.model.live import Endpoint, Host, LiveSettings
@@ -72,4 +73,5 @@ __all__ = [
     "TraceTable",
     "Uniform",
     "Weights",
+    "evolve",
 ]

@@ -29,6 +29,21 @@ def shown(value: object) -> str:
     return text if len(text) <= LONGEST_SHOWN else f"{text[: LONGEST_SHOWN - 3]}..."
 
 
+def as_read(value: object) -> str:
+    """Return a value as its author wrote it, or what it is where it is no single value."""
+    if value is None:
+        return "nothing"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float) and not math.isfinite(value):
+        return "NaN" if math.isnan(value) else "infinity" if value > 0 else "-infinity"
+    if isinstance(value, dict):
+        return "a mapping"
+    if isinstance(value, list):
+        return "a list"
+    return shown(value)
+
+
 def counted(count: float, noun: str) -> str:
     """Return how many there are of a thing: ``1 window``, ``2 windows``, ``2 policies``."""
     if count == 1:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, TypeAlias
 
 from dwell.model.bounds import (
@@ -295,19 +294,17 @@ class Link:
         return f"{self.source}->{self.target}"
 
 
-@dataclass(frozen=True, slots=True)
+@declared()
 class Fabric:
     """Nodes and links."""
 
-    nodes: Mapping[str, Node]
-    links: Mapping[str, Link] = field(default_factory=FrozenDict)
+    nodes: Mapping[str, Node] = key("Computers by name.")
+    links: Mapping[str, Link] = key("Connections between nodes.", default_factory=FrozenDict)
 
     def __post_init__(self) -> None:
         require(len(self.nodes) > 0, "nodes", dict(self.nodes), "at least one node")
         require_names("nodes", self.nodes)
         require_names("links", self.links)
-        object.__setattr__(self, "nodes", FrozenDict(self.nodes))
-        object.__setattr__(self, "links", FrozenDict(self.links))
 
     def __repr__(self) -> str:
         nodes = [

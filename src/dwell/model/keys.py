@@ -10,7 +10,6 @@ import dataclasses
 import types
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, dataclass
-from functools import cache
 from typing import (
     Any,
     Literal,
@@ -103,9 +102,15 @@ def declared(section: str = "") -> Callable[[type[T]], type[T]]:
 _sections: dict[type, str] = {}
 
 
-def within(kind: type) -> str:
-    """Return the key that the messages of a declared class begin with, or nothing."""
-    return _sections.get(kind, "")
+def within_path(path: str, kind: type, fault: str) -> str:
+    """Return the path of a fault of an object of a declared class that is at a path."""
+    around = path.rpartition(".")[0] if _sections.get(kind) else path
+    return f"{around}.{fault}" if around and fault else around or fault
+
+
+def is_declared(kind: Any) -> bool:
+    """Whether a class, or that of an object, was made by `declared`."""
+    return (kind if isinstance(kind, type) else type(kind)) in _sections
 
 
 class DeclaredField(NamedTuple):
@@ -142,9 +147,18 @@ class DeclaredField(NamedTuple):
         return get_origin(self.kind) is Mapping
 
 
-@cache
-def declared_fields(kind: Any) -> tuple[DeclaredField, ...]:
+_fields: dict[type, tuple[DeclaredField, ...]] = {}
+
+
+def declared_fields(kind: type) -> tuple[DeclaredField, ...]:
     """Return the fields of a declared class that are keys, in their order."""
+    if kind not in _fields:
+        # When all names of their types are known.
+        _fields[kind] = _read_fields(kind)
+    return _fields[kind]
+
+
+def _read_fields(kind: Any) -> tuple[DeclaredField, ...]:
     hints = get_type_hints(kind)
     return tuple(
         DeclaredField(
@@ -182,6 +196,10 @@ def _check(made: Any, section: str) -> None:
         for place, single in _values(path, value):
             if one.key.bound is not None:
                 one.key.bound.check(place, single)
+            if one.kind is bool:
+                require(isinstance(single, bool), place, single, "true or false")
+            if one.kind is str and one.key.bound is None:
+                require(isinstance(single, str), place, single, "a text")
             if one.choices:
                 require(single in one.choices, place, single, f"one of {', '.join(one.choices)}")
         if one.is_mapping:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import field, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from dwell.display import Displayed
 from dwell.errors import Fault, ProblemError
@@ -104,6 +104,17 @@ class ControllerSettings:
         return self.guard_cycles + 1
 
 
+class Drawn(NamedTuple):
+    """All of a problem that its realisations depend on: equal problems play the same ones."""
+
+    pipeline: Pipeline
+    fabric: Fabric
+    candidates: Mapping[str, Placement]
+    scenarios: Mapping[str, Scenario]
+    window_cycles: int
+    servo: Servo | None
+
+
 @declared()
 class Problem(Displayed):
     """A cell, checked as a whole: one that exists is valid.
@@ -149,7 +160,7 @@ class Problem(Displayed):
         declared = {name: tuple(items) for name, items in self.scenarios.items()}
         scenarios = {"baseline": (), **declared}
         object.__setattr__(self, "scenarios", FrozenDict(scenarios))
-        faults = [*find_faults(self._parts()), *self._unplaced()]
+        faults = [*find_faults(CellParts.of(self)), *self._unplaced()]
         if faults:
             raise ProblemError(faults)
 
@@ -180,23 +191,16 @@ class Problem(Displayed):
             if task not in placement and len(on) == 1
         ]
 
-    def _parts(self) -> CellParts:
-        links = self.fabric.links.values()
-        return CellParts(
-            nodes=self.fabric.nodes,
-            links=[(f"links[{i}]", link) for i, link in enumerate(links)],
-            tasks=self.pipeline.tasks,
-            flows=[(f"flows[{i}]", flow) for i, flow in enumerate(self.pipeline.flows)],
-            scales=self.pipeline.scales,
-            candidates=self.candidates,
-            scenarios={
-                name: [(f"scenarios.{name}[{i}]", item) for i, item in enumerate(items)]
-                for name, items in self.scenarios.items()
-            },
-            controller=self.controller,
-            tiers=self.objective.tiers,
-            accelerators=self.objective.accelerators,
-            live=self.live,
+    @property
+    def drawn(self) -> Drawn:
+        """What its realisations depend on."""
+        return Drawn(
+            self.pipeline,
+            self.fabric,
+            self.candidates,
+            self.scenarios,
+            self.window_cycles,
+            self.servo,
         )
 
     @property

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, runtime_checkable
 
 from dwell.errors import Fault, TraceError
 from dwell.model.bounds import LARGEST, VALUE, Bound, counted, require
@@ -216,6 +216,8 @@ def _one_group() -> NDArray[np.int64]:
 class TraceTable:
     """Columns of one file of measurements; every process that names the file shares its rows.
 
+    Tables are equal by what they hold, and by how it is replayed.
+
     Parameters
     ----------
     file : str
@@ -261,6 +263,34 @@ class TraceTable:
     def __repr__(self) -> str:
         columns = shortened(self.columns)
         return f"<TraceTable {self.file!r}: {counted(self.rows, 'row')} of {columns}; by {self.by}>"
+
+    def __eq__(self, other: object) -> bool:
+        import numpy as np
+
+        if self is other:
+            return True
+        if not isinstance(other, TraceTable) or self._declared != other._declared:
+            return False
+        mine, theirs = self._arrays, other._arrays
+        return mine.keys() == theirs.keys() and all(
+            np.array_equal(values, theirs[name]) for name, values in mine.items()
+        )
+
+    def __hash__(self) -> int:
+        return hash(self._declared)
+
+    @property
+    def _arrays(self) -> dict[object, NDArray[Any]]:
+        instants = {} if self.time_ms is None else {"time_ms": self.time_ms}
+        return {("column", name): values for name, values in self.columns.items()} | {
+            "starts": self.starts,
+            **instants,
+        }
+
+    @property
+    def _declared(self) -> tuple[object, ...]:
+        declared = (self.file, self.by, self.group, self.time, self.on_negative, self.wrap)
+        return (*declared, self.rows)
 
     @property
     def rows(self) -> int:

@@ -30,7 +30,7 @@ from dwell.model.scenario import (
 from dwell.model.user_classes import is_class_path
 
 if TYPE_CHECKING:
-    from dwell.model.problem import ControllerSettings
+    from dwell.model.problem import ControllerSettings, Problem
 
 # Names become columns, file names and keys of messages.
 NAME = re.compile(r"\w[\w.+:-]*(?: [\w.+:-]+)*")
@@ -47,13 +47,8 @@ class CellParts:
     A value of None is a part whose name is known but whose content could not be read (its own
     fault is reported elsewhere): references to it resolve, and nothing more is asked of it.
 
-    ``policies`` and ``estimators`` are the names that there are, and ``shadowing`` the estimators
-    that send shadow jobs. Where they are None names are not judged, nor the columns that are made
-    of names: whoever makes a policy, an estimator or a run does that. ``name`` is the cell's own,
-    not judged either where it is None.
     """
 
-    name: str | None = None
     nodes: Mapping[str, Node | None] = field(default_factory=dict)
     links: Sequence[tuple[str, Link]] = ()
     links_complete: bool = True
@@ -66,10 +61,28 @@ class CellParts:
     controller: ControllerSettings | None = None
     tiers: Mapping[str, Tier] = field(default_factory=dict)
     accelerators: Mapping[str, Tier] = field(default_factory=dict)
-    policies: Sequence[str] | None = None
-    estimators: Sequence[str] | None = None
-    shadowing: Collection[str] = ()
     live: LiveSettings | None = None
+
+    @classmethod
+    def of(cls, problem: Problem) -> CellParts:
+        """Return the parts of a problem."""
+        pipeline, fabric = problem.pipeline, problem.fabric
+        return cls(
+            nodes=fabric.nodes,
+            links=[(f"links[{i}]", link) for i, link in enumerate(fabric.links.values())],
+            tasks=pipeline.tasks,
+            flows=[(f"flows[{i}]", flow) for i, flow in enumerate(pipeline.flows)],
+            scales=pipeline.scales,
+            candidates=problem.candidates,
+            scenarios={
+                name: [(f"scenarios.{name}[{i}]", item) for i, item in enumerate(items)]
+                for name, items in problem.scenarios.items()
+            },
+            controller=problem.controller,
+            tiers=problem.objective.tiers,
+            accelerators=problem.objective.accelerators,
+            live=problem.live,
+        )
 
 
 def closest(word: str, known: Iterable[str], likeness: float = 0.6) -> str:
@@ -112,6 +125,29 @@ def find_faults(parts: CellParts) -> list[Fault]:
         *_objective(parts),
         *_controller(parts),
         *_live(parts),
+    ]
+
+
+def find_unregistered(
+    parts: CellParts,
+    name: str,
+    policies: Sequence[str],
+    estimators: Sequence[str],
+    shadowing: Collection[str],
+) -> list[Fault]:
+    """Return the faults of names that only a cell file has: who makes an object has a class.
+
+    Parameters
+    ----------
+    name : str
+        The cell's own.
+    policies, estimators, shadowing : collection of str
+        Those that there are, and the estimators that send shadow jobs.
+    """
+    message = bad_name(name)
+    return [
+        *([Fault("name", message)] if message else []),
+        *_registered(parts, policies, estimators, shadowing),
         *_columns(parts),
     ]
 
@@ -125,8 +161,6 @@ def _unknown(path: str, what: str, word: str, known: Iterable[str]) -> Iterator[
 
 
 def _names(parts: CellParts) -> Iterator[Fault]:
-    if parts.name is not None and (message := bad_name(parts.name)):
-        yield Fault("name", message)
     sections: dict[str, Iterable[str]] = {
         "nodes": parts.nodes,
         "tasks": parts.tasks,
@@ -260,8 +294,6 @@ def _candidates(parts: CellParts) -> Iterator[Fault]:
         yield Fault("candidates", "none is declared; name at least one placement, as `LOC: {}`")
     for name, moves in parts.candidates.items():
         path = f"candidates.{name}"
-        if name in (parts.policies or ()):
-            yield Fault(path, f"the name {name!r} is a policy's; choose another for the placement")
         faults = list(_placed(parts, path, moves))
         yield from faults
         if not faults:
@@ -393,21 +425,33 @@ def _controller(parts: CellParts) -> Iterator[Fault]:
         yield from _unknown("controller.initial", "candidate", settings.initial, names)
     for index, name in enumerate(settings.fallbacks):
         yield from _unknown(f"controller.fallbacks[{index}]", "candidate", name, names)
-    if parts.policies is not None and not is_class_path(settings.policy):
-        known = [*parts.policies, *names]
-        yield from _unknown("controller.policy", "policy", settings.policy, known)
-    if (
-        parts.estimators is not None
-        and settings.estimator not in parts.estimators
-        and not is_class_path(settings.estimator)
-    ):
-        bound = f"one of {', '.join(parts.estimators)}"
-        message = f"{shown(settings.estimator)} is not allowed; it must be {bound}"
-        yield Fault("controller.estimator", message)
-    if settings.estimator in parts.shadowing:
-        yield from _shadow_budget(settings, len(names))
     if settings.migration == "cold" and parts.links_complete:
         yield from _state_transfers(parts)
+
+
+def _registered(
+    parts: CellParts,
+    policies: Sequence[str],
+    estimators: Sequence[str],
+    shadowing: Collection[str],
+) -> Iterator[Fault]:
+    for name in parts.candidates:
+        if name in policies:
+            message = f"the name {name!r} is a policy's; choose another for the placement"
+            yield Fault(f"candidates.{name}", message)
+    settings = parts.controller
+    if settings is None:
+        return
+    names = [*parts.candidates, *parts.broken_candidates]
+    if not is_class_path(settings.policy):
+        known = [*policies, *names]
+        yield from _unknown("controller.policy", "policy", settings.policy, known)
+    if settings.estimator not in estimators and not is_class_path(settings.estimator):
+        bound = f"one of {', '.join(estimators)}"
+        message = f"{shown(settings.estimator)} is not allowed; it must be {bound}"
+        yield Fault("controller.estimator", message)
+    if settings.estimator in shadowing:
+        yield from _shadow_budget(settings, len(names))
 
 
 def _live(parts: CellParts) -> Iterator[Fault]:
@@ -430,12 +474,11 @@ def _live(parts: CellParts) -> Iterator[Fault]:
 
 def _columns(parts: CellParts) -> Iterator[Fault]:
     """Names of accelerators, and names of which two columns would be called the same."""
-    if parts.policies is not None:
-        for name, node in parts.nodes.items():
-            for kind in node.accelerators if node is not None else ():
-                if message := bad_name(kind):
-                    yield Fault(f"nodes.{name}.accelerators.{kind or repr(kind)}", message)
-        yield from table_columns.clash_faults(resources_of(parts.nodes), list(parts.candidates))
+    for name, node in parts.nodes.items():
+        for kind in node.accelerators if node is not None else ():
+            if message := bad_name(kind):
+                yield Fault(f"nodes.{name}.accelerators.{kind or repr(kind)}", message)
+    yield from table_columns.clash_faults(resources_of(parts.nodes), list(parts.candidates))
 
 
 def _shadow_budget(settings: ControllerSettings, candidates: int) -> Iterator[Fault]:

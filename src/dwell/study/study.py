@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from dwell.cellfile.study_paths import with_settings
 from dwell.errors import SimulationError
 from dwell.model import FrozenDict, Problem
 from dwell.model.bounds import counted
-from dwell.model.document import to_document
+from dwell.model.problem import Drawn
 from dwell.model.semantics import nearest
 from dwell.study.reference import CLAIRVOYANT, CLAIRVOYANT_DWELL
 
@@ -242,9 +241,9 @@ class Study:
 
     def _drawn_alike(self) -> Iterator[tuple[int, ...]]:
         """Yield points whose realisations are the same."""
-        groups: dict[str, list[int]] = {}
+        groups: dict[Drawn, list[int]] = {}
         for index, point in enumerate(self.points):
-            groups.setdefault(_drawn(point.problem), []).append(index)
+            groups.setdefault(point.problem.drawn, []).append(index)
         yield from (tuple(group) for group in groups.values())
 
 
@@ -258,13 +257,6 @@ def _require_each_once(what: str, given: Sequence[object]) -> None:
         if text in seen:
             raise SimulationError(f"{what} holds {text} twice; name each once")
         seen.add(text)
-
-
-def _drawn(problem: Problem) -> str:
-    """Return all of a problem that a realisation depends on, as a text."""
-    document: dict[str, Any] = to_document(problem)
-    settings = ("name", "controller", "objective", "warmup_windows")
-    return json.dumps({key: value for key, value in document.items() if key not in settings})
 
 
 def load_study(path: str | PathLike[str]) -> Study:

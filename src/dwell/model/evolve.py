@@ -1,0 +1,116 @@
+"""Evolve: a problem with other values, by the paths that they have in its cell file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias, get_args
+
+from dwell.errors import Fault, ProblemError
+from dwell.model.document import to_document
+from dwell.model.keys import DeclaredField, declared_fields, is_declared, within_path
+from dwell.model.paths import Step, dotted, steps_of
+from dwell.model.problem import Problem
+from dwell.model.process import Constant, Process
+from dwell.model.semantics import nearest
+
+#: Parts of a problem whose keys a cell file has at its top.
+AT_TOP = ("pipeline", "fabric")
+
+
+@dataclass(frozen=True, slots=True)
+class _Value:
+    value: object
+
+
+#: Values by step after step.
+_Tree: TypeAlias = "dict[Step, _Tree | _Value]"
+
+
+def evolve(problem: Problem, changes: Mapping[str, object]) -> Problem:
+    """Return a problem with other values.
+
+    Parameters
+    ----------
+    changes : mapping of str to object
+        Values by their paths in a cell file: ``{"controller.min_dwell": 1, "period_ms": 40.0,
+        "tasks.plan.on.E.exec_ms": 3.0}``. A value is one of the model; a number stands for a
+        constant process, too, and a mapping for a part with these keys.
+
+    Raises
+    ------
+    ProblemError
+        If a path leads nowhere, or a value is out of its bound or does not fit the others.
+    """
+    document = to_document(problem)
+    trees: dict[str, _Tree] = {}
+    for path, value in changes.items():
+        *before, last = steps_of(path, document)
+        first = before[0] if before else last
+        home = next((name for name in AT_TOP if first in _keys(getattr(problem, name))), "")
+        tree: Any = trees.setdefault(home, {})
+        for step in before:
+            tree = tree.setdefault(step, {})
+        tree[last] = _Value(value)
+    targets = trees.get("", {}).get("objective", {})
+    if isinstance(targets, dict) and isinstance(whole := targets.get("targets"), _Value):
+        # What a file leaves out is the deadline.
+        usual = {"latency_ms": problem.pipeline.deadline_ms}
+        if isinstance(whole.value, Mapping):
+            targets["targets"] = _Value({**usual, **whole.value})
+    given = _arguments(problem, trees.pop("", {}), "")
+    parts = {name: _changed(getattr(problem, name), tree, None, "") for name, tree in trees.items()}
+    return replace(problem, **parts, **given)
+
+
+def _keys(part: Any) -> dict[str, DeclaredField]:
+    return {one.named: one for one in declared_fields(type(part))}
+
+
+def _arguments(part: Any, tree: _Tree, path: str) -> dict[str, Any]:
+    keys = _keys(part)
+    given = {}
+    for step, inner in tree.items():
+        here, one = dotted((path, step) if path else (step,)), keys.get(str(step))
+        if one is None:
+            message = f"unknown key {step!r}; {nearest(str(step), keys)}"
+            raise ProblemError([Fault(here, message)])
+        given[one.name] = _changed(getattr(part, one.name), inner, one, here)
+    return given
+
+
+def _changed(part: Any, tree: _Tree | _Value, one: DeclaredField | None, path: str) -> Any:
+    """Return a part with what a tree has for it; `one` is what it is, or is within."""
+    if isinstance(tree, _Value):
+        return tree.value if one is None else _attempt(path, one.kind, _made, one, tree.value)
+    if isinstance(part, Mapping | tuple):
+        names = list(part) if isinstance(part, Mapping) else range(len(part))
+        items = dict(part) if isinstance(part, Mapping) else dict(enumerate(part))
+        for step, inner in tree.items():
+            name = names[step] if isinstance(step, int) else step
+            items[name] = _changed(items.get(name), inner, one, dotted((path, step)))
+        return items if isinstance(part, Mapping) else tuple(items.values())
+    return _attempt(path, type(part), replace, part, **_arguments(part, tree, path))
+
+
+def _attempt(path: str, kind: Any, make: Any, *args: object, **values: object) -> Any:
+    """Make something at a path, which its faults then say."""
+    try:
+        return make(*args, **values)
+    except ProblemError as error:
+        faults = [Fault(within_path(path, kind, one.path), one.message) for one in error.faults]
+        raise ProblemError(faults) from None
+
+
+def _made(one: DeclaredField, value: object) -> Any:
+    """Return what a value is in the model: a process of a number, a part of a mapping."""
+    kind = one.kind if not one.is_mapping or isinstance(value, Mapping) else get_args(one.kind)[1]
+    whole = one.key.bound is not None and one.key.bound.whole
+    if whole and isinstance(value, float) and value.is_integer():
+        return int(value)
+    if kind is Process and isinstance(value, int | float) and not isinstance(value, bool):
+        return Constant(float(value))
+    if isinstance(value, Mapping) and isinstance(kind, type) and is_declared(kind):
+        keys = {field.named: field for field in declared_fields(kind)}
+        return kind(**{keys[name].name: _made(keys[name], item) for name, item in value.items()})
+    return value

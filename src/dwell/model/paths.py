@@ -1,0 +1,104 @@
+"""Paths: dotted names of places in a cell file, as ``links[0].delay_ms``."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from typing import TypeAlias
+
+from dwell.errors import Fault, ProblemError
+from dwell.model.bounds import as_read
+from dwell.model.semantics import nearest
+
+Step: TypeAlias = str | int
+
+# Sections whose keys are names; what a path adds to one of them would not be connected to the rest.
+NAMED = ("nodes", "tasks", "scales", "candidates", "scenarios")
+
+INDEX = re.compile(r"\[(\d{1,9})\]")
+KEY = re.compile(r"[^.\[\]]+")
+
+
+def dotted(steps: Iterable[Step]) -> str:
+    """Return ``links[0].from`` for ("links", 0, "from")."""
+    path = ""
+    for step in steps:
+        if isinstance(step, int):
+            path += f"[{step}]"
+        else:
+            key = step or "''"
+            path += f".{key}" if path else key
+    return path
+
+
+def steps_of(path: str, document: object) -> tuple[Step, ...]:
+    """Split a path into its steps.
+
+    Parameters
+    ----------
+    path : str
+        As ``links[0].delay_ms``. A name may hold a dot: the longest key that the document has is
+        taken.
+    document : object
+        The cell's, as it is in the file.
+
+    Raises
+    ------
+    ProblemError
+        If it is no path, or leads where the document has nothing and may have nothing.
+    """
+    steps: list[Step] = []
+    here, rest = document, path
+    while rest or not steps:
+        step, rest = _first(rest, here if isinstance(here, Mapping) else (), path)
+        _require_place(step, steps, here, path)
+        steps.append(step)
+        if isinstance(here, Mapping):
+            here = here.get(step, {})
+        elif isinstance(here, list) and isinstance(step, int):
+            here = here[step]
+    return tuple(steps)
+
+
+def _first(rest: str, keys: Iterable[object], path: str) -> tuple[Step, str]:
+    """Take the first step off a path."""
+    match = INDEX.match(rest)
+    if match is not None:
+        return int(match[1]), _after(rest[match.end() :], path)
+    texts = [key for key in keys if isinstance(key, str)]
+    known = [key for key in texts if re.match(rf"{re.escape(key)}(?=[.\[]|$)", rest)]
+    key = max(known, key=len, default="")
+    if not key:
+        match = KEY.match(rest)
+        if match is None:
+            raise _fault(path, "not a path; write it as `links[0].delay_ms`")
+        key = match[0]
+    return key, _after(rest[len(key) :], path)
+
+
+def _after(rest: str, path: str) -> str:
+    if rest == "." or (rest and rest[0] not in ".["):
+        raise _fault(path, "not a path; write it as `links[0].delay_ms`")
+    return rest.removeprefix(".")
+
+
+def _require_place(step: Step, before: list[Step], here: object, path: str) -> None:
+    """Refuse a step that leads nowhere."""
+    where = dotted(before) or "the cell"
+    if isinstance(here, list):
+        if not isinstance(step, int):
+            raise _fault(path, f"{where} is a list; take one of its items, as `{where}[0]`")
+        if step >= len(here):
+            has = f"{len(here)} items, from [0]" if here else "no items"
+            raise _fault(path, f"there is no {where}[{step}]; {where} has {has}")
+    elif isinstance(step, int):
+        raise _fault(path, f"{where} is no list; it has no item [{step}]")
+    elif not isinstance(here, Mapping):
+        raise _fault(path, f"{where} is {as_read(here)}; it has no key {step!r}")
+    elif len(before) == 1 and before[0] in NAMED and step not in here:
+        hint = nearest(step, [str(key) for key in here])
+        raise _fault(path, f"the cell's {before[0]} have no {step!r}; {hint}")
+
+
+def _fault(path: str, message: str) -> ProblemError:
+    return ProblemError([Fault(path, message)])
