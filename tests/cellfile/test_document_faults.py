@@ -6,7 +6,7 @@ import pytest
 
 from dwell.cellfile.document_faults import Faults
 from dwell.errors import Fault, ProblemError, TraceError
-from dwell.model.paths import dotted
+from dwell.model.dotted_paths import dotted
 
 
 @pytest.mark.parametrize(

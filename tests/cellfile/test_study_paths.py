@@ -9,7 +9,7 @@ from dwell.cellfile import load
 from dwell.cellfile.study_paths import put, with_settings
 from dwell.errors import ProblemError
 from dwell.model import Problem
-from dwell.model.paths import steps_of
+from dwell.model.dotted_paths import steps_of
 from tests.cellfile.test_cell import EXAMPLE
 from tests.cells.many import many
 

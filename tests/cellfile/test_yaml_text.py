@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.yaml_text import read_value, read_yaml
 from dwell.errors import Fault
-from dwell.model.paths import dotted
+from dwell.model.dotted_paths import dotted
 
 
 def _read(path: Path, text: str | bytes) -> tuple[object, list[Fault]]:

@@ -36,9 +36,9 @@ from dwell.model import (
     Weights,
 )
 from dwell.model.bounds import require
+from dwell.model.declaration import within_path
 from dwell.model.fabric import accelerator_tiers
 from dwell.model.frozen import FrozenDict
-from dwell.model.keys import within_path
 from dwell.model.process import DRAWN, UnreadTrace
 from dwell.model.semantics import CellParts, find_faults, find_unregistered
 from dwell.policies import registry as policies

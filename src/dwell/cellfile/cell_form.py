@@ -4,24 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.forms import (
     FAULTY,
-    Choice,
+    ChoiceForm,
     Definitions,
     Entry,
-    Flag,
+    FlagForm,
     Form,
-    Items,
+    FormKey,
     JsonSchema,
-    Key,
-    Names,
-    Number,
+    ListForm,
+    MappingForm,
+    NumberForm,
     Shape,
-    Text,
-    Written,
+    TextForm,
+    WrittenForm,
     form_of,
     key_of,
     refused,
@@ -58,13 +58,13 @@ from dwell.model import (
     Weights,
 )
 from dwell.model.bounds import LARGEST, MAX_COUNT, VALUE, Bound, as_read
+from dwell.model.declaration import DeclaredField, declared_fields
 from dwell.model.document import VERSION
-from dwell.model.keys import DeclaredField, declared_fields
 from dwell.model.pipeline import WORKERS
 from dwell.model.process import DRAWN
 from dwell.policies.registry import REGISTRY as POLICIES
 
-NAME = Text()
+NAME = TextForm()
 
 # ------------------------------------------------------------------------------- processes
 
@@ -78,12 +78,12 @@ def _columns(value: Any) -> str | tuple[str, ...]:
     raise ValueError(f"{has} is not allowed; it must be a column name, or a list of them")
 
 
-def _optional(name: str, form: Form, says: str, usual: str = "") -> Key:
-    return Key(name, name, form, says, False, usual)
+def _optional(name: str, form: Form, says: str, usual: str = "") -> FormKey:
+    return FormKey(name, name, form, says, False, usual)
 
 
-def _required(name: str, form: Form, says: str, stand_in: Any = FAULTY) -> Key:
-    return Key(name, name, form, says, True, "", stand_in)
+def _required(name: str, form: Form, says: str, stand_in: Any = FAULTY) -> FormKey:
+    return FormKey(name, name, form, says, True, "", stand_in)
 
 
 TRACE = Shape(
@@ -92,13 +92,13 @@ TRACE = Shape(
     (
         _required(
             "file",
-            Text(may_be_empty=False),
+            TextForm(may_be_empty=False),
             "A .parquet or .csv file, relative to the cell file's folder.",
         ),
         _required("column", NAME, "Column with the values: milliseconds, or bare factors."),
         _optional(
             "by",
-            Choice(("row", "time")),
+            ChoiceForm(("row", "time")),
             "`row`: each cycle takes the next row. `time`: each cycle takes the latest row sent at "
             "or before its release.",
             "row",
@@ -111,7 +111,8 @@ TRACE = Shape(
         ),
         _optional(
             "group",
-            Written(
+            WrittenForm(
+                "text, list of texts",
                 _columns,
                 {
                     "anyOf": [
@@ -126,15 +127,17 @@ TRACE = Shape(
         ),
         _optional(
             "on_negative",
-            Choice(("error", "drop", "clip")),
+            ChoiceForm(("error", "drop", "clip")),
             "What to do with rows whose value is negative, missing or not finite: `error`, `drop` "
             "the row for all columns, or `clip` negative values to 0.",
             "error",
         ),
-        _optional("wrap", Flag(), "Whether to go on at the beginning when the rows end.", "false"),
+        _optional(
+            "wrap", FlagForm(), "Whether to go on at the beginning when the rows end.", "false"
+        ),
         _optional(
             "sha256",
-            Text(pattern="[0-9a-f]{64}", of="64 hexadecimal digits, as they were recorded"),
+            TextForm(pattern="[0-9a-f]{64}", of="64 hexadecimal digits, as they were recorded"),
             "Digest of the data that a recorded problem used; other data are refused.",
         ),
     ),
@@ -146,6 +149,7 @@ class ProcessForm(Form):
     """A number, or one named random process: an `Entry` of it, or its `Constant`."""
 
     shape: Shape
+    words: ClassVar[str] = "process"
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return a `Constant`, or the entry of the one process that is named."""
@@ -160,7 +164,7 @@ class ProcessForm(Form):
             (found,) = entry.values.values()
             return found if isinstance(found, Entry) else Constant(found)
         if isinstance(value, int | float) and not isinstance(value, bool):
-            number = Number(VALUE).read(value, path, faults)
+            number = NumberForm(VALUE).read(value, path, faults)
             return FAULTY if number is FAULTY else Constant(number)
         names = ", ".join(self.shape.names)
         remedy = f"a number from 0 to 1e9, or one of {names} with its values"
@@ -176,7 +180,7 @@ class ProcessForm(Form):
             mapping = self.shape.definition(definitions)
             says = mapping.pop("description")
             either = [
-                Number(VALUE).schema(definitions),
+                NumberForm(VALUE).schema(definitions),
                 {**mapping, "minProperties": 1, "maxProperties": 1},
             ]
             definitions["Process"] = {"description": says, "anyOf": either}
@@ -189,7 +193,7 @@ PROCESS = ProcessForm(
         "Process",
         "A number, or one named random process.",
         (
-            _optional("constant", Number(VALUE), CONSTANT.key.says),
+            _optional("constant", NumberForm(VALUE), CONSTANT.key.says),
             *(
                 _optional(name, shape_of(kind, {}), (kind.__doc__ or "").partition("\n")[0])
                 for name, kind in DRAWN.items()
@@ -207,7 +211,7 @@ def _field(kind: type, name: str) -> DeclaredField:
     return next(one for one in declared_fields(kind) if one.name == name)
 
 
-def _with_stand_in(kind: type, name: str, stand_in: object) -> Key:
+def _with_stand_in(kind: type, name: str, stand_in: object) -> FormKey:
     one = _field(kind, name)
     return key_of(one, form_of(one, PROCESSES), stand_in=stand_in)
 
@@ -229,9 +233,10 @@ LINK_BURSTS = shape_of(
     says="Episodes of extra delay on a link.",
 )
 _ACCELERATORS = _field(Node, "accelerators")
+QUOTA = shape_of(Quota, {})
 NODE = shape_of(
     Node,
-    {Quota: shape_of(Quota, {}), Bursts: NODE_BURSTS},
+    {Quota: QUOTA, Bursts: NODE_BURSTS},
     instead={
         "tier": _with_stand_in(Node, "tier", "robot"),
         # A node without its accelerators, as if tasks named unknown ones.
@@ -241,27 +246,32 @@ NODE = shape_of(
 
 
 @dataclass(frozen=True, eq=False)
-class Words(Form):
+class WordsForm(Form):
     """One of some words, or a mapping that says more.
 
     Parameters
     ----------
-    words : mapping of str to object
-        What each of them means.
+    means : mapping of str to object
+        What each word means.
     shape : Shape
         Of one key, whose value is meant.
     remedy : str
         What a value must be.
     """
 
-    words: Mapping[str, Any]
+    means: Mapping[str, Any]
     shape: Shape
     remedy: str
 
+    @property
+    def words(self) -> str:
+        """What it may be, as a table of the docs has it."""
+        return ", ".join([*(f"`{word}`" for word in self.means), self.shape.words])
+
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return what is meant."""
-        if isinstance(value, str) and value in self.words:
-            return self.words[value]
+        if isinstance(value, str) and value in self.means:
+            return self.means[value]
         if not isinstance(value, dict):
             return refused(value, self.remedy, path, faults)
         entry = self.shape.read(value, path, faults)
@@ -269,18 +279,22 @@ class Words(Form):
 
     def schema(self, definitions: Definitions) -> JsonSchema:
         """Return the words or the mapping."""
-        names = list(self.words)
+        names = list(self.means)
         word = {"const": names[0]} if len(names) == 1 else {"enum": names}
         return {"anyOf": [word, self.shape.schema(definitions)]}
 
 
 _RETRANSMIT = _field(Link, "retransmit_ms")
-ON_LOSS = Words(
+ON_LOSS = WordsForm(
     {"drop": None},
     Shape(
         "Retransmit",
         "How long after a lost attempt the next one follows.",
-        (_required("retransmit_ms", Number(_RETRANSMIT.key.bound or VALUE), _RETRANSMIT.key.says),),
+        (
+            _required(
+                "retransmit_ms", NumberForm(_RETRANSMIT.key.bound or VALUE), _RETRANSMIT.key.says
+            ),
+        ),
     ),
     "`drop` (default) or `{retransmit_ms: 20}`",
 )
@@ -289,7 +303,7 @@ LINK = shape_of(
     {**PROCESSES, Bursts: LINK_BURSTS},
     instead={
         "delay_ms": _with_stand_in(Link, "delay_ms", STAND_IN),
-        "retransmit_ms": Key(
+        "retransmit_ms": FormKey(
             "retransmit_ms",
             "on_loss",
             ON_LOSS,
@@ -301,7 +315,7 @@ LINK = shape_of(
     further=(
         _optional(
             "both_ways",
-            Flag(),
+            FlagForm(),
             "Whether there is the same link back too, drawn independently.",
             "false",
         ),
@@ -316,16 +330,16 @@ EXECUTION = shape_of(
     instead={"exec_ms": _with_stand_in(Execution, "exec_ms", STAND_IN)},
 )
 _DEPTH = _field(Task, "depth")
-INPUT = Words(
+INPUT = WordsForm(
     {"queue": 0, "latest": 1},
     Shape(
         "Input",
         "How many complete input sets may wait.",
         (
-            Key(
+            FormKey(
                 "depth",
                 "queue",
-                Number(Bound(1, MAX_COUNT, whole=True)),
+                NumberForm(Bound(1, MAX_COUNT, whole=True)),
                 "Input sets that may wait; beyond it the oldest is replaced.",
                 True,
             ),
@@ -337,10 +351,14 @@ TASK = shape_of(
     Task,
     {},
     instead={
-        "on": Key(
-            "on", "on", Names(EXECUTION, keeps=True, least=1), _field(Task, "on").key.says, True
+        "on": FormKey(
+            "on",
+            "on",
+            MappingForm(EXECUTION, keeps=True, least=1),
+            _field(Task, "on").key.says,
+            True,
         ),
-        "depth": Key(
+        "depth": FormKey(
             "depth",
             "input",
             INPUT,
@@ -352,7 +370,7 @@ TASK = shape_of(
     further=(
         _optional(
             "workers",
-            Number(WORKERS),
+            NumberForm(WORKERS),
             "Jobs that may run at a time on each node that does not say.",
             "1",
         ),
@@ -375,7 +393,7 @@ def _disturbance() -> Shape:
     first = _optional("node", NAME, known.pop("node").says)
     further = (
         _optional("link", NAME, "Link that it happens to, as `R1->E`."),
-        _optional("both_ways", Flag(), "Whether it happens to the link back as well.", "false"),
+        _optional("both_ways", FlagForm(), "Whether it happens to the link back as well.", "false"),
     )
     return Shape(
         "Disturbance",
@@ -386,17 +404,17 @@ def _disturbance() -> Shape:
 
 
 DISTURBANCE = _disturbance()
-_TARGETS = shape_of(Targets, {})
+WEIGHTS, TARGETS, CAPS = (shape_of(kind, {}) for kind in (Weights, Targets, Caps))
 OBJECTIVE = shape_of(
     Objective,
     {},
     instead={
-        "weights": _optional("weights", shape_of(Weights, {}), "Weights of the terms of J."),
-        "targets": _optional("targets", _TARGETS, "Design targets."),
-        "caps": _optional("caps", shape_of(Caps, {}), "Hard caps."),
+        "weights": _optional("weights", WEIGHTS, "Weights of the terms of J."),
+        "targets": _optional("targets", TARGETS, "Design targets."),
+        "caps": _optional("caps", CAPS, "Hard caps."),
         "accelerators": _optional(
             "accelerators",
-            Flag(),
+            FlagForm(),
             "Whether accelerators of these nodes count in their tiers, too.",
             "false",
         ),
@@ -408,12 +426,13 @@ CONTROLLER = shape_of(
     {},
     title="Controller",
     instead={
-        "policy": key_of(_POLICY, Text(examples=tuple(POLICIES))),
-        "estimator": key_of(_ESTIMATOR, Text(examples=tuple(ESTIMATORS))),
+        "policy": key_of(_POLICY, TextForm(known=tuple(POLICIES))),
+        "estimator": key_of(_ESTIMATOR, TextForm(known=tuple(ESTIMATORS))),
     },
 )
-SERVO = shape_of(Servo, {MovingTarget: shape_of(MovingTarget, {})})
-_ADDRESS = Text(may_be_empty=False)
+TARGET = shape_of(MovingTarget, {})
+SERVO = shape_of(Servo, {MovingTarget: TARGET})
+_ADDRESS = TextForm(may_be_empty=False)
 ENDPOINT = shape_of(Endpoint, {}, instead={"address": _ADDRESS})
 HOST = shape_of(Host, {Endpoint: ENDPOINT}, instead={"address": _ADDRESS})
 LIVE = shape_of(LiveSettings, {Host: HOST}, title="Live")
@@ -425,30 +444,30 @@ _PLACES = {one.name: key_of(one, form_of(one, {})) for one in declared_fields(Fa
 _WHOLE = {one.name: key_of(one, form_of(one, {})) for one in declared_fields(Problem)}
 
 
-def _section(name: str, form: Form, stand_in: object = FAULTY) -> Key:
+def _section(name: str, form: Form, stand_in: object = FAULTY) -> FormKey:
     """A section of the file, with what the model says of it."""
     says = {**_TIMING, **_PLACES, **_WHOLE}[name].says
-    return Key(name, name, form, says, stand_in is not FAULTY, "", stand_in)
+    return FormKey(name, name, form, says, stand_in is not FAULTY, "", stand_in)
 
 
 CELL_SHAPE = Shape(
     "Cell",
     "A pipeline on its robots: tasks, flows, nodes, links, candidates, scenarios, objective.",
     (
-        _required("dwell", Choice((VERSION,)), "Version of this format.", VERSION),
+        _required("dwell", ChoiceForm((VERSION,)), "Version of this format.", VERSION),
         _WHOLE["name"],
         key_of(_field(Pipeline, "period_ms"), _TIMING["period_ms"].form, stand_in=LARGEST),
         _TIMING["deadline_ms"],
         _TIMING["release_jitter_ms"],
         _WHOLE["window_cycles"],
         _WHOLE["warmup_windows"],
-        _section("nodes", Names(NODE, keeps=True, least=1), {}),
-        _section("links", Items(LINK, keeps=True)),
-        _section("tasks", Names(TASK, keeps=True, least=1), {}),
-        _section("flows", Items(FLOW, keeps=True)),
-        _section("scales", Names(PROCESS, keeps=True)),
-        _section("candidates", Names(Names(NAME), keeps=True, least=1), {}),
-        _section("scenarios", Names(Items(DISTURBANCE, keeps=True), keeps=True)),
+        _section("nodes", MappingForm(NODE, keeps=True, least=1), {}),
+        _section("links", ListForm(LINK, keeps=True)),
+        _section("tasks", MappingForm(TASK, keeps=True, least=1), {}),
+        _section("flows", ListForm(FLOW, keeps=True)),
+        _section("scales", MappingForm(PROCESS, keeps=True)),
+        _section("candidates", MappingForm(MappingForm(NAME), keeps=True, least=1), {}),
+        _section("scenarios", MappingForm(ListForm(DISTURBANCE, keeps=True), keeps=True)),
         _section("objective", OBJECTIVE),
         _section("controller", CONTROLLER),
         _section("servo", SERVO),

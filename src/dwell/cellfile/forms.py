@@ -17,8 +17,8 @@ from typing import Any, ClassVar, Final, TypeAlias, get_args, get_origin
 
 from dwell.cellfile.document_faults import Faults
 from dwell.model.bounds import Bound, as_read
-from dwell.model.keys import DeclaredField, declared_fields
-from dwell.model.paths import Step
+from dwell.model.declaration import DeclaredField, declared_fields
+from dwell.model.dotted_paths import Step
 from dwell.model.semantics import closest, nearest
 
 JsonSchema: TypeAlias = dict[str, Any]
@@ -45,6 +45,11 @@ class Form(ABC):
     #: Whether a key or an item at fault is kept as a bare name or place, None.
     is_kept: ClassVar[bool] = False
 
+    @property
+    @abstractmethod
+    def words(self) -> str:
+        """What it may be, as a table of the docs has it."""
+
     @abstractmethod
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return what a value says, or `FAULTY` beside a fault."""
@@ -64,10 +69,15 @@ def refused(value: object, bound: str, path: str, faults: Faults) -> Any:
 
 
 @dataclass(frozen=True, slots=True)
-class Number(Form):
+class NumberForm(Form):
     """A finite number within a bound."""
 
     bound: Bound
+
+    @property
+    def words(self) -> str:
+        """What it may be, as a table of the docs has it."""
+        return str(self.bound).removeprefix("a ")
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return the number, a float where the bound is none of whole numbers."""
@@ -106,21 +116,26 @@ def unquoted(text: str) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Text(Form):
+class TextForm(Form):
     """A text.
 
     Parameters
     ----------
     pattern : str
         Regular expression of the whole, with what it means in `of`.
-    examples : tuple of str
-        For editors.
+    known : tuple of str
+        Texts that an editor may complete; others are right, too.
     """
 
     may_be_empty: bool = True
     pattern: str = ""
     of: str = ""
-    examples: tuple[str, ...] = ()
+    known: tuple[str, ...] = ()
+
+    @property
+    def words(self) -> str:
+        """What it may be, as a table of the docs has it."""
+        return self.of or "text"
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return the text; that of a key which is no text, where it stands for one."""
@@ -140,12 +155,17 @@ class Text(Form):
             result["minLength"] = 1
         if self.pattern:
             result["pattern"] = f"^{self.pattern}$"
-        return {**result, "examples": list(self.examples)} if self.examples else result
+        return {"anyOf": [{"enum": list(self.known)}, result]} if self.known else result
 
 
 @dataclass(frozen=True, slots=True)
-class Flag(Form):
+class FlagForm(Form):
     """A truth value."""
+
+    @property
+    def words(self) -> str:
+        """What it may be, as a table of the docs has it."""
+        return "`true`, `false`"
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return the truth value."""
@@ -157,10 +177,15 @@ class Flag(Form):
 
 
 @dataclass(frozen=True, slots=True)
-class Choice(Form):
+class ChoiceForm(Form):
     """One of some values."""
 
     choices: tuple[Any, ...]
+
+    @property
+    def words(self) -> str:
+        """What it may be, as a table of the docs has it."""
+        return ", ".join(f"`{choice}`" for choice in self.choices)
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return the value."""
@@ -179,19 +204,27 @@ class Choice(Form):
 
 
 @dataclass(frozen=True, slots=True)
-class Written(Form):
+class WrittenForm(Form):
     """A value that may be written in several ways.
 
     Parameters
     ----------
+    ways : str
+        What it may be, in words.
     reader : callable
         Returns what the value says; raises a ValueError with what is wrong.
     shown : mapping
         JSON Schema.
     """
 
+    ways: str
     reader: Callable[[Any], Any]
     shown: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def words(self) -> str:
+        """What it may be, as a table of the docs has it."""
+        return self.ways
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return what the reader makes of the value."""
@@ -217,7 +250,7 @@ def take(form: Form, value: Any, path: str, faults: Faults, remedy: str) -> Any:
     remedy : str
         What to do where nothing is given.
     """
-    if isinstance(form, Text) and (text := faults.unquoted(value)) is not None:
+    if isinstance(form, TextForm) and (text := faults.unquoted(value)) is not None:
         value = text
     if value is None:
         if not faults.at(path):
@@ -227,7 +260,7 @@ def take(form: Form, value: Any, path: str, faults: Faults, remedy: str) -> Any:
 
 
 @dataclass(frozen=True, slots=True)
-class Names(Form):
+class MappingForm(Form):
     """Values of one form by name.
 
     Parameters
@@ -241,6 +274,11 @@ class Names(Form):
     form: Form
     keeps: bool = False
     least: int = 0
+
+    @property
+    def words(self) -> str:
+        """What it may be, as a table of the docs has it."""
+        return f"name → {self.form.words}"
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return a dict of what they say."""
@@ -270,11 +308,16 @@ class Names(Form):
 
 
 @dataclass(frozen=True, slots=True)
-class Items(Form):
-    """A list of values of one form; see `Names`."""
+class ListForm(Form):
+    """A list of values of one form; see `MappingForm`."""
 
     form: Form
     keeps: bool = False
+
+    @property
+    def words(self) -> str:
+        """What it may be, as a table of the docs has it."""
+        return f"list of {self.form.words}"
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return a list of what they say."""
@@ -295,7 +338,7 @@ class Items(Form):
 
 
 @dataclass(frozen=True, slots=True)
-class Key:
+class FormKey:
     """A key of a mapping.
 
     Parameters
@@ -368,7 +411,7 @@ class Shape(Form):
         Its name in the JSON Schema.
     says : str
         One sentence.
-    keys : tuple of Key
+    keys : tuple of FormKey
         In their order.
     kind : type, optional
         Class of the model that its values are the arguments of.
@@ -378,9 +421,14 @@ class Shape(Form):
 
     title: str
     says: str
-    keys: tuple[Key, ...]
+    keys: tuple[FormKey, ...]
     kind: Any = None
     extra: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def words(self) -> str:
+        """What it may be, as a table of the docs has it."""
+        return f"`{{{', '.join(self.names)}}}`"
 
     @property
     def names(self) -> list[str]:
@@ -411,7 +459,7 @@ class Shape(Form):
                 is_broken |= key.is_required or (key.breaks and key.named in value)
         return FAULTY if is_broken else Entry(self, path, values)
 
-    def _read_key(self, key: Key, value: Mapping[str, Any], path: str, faults: Faults) -> Any:
+    def _read_key(self, key: FormKey, value: Mapping[str, Any], path: str, faults: Faults) -> Any:
         says = key.says[:1].lower() + key.says[1:].rstrip(".")
         if key.named not in value:
             if key.is_required and not faults.at(path):
@@ -448,11 +496,13 @@ class Shape(Form):
 # ------------------------------------------------------------------------ of declared classes
 
 
-def key_of(one: DeclaredField, form: Form, *, stand_in: Any = FAULTY, breaks: bool = False) -> Key:
+def key_of(
+    one: DeclaredField, form: Form, *, stand_in: Any = FAULTY, breaks: bool = False
+) -> FormKey:
     """Return the key of a field that the model declares."""
     required = one.default is MISSING and one.key.usual is None
     usual = one.key.usual or ("" if required else _shown(one.default))
-    return Key(one.name, one.named, form, one.key.says, required, usual, stand_in, breaks)
+    return FormKey(one.name, one.named, form, one.key.says, required, usual, stand_in, breaks)
 
 
 def _shown(default: Any) -> str:
@@ -474,18 +524,18 @@ def form_of(one: DeclaredField, forms: Mapping[Any, Form]) -> Form:
     origin, inner = get_origin(one.kind), get_args(one.kind)
     if one.is_mapping:
         form = forms.get(inner[1])
-        return Names(form or _single(inner[1], one), keeps=False)
+        return MappingForm(form or _single(inner[1], one), keeps=False)
     if origin is tuple:
-        return Items(forms.get(inner[0]) or _single(inner[0], one))
+        return ListForm(forms.get(inner[0]) or _single(inner[0], one))
     return _single(one.kind, one)
 
 
 def _single(kind: Any, one: DeclaredField) -> Form:
     if one.choices:
-        return Choice(one.choices)
+        return ChoiceForm(one.choices)
     if one.key.bound is not None:
-        return Number(one.key.bound)
-    return Flag() if kind is bool else Text()
+        return NumberForm(one.key.bound)
+    return FlagForm() if kind is bool else TextForm()
 
 
 def shape_of(
@@ -494,8 +544,8 @@ def shape_of(
     *,
     title: str = "",
     without: tuple[str, ...] = (),
-    instead: Mapping[str, Form | Key] | None = None,
-    further: tuple[Key, ...] = (),
+    instead: Mapping[str, Form | FormKey] | None = None,
+    further: tuple[FormKey, ...] = (),
     says: str = "",
     extra: Mapping[str, Any] | None = None,
 ) -> Shape:
@@ -507,9 +557,9 @@ def shape_of(
         Forms of types that are no single values.
     without : tuple of str
         Fields that are no keys.
-    instead : mapping of str to Form or Key
+    instead : mapping of str to Form or FormKey
         What fields have in place of the form of their type.
-    further : tuple of Key
+    further : tuple of FormKey
         Keys that are no fields; they come last.
     says : str
         The first line of the class's docstring where empty.
@@ -519,7 +569,7 @@ def shape_of(
         if one.name in without:
             continue
         given = (instead or {}).get(one.name)
-        if isinstance(given, Key):
+        if isinstance(given, FormKey):
             keys.append(given)
         else:
             keys.append(key_of(one, given or form_of(one, forms)))

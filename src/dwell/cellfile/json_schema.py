@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
+#: Names the schema, by the version of the format.
+NAME = "urn:dwell:cell"
 
 
 def schema() -> dict[str, Any]:
@@ -22,5 +24,5 @@ def schema() -> dict[str, Any]:
 
     definitions: dict[str, Any] = {}
     cell = CELL.shape.definition(definitions)
-    head = {"$schema": DIALECT, "title": "Dwell cell"}
+    head = {"$schema": DIALECT, "$id": f"{NAME}:{CELL.version}", "title": "Dwell cell"}
     return {**head, **cell, "$defs": dict(sorted(definitions.items()))}

@@ -19,7 +19,7 @@ from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.study_paths import put
 from dwell.errors import ProblemError
 from dwell.model import Problem
-from dwell.model.paths import Step, dotted, steps_of
+from dwell.model.dotted_paths import Step, dotted, steps_of
 
 if TYPE_CHECKING:
     from dwell.cellfile.traces import Tables

@@ -12,7 +12,7 @@ from typing import Any
 from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.forms import Entry, Shape
 from dwell.model.bounds import as_read, shown
-from dwell.model.paths import Step, dotted
+from dwell.model.dotted_paths import Step, dotted
 
 MAX_DEPTH = 40
 

@@ -22,7 +22,7 @@ from dwell.errors import ProblemError
 from dwell.estimators.registry import names as estimator_names
 from dwell.model import Problem
 from dwell.model.bounds import as_read
-from dwell.model.paths import Step, steps_of
+from dwell.model.dotted_paths import Step, steps_of
 from dwell.model.semantics import bad_name, nearest, nearest_of
 from dwell.model.user_classes import is_class_path
 from dwell.policies.registry import names as policy_names

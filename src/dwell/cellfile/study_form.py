@@ -4,7 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
-from dwell.cellfile.forms import Choice, Flag, Items, Key, Names, Number, Shape, Text, Written
+from dwell.cellfile.forms import (
+    ChoiceForm,
+    FlagForm,
+    FormKey,
+    ListForm,
+    MappingForm,
+    NumberForm,
+    Shape,
+    TextForm,
+    WrittenForm,
+)
 from dwell.cellfile.structure import FileKind
 from dwell.model.bounds import MAX_COUNT, SEEDS, Bound, as_read
 
@@ -92,22 +102,22 @@ def _parameters(value: object) -> dict[str, object]:
     )
 
 
-NAME, NO_TEXT = Text(), Text(may_be_empty=False)
+NAME, NO_TEXT = TextForm(), TextForm(may_be_empty=False)
 STUDY = FileKind(
     Shape(
         "Study",
         "Scenarios, policies, parameters and seeds, of which every combination is simulated.",
         (
-            Key(
+            FormKey(
                 "version",
                 "dwell-study",
-                Choice((VERSION,)),
+                ChoiceForm((VERSION,)),
                 "Version of this format.",
                 is_required=True,
                 stand_in=VERSION,
             ),
-            Key("name", "name", NAME, "Name of the study.", usual="the file's"),
-            Key(
+            FormKey("name", "name", NAME, "Name of the study.", usual="the file's"),
+            FormKey(
                 "cell",
                 "cell",
                 NAME,
@@ -115,61 +125,67 @@ STUDY = FileKind(
                 is_required=True,
                 stand_in="",
             ),
-            Key(
+            FormKey(
                 "traces",
                 "traces",
                 NO_TEXT,
                 "Folder where the cell's trace files are, relative to this file's.",
                 usual="the cell's",
             ),
-            Key(
+            FormKey(
                 "scenarios",
                 "scenarios",
-                Written(_scenarios),
+                WrittenForm("list of names, name → list of disturbances", _scenarios),
                 "Scenarios of the cell, or a mapping of names to disturbances.",
                 usual="all of the cell's",
             ),
-            Key(
+            FormKey(
                 "windows",
                 "windows",
-                Number(WINDOWS),
+                NumberForm(WINDOWS),
                 "Length of every run, the warm-up included.",
                 usual="300",
             ),
-            Key("seeds", "seeds", Written(_seeds), "A number of seeds, or which.", usual="20"),
-            Key(
+            FormKey(
+                "seeds",
+                "seeds",
+                WrittenForm("number, list, `{from, count}`", _seeds),
+                "A number of seeds, or which.",
+                usual="20",
+            ),
+            FormKey(
                 "references",
                 "references",
-                Flag(),
+                FlagForm(),
                 "Whether to play the references in hindsight as well.",
                 usual="false",
             ),
-            Key(
+            FormKey(
                 "policies",
                 "policies",
-                Written(_policies),
+                WrittenForm("list of names, name → policy", _policies),
                 "Policies and candidates, or a mapping of names to what they are.",
                 is_required=True,
                 stand_in={},
             ),
-            Key(
+            FormKey(
                 "parameters",
                 "parameters",
-                Written(_parameters),
+                WrittenForm("path → list of values", _parameters),
                 "Values by their path in the cell; every combination is a point.",
             ),
-            Key(
+            FormKey(
                 "zip",
                 "zip",
-                Items(Items(NAME)),
+                ListForm(ListForm(NAME)),
                 "Groups of parameters whose values go together, the first with the first.",
                 usual="none",
             ),
-            Key(
+            FormKey(
                 "labels",
                 "labels",
-                Names(NO_TEXT),
-                "Names of parameters in figures and tables, by their paths.",
+                MappingForm(NO_TEXT),
+                "MappingForm of parameters in figures and tables, by their paths.",
                 usual="the paths",
             ),
         ),

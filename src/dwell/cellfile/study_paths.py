@@ -8,8 +8,8 @@ from typing import Any
 from dwell.cellfile.document_faults import Faults
 from dwell.errors import ProblemError
 from dwell.model import Problem, evolve
+from dwell.model.dotted_paths import Step
 from dwell.model.fabric import accelerator_tiers
-from dwell.model.paths import Step
 from dwell.model.semantics import CellParts
 
 #: Where the settings of a policy are: what they change is drawn nowhere.

@@ -15,7 +15,7 @@ from collections.abc import Hashable
 import yaml
 
 from dwell.cellfile.document_faults import Faults
-from dwell.model.paths import Step, dotted
+from dwell.model.dotted_paths import Step, dotted
 
 MAX_BYTES = 4_000_000
 MAX_DEPTH = 40

@@ -11,8 +11,8 @@ from functools import lru_cache
 from typing import Any, TypeAlias
 
 from dwell.errors import Fault, ProblemError
+from dwell.model.declaration import declared_fields
 from dwell.model.fabric import Link, Node
-from dwell.model.keys import declared_fields
 from dwell.model.live import LiveSettings
 from dwell.model.objective import Objective
 from dwell.model.pipeline import Task

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeAlias, get_args
 
 from dwell.errors import Fault, ProblemError
+from dwell.model.declaration import DeclaredField, declared_fields, is_declared, within_path
 from dwell.model.document import to_document
-from dwell.model.keys import DeclaredField, declared_fields, is_declared, within_path
-from dwell.model.paths import Step, dotted, steps_of
+from dwell.model.dotted_paths import Step, dotted, steps_of
 from dwell.model.problem import Problem
 from dwell.model.process import Constant, Process
 from dwell.model.semantics import nearest

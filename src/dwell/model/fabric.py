@@ -17,8 +17,8 @@ from dwell.model.bounds import (
     counted,
     require,
 )
+from dwell.model.declaration import declared, key
 from dwell.model.frozen import FrozenDict, require_names, shortened
-from dwell.model.keys import declared, key
 from dwell.model.objective import Tier
 from dwell.model.process import Constant, Process, require_mean
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Literal
 
 from dwell.model.bounds import LARGEST, MAX_COUNT, Bound, require
+from dwell.model.declaration import declared, key
 from dwell.model.frozen import FrozenDict
-from dwell.model.keys import declared, key
 
 PORT = Bound(1024, 65_000, whole=True)
 

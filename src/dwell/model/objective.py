@@ -8,8 +8,8 @@ from typing import Literal, TypeAlias
 
 from dwell.errors import Fault, ProblemError
 from dwell.model.bounds import LARGEST, Bound
+from dwell.model.declaration import declared, key
 from dwell.model.frozen import FrozenDict
-from dwell.model.keys import declared, key
 
 Tier: TypeAlias = Literal["robot", "edge", "cloud"]
 TIERS: tuple[Tier, ...] = ("robot", "edge", "cloud")

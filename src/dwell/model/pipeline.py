@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from dwell.model.bounds import LARGEST, MAX_COUNT, PERIOD_MS, TIME_MS, Bound, require
+from dwell.model.declaration import declared, key
 from dwell.model.fabric import accelerator_name
 from dwell.model.frozen import FrozenDict, require_names, shortened
-from dwell.model.keys import declared, key
 from dwell.model.live import require_callable_name
 from dwell.model.process import Constant, Process
 

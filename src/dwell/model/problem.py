@@ -10,10 +10,10 @@ from typing import Literal, NamedTuple
 from dwell.display import Displayed
 from dwell.errors import Fault, ProblemError
 from dwell.model.bounds import MAX_COUNT, MIN_DWELL, MIN_IMPROVEMENT, TIME_MS, Bound, counted
+from dwell.model.declaration import declared, key
 from dwell.model.fabric import Fabric
 from dwell.model.frozen import FrozenDict, shortened
 from dwell.model.instants import require_length
-from dwell.model.keys import declared, key
 from dwell.model.live import LiveSettings
 from dwell.model.objective import Objective
 from dwell.model.pipeline import Pipeline

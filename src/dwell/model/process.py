@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, runtime_che
 
 from dwell.errors import Fault, TraceError
 from dwell.model.bounds import LARGEST, VALUE, Bound, counted, require
+from dwell.model.declaration import declared, key
 from dwell.model.frozen import shortened
-from dwell.model.keys import declared, key
 
 if TYPE_CHECKING:
     import numpy as np
@@ -280,12 +280,13 @@ class TraceTable:
         return hash(self._declared)
 
     @property
-    def _arrays(self) -> dict[object, NDArray[Any]]:
-        instants = {} if self.time_ms is None else {"time_ms": self.time_ms}
-        return {("column", name): values for name, values in self.columns.items()} | {
-            "starts": self.starts,
-            **instants,
-        }
+    def _arrays(self) -> dict[tuple[str, str], NDArray[Any]]:
+        arrays: dict[tuple[str, str], NDArray[Any]] = {("", "starts"): self.starts}
+        if self.time_ms is not None:
+            arrays["", "time_ms"] = self.time_ms
+        for name, values in self.columns.items():
+            arrays["column", name] = values
+        return arrays
 
     @property
     def _declared(self) -> tuple[object, ...]:

@@ -10,7 +10,7 @@ import math
 from typing import Any, TypeAlias
 
 from dwell.model.bounds import FOREIGN_THREADS, LARGEST, RATE_MBPS, Bound, require
-from dwell.model.keys import declared, key
+from dwell.model.declaration import declared, key
 from dwell.model.process import Process, require_mean
 
 # Equal steps in which a ramp reaches its full strength. Their number has that many binary digits,

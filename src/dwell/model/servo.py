@@ -6,7 +6,7 @@ import math
 from typing import Literal, TypeAlias
 
 from dwell.model.bounds import LARGEST, MAX_COUNT, Bound, require
-from dwell.model.keys import declared, key
+from dwell.model.declaration import declared, key
 
 Plant: TypeAlias = Literal["integrator", "double-integrator"]
 

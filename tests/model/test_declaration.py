@@ -11,8 +11,8 @@ import pytest
 import dwell.model
 from dwell.errors import ProblemError
 from dwell.model.bounds import Bound
+from dwell.model.declaration import declared, declared_fields, is_declared, key, within_path
 from dwell.model.frozen import FrozenDict
-from dwell.model.keys import declared, declared_fields, is_declared, key, within_path
 
 
 @declared("part")

@@ -27,12 +27,12 @@ from dwell.model.frozen import FrozenDict
 
 T = TypeVar("T")
 
-#: Where a field keeps its `Key`, and a class the name of the mapping that holds its keys.
+#: Where a field keeps its `Declaration`.
 KEY = "dwell"
 
 
 @dataclass(frozen=True, slots=True)
-class Key:
+class Declaration:
     """What a field is, beside its type and default.
 
     Parameters
@@ -62,8 +62,8 @@ def key(
     named: str | None = None,
     usual: str | None = None,
 ) -> Any:
-    """Declare a field of a class that is `declared` (see `Key`)."""
-    about = {KEY: Key(says, bound, named, usual)}
+    """Declare a field of a class that is `declared` (see `Declaration`)."""
+    about = {KEY: Declaration(says, bound, named, usual)}
     if default_factory is not MISSING:
         return dataclasses.field(default_factory=default_factory, metadata=about)
     return dataclasses.field(default=default, metadata=about)
@@ -126,7 +126,7 @@ class DeclaredField(NamedTuple):
         What a text must be one of, or the texts of a mapping; empty where any is right.
     default : object
         `dataclasses.MISSING` where it is required.
-    key : Key
+    key : Declaration
         What else it declares.
     """
 
@@ -134,7 +134,7 @@ class DeclaredField(NamedTuple):
     kind: Any
     choices: tuple[str, ...]
     default: Any
-    key: Key
+    key: Declaration
 
     @property
     def named(self) -> str:

@@ -1,0 +1,75 @@
+"""The tables of cells.md, from the forms of the file: `python docs/cell_tables.py` writes them.
+
+A table stands between ``<!-- keys of NAME -->`` and the next empty line.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from dwell.cellfile import cell_form
+from dwell.cellfile.forms import FormKey, ListForm, MappingForm, Shape
+
+FILE = Path(__file__).parent / "cells.md"
+SHAPES = {
+    "the file": cell_form.CELL_SHAPE,
+    "a trace": cell_form.TRACE,
+    "a node": cell_form.NODE,
+    "a quota": cell_form.QUOTA,
+    "a link": cell_form.LINK,
+    "a task": cell_form.TASK,
+    "an execution": cell_form.EXECUTION,
+    "a flow": cell_form.FLOW,
+    "a disturbance": cell_form.DISTURBANCE,
+    "the objective": cell_form.OBJECTIVE,
+    "weights": cell_form.WEIGHTS,
+    "targets": cell_form.TARGETS,
+    "caps": cell_form.CAPS,
+    "the controller": cell_form.CONTROLLER,
+    "the servo": cell_form.SERVO,
+    "its target": cell_form.TARGET,
+    "live": cell_form.LIVE,
+    "a host": cell_form.HOST,
+}
+PLACE = re.compile(r"<!-- keys of ([^\n]*) -->\n(?:\|[^\n]*\n)*")
+
+
+def with_tables(text: str) -> str:
+    """Return the page with every table as the forms have it."""
+    return PLACE.sub(lambda found: f"{found[0].splitlines()[0]}\n{_table(found[1])}", text)
+
+
+def _table(name: str) -> str:
+    return "".join(f"{line}\n" for line in _lines(SHAPES[name]))
+
+
+def _lines(shape: Shape) -> Iterator[str]:
+    yield "| key | value | default | meaning |"
+    yield "|---|---|---|---|"
+    for key in shape.keys:
+        yield f"| `{key.named}` | {_value(key)} | {_usual(key)} | {key.says} |"
+
+
+def _value(key: FormKey) -> str:
+    words = key.form.words
+    if len(words) <= 60:
+        return words
+    return (
+        "names"
+        if isinstance(key.form, MappingForm)
+        else "list"
+        if isinstance(key.form, ListForm)
+        else "keys"
+    )
+
+
+def _usual(key: FormKey) -> str:
+    if key.is_required:
+        return ""
+    return key.usual or "none"
+
+
+if __name__ == "__main__":
+    FILE.write_text(with_tables(FILE.read_text(encoding="utf-8")), encoding="utf-8")
