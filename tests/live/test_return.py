@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 
@@ -27,7 +27,7 @@ class Wanting(Staying):
         return self.name
 
 
-def slow_cell(window_cycles: int, *fallbacks: str, mode: str = "control") -> Problem:
+def slow_cell(window_cycles: int, *fallbacks: str, mode: Literal["control", "advise"] = "control") -> Problem:
     """The canonical cell, on SO, at a period at which h probes take 3 s."""
     cell = dwell.load("examples/canonical.yaml")
     settings = replace(

@@ -36,7 +36,7 @@ from dwell.model import (
     Weights,
 )
 from dwell.model.bounds import require
-from dwell.model.declaration import within_path
+from dwell.model.declaration import declared_fields, within_path
 from dwell.model.fabric import accelerator_tiers
 from dwell.model.frozen import FrozenDict
 from dwell.model.process import DRAWN, UnreadTrace
@@ -245,17 +245,9 @@ class Assembly:
             name: STAND_IN if scale is None else scale
             for name, scale in (entry.scales or {}).items()
         }
-        deadline_ms = entry.period_ms if entry.deadline_ms is None else entry.deadline_ms
-        return self._make(
-            entry,
-            Pipeline,
-            tasks={},
-            flows=(),
-            period_ms=entry.period_ms,
-            deadline_ms=deadline_ms,
-            scales=scales,
-            release_jitter_ms=entry.release_jitter_ms,
-        )
+        given = {one.name: entry.values.get(one.name) for one in declared_fields(Pipeline)}
+        given["deadline_ms"] = entry.period_ms if entry.deadline_ms is None else entry.deadline_ms
+        return self._make(entry, Pipeline, **{**given, "tasks": {}, "flows": (), "scales": scales})
 
     # --------------------------------------------------- scenarios, objective, controller
 

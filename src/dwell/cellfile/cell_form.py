@@ -439,14 +439,20 @@ LIVE = shape_of(LiveSettings, {Host: HOST}, title="Live")
 
 # ------------------------------------------------------------------------------------ cell
 
-_TIMING = {one.name: key_of(one, form_of(one, PROCESSES)) for one in declared_fields(Pipeline)}
+_STAND_INS = {"period_ms": LARGEST}
+_PIPELINE = {
+    one.name: key_of(one, form_of(one, PROCESSES), stand_in=_STAND_INS.get(one.name, FAULTY))
+    for one in declared_fields(Pipeline)
+}
+_SECTIONS = ("tasks", "flows", "scales")
+_TIMING = {name: key for name, key in _PIPELINE.items() if name not in _SECTIONS}
 _PLACES = {one.name: key_of(one, form_of(one, {})) for one in declared_fields(Fabric)}
 _WHOLE = {one.name: key_of(one, form_of(one, {})) for one in declared_fields(Problem)}
 
 
 def _section(name: str, form: Form, stand_in: object = FAULTY) -> FormKey:
     """A section of the file, with what the model says of it."""
-    says = {**_TIMING, **_PLACES, **_WHOLE}[name].says
+    says = {**_PIPELINE, **_PLACES, **_WHOLE}[name].says
     return FormKey(name, name, form, says, stand_in is not FAULTY, "", stand_in)
 
 
@@ -456,9 +462,7 @@ CELL_SHAPE = Shape(
     (
         _required("dwell", ChoiceForm((VERSION,)), "Version of this format.", VERSION),
         _WHOLE["name"],
-        key_of(_field(Pipeline, "period_ms"), _TIMING["period_ms"].form, stand_in=LARGEST),
-        _TIMING["deadline_ms"],
-        _TIMING["release_jitter_ms"],
+        *_TIMING.values(),
         _WHOLE["window_cycles"],
         _WHOLE["warmup_windows"],
         _section("nodes", MappingForm(NODE, keeps=True, least=1), {}),

@@ -45,12 +45,15 @@ class Declaration:
         Its name in a cell file, and in messages, where that is another than the field's.
     usual : str, optional
         What holds where it is not given, in words, where that follows from others.
+    is_rare : bool
+        Whether a document leaves it out where it is as usual.
     """
 
     says: str
     bound: Bound | None = None
     named: str | None = None
     usual: str | None = None
+    is_rare: bool = False
 
 
 def key(
@@ -61,9 +64,10 @@ def key(
     default_factory: Any = MISSING,
     named: str | None = None,
     usual: str | None = None,
+    is_rare: bool = False,
 ) -> Any:
     """Declare a field of a class that is `declared` (see `Declaration`)."""
-    about = {KEY: Declaration(says, bound, named, usual)}
+    about = {KEY: Declaration(says, bound, named, usual, is_rare)}
     if default_factory is not MISSING:
         return dataclasses.field(default_factory=default_factory, metadata=about)
     return dataclasses.field(default=default, metadata=about)

@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import is_dataclass
 from functools import lru_cache
 from typing import Any, TypeAlias
 
@@ -28,13 +28,6 @@ Document: TypeAlias = dict[str, Any]
 
 NAMES: dict[type, str] = {kind: name for name, kind in DRAWN.items()}
 
-#: Fields that a document has only where they say something else than their default.
-UNLESS_USUAL = frozenset(
-    {
-        *("slack_ms", "tick_ms", "background", "background_hz", "interference"),
-        *("contention", "contention_stressed", "standby", "before_ms", "after_ms"),
-    }
-)
 PLAIN = (float, int, str, bool)
 #: Keys of every disturbance, which come last.
 INTERVAL = ("at_s", "for_s", "down", "episodes", "ramp_s")
@@ -61,9 +54,7 @@ def to_document(problem: Problem) -> Document:
         {
             "dwell": VERSION,
             "name": problem.name,
-            "period_ms": pipeline.period_ms,
-            "deadline_ms": pipeline.deadline_ms,
-            "release_jitter_ms": _process("release_jitter_ms", pipeline.release_jitter_ms),
+            **_part("", pipeline, "tasks", "flows", "scales"),
             "window_cycles": problem.window_cycles,
             "warmup_windows": problem.warmup_windows,
             "nodes": {name: _node(node) for name, node in fabric.nodes.items()},
@@ -119,20 +110,17 @@ def _part(path: str, part: Any, *but: str, **more: object) -> Document:
     for name, key, usual in _fields(kind):
         value = getattr(part, name)
         if name not in but and name not in more and value != usual:
-            document[key] = value if type(value) in PLAIN else _value(f"{path}.{key}", value)
+            document[key] = value if type(value) in PLAIN else _value(f"{path}.{key}" if path else key, value)
     return _filled({**document, **more})
 
 
 @lru_cache(maxsize=64)
 def _fields(kind: type) -> tuple[tuple[str, str, object], ...]:
     """Return name, key and, where a document leaves that out, default of every field."""
-    keys = {one.name: one.named for one in declared_fields(kind)}
-    declared: list[tuple[str, str, object]] = []
-    for item in fields(kind):
-        made = item.default if item.default_factory is MISSING else item.default_factory()
-        usual = made if item.name in UNLESS_USUAL else None
-        declared.append((item.name, keys.get(item.name, item.name), usual))
-    return tuple(declared)
+    return tuple(
+        (one.name, one.named, one.default if one.key.is_rare else None)
+        for one in declared_fields(kind)
+    )
 
 
 def _value(path: str, value: Any) -> Any:

@@ -63,12 +63,14 @@ class Quota:
         "ms. Linux keeps 1.",
         Bound(0, 1000),
         default=0.0,
+        is_rare=True,
     )
     tick_ms: float = key(
         "Time between the ticks at which a used-up budget is noticed and threads take turns, ms; "
         "0: at once, and threads share evenly. Linux: 1000 / HZ. One core, `fair`.",
         Bound(0, 1000),
         default=0.0,
+        is_rare=True,
     )
 
     def __post_init__(self) -> None:
@@ -99,6 +101,7 @@ class Node:
         "Cores that others than the jobs always take, in small pieces; less than the node can do.",
         Bound(0, 4096),
         default=0.0,
+        is_rare=True,
     )
     background_beside: float | None = key(
         "What of `background` is taken while jobs run and no foreign thread does, on a node with "
@@ -112,24 +115,28 @@ class Node:
         "quota has `tick_ms`: the kernel looks at the quota then, too, and picks anew who runs.",
         BACKGROUND_HZ,
         default=0.0,
+        is_rare=True,
     )
     interference: float = key(
         "How many times as much core time jobs take while foreign threads run, whose data take "
         "the place of theirs in the caches.",
         Bound(1, 100),
         default=1.0,
+        is_rare=True,
     )
     contention: float = key(
         "Share of a CPU's time that others take from what runs there, and that the node's quota "
         "does not count. Only of a node with a quota.",
         CONTENTION,
         default=0.0,
+        is_rare=True,
     )
     contention_stressed: Mapping[str, float] = key(
         "What `contention` is while another node, on the same CPUs, has foreign threads, as "
         "`{R1: 0.4}`; of several the largest counts.",
         CONTENTION,
         default_factory=FrozenDict,
+        is_rare=True,
     )
 
     def __post_init__(self) -> None:

@@ -39,15 +39,20 @@ class Execution:
         "Further workers that a live node keeps, to take over when the first is silent.",
         STANDBY,
         default=0,
+        is_rare=True,
     )
     before_ms: float = key(
         "What of `exec_ms` another thread of its worker does before it, ms; it waits for its own "
         "turn where threads take turns (`quota.tick_ms`).",
         HANDED_MS,
         default=0.0,
+        is_rare=True,
     )
     after_ms: float = key(
-        "What of `exec_ms` another thread of its worker does after it, ms.", HANDED_MS, default=0.0
+        "What of `exec_ms` another thread of its worker does after it, ms.",
+        HANDED_MS,
+        default=0.0,
+        is_rare=True,
     )
 
     def resource(self, node: str) -> str:
