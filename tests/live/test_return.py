@@ -27,7 +27,9 @@ class Wanting(Staying):
         return self.name
 
 
-def slow_cell(window_cycles: int, *fallbacks: str, mode: Literal["control", "advise"] = "control") -> Problem:
+def slow_cell(
+    window_cycles: int, *fallbacks: str, mode: Literal["control", "advise"] = "control"
+) -> Problem:
     """The canonical cell, on SO, at a period at which h probes take 3 s."""
     cell = dwell.load("examples/canonical.yaml")
     settings = replace(
@@ -143,7 +145,7 @@ def test_a_pin_to_the_fallback_itself_probes_nothing() -> None:
 @pytest.mark.parametrize("window_cycles", [5, 15, 40])
 @pytest.mark.parametrize("mode", ["control", "advise"])
 def test_a_fallback_that_is_drained_is_left_for_what_is_proven(
-    window_cycles: int, mode: str
+    window_cycles: int, mode: Literal["control", "advise"]
 ) -> None:
     problem = slow_cell(window_cycles, "HYB", "LOC", mode=mode)
     world = on_fallback(problem, ended="planning@E")

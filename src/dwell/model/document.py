@@ -110,7 +110,9 @@ def _part(path: str, part: Any, *but: str, **more: object) -> Document:
     for name, key, usual in _fields(kind):
         value = getattr(part, name)
         if name not in but and name not in more and value != usual:
-            document[key] = value if type(value) in PLAIN else _value(f"{path}.{key}" if path else key, value)
+            document[key] = (
+                value if type(value) in PLAIN else _value(f"{path}.{key}" if path else key, value)
+            )
     return _filled({**document, **more})
 
 
