@@ -30,6 +30,7 @@ from dwell.live.offsets import Offsets
 from dwell.live.transport.transport import Arrival, Transport
 from dwell.live.wiring import roles
 from dwell.model import Problem
+from dwell.model.bounds import require
 from dwell.model.document import fingerprint
 from dwell.model.instants import NEVER_NS
 
@@ -96,6 +97,10 @@ class RolePlace:
     seals: Seals | None = None
     complained: int = 0
     last_complaint: str = ""
+
+    def __post_init__(self) -> None:
+        phase_ms = self.problem.pipeline.phase_ms
+        require(phase_ms == 0, "phase_ms", phase_ms, "0 in a live cell, which begins when it is up")
 
     @property
     def keys(self) -> Keys:

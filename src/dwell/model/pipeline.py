@@ -137,10 +137,18 @@ class Pipeline:
         "Factors, one a cycle, that tasks may name, as the scene's complexity.",
         default_factory=FrozenDict,
     )
+    phase_ms: float = key(
+        "Offset of all its releases, with their deadlines and windows, ms; less than P.",
+        TIME_MS,
+        default=0.0,
+        is_rare=True,
+    )
 
     def __post_init__(self) -> None:
         bound = f"at most period_ms = {self.period_ms:g}"
         require(self.deadline_ms <= self.period_ms, "deadline_ms", self.deadline_ms, bound)
+        bound = f"less than period_ms = {self.period_ms:g}"
+        require(self.phase_ms < self.period_ms, "phase_ms", self.phase_ms, bound)
         require_names("tasks", self.tasks)
 
     def __repr__(self) -> str:

@@ -9,7 +9,15 @@ from typing import Literal, NamedTuple
 
 from dwell.display import Displayed
 from dwell.errors import Fault, ProblemError
-from dwell.model.bounds import MAX_COUNT, MIN_DWELL, MIN_IMPROVEMENT, TIME_MS, Bound, counted
+from dwell.model.bounds import (
+    MAX_COUNT,
+    MIN_DWELL,
+    MIN_IMPROVEMENT,
+    TIME_MS,
+    Bound,
+    counted,
+    require,
+)
 from dwell.model.declaration import declared, key
 from dwell.model.fabric import Fabric
 from dwell.model.frozen import FrozenDict, shortened
@@ -157,6 +165,9 @@ class Problem(Displayed):
         require_length(1, self.window_cycles, self.pipeline.period_ms, "window_cycles")
         if self.servo is not None:
             self.servo.require_seen(self.pipeline.period_ms)
+        phased = self.pipeline.phase_ms and self.live.release == "frames"
+        bound = "timer in a cell with a phase_ms, which a camera's frames do not keep"
+        require(not phased, "live.release", self.live.release, bound)
         declared = {name: tuple(items) for name, items in self.scenarios.items()}
         scenarios = {"baseline": (), **declared}
         object.__setattr__(self, "scenarios", FrozenDict(scenarios))
