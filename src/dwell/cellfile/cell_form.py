@@ -57,7 +57,7 @@ from dwell.model import (
     Task,
     Weights,
 )
-from dwell.model.bounds import LARGEST, MAX_COUNT, VALUE, Bound, as_read
+from dwell.model.bounds import LARGEST, MAX_COUNT, NOT_EMPTY, VALUE, Bound, Pattern, as_read
 from dwell.model.declaration import DeclaredField, declared_fields
 from dwell.model.document import VERSION
 from dwell.model.pipeline import WORKERS
@@ -92,7 +92,7 @@ TRACE = Shape(
     (
         _required(
             "file",
-            TextForm(may_be_empty=False),
+            TextForm(NOT_EMPTY),
             "A .parquet or .csv file, relative to the cell file's folder.",
         ),
         _required("column", NAME, "Column with the values: milliseconds, or bare factors."),
@@ -137,7 +137,7 @@ TRACE = Shape(
         ),
         _optional(
             "sha256",
-            TextForm(pattern="[0-9a-f]{64}", of="64 hexadecimal digits, as they were recorded"),
+            TextForm(Pattern("[0-9a-f]{64}", "64 hexadecimal digits, as they were recorded")),
             "Digest of the data that a recorded problem used; other data are refused.",
         ),
     ),
@@ -290,11 +290,7 @@ ON_LOSS = WordsForm(
     Shape(
         "Retransmit",
         "How long after a lost attempt the next one follows.",
-        (
-            _required(
-                "retransmit_ms", NumberForm(_RETRANSMIT.key.bound or VALUE), _RETRANSMIT.key.says
-            ),
-        ),
+        (_required("retransmit_ms", form_of(_RETRANSMIT, {}), _RETRANSMIT.key.says),),
     ),
     "`drop` (default) or `{retransmit_ms: 20}`",
 )
@@ -432,7 +428,7 @@ CONTROLLER = shape_of(
 )
 TARGET = shape_of(MovingTarget, {})
 SERVO = shape_of(Servo, {MovingTarget: TARGET})
-_ADDRESS = TextForm(may_be_empty=False)
+_ADDRESS = TextForm(NOT_EMPTY)
 ENDPOINT = shape_of(Endpoint, {}, instead={"address": _ADDRESS})
 HOST = shape_of(Host, {Endpoint: ENDPOINT}, instead={"address": _ADDRESS})
 LIVE = shape_of(LiveSettings, {Host: HOST}, title="Live")

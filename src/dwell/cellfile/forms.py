@@ -8,7 +8,6 @@ there gets a stand-in where there is a harmless one, and takes its mapping with 
 from __future__ import annotations
 
 import math
-import re
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
@@ -16,7 +15,7 @@ from dataclasses import MISSING, dataclass, field
 from typing import Any, ClassVar, Final, TypeAlias, get_args, get_origin
 
 from dwell.cellfile.document_faults import Faults
-from dwell.model.bounds import Bound, as_read
+from dwell.model.bounds import Bound, Pattern, as_read
 from dwell.model.declaration import DeclaredField, declared_fields
 from dwell.model.dotted_paths import Step
 from dwell.model.semantics import closest, nearest
@@ -121,40 +120,34 @@ class TextForm(Form):
 
     Parameters
     ----------
-    pattern : str
-        Regular expression of the whole, with what it means in `of`.
+    bound : Pattern, optional
+        What it must match.
     known : tuple of str
         Texts that an editor may complete; others are right, too.
     """
 
-    may_be_empty: bool = True
-    pattern: str = ""
-    of: str = ""
+    bound: Pattern | None = None
     known: tuple[str, ...] = ()
 
     @property
     def words(self) -> str:
         """What it may be, as a table of the docs has it."""
-        return self.of or "text"
+        return "text" if self.bound is None else str(self.bound).removeprefix("a ")
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return the text; that of a key which is no text, where it stands for one."""
         if not isinstance(value, str):
             what = "a text" if isinstance(value, dict | list) else "a text; put it in quotes"
             return refused(value, what, path, faults)
-        if not value and not self.may_be_empty:
-            return refused(value, "a text that is not empty", path, faults)
-        if self.pattern and re.fullmatch(self.pattern, value) is None:
-            return refused(value, self.of, path, faults)
+        if self.bound is not None and not self.bound.holds(value):
+            return refused(value, str(self.bound), path, faults)
         return value
 
     def schema(self, definitions: Definitions) -> JsonSchema:
         """Return its type."""
         result: JsonSchema = {"type": "string"}
-        if not self.may_be_empty:
-            result["minLength"] = 1
-        if self.pattern:
-            result["pattern"] = f"^{self.pattern}$"
+        if self.bound is not None:
+            result["pattern"] = f"^{self.bound.expression}$"
         return {"anyOf": [{"enum": list(self.known)}, result]} if self.known else result
 
 
@@ -533,6 +526,8 @@ def form_of(one: DeclaredField, forms: Mapping[Any, Form]) -> Form:
 def _single(kind: Any, one: DeclaredField) -> Form:
     if one.choices:
         return ChoiceForm(one.choices)
+    if isinstance(one.key.bound, Pattern):
+        return TextForm(one.key.bound)
     if one.key.bound is not None:
         return NumberForm(one.key.bound)
     return FlagForm() if kind is bool else TextForm()

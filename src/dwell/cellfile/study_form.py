@@ -16,7 +16,7 @@ from dwell.cellfile.forms import (
     WrittenForm,
 )
 from dwell.cellfile.structure import FileKind
-from dwell.model.bounds import MAX_COUNT, SEEDS, Bound, as_read
+from dwell.model.bounds import MAX_COUNT, NOT_EMPTY, SEEDS, Bound, as_read
 
 VERSION = 1
 
@@ -102,7 +102,7 @@ def _parameters(value: object) -> dict[str, object]:
     )
 
 
-NAME, NO_TEXT = TextForm(), TextForm(may_be_empty=False)
+NAME, NO_TEXT = TextForm(), TextForm(NOT_EMPTY)
 STUDY = FileKind(
     Shape(
         "Study",

@@ -103,6 +103,16 @@ def read_value(text: str, faults: Faults, path: str) -> object:
     return value
 
 
+def yaml_of(document: object) -> str:
+    """Return plain values as YAML: keys in their order, nothing by reference."""
+
+    class Plain(yaml.SafeDumper):
+        def ignore_aliases(self, data: object) -> bool:
+            return True
+
+    return yaml.dump(document, Dumper=Plain, sort_keys=False, width=100, allow_unicode=True)
+
+
 def _composed(text: str, faults: Faults) -> yaml.Node | None:
     """Return the node of a text; None where it is empty, or beside a fault."""
     try:

@@ -100,12 +100,39 @@ class Bound:
         return f"{kind} {first} and {last}"
 
 
+@dataclass(frozen=True, slots=True)
+class Pattern:
+    """Texts that match a regular expression as a whole.
+
+    Parameters
+    ----------
+    words : str
+        What they are; completes the sentence "it must be ...".
+    """
+
+    expression: str
+    words: str
+
+    def holds(self, value: object) -> bool:
+        """Whether `value` is such a text."""
+        return isinstance(value, str) and re.fullmatch(self.expression, value) is not None
+
+    def check(self, path: str, value: object) -> None:
+        """Raise a ProblemError that names `path`, `value` and what it must be, unless it is."""
+        require(self.holds(value), path, value, self.words)
+
+    def __str__(self) -> str:
+        return self.words
+
+
 def short(value: float) -> str:
     """Return a number as people write it: 1e9 and 1000000, not 1e+09."""
     if abs(value) <= MAX_COUNT and value == int(value):
         return str(int(value))
     return f"{value:g}".replace("e+0", "e").replace("e+", "e").replace("e-0", "e-")
 
+
+NOT_EMPTY = Pattern(r"[\s\S]+", "a text that is not empty")
 
 # Bounds that several keys share, or that others than the model check by.
 VALUE = Bound(0, LARGEST)

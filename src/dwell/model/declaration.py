@@ -22,7 +22,7 @@ from typing import (
     get_type_hints,
 )
 
-from dwell.model.bounds import Bound, require
+from dwell.model.bounds import Bound, Pattern, require
 from dwell.model.frozen import FrozenDict
 
 T = TypeVar("T")
@@ -39,8 +39,8 @@ class Declaration:
     ----------
     says : str
         One sentence, its unit in it.
-    bound : Bound, optional
-        Of a number, or of every number of a mapping.
+    bound : Bound or Pattern, optional
+        Of a number or a text, or of every one of a mapping.
     named : str, optional
         Its name in a cell file, and in messages, where that is another than the field's.
     usual : str, optional
@@ -50,7 +50,7 @@ class Declaration:
     """
 
     says: str
-    bound: Bound | None = None
+    bound: Bound | Pattern | None = None
     named: str | None = None
     usual: str | None = None
     is_rare: bool = False
@@ -58,7 +58,7 @@ class Declaration:
 
 def key(
     says: str,
-    bound: Bound | None = None,
+    bound: Bound | Pattern | None = None,
     *,
     default: Any = MISSING,
     default_factory: Any = MISSING,

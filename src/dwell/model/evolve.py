@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeAlias, get_args
 
 from dwell.errors import Fault, ProblemError
+from dwell.model.bounds import Bound
 from dwell.model.declaration import DeclaredField, declared_fields, is_declared, within_path
 from dwell.model.document import to_document
 from dwell.model.dotted_paths import Step, dotted, steps_of
@@ -105,7 +106,7 @@ def _attempt(path: str, kind: Any, make: Any, *args: object, **values: object) -
 def _made(one: DeclaredField, value: object) -> Any:
     """Return what a value is in the model: a process of a number, a part of a mapping."""
     kind = one.kind if not one.is_mapping or isinstance(value, Mapping) else get_args(one.kind)[1]
-    whole = one.key.bound is not None and one.key.bound.whole
+    whole = isinstance(one.key.bound, Bound) and one.key.bound.whole
     if whole and isinstance(value, float) and value.is_integer():
         return int(value)
     if kind is Process and isinstance(value, int | float) and not isinstance(value, bool):

@@ -18,6 +18,7 @@ import numpy as np
 
 from dwell.calibration.profile_file import Measurement, link_name, stamp, task_name, write_profile
 from dwell.calibration.speeds import Usual, at_speed_of
+from dwell.cellfile.yaml_text import yaml_of
 from dwell.errors import DwellError, RunError
 from dwell.estimators.registry import name_in_run
 from dwell.files import write_whole
@@ -372,17 +373,10 @@ def _put_in(
 
 
 def _write_cell(out: Path, document: dict[str, Any], cell: Path, runs: Sequence[Path]) -> None:
-    import yaml
-
-    class Plain(yaml.SafeDumper):
-        def ignore_aliases(self, data: object) -> bool:
-            return True
-
     names = ", ".join(path.resolve().name for path in runs)
-    text = yaml.dump(document, Dumper=Plain, sort_keys=False, width=100, allow_unicode=True)
     head = f"# {cell.name} with what was measured of it, by `dwell testbed calibrate`.\n"
     head += f"# Runs: {names}\n"
-    write_whole(out, head + text)
+    write_whole(out, head + yaml_of(document))
 
 
 def _missing(

@@ -16,18 +16,28 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 import shlex
-from collections.abc import Collection, Mapping
-from dataclasses import asdict, dataclass, fields, replace
-from os import PathLike
-from pathlib import Path
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from os import PathLike, fspath
 from typing import Any
 
-import yaml
-
-from dwell.errors import Fault, ProblemError
+from dwell.cellfile.document_faults import Faults
+from dwell.cellfile.forms import (
+    ChoiceForm,
+    Entry,
+    FormKey,
+    MappingForm,
+    Shape,
+    WrittenForm,
+    shape_of,
+)
+from dwell.cellfile.structure import FileKind, read_structure
+from dwell.cellfile.yaml_text import read_yaml
 from dwell.model import Problem
+from dwell.model.bounds import NOT_EMPTY, Bound, Pattern, as_read, require
+from dwell.model.declaration import declared, key
+from dwell.model.semantics import nearest
 
 VERSION = 1
 FORMAT = "dwell-inventory"
@@ -37,52 +47,115 @@ STRESS = (
     "if command -v stress-ng >/dev/null; then exec stress-ng --quiet --cpu {threads}; fi; "
     "i=0; while [ $i -lt {threads} ]; do while :; do :; done & i=$((i + 1)); done; wait"
 )
-CPUS = re.compile(r"\d+(-\d+)?(,\d+(-\d+)?)*")
+CPUS = Pattern(r"(\d+(-\d+)?(,\d+(-\d+)?)*)?", "a list of CPUs, as 0,2-3")
 
 
-@dataclass(frozen=True, slots=True)
+@declared()
 class RealHost:
-    """A host.
+    """A host."""
 
-    Parameters
-    ----------
-    run : tuple of str
-        Words that, with a line for a shell behind them, have it done there: ``ssh robot-1``.
-    address : str
-        Where its processes are reached from the other hosts.
-    port : int
-        First one.
-    python : str
-        The interpreter there that has this package, with the cell's stages.
-    folder : str
-        Where files may be put there.
-    cpus : str
-        CPUs that the cell may use, as ``2-7``; any where empty.
-    stress : str
-        Line for a shell that loads ``{threads}`` threads until it is told to end.
-    """
-
-    run: tuple[str, ...]
-    address: str
-    port: int = 7450
-    python: str = "python3"
-    folder: str = FOLDER
-    cpus: str = ""
-    stress: str = STRESS
+    run: tuple[str, ...] = key(
+        "Words that, with a line for a shell behind them, have it done there: `ssh robot-1`."
+    )
+    address: str = key("Where its processes are reached from the other hosts.", NOT_EMPTY)
+    port: int = key("First one.", Bound(1, 65_000, whole=True), default=7450)
+    python: str = key(
+        "The interpreter there that has this package, with the cell's stages.", default="python3"
+    )
+    folder: str = key(
+        "Where files may be put there.", Pattern("/.*", "a path that begins with /"), default=FOLDER
+    )
+    cpus: str = key("CPUs that the cell may use, as `2-7`.", CPUS, default="", usual="any")
+    stress: str = key(
+        "Line for a shell that loads `{threads}` threads until it is told to end.",
+        Pattern(r"[\s\S]*{threads}[\s\S]*", "a line that says where {threads} go"),
+        default=STRESS,
+        usual="stress-ng, or busy loops",
+    )
 
 
-@dataclass(frozen=True, slots=True)
+@declared()
 class LinkCommands:
-    """Lines for a shell on the host that a link leaves from.
+    """Lines for a shell on the host that a link leaves from."""
 
-    Parameters
-    ----------
-    begin : str
-        With ``{mean_ms}``, ``{std_ms}`` of the extra delay, ``{loss_percent}``, ``{rate_mbps}``.
-    """
+    begin: str = key(
+        "Impairs the link, with `{mean_ms}`, `{std_ms}` of the extra delay, `{loss_percent}`, "
+        "`{rate_mbps}`."
+    )
+    end: str = key("Takes that back.", NOT_EMPTY)
 
-    begin: str
-    end: str
+    def __post_init__(self) -> None:
+        wrong = _wrong_places(self.begin)
+        require(not wrong, "begin", self.begin, wrong)
+
+
+def _wrong_places(line: str) -> str:
+    """Return what a line that impairs a link must be, or nothing where it is that."""
+    try:
+        line.format(mean_ms=0, std_ms=0, loss_percent=0, rate_mbps=0)
+    except (KeyError, IndexError, ValueError) as error:
+        return f"a line that can be filled in ({error!r})"
+    return ""
+
+
+def _impairing(value: Any) -> str:
+    wrong = _wrong_places(value) if isinstance(value, str) and value else "a line for a shell"
+    if wrong:
+        raise ValueError(f"{as_read(value)} is not allowed; it must be {wrong}")
+    return str(value)
+
+
+def _words(value: Any) -> tuple[str, ...]:
+    if isinstance(value, list) and value and all(isinstance(word, str) for word in value):
+        return tuple(value)
+    remedy = "a command line, or a list of its words"
+    try:
+        words = tuple(shlex.split(value)) if isinstance(value, str) else ()
+    except ValueError as error:
+        remedy, words = f"{remedy} ({error})", ()
+    if not words:
+        raise ValueError(f"{as_read(value)} is not allowed; it must be {remedy}")
+    return words
+
+
+_HOST = shape_of(RealHost, {}, instead={"run": WrittenForm("text, list of texts", _words)})
+INVENTORY = FileKind(
+    Shape(
+        "Inventory",
+        "The hosts that the nodes of a cell are.",
+        (
+            FormKey(
+                "version",
+                FORMAT,
+                ChoiceForm((VERSION,)),
+                "Version of this format.",
+                is_required=True,
+                stand_in=VERSION,
+            ),
+            FormKey(
+                "hosts",
+                "hosts",
+                MappingForm(_HOST, keeps=True),
+                "The host of each node.",
+                is_required=True,
+                stand_in={},
+            ),
+            FormKey(
+                "links",
+                "links",
+                MappingForm(
+                    shape_of(LinkCommands, {}, instead={"begin": WrittenForm("text", _impairing)}),
+                    keeps=True,
+                ),
+                "What impairs a directed link.",
+                usual="none",
+            ),
+        ),
+    ),
+    "inventory",
+    FORMAT,
+    VERSION,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,92 +189,38 @@ def load_inventory(path: str | PathLike[str], problem: Problem) -> Inventory:
     ProblemError
         With every fault.
     """
-    source = str(path)
-    try:
-        document = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ProblemError(f"cannot be read ({error.strerror})", source) from None
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ProblemError(f"is not YAML ({error})".replace("\n", " "), source) from None
-    faults: list[Fault] = []
-    found = _inventory(document, problem, faults)
-    if faults or found is None:
-        raise ProblemError(faults, source)
-    return found
+    faults = Faults(fspath(path))
+    document = read_yaml(fspath(path), faults, INVENTORY.what, INVENTORY.begin)
+    if faults.at(""):
+        raise faults.error()
+    entry = read_structure(document, faults, INVENTORY)
+    _judge("hosts", entry.hosts, problem.fabric.nodes, "node", faults)
+    _judge("links", entry.links or {}, problem.fabric.links, "link", faults)
+    for node in problem.fabric.nodes:
+        if node not in entry.hosts:
+            faults.add(f"hosts.{node}", "missing; add it: every node is on a host")
+    hosts: Mapping[str, RealHost] = _made(entry.hosts, faults)
+    links: Mapping[str, LinkCommands] = _made(entry.links or {}, faults)
+    if faults:
+        raise faults.error()
+    return Inventory(hosts, links)
 
 
-def _inventory(document: Any, problem: Problem, faults: list[Fault]) -> Inventory | None:
-    if not isinstance(document, dict) or document.get(FORMAT) != VERSION:
-        faults.append(Fault(FORMAT, f"must be {VERSION}: this is no inventory of this version"))
-        return None
-    _keys("", document, (FORMAT, "hosts", "links"), (), faults)
-    hosts, links = (_mapping(document.get(key), key, faults) for key in ("hosts", "links"))
-    nodes = list(problem.fabric.nodes)
-    _keys("hosts", hosts, nodes, nodes, faults)
-    _keys("links", links, list(problem.fabric.links), (), faults)
-    return Inventory(
-        {str(name): _host(f"hosts.{name}", host, faults) for name, host in hosts.items()},
-        {str(name): _link(f"links.{name}", link, faults) for name, link in links.items()},
-    )
-
-
-def _mapping(value: Any, path: str, faults: list[Fault]) -> Mapping[Any, Any]:
-    if value is None:
-        return {}
-    if isinstance(value, dict):
-        return value
-    faults.append(Fault(path, f"is {value!r}; it must be a mapping"))
-    return {}
-
-
-def _keys(
-    path: str,
-    given: Mapping[Any, Any],
-    known: Collection[str],
-    needed: Collection[str],
-    faults: list[Fault],
-) -> None:
-    """Note unknown keys, and needed keys that are missing."""
-    before = f"{path}." if path else ""
-    faults += [
-        Fault(f"{before}{key}", f"is unknown here; there may be {', '.join(known)}")
-        for key in given
-        if key not in known
-    ]
-    faults += [Fault(f"{before}{key}", "is missing") for key in needed if not given.get(key)]
-
-
-def _host(path: str, value: Any, faults: list[Fault]) -> RealHost:
-    given = _mapping(value, path, faults)
-    _keys(path, given, [item.name for item in fields(RealHost)], ("run", "address"), faults)
-    usual = asdict(RealHost((), ""))
-    run, port = given.get("run", ""), given.get("port", usual["port"])
-    texts: dict[str, Any] = {
-        name: str(given.get(name, value)) for name, value in usual.items() if isinstance(value, str)
+def _made(given: Mapping[str, Entry | None], faults: Faults) -> dict[str, Any]:
+    return {
+        name: faults.attempt(one.path, one.shape.kind, **one.values)
+        for name, one in given.items()
+        if one is not None
     }
-    host = RealHost((), **texts)
-    try:
-        words = tuple(map(str, run)) if isinstance(run, list) else tuple(shlex.split(str(run)))
-        host = replace(host, run=words)
-    except ValueError as error:
-        faults.append(Fault(f"{path}.run", f"is {run!r}, which is no command line ({error})"))
-    if type(port) is not int or not 1 <= port <= 65_000:
-        faults.append(Fault(f"{path}.port", f"is {port!r}; it must be in [1, 65000]"))
-    if not host.folder.startswith("/"):
-        faults.append(Fault(f"{path}.folder", f"is {host.folder!r}; it must begin with /"))
-    if host.cpus and not CPUS.fullmatch(host.cpus):
-        faults.append(Fault(f"{path}.cpus", f"is {host.cpus!r}; write 0,2-3"))
-    if "{threads}" not in host.stress:
-        faults.append(Fault(f"{path}.stress", "must say where the number goes: {threads}"))
-    return replace(host, port=port)
 
 
-def _link(path: str, value: Any, faults: list[Fault]) -> LinkCommands:
-    given, keys = _mapping(value, path, faults), [item.name for item in fields(LinkCommands)]
-    _keys(path, given, keys, keys, faults)
-    commands = LinkCommands(*(str(given.get(key, "")) for key in keys))
-    try:
-        commands.begin.format(mean_ms=0, std_ms=0, loss_percent=0, rate_mbps=0)
-    except (KeyError, IndexError, ValueError) as error:
-        faults.append(Fault(f"{path}.begin", f"cannot be filled in ({error!r})"))
-    return commands
+def _judge(
+    section: str,
+    given: Mapping[str, object],
+    known: Mapping[str, object],
+    what: str,
+    faults: Faults,
+) -> None:
+    for name in given:
+        if name not in known:
+            faults.add(f"{section}.{name}", f"unknown {what} {name!r}; {nearest(name, known)}")

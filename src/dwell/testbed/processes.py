@@ -16,8 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
-import yaml
-
+from dwell.cellfile.yaml_text import yaml_of
 from dwell.errors import LiveError
 from dwell.live.parent_death import OPTION, start_sweeper
 from dwell.live.transport.orphans import remove_orphans
@@ -158,8 +157,7 @@ class Processes:
             file.parent.mkdir(parents=True, exist_ok=True)
             document = to_document(problem)
             move_traces(document, Path(problem.folder or "").resolve())
-            text = yaml.safe_dump(document, sort_keys=False)
-            file.write_text(text, encoding="utf-8")
+            file.write_text(yaml_of(document), encoding="utf-8")
 
     def start_agent(self, node: str) -> None:
         """Start a node's agent, or start it again; of every cell that has the node."""

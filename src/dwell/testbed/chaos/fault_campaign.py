@@ -13,9 +13,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 import dwell
+from dwell.cellfile.yaml_text import yaml_of
 from dwell.errors import DwellError, LiveError
 from dwell.model import FrozenDict, Problem
 from dwell.testbed.chaos.disk import may_mount
@@ -61,7 +60,7 @@ class Staging:
         if self.cell is None:
             written = folder / "written.yaml"
             light = document(LIGHT_HOME, period_ms=PATIENT_MS, quotas=self.hosts)
-            written.write_text(yaml.safe_dump(light), encoding="utf-8")
+            written.write_text(yaml_of(light), encoding="utf-8")
             problem, environment = dwell.load(written), environment_of(folder, exec_ms(LIGHT_HOME))
         else:
             problem, environment = _witnessed(dwell.load(self.cell), folder)
