@@ -15,7 +15,7 @@ from typing import Any
 
 import yaml
 
-import dwell
+from dwell.cellfile import load
 from dwell.errors import DwellError, LiveError
 from dwell.model import FrozenDict, Problem
 from dwell.testbed.chaos.disk import may_mount
@@ -62,9 +62,9 @@ class Staging:
             written = folder / "written.yaml"
             light = document(LIGHT_HOME, period_ms=PATIENT_MS, quotas=self.hosts)
             written.write_text(yaml.safe_dump(light), encoding="utf-8")
-            problem, environment = dwell.load(written), environment_of(folder, exec_ms(LIGHT_HOME))
+            problem, environment = load(written), environment_of(folder, exec_ms(LIGHT_HOME))
         else:
-            problem, environment = _witnessed(dwell.load(self.cell), folder)
+            problem, environment = _witnessed(load(self.cell), folder)
         clocks = folder / CLOCK_FILE
         testbed: LocalTestbed
         if self.hosts:
@@ -348,10 +348,12 @@ def _old(cell: Harness, observer: ActuatorObserver, fault: Fault, outcome: Outco
 
 def _unread(cell: Harness) -> Sequence[str]:
     """Return which runs cannot be read."""
+    from dwell.record import open_run
+
     unreadable = []
     for folder in cell.runs:
         try:
-            dwell.open_run(folder).cycles.height  # noqa: B018 - reads it
+            open_run(folder).cycles.height  # noqa: B018 - reads it
         except DwellError as error:
             unreadable.append(str(error))
     return unreadable
