@@ -112,7 +112,7 @@ def hops() -> Iterator[Hops]:
         last = ZenohTransport(wiring.entry("last@R1"))
         stack.callback(last.close)
         for who in ("first@R1", "second@R1", "second@E"):
-            command = [sys.executable, "-m", "dwell.cli.process", "--who", who]
+            command = [sys.executable, "-m", "dwell.live.role_command", "--who", who]
             child = subprocess.Popen(
                 [
                     *command,

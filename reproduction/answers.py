@@ -156,7 +156,7 @@ def svg(rows: pl.DataFrame) -> str:
 def _drawing(rows: pl.DataFrame) -> dict[str, object]:
     primary = rows.row(0, named=True)
     share = primary["metric"] in SHARES
-    unit, heading = (100.0, " points") if share else (1.0, "")
+    unit, heading = (100.0, ", points") if share else (1.0, "")
     shown = rows.with_columns(pl.col("effect", "low", "high") * unit)
     pair = pl.format("{} less {}", "first", "second")
     panels = [

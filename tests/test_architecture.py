@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import ast
 import re
+import subprocess
+import sys
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -78,3 +80,90 @@ def test_no_public_class_has_the_name_of_another_one_but_for_those_listed() -> N
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 places[node.name].append(package_of(path))
     assert twice(places) == listed("class")
+
+
+#: Modules that import what a string names: the façades when a name of theirs is asked for, the
+#: entry points of classes (rows of the registries, other packages' declarations), and those that
+#: import a user's modules or packages of others. Everything else imports in so many words.
+BY_NAME = {
+    *("__init__", "estimators/__init__", "policies/__init__", "sim/__init__", "study/__init__"),
+    "model/entry_points",
+    *("calibration/target", "live/stage", "model/user_classes"),
+    *("cli/doctor", "study/cluster"),
+}
+TREES = {
+    str(path.relative_to(SOURCES).with_suffix("")): ast.parse(path.read_text(encoding="utf-8"))
+    for path in SOURCES.rglob("*.py")
+}
+
+
+def test_only_facades_and_entry_points_import_by_name() -> None:
+    calls = {"import_module", "__import__"}
+    found = {
+        name
+        for name, tree in TREES.items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call)
+        and calls & {getattr(node.func, "id", ""), getattr(node.func, "attr", "")}
+    }
+    assert found == BY_NAME
+
+
+def strings(tree: ast.AST) -> Iterator[str]:
+    """Yield all strings of a source, and the parts of those that are composed."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield node.value
+
+
+def test_a_string_names_modules_of_its_own_package_alone() -> None:
+    """Rows of a registry and of a façade, and programs that are started, are of the same one."""
+    named = {
+        name: {
+            match[1]
+            for text in strings(tree)
+            if (match := re.fullmatch(r"dwell\.(\w*)(?:\.[\w.]*)?(?::\w*)?", text))
+            and (match[1] in {"", *PACKAGES, *MODULES})
+        }
+        for name, tree in TREES.items()
+        if name != "__init__"
+    }
+    abroad = {name: some - {name.partition("/")[0]} for name, some in named.items()}
+    assert not {name: some for name, some in abroad.items() if some}
+
+
+def test_only_the_command_imports_the_facade() -> None:
+    """The façade may import all, so that what it is imported by would be above all."""
+    found = {
+        name.partition("/")[0]
+        for name, tree in TREES.items()
+        for node in ast.walk(tree)
+        if (isinstance(node, ast.Import) and any(one.name == "dwell" for one in node.names))
+        or (isinstance(node, ast.ImportFrom) and node.module == "dwell")
+    }
+    assert found == {"cli"}
+
+
+def test_what_shows_itself_does_after_an_import_of_the_package_alone() -> None:
+    """Nothing that makes what is shown is imported before it is shown."""
+    script = (
+        "import dwell, sys; problem = dwell.load('examples/canonical.yaml'); "
+        "before = [name for name in sys.modules if name.startswith('dwell.report')]; "
+        "assert problem.summary() and problem._repr_html_(); print(before)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=ROOT, check=True, capture_output=True, text=True
+    )
+    assert done.stdout == "[]\n"
+
+
+def test_a_live_process_imports_no_command_and_no_report() -> None:
+    script = (
+        "import sys, dwell.live.node_command, dwell.live.role_process; "
+        "print([name for name in sys.modules if name.split('.')[:2] in "
+        "(['dwell', 'cli'], ['dwell', 'report'], ['dwell', 'testbed'], ['typer'])])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], check=True, capture_output=True, text=True
+    )
+    assert done.stdout == "[]\n"

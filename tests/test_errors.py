@@ -10,7 +10,18 @@ from pathlib import Path
 import pytest
 
 from dwell import errors
-from dwell.errors import DwellError, Fault, KernelError, ProblemError, TraceError, missing_package
+from dwell.errors import (
+    DwellError,
+    ExitCode,
+    Fault,
+    KernelError,
+    LiveError,
+    PolicyError,
+    ProblemError,
+    TraceError,
+    line_and_code,
+    missing_package,
+)
 
 ROOT = Path(__file__).parents[1]
 KINDS = [
@@ -64,3 +75,26 @@ def test_what_is_missing_is_named_with_an_extra_that_brings_it() -> None:
     told = missing_package(ModuleNotFoundError(name="cv2"))
     assert str(told) == "cv2 is not installed; pip install opencv-python-headless"
     assert missing_package(ModuleNotFoundError(name="stages")) is None
+
+
+@pytest.mark.parametrize(
+    ("error", "line", "code"),
+    [
+        (PolicyError("unknown"), "error: unknown", ExitCode.WRONG),
+        (LiveError("a port is taken"), "error: a port is taken", ExitCode.FAILED),
+        (ProblemError("no", "cell.yaml"), "cell.yaml: no", ExitCode.WRONG),
+        (OSError(2, "no such file", "x.yaml"), "error: x.yaml: no such file", ExitCode.FAILED),
+        (OSError("broken"), "error: broken", ExitCode.FAILED),
+    ],
+)
+def test_a_command_prints_a_line_and_ends_with_a_code(
+    error: DwellError | OSError, line: str, code: ExitCode
+) -> None:
+    assert line_and_code(error) == (line, code)
+
+
+def test_a_module_of_a_user_that_is_missing_has_no_line() -> None:
+    assert line_and_code(ModuleNotFoundError(name="stages")) is None
+    known = line_and_code(ModuleNotFoundError(name="zenoh"))
+    assert known is not None
+    assert known[1] == ExitCode.FAILED

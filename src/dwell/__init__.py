@@ -5,11 +5,14 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from dwell.display import Answers, Displayed
+
 if TYPE_CHECKING:
     from dwell.cellfile import load
     from dwell.errors import DwellError
     from dwell.record import Run, open_run
     from dwell.sim import Realisation, draw, simulate, simulate_realisation
+    from dwell.version import __version__ as __version__
 
 __all__ = [
     "DwellError",
@@ -22,8 +25,6 @@ __all__ = [
     "simulate_realisation",
 ]
 
-__version__ = "0.1.0"
-
 _HOME = {
     "DwellError": "dwell.errors",
     "load": "dwell.cellfile",
@@ -33,6 +34,7 @@ _HOME = {
     "draw": "dwell.sim",
     "simulate": "dwell.sim",
     "simulate_realisation": "dwell.sim",
+    "__version__": "dwell.version",
 }
 
 
@@ -56,3 +58,13 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *_HOME})
+
+
+def _answers() -> Answers:
+    """Return what makes summaries and pictures, imported when something is shown."""
+    from dwell.report import answer
+
+    return answer
+
+
+Displayed.shown_by(_answers)

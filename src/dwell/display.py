@@ -1,11 +1,13 @@
 """Display of results: a summary on a screen, and a picture in a notebook.
 
-Both are made by `dwell.report`, which is imported when something is shown.
+Both are made by what the package `dwell` has given `Displayed`, and only when something is shown.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import ClassVar, Protocol
 
 #: Decimals of a nanosecond in milliseconds: nobody asks for what is behind them.
 OF_A_NANOSECOND = 6
@@ -32,18 +34,32 @@ def milliseconds(value: float, decimals: int = 1) -> str:
     return f"{value:.{decimals_for(value, decimals)}f}"
 
 
+class Answers(Protocol):
+    """What makes summaries and pictures."""
+
+    def summary_of(self, shown: object) -> str:
+        """Return the answer as text: 24 lines of 80 columns at most."""
+        ...
+
+    def html_of(self, shown: object) -> str:
+        """Return the answer as HTML for a notebook."""
+        ...
+
+
 class Displayed:
     """Has a summary, and in a notebook a picture with its numbers."""
 
     __slots__ = ()
+    _answers: ClassVar[Callable[[], Answers]]
+
+    @staticmethod
+    def shown_by(answers: Callable[[], Answers]) -> None:
+        """Have this called whenever something is shown."""
+        Displayed._answers = answers
 
     def summary(self) -> str:
         """Return what it comes to as text: 24 lines of 80 columns at most."""
-        from dwell.report.answer import summary_of
-
-        return summary_of(self)
+        return Displayed._answers().summary_of(self)
 
     def _repr_html_(self) -> str:
-        from dwell.report.answer import html_of
-
-        return html_of(self)
+        return Displayed._answers().html_of(self)

@@ -1,13 +1,18 @@
-"""The exceptions of Dwell: one root, one class for each kind of thing that can be wrong."""
+"""The exceptions of Dwell: one root, one class for each kind of thing that can be wrong.
+
+With what a command says of them, and the code that it exits with.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from importlib.util import find_spec
 
 __all__ = [
     "DwellError",
+    "ExitCode",
     "Fault",
     "KernelError",
     "LiveError",
@@ -23,6 +28,7 @@ __all__ = [
     "TrustError",
     "UnwritableError",
     "installing",
+    "line_and_code",
     "missing_package",
     "not_installed",
 ]
@@ -44,6 +50,19 @@ OPTIONAL = {
 }
 #: By module: a package that no extra brings.
 FURTHER = {"SALib": "salib", "cv2": "opencv-python-headless", "osqp": "osqp"}
+
+
+class ExitCode(IntEnum):
+    """Exit codes, the same for every command."""
+
+    #: All that was asked for is there.
+    DONE = 0
+    #: The work failed, or what was examined is not as it has to be.
+    FAILED = 1
+    #: The input is wrong: arguments, files, names.
+    WRONG = 2
+    #: By Ctrl-C.
+    INTERRUPTED = 130
 
 
 class DwellError(Exception):
@@ -197,3 +216,23 @@ def missing_package(error: ModuleNotFoundError) -> DwellError | None:
     if module in FURTHER:
         return DwellError(f"{module} is not installed; pip install {FURTHER[module]}")
     return None
+
+
+def line_and_code(error: DwellError | OSError | ModuleNotFoundError) -> tuple[str, ExitCode] | None:
+    """Return what a command prints of an error, and its exit code.
+
+    Returns
+    -------
+    tuple of str and ExitCode, or None
+        None of a module that is none of an optional package of Dwell's.
+    """
+    if isinstance(error, ModuleNotFoundError):
+        missing = missing_package(error)
+        return None if missing is None else (f"error: {missing}", ExitCode.FAILED)
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename else ""
+        return f"error: {where}{error.strerror or error}", ExitCode.FAILED
+    located = isinstance(error, ProblemError) and error.source is not None
+    # Of the errors, those of what was given are ValueErrors.
+    code = ExitCode.WRONG if isinstance(error, ValueError) else ExitCode.FAILED
+    return str(error) if located else f"error: {error}", code

@@ -18,10 +18,9 @@ import msgspec
 import pytest
 
 import dwell
-from dwell.cli.live import environment
 from dwell.live.keys import Keys
 from dwell.live.messages import Order, Stamped, encode
-from dwell.live.security import INSECURE, Security
+from dwell.live.security import INSECURE, Security, environment
 from dwell.live.wiring import Role, wire
 from tests.cli.live_cell import EXAMPLE, PATIENCE_S, RealCell, invoke
 from tests.live.test_security import Intruder, tls

@@ -76,7 +76,7 @@ class Ending:
         return self.file.with_name("calls").exists() and any(self.state.glob(f"{SINK}.highest"))
 
     def sink(self) -> subprocess.Popen[bytes]:
-        return self.start("dwell.cli.process", "--who", SINK, "--state", self.state)
+        return self.start("dwell.live.role_command", "--who", SINK, "--state", self.state)
 
     def agent(self) -> subprocess.Popen[bytes]:
         return self.start("dwell", "agent", "--node", "R2", "--state", self.state)

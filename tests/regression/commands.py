@@ -12,7 +12,7 @@ import typer
 from typer.testing import CliRunner
 
 from dwell.cli.commands import app
-from dwell.cli.exit_codes import ExitCode
+from dwell.errors import ExitCode
 
 FILE = Path(__file__).parent / "data" / "commands.txt"
 HELPS = FILE.with_name("helps.txt")

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 import pytest
@@ -10,9 +13,11 @@ import pytest
 from reproduction.answers import (
     COLOURS,
     ELSEWHERE,
+    FOUND,
     OTHERS,
     PRIMARY,
     PRIMARY_PART,
+    SHARES,
     Compared,
     found,
     page_of,
@@ -22,6 +27,7 @@ from reproduction.answers import (
     write,
 )
 from reproduction.verdicts import SCHEMA
+from tests.regression.paper import FULL, read
 
 COMPARED = Compared("asked", "one beats another", "calm", "one", "another", "violation_rate")
 
@@ -83,7 +89,7 @@ def test_an_effect_that_is_infinite_is_not_drawn() -> None:
 @pytest.mark.parametrize(("word", "colour"), COLOURS.items())
 def test_a_figure_names_who_where_and_the_word(word: str, colour: str) -> None:
     drawn = svg(rows_of(COMPARED, verdicts({"word": word}, {"second": "third", "word": word})))
-    for told in ("one less another", "one less third", "in calm", "V_D points", word, colour):
+    for told in ("one less another", "one less third", "in calm", "V_D, points", word, colour):
         assert told in drawn
 
 
@@ -98,3 +104,74 @@ def test_the_page_has_the_words_and_every_figure(tmp_path: Path) -> None:
         f"{name}.{end}" for name in PRIMARY for end in ("csv", "svg")
     }
     assert pl.read_csv(tmp_path / "answers" / "RQ1.csv").height == 1
+
+
+# ------------------------------------------------------------------------- what is written
+
+
+def section(name: str) -> str:
+    """What is written of a question."""
+    return re.split(r"^## ", words(), flags=re.MULTILINE)[1 + list(PRIMARY).index(name)]
+
+
+def line(row: Mapping[str, Any]) -> str:
+    """A row of an answer as the page has it."""
+    unit = 100 if row["metric"] in SHARES else 1
+    effect, low, high = (
+        f"{unit * row[name]:+.2f}".replace("-", "−") for name in ("effect", "low", "high")
+    )
+    names = f"{row['scenario']} | {row['first']} | {row['second']}"
+    return f"| {names} | {effect} [{low}, {high}] | {row['word']} |"
+
+
+@pytest.mark.parametrize("name", PRIMARY)
+def test_every_row_that_is_written_is_one_that_was_found(name: str) -> None:
+    rows = pl.read_csv(FOUND / f"{name}.csv")
+    primary, *others = [one for one in section(name).splitlines() if "] | " in one]
+    known = {line(row) for row in rows.drop_nulls("low").iter_rows(named=True)}
+    assert primary == line(rows.row(0, named=True))
+    assert len(others) == 3
+    assert set(others) <= known
+
+
+@pytest.mark.parametrize("name", PRIMARY)
+def test_what_was_found_is_of_the_comparison_that_was_named(name: str) -> None:
+    rows = pl.read_csv(
+        FOUND / f"{name}.csv", schema_overrides=dict.fromkeys(("p", "low"), pl.Float64)
+    )
+    primary = PRIMARY[name]
+    assert rows.row(0, named=True)["part"] == PRIMARY_PART
+    for key in ("claim", "scenario", "first", "second", "metric"):
+        assert rows[key][0] == getattr(primary, key)
+    assert rows.equals(rows_of(primary, rows.drop("part")))
+
+
+@pytest.mark.parametrize("name", PRIMARY)
+def test_the_figure_is_drawn_of_what_was_found(name: str) -> None:
+    drawn = (FOUND / f"{name}.svg").read_text(encoding="utf-8")
+    assert drawn == svg(pl.read_csv(FOUND / f"{name}.csv"))
+
+
+@pytest.mark.parametrize(
+    ("name", "study", "first", "second"),
+    [
+        ("RQ1", "concurrent", "dtp+corrected", "atp-tuned"),
+        ("RQ4", "weights-one", "α_V × ½", "as in the cell"),
+    ],
+)
+def test_effects_are_differences_of_the_means_that_are_kept(
+    name: str, study: str, first: str, second: str
+) -> None:
+    kept = read(FULL).filter(study=study, scenario=PRIMARY[name].scenario)
+    one, other = (kept.filter(policy=who)["violation_rate"][0] for who in (first, second))
+    effect = pl.read_csv(FOUND / f"{name}.csv")["effect"][0]
+    assert one - other == pytest.approx(effect, abs=1e-6)
+
+
+def test_weights_change_nothing_in_three_steady_scenarios() -> None:
+    kept = read(FULL).filter(study="weights")
+    steady = ("edge-cpu-stress", "network-impairment", "network-impairment-mild")
+    for scenario in steady:
+        assert kept.filter(scenario=scenario)["violation_rate"].n_unique() == 1
+    for scenario in ("baseline", "robot-cpu-stress"):
+        assert kept.filter(scenario=scenario)["violation_rate"].n_unique() > 1

@@ -28,6 +28,7 @@ from tests.cells.light import document
 HOUR_NS = 3_600_000_000_000
 NODES = ("R1", "E", "R2")
 PROBLEM = from_document(document())
+CELL = str(Path(__file__).parents[2] / "examples" / "live" / "cell.yaml")
 
 
 def test_a_clock_is_right_where_no_file_says_otherwise() -> None:
@@ -39,6 +40,26 @@ def test_a_command_that_is_no_role_is_refused(capsys: pytest.CaptureFixture[str]
         main(["simulate"])
     assert ended.value.code == 2
     assert "invalid choice: 'simulate'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "told"),
+    [
+        (["agent", "--node", "R1"], 2, "the following arguments are required: --cell"),
+        (["agent", "--node", "R1", "--cell", CELL, "--cpus", "x"], 2, "--cpus: 'x' is no list"),
+        (["agent", "--node", "X", "--cell", CELL], 1, "error: no node 'X' in cell"),
+        (["controller", "--cell", "none.yaml"], 2, "none.yaml"),
+    ],
+)
+def test_a_mistake_is_told_as_by_the_command(
+    words: list[str], code: int, told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    try:
+        ended: int | str | None = main(words)
+    except SystemExit as error:
+        ended = error.code
+    assert ended == code
+    assert told in capsys.readouterr().err
 
 
 def test_faults_are_around_an_agent_and_what_it_starts(tmp_path: Path) -> None:

@@ -86,7 +86,7 @@ def _require_names(**names: str) -> None:
 
 def stamp() -> dict[str, str]:
     """Return the time and the version that every measurement is stamped with."""
-    from dwell import __version__
+    from dwell.version import __version__
 
     return {
         "at": datetime.now(UTC).isoformat(timespec="seconds"),

@@ -5,25 +5,19 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
-from dwell.cli.exit_codes import ExitCode
-
-if TYPE_CHECKING:
-    from dwell.live.hosting import Platform
+from dwell.errors import ExitCode
 
 __all__ = ["main"]
 
 
-def main(arguments: Sequence[str] | None = None, platform: Platform | None = None) -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command and exit with its code.
 
     Parameters
     ----------
     arguments : sequence of str, optional
         Words after ``dwell``; those of this process if not given.
-    platform : Platform, optional
-        Clock and transport of an agent or a controller; without faults if not given.
     """
     # Pydantic would look for plugins in all that is installed; Dwell uses none.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
@@ -35,7 +29,7 @@ def main(arguments: Sequence[str] | None = None, platform: Platform | None = Non
             return answer(os.environ[LINE])
         from dwell.cli.commands import app
 
-        app(arguments, prog_name="dwell", obj=platform)
+        app(arguments, prog_name="dwell")
     except KeyboardInterrupt:
         sys.exit(ExitCode.INTERRUPTED)
     finally:

@@ -24,7 +24,6 @@ from pathlib import Path
 import psutil
 import typer
 
-from dwell.cli.state_folder import logs
 from dwell.errors import LiveError, ProblemError
 from dwell.live.local_addresses import is_here, listening_ports, taken_ports, why_not_listen
 from dwell.live.log import printable
@@ -32,6 +31,7 @@ from dwell.live.process_group import ProcessGroup
 from dwell.live.security import Security
 from dwell.live.stage_modules import require_stages
 from dwell.live.state_files import make_folder, open_own
+from dwell.live.state_folder import logs
 from dwell.live.supervision import LOG_BYTES, survivor, write_mark
 from dwell.live.transport.orphans import remove_orphans
 from dwell.live.wiring import Role, Wiring, wire

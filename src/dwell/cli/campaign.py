@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import dwell
-from dwell.cli.exit_codes import ExitCode
 from dwell.cli.options import (
     CellArgument,
     Json,
@@ -20,7 +19,9 @@ from dwell.cli.options import (
     Windows,
     seconds_of_runs,
 )
-from dwell.cli.output import file_name, print_json, say, working, write_report
+from dwell.cli.output import file_name, print_json, working, write_report
+from dwell.errors import ExitCode
+from dwell.live.log import say
 from dwell.model.bounds import counted
 
 if TYPE_CHECKING:

@@ -9,9 +9,10 @@ from typing import Annotated
 
 import typer
 
-from dwell.cli.exit_codes import ExitCode
 from dwell.cli.options import Json, Seed
-from dwell.cli.output import json_text, print_json, say, write_file
+from dwell.cli.output import json_text, print_json, write_file
+from dwell.errors import ExitCode
+from dwell.live.log import say
 
 #: A folder with this file is a campaign's, and may be replaced by the next.
 MARK = ".dwell-chaos"

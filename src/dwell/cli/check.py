@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 import dwell
-from dwell.cli.exit_codes import ExitCode
 from dwell.cli.options import CellArgument, Insecure, Json, Keys, Scenario, Traces
 from dwell.cli.output import aligned, print_json, warn
 from dwell.display import milliseconds
-from dwell.errors import Fault, PolicyError, ProblemError
+from dwell.errors import ExitCode, Fault, PolicyError, ProblemError
 from dwell.model.bounds import counted
 
 if TYPE_CHECKING:

@@ -9,11 +9,10 @@ from pathlib import Path
 
 import typer
 
-from dwell.cli.live import environment
 from dwell.cli.output import aligned, print_json
 from dwell.errors import Fault, LiveError, TrustError, installing
 from dwell.live.lint import lint
-from dwell.live.security import Security, exposed
+from dwell.live.security import Security, environment, exposed
 from dwell.live.stage import Stage, Stateful, load_actuator, load_stage
 from dwell.live.wiring import PORTS_PER_ROLE, Role, Wiring, roles, wire
 from dwell.model import Problem

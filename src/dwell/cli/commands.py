@@ -12,7 +12,6 @@ from dwell import __version__
 from dwell.cli.check import check
 from dwell.cli.completion import completion
 from dwell.cli.demo import demo
-from dwell.cli.exit_codes import ExitCode
 from dwell.cli.keys import keys
 from dwell.cli.live import agent, controller, live
 from dwell.cli.new import new
@@ -24,7 +23,7 @@ from dwell.cli.schema import schema
 from dwell.cli.study import study
 from dwell.cli.testbed import testbed
 from dwell.cli.validate import validate
-from dwell.errors import DwellError, ProblemError, missing_package
+from dwell.errors import DwellError, ExitCode, line_and_code
 
 
 class Commands(TyperGroup):
@@ -38,24 +37,15 @@ class Commands(TyperGroup):
         """Run the command that the arguments name."""
         try:
             return super().invoke(ctx)
-        except DwellError as error:
-            located = isinstance(error, ProblemError) and error.source is not None
-            typer.echo(str(error) if located else f"error: {error}", err=True)
-            # Of the errors, those of what was given are ValueErrors.
-            code = ExitCode.WRONG if isinstance(error, ValueError) else ExitCode.FAILED
-            raise typer.Exit(code) from None
-        except ModuleNotFoundError as error:
-            missing = missing_package(error)
-            if missing is None:
-                raise
-            typer.echo(f"error: {missing}", err=True)
-            raise typer.Exit(ExitCode.FAILED) from None
         except BrokenPipeError:
             raise
-        except OSError as error:
-            where = f"{error.filename}: " if error.filename else ""
-            typer.echo(f"error: {where}{error.strerror or error}", err=True)
-            raise typer.Exit(ExitCode.FAILED) from None
+        except (DwellError, OSError, ModuleNotFoundError) as error:
+            known = line_and_code(error)
+            if known is None:
+                raise
+            line, code = known
+            typer.echo(line, err=True)
+            raise typer.Exit(code) from None
         except MemoryError:
             typer.echo("error: not enough memory; ask for fewer windows", err=True)
             raise typer.Exit(ExitCode.FAILED) from None

@@ -335,7 +335,7 @@ def _files_with(key: str) -> Offer:
 
 
 def _logged(line: _Line, begun: str) -> list[str]:
-    from dwell.cli.state_folder import logs, state_root
+    from dwell.live.state_folder import logs, state_root
 
     return list(logs(state_root(*map(Path, line.given.get("state", ())))))
 

@@ -16,7 +16,6 @@ from dataclasses import asdict, replace
 from functools import cache
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, packages_distributions, requires, version
-from importlib.resources import files
 from pathlib import Path
 
 import typer
@@ -161,7 +160,7 @@ def _kernel() -> Finding:
     try:
         found = f"of the sources {library.digest()[:12]}, by {library.compiler()}"
     except KernelError as error:
-        there = files("dwell.kernels").joinpath(NAME).is_file()
+        there = Path(library.__file__).with_name(NAME).is_file()
         return Finding(name, False, error.flaw, error.remedy, needed=there)
     return Finding(name, True, found)
 

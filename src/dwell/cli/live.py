@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import fnmatch
-import os
 import shlex
 import shutil
 import sys
-import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from dwell.cli.exit_codes import ExitCode
 from dwell.cli.options import (
     CellArgument,
     CellOption,
@@ -27,14 +24,13 @@ from dwell.cli.options import (
     Seed,
     require_held,
 )
-from dwell.cli.output import json_text, print_json, say
-from dwell.cli.state_folder import state_root
+from dwell.cli.output import json_text, print_json
 from dwell.display import milliseconds
+from dwell.errors import ExitCode
+from dwell.live.state_folder import state_root
 
 if TYPE_CHECKING:
     from dwell.live.operator_client import OperatorClient
-
-T = TypeVar("T")
 
 #: Time between two looks of ``status --watch``.
 WATCH_S = 1.0
@@ -57,7 +53,6 @@ live = typer.Typer(
 
 
 def agent(
-    ctx: typer.Context,
     node: Annotated[str, typer.Option(help="Node of the cell that this computer is.")],
     cell: CellOption,
     state: Annotated[
@@ -92,44 +87,24 @@ def agent(
     owner: Owner = None,
 ) -> None:
     """Run a node of a live cell: its workers, and on the right nodes stamper and sinks."""
-    from dwell.cellfile import load_without_traces
-    from dwell.cli.process import server, words
-    from dwell.live.hosting import Platform
-    from dwell.live.lint import lint
-    from dwell.live.node import run_agent
-    from dwell.live.stage import load_function
-    from dwell.live.wiring import roles
+    from dwell.live import node_command
 
-    problem = load_without_traces(cell)
-    for caution in lint(problem):
-        say(f"warning: {caution}")
-    folder = state or state_root() / problem.name / node
-    sys.path.insert(0, str(cell.resolve().parent))
-    read = None if accelerator is None else load_function(accelerator, "--accelerator")
-    wanted = _cpus(cpus)
-    there = sorted(role.who for role in roles(problem) if role.node == node)
-    of = _by_process("--cpus-of", cpus_of, there, lambda text: _cpus(text, "--cpus-of", wanted))
-    platform = ctx.find_object(Platform) or Platform()
-    priorities = _by_process("--realtime", realtime, there, _priority)
-    hurried = threading.Event()
-    run_agent(
-        problem,
-        node,
-        folder,
-        server(cell.resolve(), platform.program, owner),
-        lambda who: words(cell.resolve(), who, folder, of.get(who), priorities.get(who)),
-        _until_told(owner, hurried.set),
-        hurried=hurried,
-        cpus=wanted,
-        accelerator=read,
-        environment=environment(keys, insecure=insecure),
-        platform=platform,
-        say=say,
-    )
+    with _bad_parameters():
+        node_command.agent(
+            node,
+            cell,
+            state=state,
+            cpus=cpus,
+            cpus_of=cpus_of or (),
+            realtime=realtime or (),
+            accelerator=accelerator,
+            keys=keys,
+            insecure=insecure,
+            owner=owner,
+        )
 
 
 def controller(
-    ctx: typer.Context,
     cell: Annotated[
         list[Path], typer.Option("--cell", metavar="FILE", help="Cell file; may be repeated.")
     ],
@@ -153,25 +128,31 @@ def controller(
     owner: Owner = None,
 ) -> None:
     """Decide where the stages of live cells run."""
-    import dwell
-    from dwell.live.hosting import Platform
-    from dwell.live.node import run_controller
+    from dwell.live import node_command
 
-    wanted = _cpus(cpus)
-    if wanted is not None:
-        os.sched_setaffinity(0, wanted)
-    problems = [dwell.load(file) for file in cell]
-    folders = run_controller(
-        *(problems, out, _until_told(owner, lambda: os._exit(ExitCode.FAILED))),
-        policy=policy,
-        name=name,
-        jobs=jobs,
-        environment=environment(keys, insecure=insecure),
-        platform=ctx.find_object(Platform),
-        say=say,
-    )
-    for folder in folders:
-        say(f"run: {folder}")
+    with _bad_parameters():
+        node_command.controller(
+            cell,
+            out,
+            policy=policy,
+            name=name,
+            jobs=jobs,
+            cpus=cpus,
+            keys=keys,
+            insecure=insecure,
+            owner=owner,
+        )
+
+
+@contextmanager
+def _bad_parameters() -> Iterator[None]:
+    """Have an option that is wrong told with the command's usage."""
+    from dwell.live.node_command import OptionError
+
+    try:
+        yield
+    except OptionError as error:
+        raise typer.BadParameter(str(error)) from None
 
 
 @live.command()
@@ -193,6 +174,7 @@ def status(
         raise typer.BadParameter("--check looks once; leave --watch out")
     from dwell.cellfile import load_without_traces
     from dwell.live.operator_client import OperatorClient
+    from dwell.live.security import environment
 
     with OperatorClient(load_without_traces(cell), environment(keys, insecure=insecure)) as visitor:
         if watch:
@@ -355,6 +337,7 @@ def up(
     """Start a cell's part on this computer in the background: agents, and its controller here."""
     from dwell.cellfile import load, load_without_traces
     from dwell.cli import background
+    from dwell.live.security import environment
 
     problem = load_without_traces(cell)
     nodes = background.nodes_here(problem, node or ())
@@ -457,6 +440,7 @@ def _ask(
 ) -> None:
     from dwell.cellfile import load_without_traces
     from dwell.live.operator_client import OperatorClient
+    from dwell.live.security import environment
 
     with OperatorClient(load_without_traces(cell), environment(keys, insecure=insecure)) as visitor:
         answer = visitor.ask(what, about)
@@ -465,15 +449,6 @@ def _ask(
         return
     for line in status_lines(answer):
         typer.echo(line)
-
-
-def environment(keys: Path | None, *, insecure: bool) -> dict[str, str]:
-    """Return this process's environment with what was said of its keys."""
-    from dwell.live.security import INSECURE
-    from dwell.live.trust import KEYS
-
-    named = {KEYS: str(keys.resolve())} if keys is not None else {}
-    return {**os.environ, **named, **({INSECURE: "1"} if insecure else {})}
 
 
 def status_lines(status: dict[str, Any]) -> list[str]:
@@ -524,54 +499,3 @@ def status_lines(status: dict[str, Any]) -> list[str]:
 def proof(proving: Mapping[str, Any]) -> str:
     """Return in words how far a proof is."""
     return "proving {candidate}: {done} of {needed} cycles".format_map(proving)
-
-
-def _by_process(
-    option: str, given: Sequence[str] | None, there: Sequence[str], read: Callable[[str], T]
-) -> dict[str, T]:
-    """Read options of the form PROCESS=VALUE, where PROCESS may have a ``*``; the last counts."""
-    values: dict[str, T] = {}
-    for text in given or ():
-        pattern, equals, value = text.partition("=")
-        names = fnmatch.filter(there, pattern)
-        if not equals or not names:
-            known = ", ".join(there)
-            raise typer.BadParameter(f"{option}: {text!r} is for no process of the node: {known}")
-        values.update(dict.fromkeys(names, read(value)))
-    return values
-
-
-def _priority(text: str) -> int:
-    if not text.isdecimal() or not 1 <= int(text) <= 99:
-        raise typer.BadParameter(f"--realtime: {text!r} is no priority from 1 to 99")
-    return int(text)
-
-
-def _cpus(
-    text: str | None, option: str = "--cpus", among: set[int] | None = None
-) -> set[int] | None:
-    """Read a list of CPUs, each of which has to be available."""
-    if text is None:
-        return None
-    cpus: set[int] = set()
-    try:
-        for part in text.split(","):
-            first, _, last = part.partition("-")
-            cpus.update(range(int(first), int(last or first) + 1))
-    except ValueError:
-        raise typer.BadParameter(f"{option}: {text!r} is no list of CPUs, as 0,2-3") from None
-    available = among or os.sched_getaffinity(0)
-    if not cpus or not cpus <= available:
-        raise typer.BadParameter(f"{option}: {text} cannot be had; there are {sorted(available)}")
-    return cpus
-
-
-def _until_told(owner: int | None, at_once: Callable[[], None]) -> threading.Event:
-    """Return an event that is set when this process is told to end, or its owner has ended."""
-    from dwell.cli.ending import end_when_told
-    from dwell.live.parent_death import end_with_owner
-
-    stopped = threading.Event()
-    end_with_owner(stopped, owner)
-    end_when_told(stopped, at_once)
-    return stopped

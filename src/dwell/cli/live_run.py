@@ -13,10 +13,9 @@ from typing import Any, Protocol
 import typer
 
 import dwell
-from dwell.cli.exit_codes import ExitCode
 from dwell.cli.live_view import CellState, View, live_view
 from dwell.cli.output import aligned, print_json, working, write_file
-from dwell.errors import LiveError, installing, not_installed
+from dwell.errors import ExitCode, LiveError, installing, not_installed
 from dwell.live.stage_modules import require_stages
 from dwell.model import Problem, Scenario
 from dwell.model.bounds import counted

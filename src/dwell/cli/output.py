@@ -7,7 +7,7 @@ import math
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -97,12 +97,6 @@ def write_report(page: Page, path: Path, *, figures: Path | None, static: bool) 
         figures.mkdir(parents=True, exist_ok=True)
         for name, data in figure_files(page):
             write_whole(figures / name, data, durable=False)
-
-
-def say(line: str) -> None:
-    """Print a line on stderr; a log on a disk that is full does not end its writer."""
-    with suppress(OSError):
-        typer.echo(line, err=True)
 
 
 @contextmanager

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dwell.cli.options import Json, Samples, Warmup
-from dwell.cli.output import aligned, file_name, print_json, say
+from dwell.cli.output import aligned, file_name, print_json
 from dwell.errors import ProfileError
+from dwell.live.log import say
 
 if TYPE_CHECKING:
     from dwell.calibration.measure import Settings
@@ -82,8 +83,8 @@ def measure(
     # cores when they are imported. What the tasks print must not get into the results.
     with pinned(choose_cores(core)), redirect_stdout(sys.stderr):
         from dwell.calibration.measure import Settings
-        from dwell.calibration.memory import keep_memory
         from dwell.calibration.profile_file import require_free, task_name, write_profile
+        from dwell.live.memory import keep_memory
 
         require_free(path, [task_name(name, node) for name in sources])
         keep_memory()  # as the processes of a live cell do

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import dwell
-from dwell.cli.exit_codes import ExitCode
 from dwell.cli.options import (
     CellArgument,
     Estimator,
@@ -28,7 +27,7 @@ from dwell.cli.options import (
 )
 from dwell.cli.output import file_name, print_json, warn, working
 from dwell.display import milliseconds
-from dwell.errors import RunError
+from dwell.errors import ExitCode, RunError
 from dwell.model.bounds import counted
 
 if TYPE_CHECKING:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dwell.cli.exit_codes import ExitCode
 from dwell.cli.options import (
     Json,
     Processes,
@@ -21,6 +20,7 @@ from dwell.cli.options import (
     windows_of,
 )
 from dwell.cli.output import Progress, aligned, file_name, print_json, progress, warn, working
+from dwell.errors import ExitCode
 from dwell.model.bounds import counted
 
 if TYPE_CHECKING:

@@ -10,7 +10,6 @@ import typer
 
 from dwell.cli.campaign import campaign
 from dwell.cli.chaos import chaos
-from dwell.cli.exit_codes import ExitCode
 from dwell.cli.options import (
     CellArgument,
     Json,
@@ -23,7 +22,9 @@ from dwell.cli.options import (
     require_one_length,
     seconds_of_runs,
 )
-from dwell.cli.output import aligned, file_name, print_json, say
+from dwell.cli.output import aligned, file_name, print_json
+from dwell.errors import ExitCode
+from dwell.live.log import say
 
 testbed = typer.Typer(
     no_args_is_help=True,

@@ -9,7 +9,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from dwell.cli.output import say, write_file
+from dwell.cli.output import write_file
+from dwell.live.log import say
 from dwell.model import Problem
 
 #: Files and connections that a process of a cell may have open: what only connects, and says

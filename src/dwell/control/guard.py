@@ -1,8 +1,12 @@
 """The guard beside the stamper: it leaves a placement that has fallen silent, and never returns.
 
 Everything here is arithmetic on instants that the caller brings: there is no clock, no thread and
-no message, so that the simulator and the live runtime run the same lines. Instants are whole
-nanoseconds of one clock, that of the node the guard is on, and never go back.
+no message. Instants are whole nanoseconds of one clock, that of the node the guard is on, and never
+go back.
+
+Only the stamper of the live runtime runs `Guard`, `Presence.whole` and `Failures`. The simulator
+shares `FallbackRound`, `Probation`, `rest_cycles` and `parts_of`, has the rest of the same rules in
+`dwell.sim.simulated_guard` and the compiled event loop, and is tested against these classes.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ class Platform:
         Module, and its first arguments, that runs one process of a cell.
     """
 
-    program: Sequence[str] = ("dwell.cli.process",)
+    program: Sequence[str] = ("dwell.live.role_command",)
 
     def clock(self, problem: Problem, node: str) -> Clock:
         """Return what the processes of a node read the time from."""

@@ -46,6 +46,12 @@ def escape_output() -> None:
         setattr(sys, name, _Escaping(raw, encoding="utf-8", write_through=True))
 
 
+def say(line: str) -> None:
+    """Print a line on stderr; a log on a disk that is full does not end its writer."""
+    with suppress(OSError):
+        print(line, file=sys.stderr, flush=True)
+
+
 class Log:
     """Passes on a line a second at most, and says how many it has left out.
 

@@ -8,7 +8,6 @@ from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
-from dwell import __version__
 from dwell.control import Controller
 from dwell.errors import RunError, UnwritableError, installing
 from dwell.live.run_rows import Resume, Rows, columns_of
@@ -16,6 +15,7 @@ from dwell.model import Problem
 from dwell.model.document import to_document
 from dwell.record import seal_run
 from dwell.record.journal import Journal
+from dwell.version import __version__
 
 #: Rows that wait in memory while the folder cannot be written, some 25 MB; of more, those of the
 #: oldest windows are dropped.

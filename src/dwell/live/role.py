@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import msgspec
 
-from dwell import __version__
 from dwell.errors import LiveError, TrustError
 from dwell.live.failure_detector import FailureDetector
 from dwell.live.keys import CONTROLLER, TWICE, Keys
@@ -33,6 +32,7 @@ from dwell.model import Problem
 from dwell.model.bounds import require
 from dwell.model.document import fingerprint
 from dwell.model.instants import NEVER_NS
+from dwell.version import __version__
 
 #: What PTP and chrony on one network keep to.
 SYSTEM_BOUND_NS = 1_000_000

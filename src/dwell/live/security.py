@@ -37,6 +37,20 @@ VISITORS_AT_ONCE = 8
 VISITORS = ("operator", "observer", "controller")
 
 
+def environment(keys: Path | None, *, insecure: bool) -> dict[str, str]:
+    """Return this process's environment with what was said of its keys.
+
+    Parameters
+    ----------
+    keys : Path, optional
+        Keyring; what the environment says if not given.
+    insecure : bool
+        Whether addresses beyond this computer are allowed without keys.
+    """
+    named = {KEYS: str(keys.resolve())} if keys is not None else {}
+    return {**os.environ, **named, **({INSECURE: "1"} if insecure else {})}
+
+
 @dataclass(frozen=True, slots=True)
 class Security:
     """Protection of a process of a cell.

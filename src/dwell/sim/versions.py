@@ -6,8 +6,8 @@ import platform
 
 import numpy as np
 
-from dwell import __version__
 from dwell.kernels import library
+from dwell.version import __version__
 
 
 def versions() -> dict[str, str]:

@@ -112,13 +112,13 @@ def calibrate(
     OSError
         If the files cannot be written.
     """
-    import dwell
+    from dwell.cellfile import load
 
     if out.suffix not in (".yaml", ".yml"):
         raise RunError(f"{out}: a cell file ends in .yaml")
     if out.exists() and out.samefile(cell):
         raise RunError(f"{out} is the cell itself; name another file")
-    problem = dwell.load(cell)
+    problem = load(cell)
     measured = _measured(runs, problem)
     messaging_ms = messaging(measured, problem)
     usual = usual_of(measured)
@@ -146,7 +146,7 @@ def calibrate(
     _write_samples(samples, costs, columns, delays_ms, measured, added_ms)
     _put_in(document, samples.name, costs, delays_ms, nodes)
     _write_cell(out, document, cell, runs)
-    written = dwell.load(out)
+    written = load(out)
     missing = _missing(problem, costs, delays_ms)
     report = {
         "runs": [one.name for one in measured],
@@ -213,10 +213,11 @@ def make_runs(
     DwellError
         If the cell cannot be run here, or the machine was the bottleneck of a run.
     """
-    import dwell
+    from dwell.cellfile import load
+    from dwell.record import open_run
     from dwell.testbed.run import run_once
 
-    problem = dwell.load(cell)
+    problem = load(cell)
     runs = []
     for candidate in problem.candidates:
         run = run_once(
@@ -230,7 +231,7 @@ def make_runs(
             jobs=True,
             tell=tell,
         )
-        pressure = dwell.open_run(run).meta.get("pressure") or {}
+        pressure = open_run(run).meta.get("pressure") or {}
         if pressure.get("failed"):
             raise RunError(
                 f"{run}: the machine was the bottleneck ({pressure.get('why')}); measure on one "
@@ -241,7 +242,7 @@ def make_runs(
 
 
 def _measured(runs: Sequence[Path], problem: Problem) -> list[Measured]:
-    import dwell
+    from dwell.record import open_run
 
     names = [path.resolve().name for path in runs]
     if not runs:
@@ -250,7 +251,7 @@ def _measured(runs: Sequence[Path], problem: Problem) -> list[Measured]:
     measured = []
     for name, path in zip(names, runs, strict=True):
         try:
-            measured.append(look_at(name, dwell.open_run(path), problem))
+            measured.append(look_at(name, open_run(path), problem))
         except DwellError as error:
             faults.append(str(error))
     if faults:

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dwell import __version__
 from dwell.cellfile.sources import digest_of
 from dwell.cellfile.study_paths import with_settings
 from dwell.errors import LiveError, PolicyError, ProblemError
@@ -24,6 +23,7 @@ from dwell.model.document import to_document
 from dwell.policies.registry import by_name, estimates, names
 from dwell.record.campaign_folder import TRACES
 from dwell.testbed.trace_names import rename_traces
+from dwell.version import __version__
 
 PAPERS_SCENARIOS = ("baseline", "robot-cpu-stress", "edge-cpu-stress", "network-impairment")
 #: Parts of this package that a measurement depends on.

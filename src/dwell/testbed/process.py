@@ -1,20 +1,24 @@
 """Agents, controllers and their processes with faults around them: a testbed's entry point.
 
-``python -m dwell.testbed.process [--links FILE] [--clocks FILE] COMMAND ...`` runs the code of
-``dwell COMMAND ...`` (``agent`` or ``controller``), and that of ``python -m dwell.cli.process``
-where the command is ``process``. Its messages meet the links that a `LinkFile` says, and
-its clock is wrong by what a `ClockFile` says.
+``python -m dwell.testbed.process [--links FILE] [--clocks FILE] COMMAND ...`` runs what
+``dwell COMMAND ...`` does (``agent`` or ``controller``, with the same options), and what
+``python -m dwell.live.role_command`` does where the command is ``process``. Its messages meet the
+links that a `LinkFile` says, and its clock is wrong by what a `ClockFile` says.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from dwell.errors import DwellError, ExitCode, line_and_code
+from dwell.live import role_command
 from dwell.live.hosting import Clock, Platform
-from dwell.live.security import Security
+from dwell.live.log import say
+from dwell.live.security import INSECURE, Security
 from dwell.live.transport.transport import Transport
 from dwell.model import Problem
 from dwell.testbed.clocks import wrong_clock
@@ -63,9 +67,6 @@ class FaultyPlatform(Platform):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command until it is told to end; returns the exit code."""
-    from dwell.cli import main as dwell
-    from dwell.cli.process import main as process
-
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--links", type=Path)
     parser.add_argument("--clocks", type=Path)
@@ -74,9 +75,69 @@ def main(arguments: Sequence[str] | None = None) -> int:
     asked = parser.parse_args(arguments)
     platform = FaultyPlatform(links=asked.links, clocks=asked.clocks)
     if asked.command == "process":
-        return process(asked.words, platform)
-    dwell([asked.command, *asked.words], platform)
-    return 0
+        return role_command.main(asked.words, platform)
+    # Pydantic would look for plugins in all that is installed; Dwell uses none.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
+    return _run_node(asked.command, asked.words, platform)
+
+
+def _run_node(command: str, words: Sequence[str], platform: Platform) -> int:
+    """Run an agent or a controller."""
+    from dwell.live import node_command
+
+    parser = _agent_parser() if command == "agent" else _controller_parser()
+    options = vars(parser.parse_args(words))
+    try:
+        if command == "agent":
+            node_command.agent(**options, platform=platform)
+        else:
+            node_command.controller(**options, platform=platform)
+    except node_command.OptionError as error:
+        parser.error(str(error))
+    except (DwellError, OSError, ModuleNotFoundError) as error:
+        known = line_and_code(error)
+        if known is None:
+            raise
+        line, code = known
+        say(line)
+        return code
+    return ExitCode.DONE
+
+
+def _agent_parser() -> argparse.ArgumentParser:
+    parser = _parser("agent")
+    parser.add_argument("--node", required=True)
+    parser.add_argument("--cell", type=Path, required=True)
+    parser.add_argument("--state", type=Path)
+    parser.add_argument("--cpus-of", action="append", default=[])
+    parser.add_argument("--realtime", action="append", default=[])
+    parser.add_argument("--accelerator")
+    return parser
+
+
+def _controller_parser() -> argparse.ArgumentParser:
+    parser = _parser("controller")
+    parser.add_argument("--cell", dest="cells", action="append", type=Path, required=True)
+    parser.add_argument("--out", type=Path, default=Path("runs"))
+    parser.add_argument("--policy")
+    parser.add_argument("--name")
+    parser.add_argument("--jobs", action=argparse.BooleanOptionalAction, default=_set("DWELL_JOBS"))
+    return parser
+
+
+def _parser(command: str) -> argparse.ArgumentParser:
+    """Return a parser with what an agent and a controller may both be told."""
+    parser = argparse.ArgumentParser(command, allow_abbrev=False)
+    parser.add_argument("--cpus")
+    parser.add_argument("--keys", type=Path)
+    parser.add_argument("--insecure", action="store_true", default=_set(INSECURE))
+    parser.add_argument("--owner", type=int)
+    return parser
+
+
+def _set(variable: str) -> bool:
+    """Whether a variable of the environment says yes, as `dwell` reads it."""
+    return os.environ.get(variable, "").lower() in ("1", "on", "t", "true", "y", "yes")
 
 
 if __name__ == "__main__":

@@ -45,7 +45,7 @@ class Watcher(Child):
 
 def main() -> None:
     """Answer until the parent ends, or wants this to."""
-    import dwell
+    from dwell.cellfile import load
     from dwell.live.operator_client import OperatorClient
     from dwell.live.security import INSECURE
     from dwell.testbed.processes import without_keys
@@ -56,7 +56,7 @@ def main() -> None:
         try:
             # The testbed's hosts lead nowhere but to each other.
             environment = {**without_keys(), INSECURE: "1"}
-            visitor = OperatorClient(dwell.load(cast("str", settings["cell"])), environment)
+            visitor = OperatorClient(load(cast("str", settings["cell"])), environment)
         except DwellError as error:
             parent.answer({"error": str(error)})
             return

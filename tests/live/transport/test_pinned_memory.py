@@ -35,7 +35,7 @@ VICTIM = """
 import sys
 from dwell.live.security import KEYS, Security
 from dwell.live.wiring import wire
-from dwell.calibration.memory import keep_memory
+from dwell.live.memory import keep_memory
 from tests.live.transport.test_pinned_memory import housed_at
 
 keep_memory()

@@ -13,7 +13,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import dwell
+from dwell.cellfile import load
 from dwell.cellfile.yaml_text import yaml_of
 from dwell.errors import DwellError, LiveError
 from dwell.model import FrozenDict, Problem
@@ -61,9 +61,9 @@ class Staging:
             written = folder / "written.yaml"
             light = document(LIGHT_HOME, period_ms=PATIENT_MS, quotas=self.hosts)
             written.write_text(yaml_of(light), encoding="utf-8")
-            problem, environment = dwell.load(written), environment_of(folder, exec_ms(LIGHT_HOME))
+            problem, environment = load(written), environment_of(folder, exec_ms(LIGHT_HOME))
         else:
-            problem, environment = _witnessed(dwell.load(self.cell), folder)
+            problem, environment = _witnessed(load(self.cell), folder)
         clocks = folder / CLOCK_FILE
         testbed: LocalTestbed
         if self.hosts:
@@ -347,10 +347,12 @@ def _old(cell: Harness, observer: ActuatorObserver, fault: Fault, outcome: Outco
 
 def _unread(cell: Harness) -> Sequence[str]:
     """Return which runs cannot be read."""
+    from dwell.record import open_run
+
     unreadable = []
     for folder in cell.runs:
         try:
-            dwell.open_run(folder).cycles.height  # noqa: B018 - reads it
+            open_run(folder).cycles.height  # noqa: B018 - reads it
         except DwellError as error:
             unreadable.append(str(error))
     return unreadable

@@ -145,7 +145,7 @@ class ActuatorObserver:
 
 def main() -> None:
     """Listen until the parent ends, or wants this to."""
-    import dwell
+    from dwell.cellfile import load
     from dwell.live.security import INSECURE
     from dwell.live.transport.zenoh import ZenohTransport
     from dwell.live.wiring import wire
@@ -156,7 +156,7 @@ def main() -> None:
         settings = parent.receive()
         os.environ[INSECURE] = "1"
         try:
-            problem = dwell.load(cast("str", settings["cell"]))
+            problem = load(cast("str", settings["cell"]))
             entry = entry_for(wire(problem), cast("list[str]", settings["nodes"]))
             transport = ZenohTransport(entry)
         except DwellError as error:

@@ -10,7 +10,7 @@ import pytest
 LOOP = """
 import resource, sys
 import numpy as np
-from dwell.calibration.memory import keep_memory
+from dwell.live.memory import keep_memory
 
 if sys.argv[1] == "keep":
     assert keep_memory()

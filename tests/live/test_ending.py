@@ -11,7 +11,7 @@ import pytest
 #: Says that it waits, then that it ends in order; a second signal keeps it from that.
 PROGRAM = """
 import os, signal, sys, threading
-from dwell.cli.ending import end_when_told
+from dwell.live.ending import end_when_told
 if "nohup" in sys.argv:
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
 stopped = threading.Event()

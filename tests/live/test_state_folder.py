@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from dwell.cli.background import log_of
-from dwell.cli.state_folder import logs, state_root
 from dwell.errors import ProblemError
+from dwell.live.state_folder import logs, state_root
 
 
 def test_it_is_where_the_desktop_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

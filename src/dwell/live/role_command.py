@@ -1,4 +1,4 @@
-"""The processes of a cell: ``python -m dwell.cli.process --cell FILE --who NAME --state FOLDER``.
+"""A process of a cell: ``python -m dwell.live.role_command --cell FILE --who NAME --state FOLDER``.
 
 With ``--serve`` it is the one that an agent has them forked from, which has done their imports.
 """
@@ -14,9 +14,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dwell.cli.ending import end_when_told
-from dwell.cli.exit_codes import ExitCode
-from dwell.errors import DwellError, missing_package
+from dwell.errors import DwellError, ExitCode, missing_package
+from dwell.live.ending import end_when_told
 
 if TYPE_CHECKING:
     from dwell.live.hosting import Platform
@@ -100,9 +99,8 @@ def main(arguments: Sequence[str] | None = None, platform: Platform | None = Non
 
 def _serve(cell: Path, owner: int | None, platform: Platform | None) -> int:
     """Import what every process needs, and fork; in a forked process, run it."""
-    from dwell.calibration import memory  # noqa: F401
     from dwell.cellfile import load_without_traces
-    from dwell.live import parent_death, role_process, supervision  # noqa: F401
+    from dwell.live import memory, parent_death, role_process, supervision  # noqa: F401
     from dwell.live.launcher import serve
 
     load_without_traces(cell)
@@ -122,9 +120,9 @@ def _run(options: argparse.Namespace, platform: Platform | None) -> int:
     # The user's stages lie beside their cell file.
     sys.path.insert(0, str(options.cell.resolve().parent))
 
-    from dwell.calibration.memory import keep_memory
     from dwell.cellfile import load_without_traces
     from dwell.live.log import escape_output
+    from dwell.live.memory import keep_memory
     from dwell.live.parent_death import end_with_owner
     from dwell.live.process_group import end_helpers
     from dwell.live.role_process import run_process

@@ -1,0 +1,194 @@
+"""An agent, and a controller of some cells, from what a command line says of them."""
+
+from __future__ import annotations
+
+import fnmatch
+import os
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+from dwell.cellfile import load, load_without_traces
+from dwell.errors import ExitCode
+from dwell.live.ending import end_when_told
+from dwell.live.hosting import Platform
+from dwell.live.lint import lint
+from dwell.live.log import say
+from dwell.live.node import run_agent, run_controller
+from dwell.live.parent_death import end_with_owner
+from dwell.live.role_command import server, words
+from dwell.live.security import environment
+from dwell.live.stage import load_function
+from dwell.live.state_folder import state_root
+from dwell.live.wiring import roles
+
+T = TypeVar("T")
+
+
+class OptionError(ValueError):
+    """An option of a command is wrong; the text names it, and what was given."""
+
+
+def agent(
+    node: str,
+    cell: Path,
+    *,
+    state: Path | None = None,
+    cpus: str | None = None,
+    cpus_of: Sequence[str] = (),
+    realtime: Sequence[str] = (),
+    accelerator: str | None = None,
+    keys: Path | None = None,
+    insecure: bool = False,
+    owner: int | None = None,
+    platform: Platform | None = None,
+) -> None:
+    """Run a node of a live cell until told to end (see `run_agent`).
+
+    Parameters
+    ----------
+    state : Path, optional
+        Where processes keep their files; below `state_root` if not given.
+    cpus : str, optional
+        CPUs to use, as ``0,2-3``; those of this process if not given.
+    cpus_of, realtime : sequence of str
+        CPUs, and real-time priorities, of some processes, as ``perception@*=2-3``; of those that
+        name one process the last counts.
+    accelerator : str, optional
+        Function that returns the utilisation of the node's accelerator, as ``module:function``.
+    keys : Path, optional
+        Keyring; that of the environment if not given.
+    owner : int, optional
+        Id of the process that this one ends with.
+    platform : Platform, optional
+        Clock and transport; without faults if not given.
+
+    Raises
+    ------
+    OptionError
+        If what an option says cannot be.
+    DwellError
+        If the cell cannot be read, or the agent cannot run.
+    """
+    problem = load_without_traces(cell)
+    for caution in lint(problem):
+        say(f"warning: {caution}")
+    folder = state or state_root() / problem.name / node
+    sys.path.insert(0, str(cell.resolve().parent))
+    read = None if accelerator is None else load_function(accelerator, "--accelerator")
+    wanted = _cpus(cpus)
+    there = sorted(role.who for role in roles(problem) if role.node == node)
+    of = _by_process("--cpus-of", cpus_of, there, lambda text: _cpus(text, "--cpus-of", wanted))
+    platform = platform or Platform()
+    priorities = _by_process("--realtime", realtime, there, _priority)
+    hurried = threading.Event()
+    run_agent(
+        problem,
+        node,
+        folder,
+        server(cell.resolve(), platform.program, owner),
+        lambda who: words(cell.resolve(), who, folder, of.get(who), priorities.get(who)),
+        _until_told(owner, hurried.set),
+        hurried=hurried,
+        cpus=wanted,
+        accelerator=read,
+        environment=environment(keys, insecure=insecure),
+        platform=platform,
+        say=say,
+    )
+
+
+def controller(
+    cells: Sequence[Path],
+    out: Path,
+    *,
+    policy: str | None = None,
+    name: str | None = None,
+    jobs: bool = False,
+    cpus: str | None = None,
+    keys: Path | None = None,
+    insecure: bool = False,
+    owner: int | None = None,
+    platform: Platform | None = None,
+) -> None:
+    """Decide where the stages of live cells run until told to end (see `run_controller`).
+
+    Parameters
+    ----------
+    out : Path
+        Where the runs' folders go.
+    cpus, keys, owner, platform : optional
+        As those of an `agent`.
+
+    Raises
+    ------
+    OptionError
+        If the CPUs cannot be had.
+    DwellError
+        If a cell cannot be read, or the controller cannot run.
+    """
+    wanted = _cpus(cpus)
+    if wanted is not None:
+        os.sched_setaffinity(0, wanted)
+    problems = [load(file) for file in cells]
+    folders = run_controller(
+        *(problems, out, _until_told(owner, lambda: os._exit(ExitCode.FAILED))),
+        policy=policy,
+        name=name,
+        jobs=jobs,
+        environment=environment(keys, insecure=insecure),
+        platform=platform,
+        say=say,
+    )
+    for folder in folders:
+        say(f"run: {folder}")
+
+
+def _by_process(
+    option: str, given: Sequence[str], there: Sequence[str], read: Callable[[str], T]
+) -> dict[str, T]:
+    """Read options of the form PROCESS=VALUE, where PROCESS may have a ``*``; the last counts."""
+    values: dict[str, T] = {}
+    for text in given:
+        pattern, equals, value = text.partition("=")
+        names = fnmatch.filter(there, pattern)
+        if not equals or not names:
+            known = ", ".join(there)
+            raise OptionError(f"{option}: {text!r} is for no process of the node: {known}")
+        values.update(dict.fromkeys(names, read(value)))
+    return values
+
+
+def _priority(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= 99:
+        raise OptionError(f"--realtime: {text!r} is no priority from 1 to 99")
+    return int(text)
+
+
+def _cpus(
+    text: str | None, option: str = "--cpus", among: set[int] | None = None
+) -> set[int] | None:
+    """Read a list of CPUs, each of which has to be available."""
+    if text is None:
+        return None
+    cpus: set[int] = set()
+    try:
+        for part in text.split(","):
+            first, _, last = part.partition("-")
+            cpus.update(range(int(first), int(last or first) + 1))
+    except ValueError:
+        raise OptionError(f"{option}: {text!r} is no list of CPUs, as 0,2-3") from None
+    available = among or os.sched_getaffinity(0)
+    if not cpus or not cpus <= available:
+        raise OptionError(f"{option}: {text} cannot be had; there are {sorted(available)}")
+    return cpus
+
+
+def _until_told(owner: int | None, at_once: Callable[[], None]) -> threading.Event:
+    """Return an event that is set when this process is told to end, or its owner has ended."""
+    stopped = threading.Event()
+    end_with_owner(stopped, owner)
+    end_when_told(stopped, at_once)
+    return stopped
