@@ -16,26 +16,34 @@ import yaml
 
 import dwell
 from dwell import model
-from dwell.cellfile import from_document
+from dwell.cellfile import from_document, load_without_traces
 from dwell.cellfile.overrides import load_with
 from dwell.cellfile.study_paths import with_settings
 from dwell.errors import DwellError
 from dwell.estimators import registry as estimators
+from dwell.policies import ATP, Cusum
 from dwell.policies import registry as policies
-from dwell.study import load_study
+from dwell.study import Contender, Point, load_study
 
 ROOT = Path(__file__).parents[2]
 DATA = Path(__file__).parent / "data"
 CASES = DATA / "messages.yaml"
 FILE = DATA / "messages.txt"
-#: What cases in Python may name, beside the classes of `dwell.model` and two cells.
-FUNCTIONS: dict[str, Any] = {
+#: What cases in Python may name, beside the classes of `dwell.model` and what is read for them.
+NAMES: dict[str, Any] = {
+    "ATP": ATP,
+    "Contender": Contender,
+    "Cusum": Cusum,
+    "Path": Path,
+    "Point": Point,
     "from_document": from_document,
     "load": dwell.load,
     "load_with": load_with,
+    "load_without_traces": load_without_traces,
     "make_estimator": estimators.by_name,
     "make_policy": policies.by_name,
     "replace": replace,
+    "simulate": dwell.simulate,
     "with_settings": with_settings,
 }
 
@@ -81,9 +89,13 @@ def _whole(texts: dict[str, list[str]]) -> Iterator[str]:
 def _python(cases: list[str]) -> Iterator[str]:
     """Yield what is said of expressions."""
     classes = {name: getattr(model, name) for name in model.__all__}
-    cells = {"canonical": dwell.load("canonical.yaml"), "fan_in": dwell.load("fan-in.yaml")}
+    examples = {
+        "canonical": dwell.load("canonical.yaml"),
+        "fan_in": dwell.load("fan-in.yaml"),
+        "study": load_study("studies/first.yaml"),
+    }
     for case in cases:
-        yield _block("# Python", case, partial(eval, case, {**classes, **FUNCTIONS, **cells}))
+        yield _block("# Python", case, partial(eval, case, {**classes, **NAMES, **examples}))
 
 
 def _read(name: str, text: str) -> object:
@@ -160,7 +172,7 @@ def _place(text: str, path: str) -> tuple[Any, str, Any]:
     Of the keys that a path may begin with the longest is taken; where there is none, all of the
     rest is the key.
     """
-    node = yaml.compose(text, yaml.CSafeLoader)
+    node: Any = yaml.compose(text, yaml.CSafeLoader)
     parent, key, rest = node, "", path
     while rest:
         parent = node
