@@ -6,12 +6,16 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from tests.regression import commands, exact, paper, runs
+from tests.regression import commands, exact, messages, paper, runs
 
 
 def _write_commands() -> None:
     commands.FILE.write_text(commands.surface(), encoding="utf-8")
     commands.HELPS.write_text(commands.helps(), encoding="utf-8")
+
+
+def _write_messages() -> None:
+    messages.FILE.write_text(messages.messages(), encoding="utf-8")
 
 
 def _write_runs() -> None:
@@ -23,7 +27,11 @@ def _write_paper(folder: str, file: Path) -> None:
     print(f"{paper.write(Path(folder) / 'runs', file)} means")
 
 
-KINDS: dict[str, Callable[[], None]] = {"commands": _write_commands, "runs": _write_runs}
+KINDS: dict[str, Callable[[], None]] = {
+    "commands": _write_commands,
+    "messages": _write_messages,
+    "runs": _write_runs,
+}
 
 USAGE = f"""\
 usage: python -m tests.regression {{{",".join(KINDS)}}}...
