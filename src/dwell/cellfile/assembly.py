@@ -197,7 +197,8 @@ class Assembly:
             made = self._made(value)
             return STAND_IN if made is None and value.shape.kind in PROCESSES else made
         if isinstance(value, dict):
-            return {name: self._value(item) for name, item in value.items()}
+            made = {name: self._value(item) for name, item in value.items()}
+            return {name: item for name, item in made.items() if item is not None}
         return value
 
     def _trace(self, entry: Entry) -> Process:

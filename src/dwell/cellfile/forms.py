@@ -206,12 +206,15 @@ class WrittenForm(Form):
         What it may be, in words.
     reader : callable
         Returns what the value says; raises a ValueError with what is wrong.
+    may_be_empty : bool
+        Whether nothing may be given for a key within it.
     shown : mapping
         JSON Schema.
     """
 
     ways: str
     reader: Callable[[Any], Any]
+    may_be_empty: bool = False
     shown: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -221,6 +224,11 @@ class WrittenForm(Form):
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return what the reader makes of the value."""
+        for place, step in _empty_places(value, path):
+            within = place.removeprefix(path)
+            if not (self.may_be_empty and within == f".{step}") and not faults.at(place):
+                what = f"the key {step!r}" if isinstance(step, str) else "the item"
+                faults.add(place, f"nothing is given; give a value, or remove {what}")
         try:
             return self.reader(value)
         except ValueError as error:
@@ -230,6 +238,18 @@ class WrittenForm(Form):
     def schema(self, definitions: Definitions) -> JsonSchema:
         """Return the schema as given."""
         return dict(self.shown)
+
+
+def _empty_places(value: Any, path: str) -> Iterator[tuple[str, Step]]:
+    """Yield the places within a value at which nothing is given, with their last step."""
+    steps: Any = ()
+    if isinstance(value, dict | list):
+        steps = value.items() if isinstance(value, dict) else enumerate(value)
+    for step, item in steps:
+        place = beneath(path, step)
+        if item is None:
+            yield place, step
+        yield from _empty_places(item, place)
 
 
 # ------------------------------------------------------------------------------- containers
@@ -436,7 +456,8 @@ class Shape(Form):
         for name in value:
             if name not in self.names:
                 here = beneath(path, name)
-                faults.add(here, f"unknown key {name!r}; {nearest(name, self.names)}")
+                if not faults.at(here):
+                    faults.add(here, f"unknown key {name!r}; {nearest(name, self.names)}")
                 meant = closest(name, self.names, MISSPELT)
                 if meant in missing:
                     faults.excuse(beneath(path, meant))

@@ -135,7 +135,9 @@ STUDY = FileKind(
             FormKey(
                 "scenarios",
                 "scenarios",
-                WrittenForm("list of names, name → list of disturbances", _scenarios),
+                WrittenForm(
+                    "list of names, name → list of disturbances", _scenarios, may_be_empty=True
+                ),
                 "Scenarios of the cell, or a mapping of names to disturbances.",
                 usual="all of the cell's",
             ),

@@ -83,7 +83,7 @@ class Node:
     """A computer."""
 
     name: str
-    tier: Tier = key("Kind of computer.")
+    tier: Tier = key("Kind of computer: robot, edge or cloud.")
     cores: int = key("Cores of its CPU.", Bound(1, 4096, whole=True), default=1)
     scheduler: Scheduler = key(
         "How jobs share the cores: `fair` (processor sharing), `fifo` (one after another) or "

@@ -66,7 +66,7 @@ class Task:
 
     name: str
     on: Mapping[str, Execution] = key(
-        "Nodes it can run on (N_v), and how; one anchors it, more make it relocatable."
+        "Nodes it can run on, and how; one anchors it, more make it relocatable."
     )
     depth: int = key(
         "Complete input sets that may wait for a worker, 0 without a bound; beyond it the oldest "
@@ -122,7 +122,7 @@ class Flow:
 class Pipeline:
     """Tasks and flows of a control loop with its timing."""
 
-    tasks: Mapping[str, Task] = key("Stages of the pipeline by name, in the file's order.")
+    tasks: Mapping[str, Task] = key("Stages of the pipeline by name.")
     flows: tuple[Flow, ...] = key("What tasks send to one another: a directed acyclic graph.")
     period_ms: float = key("Time between two releases (P), ms.", PERIOD_MS)
     deadline_ms: float = key(

@@ -137,7 +137,7 @@ class Problem(Displayed):
     pipeline: Pipeline
     fabric: Fabric
     candidates: Mapping[str, Placement] = key(
-        "Placements the policy may choose (Pi_cand), by name: relocatable task to node; anchored "
+        "Placements the policy may choose, by name: relocatable task to node; anchored "
         "tasks follow."
     )
     objective: Objective = key("Cost, targets and caps.")
