@@ -30,7 +30,9 @@ def put(document: Any, steps: tuple[Step, ...], value: object) -> Any:
         items = list(document)
         items[step] = put(items[step], tuple(rest), value)
         return items
-    return {**document, step: put(document.get(step, {}), tuple(rest), value)}
+    # What is no mapping was put there by a path that this one leads into: a fault, and told.
+    inner = document if isinstance(document, Mapping) else {}
+    return {**inner, step: put(inner.get(step, {}), tuple(rest), value)}
 
 
 def with_settings(problem: Problem, settings: Mapping[str, object]) -> Problem:
