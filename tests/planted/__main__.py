@@ -1,0 +1,168 @@
+"""Plant each fault in a copy of the tree, and see that the tests find it: `make planted`."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from queue import Queue
+from tempfile import TemporaryDirectory
+
+from tests.planted.catalogue import ROOT, Fault, catalogue, section_of
+
+#: Time after which tests that a fault keeps from ending are stopped, seconds.
+PATIENCE_S = 600
+#: What pytest ends with where all tests have passed, and where one has failed.
+PASSED, FAILED = 0, 1
+
+LIBRARY = Path("src/dwell/kernels/libdwell_kernel.so")
+BUILD = "import hatch_build as h; h.build(h.find_compiler(), h.KERNELS / h.FILE['NAME'])"
+IMPORTED = "import dwell; print(dwell.__file__)"
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What has become of a planted fault.
+
+    Parameters
+    ----------
+    result : str
+        ``found``, ``survived``, or why nothing can be said.
+    by : str
+        The test that has found it.
+    """
+
+    fault: Fault
+    place: str
+    result: str
+    by: str
+    seconds: float
+
+    @property
+    def row(self) -> str:
+        """The outcome as a row of the table."""
+        cells = (self.fault.fault, self.place, self.result, self.by, f"{self.seconds:.0f}")
+        return f"| {' | '.join(cells)} |"
+
+
+class Copy:
+    """A copy of the tree, in which the sources are changed and tested."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        listed = _run(["git", "ls-files", "-co", "--exclude-standard", "-z"], ROOT).stdout
+        for name in filter(None, listed.split("\0")):
+            if (ROOT / name).is_file():
+                (root / name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy2(ROOT / name, root / name)
+        shutil.copy2(ROOT / LIBRARY, root / LIBRARY)
+        imported = Path(self.python("-c", IMPORTED).stdout.strip())
+        if not imported.is_relative_to(root):
+            sys.exit(f"the tests would be of {imported}, and not of the copy in {root}")
+
+    def python(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """Run Python with the copy's package."""
+        return _run([sys.executable, *arguments], self.root)
+
+    def test(self, ids: Iterable[str]) -> tuple[int, str]:
+        """Run tests until one fails; returns how pytest ended, and what it printed."""
+        # Compiled files beside the sources are told apart by the second of their change.
+        done = self.python("-m", "pytest", "-x", "-p", "no:cacheprovider", "--tb=no", *ids)
+        return done.returncode, done.stdout + done.stderr
+
+    def plant(self, fault: Fault) -> tuple[str, str]:
+        """Plant a fault and run its tests; returns the result, and the test that has found it."""
+        if flaw := fault.flaw(self.root):
+            return f"does not apply: {flaw}", ""
+        file, library = self.root / fault.path, self.root / LIBRARY
+        before = file.read_text(encoding="utf-8")
+        built = library.read_bytes()
+        file.write_text(before.replace(fault.text, fault.planted), encoding="utf-8")
+        try:
+            if fault.is_compiled and self.python("-c", BUILD).returncode:
+                return "does not apply: the kernel cannot be built with it", ""
+            code, printed = self.test(fault.ids)
+        except subprocess.TimeoutExpired:
+            return f"its tests take more than {PATIENCE_S} s", ""
+        finally:
+            file.write_text(before, encoding="utf-8")
+            if fault.is_compiled:
+                library.unlink()
+                library.write_bytes(built)
+        if code == PASSED:
+            return "survived", ""
+        by = re.search(r"^FAILED (\S+)", printed, re.MULTILINE)
+        return ("found", by[1]) if code == FAILED and by else (f"pytest ended with {code}", "")
+
+
+def _run(command: Sequence[str], folder: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command,
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(folder / "src")},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=PATIENCE_S,
+    )
+
+
+def _tell(outcome: Outcome) -> None:
+    print(outcome.row, flush=True)
+
+
+def main() -> int:
+    """Return 1 where a fault has survived, or could not be planted."""
+    parser = argparse.ArgumentParser(prog="python -m tests.planted", description=__doc__)
+    parser.add_argument("-n", type=int, default=2, help="copies that are tested side by side")
+    parser.add_argument("--only", nargs="+", metavar="NAME", help="faults, by name")
+    asked = parser.parse_args()
+    every = [
+        (fault, f"{Path(page).name}: {section_of(fault, page)}")
+        for page, faults in catalogue().items()
+        for fault in faults
+    ]
+    chosen = [one for one in every if asked.only is None or one[0].fault in asked.only]
+    if unknown := set(asked.only or ()) - {fault.fault for fault, _ in chosen}:
+        parser.error(f"no fault {', '.join(sorted(unknown))}")
+
+    with TemporaryDirectory(prefix="dwell-planted-") as folder:
+        copies = Queue[Copy]()
+        for number in range(min(asked.n, len(chosen))):
+            copies.put(Copy(Path(folder).resolve() / str(number)))
+
+        copy = copies.get()
+        code, printed = copy.test(dict.fromkeys(test for fault, _ in chosen for test in fault.ids))
+        copies.put(copy)
+        if code != PASSED:
+            print(f"{printed}\nwithout a fault, tests end with {code}", file=sys.stderr)
+            return 1
+
+        def plant(one: tuple[Fault, str]) -> Outcome:
+            copy, begun_s = copies.get(), time.monotonic()
+            try:
+                result, by = copy.plant(one[0])
+            finally:
+                copies.put(copy)
+            outcome = Outcome(*one, result, by, time.monotonic() - begun_s)
+            _tell(outcome)
+            return outcome
+
+        print("| fault | promise | result | by | s |\n|---|---|---|---|---|", flush=True)
+        with ThreadPoolExecutor(asked.n) as threads:
+            outcomes = list(threads.map(plant, chosen))
+    wrong = [outcome.fault.fault for outcome in outcomes if outcome.result != "found"]
+    print(f"\n{len(outcomes) - len(wrong)} of {len(outcomes)} found; not: {', '.join(wrong) or '-'}")
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
