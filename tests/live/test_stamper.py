@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import pytest
 
+from dwell.control import Probation
 from dwell.live.stamper import Stamper
 from dwell.live.transport.transport import Arrival
 from dwell.model import Problem
@@ -36,6 +37,18 @@ def test_the_stamper_beats_between_two_releases(
     since = [(at_ns - stamper._next_ns) % period_ns / period_ns for at_ns in beats[10:]]
     assert since == pytest.approx([0.5] * len(since), abs=0.01)
     assert max(b - a for a, b in pairwise(beats)) <= 1.5 * period_ns
+
+
+def test_both_copies_of_a_completion_are_one_cycle(
+    problem: Problem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = World(problem)
+    world.run(1_000)
+    completed: list[int] = []
+    monkeypatch.setattr(Probation, "healthy", lambda _, cycles=1: completed.append(cycles))
+    before = world.stamper.cycle
+    world.run(2_000)
+    assert world.stamper.cycle - before == pytest.approx(sum(completed), abs=1)
 
 
 def test_a_flood_of_frames_makes_two_cycles_a_period(problem: Problem) -> None:
