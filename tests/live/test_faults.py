@@ -527,6 +527,10 @@ def test_rule_8_a_state_that_comes_too_late_replaces_nothing(problem: Problem) -
     worker.receive(Arrival(key, b"3", encode(late)), world.network.now_ns)
     world.run(1_000)
     require_whole(world)
+    # Nor where it is handed to the worker itself.
+    worker.do_chore((late, b"3"))
+    world.run(1_000)
+    require_whole(world)
 
 
 def false_state(world: World, to: str, source: str, ahead: int, number: int) -> None:
