@@ -17,7 +17,7 @@ from dwell.live.messages import Completion, Order, Stamp, State, encode
 from dwell.live.stage import Message
 from dwell.live.transport.transport import Arrival
 from dwell.model import Problem
-from tests.live.memory_transport import Clock
+from tests.live.memory_transport import Clock, NetworkConditions
 from tests.live.small_world import MS, Counting, Passing, World, canonical, on, stateful
 
 EDGE = ("perception@E", "perception@E.shadow", "planning@E", "planning@E.shadow", "agent@E")
@@ -429,8 +429,12 @@ def test_rule_12_a_standby_takes_over(problem: Problem, who: str) -> None:
     world.run(1_000)
     assert not world.worker(f"{who}.1").active
     world.network.freeze(who)
-    world.run(1_000)
+    # Its last beat is up to a period old.
+    world.run(0.9 * problem.pipeline.period_ms)
+    assert not world.worker(f"{who}.1").active
+    world.run(1.7 * problem.pipeline.period_ms)
     assert world.worker(f"{who}.1").active
+    world.run(1_000)
     assert world.stamper.placement == "LOC"
     assert lost(world) <= 4
     world.network.thaw(who)
@@ -472,6 +476,18 @@ def test_rule_8_a_state_moves_without_losing_a_cycle(problem: Problem) -> None:
     world.run(2_000)
     assert world.stamper.placement == "SO"
     assert lost(world) == 0
+    require_whole(world)
+
+
+def test_rule_8_what_is_in_a_state_already_is_not_replayed(problem: Problem) -> None:
+    world = counting(problem, "LOC")
+    world.run(2_000)
+    # The state is asked for late, so that inputs of cycles that are in it have been forked.
+    late = NetworkConditions(delay_ns=300 * MS)
+    world.network.impair(late, "controller@E", "planning@R2", key="**/snapshot/**")
+    world.pin("SO")
+    world.run(3_000)
+    assert world.stamper.placement == "SO"
     require_whole(world)
 
 
@@ -597,6 +613,20 @@ def test_rule_8_no_false_checkpoint_keeps_a_good_one_from_being_used(
     assert world.stamper.placement == "LOC"
     cycle, count = world.arm.counts[-1]
     assert cycle + 1 - 2 * every <= count <= cycle + 1
+
+
+def test_rule_8_a_checkpoint_of_a_cycle_to_come_is_not_used(problem: Problem) -> None:
+    world = counting(problem, "SO")
+    world.run(3_000)
+    state = State(world.stamper.run, world.stamper.cycle + 1_000, "planning", "E")
+    key = world.keys.state("planning", "R2", "E")
+    world.worker("planning@R2").receive(
+        Arrival(key, b"1000000", encode(state)), world.network.now_ns
+    )
+    kill(*EDGE)(world)
+    world.run(1_000)
+    assert world.stamper.placement == "LOC"
+    assert world.arm.counts[-1][1] < 1_000
 
 
 @pytest.mark.parametrize("state_bytes", [100, 100_000])

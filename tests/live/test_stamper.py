@@ -51,6 +51,17 @@ def test_both_copies_of_a_completion_are_one_cycle(
     assert world.stamper.cycle - before == pytest.approx(sum(completed), abs=1)
 
 
+def test_a_beat_says_how_long_ago_its_sender_has_heard_others(problem: Problem) -> None:
+    world = World(problem)
+    world.run(1_000)
+    presence = world.stamper.presence
+    assert not presence.missing("SO", world.network.now_ns)
+    world.network.cut("R1", "E")
+    world.run(500)
+    # E is heard, and tells of the last that it has heard of R1.
+    assert presence.missing("SO", world.network.now_ns) == {"R1->E"}
+
+
 def test_a_flood_of_frames_makes_two_cycles_a_period(problem: Problem) -> None:
     cell = replace(problem, live=replace(problem.live, release="frames"))
     world = World(cell)
