@@ -78,7 +78,7 @@ def folded(text: str) -> str:
 
 
 def sections(page: str) -> dict[str, str]:
-    """Return the sections of a page, folded: by heading, or by the words in bold they begin with."""
+    """Return the sections of a page, folded, by their heading or the bold words they begin with."""
     parts: dict[str, list[str]] = {}
     name = ""
     for line in (ROOT / page).read_text(encoding="utf-8").splitlines():

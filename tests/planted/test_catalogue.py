@@ -1,4 +1,4 @@
-"""The catalogue of planted faults can be planted: a rearrangement keeps it alive (see README.md)."""
+"""Every fault of the catalogue can be planted: a rearrangement keeps it so (see README.md)."""
 
 from __future__ import annotations
 
