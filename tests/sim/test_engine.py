@@ -217,6 +217,9 @@ def test_an_order_takes_effect_after_its_delay_and_its_lead(
     ]
     assert run.windows["first_cycle"].to_list()[:3] == [0, first, first + 50]
     assert not run.windows["mixed"].any()
+    # A window's work is counted from its first cycle on.
+    used = run.windows["u_R"].to_list()
+    assert used[1] == pytest.approx(used[2])
 
 
 @pytest.mark.parametrize("min_dwell", [0, 1, 3, 10])
