@@ -68,15 +68,20 @@ class Copy:
         if not imported.is_relative_to(root):
             sys.exit(f"the tests would be of {imported}, and not of the copy in {root}")
 
-    def python(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+    def python(
+        self, *arguments: str, patience_s: float | None = PATIENCE_S
+    ) -> subprocess.CompletedProcess[str]:
         """Run Python with the copy's package."""
-        return _run([sys.executable, *arguments], self.root)
+        return _run([sys.executable, *arguments], self.root, patience_s)
 
-    def test(self, ids: Iterable[str], *options: str) -> tuple[int, list[str]]:
+    def test(
+        self, ids: Iterable[str], *options: str, patience_s: float | None = PATIENCE_S
+    ) -> tuple[int, list[str]]:
         """Run tests; returns how pytest ended, and which tests have failed."""
         # What Python has compiled is told from older sources by the second of their change; no two
         # runs begin within one.
-        done = self.python("-m", "pytest", "-p", "no:cacheprovider", "--tb=no", *options, *ids)
+        options = ("-p", "no:cacheprovider", "--tb=no", *options)
+        done = self.python("-m", "pytest", *options, *ids, patience_s=patience_s)
         return done.returncode, re.findall(r"^FAILED (.+?)(?: - .*)?$", done.stdout, re.MULTILINE)
 
     def plant(self, fault: Fault) -> tuple[str, str]:
@@ -105,7 +110,9 @@ class Copy:
         return f"pytest ended with {code}", ""
 
 
-def _run(command: Sequence[str], folder: Path) -> subprocess.CompletedProcess[str]:
+def _run(
+    command: Sequence[str], folder: Path, patience_s: float | None = None
+) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         command,
         cwd=folder,
@@ -113,7 +120,7 @@ def _run(command: Sequence[str], folder: Path) -> subprocess.CompletedProcess[st
         capture_output=True,
         text=True,
         check=False,
-        timeout=PATIENCE_S,
+        timeout=patience_s,
     )
 
 
@@ -151,7 +158,8 @@ def main() -> int:
         with ThreadPoolExecutor(asked.n) as threads:
             outcomes = list(threads.map(plant, chosen))
         # A test that fails anyway finds nothing.
-        _, failing = copies.get().test(sorted({one.by for one in outcomes if one.by}))
+        finders = sorted({one.by for one in outcomes if one.by})
+        failing = copies.get().test(finders, "-n", str(asked.n), patience_s=None)[1]
     found = [one for one in outcomes if one.result == "found" and one.by not in failing]
     wrong = [one.fault.fault for one in outcomes if one not in found]
     print(f"\n{len(found)} of {len(outcomes)} found; not: {', '.join(wrong) or 'none'}")
