@@ -105,15 +105,17 @@ class _Pair:
 
     def _reach(self, t_ns: int, value_ns: int, fastest: int, slowest: int) -> int:
         """Bring the interval and an upper bound at `t_ns` to the same instant, the later one."""
-        if not self.known:
+        if self.low_ns is None and self.high_ns is None:
             self.t_ns = t_ns
-        if t_ns < self.t_ns - MEMORY_NS:
-            if self._overshoot.behind(t_ns):
-                # No message is that late: the instant that was believed was false.
-                self._begin(t_ns)
-        else:
-            self._overshoot.advanced()
         if t_ns >= self.t_ns:
+            self._overshoot.advanced()
+            self._advance(t_ns)
+            return value_ns
+        if t_ns >= self.t_ns - MEMORY_NS:
+            self._overshoot.advanced()
+        elif self._overshoot.behind(t_ns):
+            # No message is that late: the instant that was believed was false.
+            self._begin(t_ns)
             self._advance(t_ns)
             return value_ns
         return value_ns + _grown(self.t_ns - t_ns, fastest, slowest)
@@ -209,19 +211,17 @@ class Offsets:
         """Take in one message between two nodes, each instant on its own node's clock."""
         if source == target or self._system_bound_ns is not None:
             return
-        if len({source, target} - self._known) + len(self._known) > MAX_NODES:
-            return
-        if source < target:
-            self._pair(source, target).at_most(sent_ns, arrived_ns - sent_ns)
-        else:
-            self._pair(target, source).at_least(arrived_ns, sent_ns - arrived_ns)
-
-    def _pair(self, one: str, other: str) -> _Pair:
-        pair = self._pairs.get((one, other))
+        ends = (source, target) if source < target else (target, source)
+        pair = self._pairs.get(ends)
         if pair is None:
-            pair = self._pairs[one, other] = _Pair()
-            self._known.update((one, other))
-        return pair
+            if len(self._known.union(ends)) > MAX_NODES:
+                return
+            pair = self._pairs[ends] = _Pair()
+            self._known.update(ends)
+        if source < target:
+            pair.at_most(sent_ns, arrived_ns - sent_ns)
+        else:
+            pair.at_least(arrived_ns, sent_ns - arrived_ns)
 
     @property
     def breaks(self) -> int:

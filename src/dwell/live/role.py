@@ -96,16 +96,13 @@ class RolePlace:
     seals: Seals | None = None
     complained: int = 0
     last_complaint: str = ""
+    #: Keys of its cell, and P.
+    keys: Keys = field(init=False)
+    period_ns: int = field(init=False)
 
-    @property
-    def keys(self) -> Keys:
-        """Keys of its cell."""
-        return Keys(self.problem.name)
-
-    @property
-    def period_ns(self) -> int:
-        """P."""
-        return round(self.problem.pipeline.period_ms * 1e6)
+    def __post_init__(self) -> None:
+        self.keys = Keys(self.problem.name)
+        self.period_ns = round(self.problem.pipeline.period_ms * 1e6)
 
     @property
     def patience_ns(self) -> int:
@@ -380,7 +377,7 @@ class Pulse:
                 f"{beat.who} has another cell file ({beat.cell}) than {place.who} "
                 f"({self._digest}); copy one file to all nodes"
             )
-        strange = any(heard.node not in self._nodes for heard in beat.heard)
+        strange = {heard.node for heard in beat.heard} - self._nodes
         if self._known.get(beat.who) != beat.node or strange:
             return f"{beat.who} on {beat.node} is no process of cell {place.problem.name!r}"
         return ""
