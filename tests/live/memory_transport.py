@@ -29,6 +29,7 @@ Reach: TypeAlias = Callable[[str, str, Lane, str], bool]
 
 #: How many messages wait for a link that stalls, or a process that is frozen.
 STALLED_MESSAGES = 64
+LONGEST_SLEEP_NS = round(LONGEST_SLEEP_S * 1e9)
 
 
 def matcher(expression: str) -> Callable[[str], bool]:
@@ -512,11 +513,11 @@ class _Drive:
 
     def receive(self, sample: Arrival) -> None:
         """Hand over a message, and see whether that makes something due sooner."""
-        due_ns = self._instant(
-            self.participant.receive(sample, self.end.clock.shown(self.network.now_ns))
-        )
-        if due_ns is not None and (self.due_ns is None or due_ns < self.due_ns):
-            self._arrange(due_ns)
+        wanted_ns = self.participant.receive(sample, self.end.clock.shown(self.network.now_ns))
+        if wanted_ns is not None:
+            due_ns = self._instant(wanted_ns)
+            if self.due_ns is None or due_ns < self.due_ns:
+                self._arrange(due_ns)
 
     def wake(self, due_ns: int | None) -> None:
         """Wake the participant unless it has asked for another instant since."""
@@ -526,16 +527,14 @@ class _Drive:
             self.end.wakes.append(lambda: self.wake(due_ns))
             return
         self.due_ns = None
-        due_ns = self._instant(self.participant.wake(self.end.clock.shown(self.network.now_ns)))
-        if due_ns is not None:
-            self._arrange(due_ns)
+        wanted_ns = self.participant.wake(self.end.clock.shown(self.network.now_ns))
+        if wanted_ns is not None:
+            self._arrange(self._instant(wanted_ns))
 
-    def _instant(self, wanted_ns: int | None) -> int | None:
+    def _instant(self, wanted_ns: int) -> int:
         """Return the network's instant for one of the node's clock; a host never sleeps long."""
-        if wanted_ns is None:
-            return None
         now_ns = self.network.now_ns
-        latest_ns = now_ns + round(LONGEST_SLEEP_S * 1e9)
+        latest_ns = now_ns + LONGEST_SLEEP_NS
         # A wake at the present instant would be followed by itself for ever.
         return min(max(self.end.clock.instant(wanted_ns), now_ns + 1), latest_ns)
 

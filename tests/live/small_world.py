@@ -269,6 +269,8 @@ class World:
         delay_ns = round(delay_ms * MS)
         self.network = Network(seed=seed, delay_ns=delay_ns, start_ns=MS, reach=reach)
         self.clocks = dict(clocks or {})
+        self.keys = Keys(problem.name)
+        self._roles = {role.who: role for role in roles(problem)}
         self.exec_ms = exec_ms
         self.stages = stages or {}
         self.book = MemoryBook()
@@ -283,14 +285,14 @@ class World:
         self.policy = policy
         self.seals = seals or {}
         self.recorder = MemoryRecorder(jobs=jobs)
-        for role in roles(problem):
+        for role in self._roles.values():
             if role.kind != "controller" or policy is not None:
                 self.start(role.who)
 
     def start(self, who: str) -> None:
         """Start a process, or start it again."""
         self.lives += 1
-        role = next(role for role in roles(self.problem) if role.who == who)
+        role = self._roles[who]
         clock = self.clocks.get(role.node, Clock())
         end = self.network.transport(who, role.node, clock=clock)
         subject = CONTROLLER if role.kind == "controller" else role.node
@@ -374,10 +376,6 @@ class World:
         before = self.cell.place.complained
         self.cell.receive(Arrival(key, data), self.network.now_ns)
         return self.cell.place.complained - before
-
-    @property
-    def keys(self) -> Keys:
-        return Keys(self.problem.name)
 
     @property
     def cell(self) -> ControlledCell:
