@@ -670,7 +670,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--delay-ms", type=float, help="of every message")
     parser.add_argument("--play", nargs="*", type=_read, help="play these faults instead")
     parser.add_argument("--faults", type=int, default=0, help="so many, seed after seed")
-    parser.add_argument("--out", type=Path, default=Path("seeded-faults"))
+    parser.add_argument("--out", type=Path, default=Path("build/seeded-faults"))
     asked = parser.parse_args(arguments)
     if asked.seed is None:
         rows = campaign(asked.out, asked.faults)

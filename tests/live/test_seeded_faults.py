@@ -39,8 +39,8 @@ from tests.live.seeded_faults import (
     table,
 )
 
-#: Seeds of a block; all blocks together bring more than 300 faults.
-BLOCK, BLOCKS = 30, 6
+#: Seeds of a block; all blocks together bring 300 faults.
+BLOCK, BLOCKS = 25, 7
 Patch = Callable[[pytest.MonkeyPatch], None]
 
 
