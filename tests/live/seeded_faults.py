@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
-from itertools import islice
+from itertools import islice, takewhile
 from pathlib import Path
 from random import Random
 from typing import Any, Self
@@ -31,6 +31,7 @@ from dwell.cellfile import from_document
 from dwell.control import Controller
 from dwell.errors import UnwritableError
 from dwell.live.controlled_cell import Recorder
+from dwell.live.failures import described
 from dwell.live.recording import RunRecorder
 from dwell.live.run_rows import Rows
 from dwell.live.stage import Actuator, Message, Stage
@@ -284,8 +285,9 @@ class FaultyWorld(World):
     def away(self, home: str | None) -> str:
         """Return what keeps it from being whole, watched, and where its controller wants it."""
         since_ns = self.network.now_ns - RECENT_PERIODS * self.period_ns
-        seen = [one for one in self.since(since_ns) if one.what == APPLY]
-        return away_from_home(self.problem, home, seen, self._status)
+        recent = takewhile(lambda one: one.at_ns >= since_ns, reversed(self.seen))
+        applied = [one for one in recent if one.what == APPLY]
+        return away_from_home(self.problem, home, applied[::-1], self._status)
 
     def _status(self) -> Mapping[str, Any]:
         end = self.network.end(f"controller@{self.problem.controller_node}")
@@ -295,15 +297,6 @@ class FaultyWorld(World):
     def period_ns(self) -> int:
         """P."""
         return round(self.problem.pipeline.period_ms * MS)
-
-    def since(self, at_ns: int) -> list[Seen]:
-        """Return the calls of the actuator from an instant on."""
-        count = 0
-        for one in reversed(self.seen):
-            if one.at_ns < at_ns:
-                break
-            count += 1
-        return self.seen[len(self.seen) - count :]
 
     # ------------------------------------------------------------------------------- faults
 
@@ -380,10 +373,10 @@ class FaultyWorld(World):
 
     def _starve(self, names: Sequence[str], draw: Random) -> Callable[[], None]:
         """Have processes wait for a CPU most of the time, each by itself."""
-        over: list[Callable[[], None]] = []
+        hungry = True
 
         def wait(who: str) -> None:
-            if over and over[0] is fed:
+            if not hungry:
                 return
             thaw = self._freeze([who])
             run_ns = self.network.now_ns + round(draw.uniform(*STARVED_MS) * MS)
@@ -396,7 +389,8 @@ class FaultyWorld(World):
             self.network.call_at(run_ns, go_on)
 
         def fed() -> None:
-            over.append(fed)
+            nonlocal hungry
+            hungry = False
 
         for who in names:
             wait(who)
@@ -462,13 +456,7 @@ def play(plan: Plan) -> Played:
     except MissingError as error:
         played.wrong.append(str(error))
     except Exception as error:  # a role that fails ends its process
-        frames = error.__traceback__
-        while frames is not None and frames.tb_next is not None:
-            frames = frames.tb_next
-        where = "" if frames is None else f"{frames.tb_frame.f_code.co_qualname}: "
-        played.wrong.append(
-            f"a process has ended by itself: {where}{type(error).__name__}: {error}"
-        )
+        played.wrong.append(f"a process has ended by itself: {described(error)}")
     played.wrong = [*world.wrong, *played.wrong, *played.outcome.wrong, *played.outcome.late]
     played.cycles = world.judge.counts["stamped"]
     heard = world.seen, sorted(world.judge.counts.items()), world.judge.stamped_ns
@@ -508,14 +496,13 @@ def _play(world: FaultyWorld, played: Played) -> None:
     _wait(world, "the whole cell at home after it", home, RECOVERED_S)
     outcome.back_ns = network.now_ns
     network.advance(network.now_ns + 5 * world.period_ns)
-    seen = world.since(outcome.begin_ns - 10 * world.period_ns)
-    weigh(problem, faults, seen, outcome)
+    weigh(problem, faults, world.seen, outcome)
     recovered(judge, outcome, home)
     outcome.late += beyond(outcome)
     if len(faults) == 1:
         outcome.late += moved_in_vain(judge, faults[0], term)
     if not any(fault.how in ("jump", "drift") for fault in faults):
-        outcome.late += too_old(problem, seen, judge.stamped_ns)
+        outcome.late += too_old(problem, world.seen, judge.stamped_ns)
     world.wrong += judge.migrations()
     played.wrong += _wrong_record(world)
 

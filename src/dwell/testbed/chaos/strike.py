@@ -177,7 +177,7 @@ def weigh(
     Parameters
     ----------
     seen : sequence of Seen
-        Calls of the actuator from ten periods before the first on.
+        Calls of the actuator, from ten periods before the first fault on at least.
     outcome : Outcome
         With its instants and the machine's stall.
     """
