@@ -16,7 +16,7 @@ COMPILE := $(UV) pip compile --quiet --python $(BIN)/python --universal --python
 	--generate-hashes --custom-compile-command "make lock" $(if $(UPGRADE),--upgrade)
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test check bench paper deadlines planted faults chaos soak fuzz audit sbom lock clean again
+.PHONY: help env demo test check bench paper deadlines planted faults chaos soak fuzz audit sbom lock clean again seeds
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' Makefile
@@ -91,6 +91,9 @@ faults: env ## Kill, freeze and cut real processes, 60 times each way; goes on w
 
 chaos: env ## Half an hour of chaos on a real cell, judged from the wire (ARGS="--minutes 2 --seed 7")
 	$(BIN)/python -m dwell testbed chaos --minutes 30 --faults 1000 $(ARGS)
+
+seeds: env ## 1,000 faults by seed on cells in memory; goes on where it was stopped (ARGS="--faults 100000")
+	$(BIN)/python -m tests.live.seeded_faults --faults 1000 $(ARGS)
 
 soak: env ## An hour of a real cell at 25 Hz: memory, files, threads (ARGS="--minutes 10")
 	$(BIN)/python -m tests.live.soak $(ARGS)

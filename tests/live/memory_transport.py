@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import count
@@ -21,6 +21,7 @@ from typing import Protocol, TypeAlias
 import zenoh
 
 from dwell.errors import LiveError
+from dwell.live.hosting import LONGEST_SLEEP_S
 from dwell.live.transport.transport import Arrival, Lane, Receive, require_expression, require_key
 
 #: Says who may hear whom: names of sender and receiver, lane, key.
@@ -28,6 +29,7 @@ Reach: TypeAlias = Callable[[str, str, Lane, str], bool]
 
 #: How many messages wait for a link that stalls, or a process that is frozen.
 STALLED_MESSAGES = 64
+LONGEST_SLEEP_NS = round(LONGEST_SLEEP_S * 1e9)
 
 
 def matcher(expression: str) -> Callable[[str], bool]:
@@ -45,7 +47,7 @@ class Participant(Protocol):
         ...
 
     def receive(self, sample: Arrival, now_ns: int) -> int | None:
-        """Take a message."""
+        """Take a message; returns an instant at which something is due since, if that is so."""
         ...
 
     def wake(self, now_ns: int) -> int | None:
@@ -70,10 +72,14 @@ class Clock:
 
     def shown(self, at_ns: int) -> int:
         """What it shows at an instant of the network."""
+        if not self.drift_ppm:
+            return at_ns + self.offset_ns
         return at_ns + self.offset_ns + round(at_ns * self.drift_ppm * 1e-6)
 
     def instant(self, shown_ns: int) -> int:
         """First instant of the network at which it shows at least that."""
+        if not self.drift_ppm:
+            return shown_ns - self.offset_ns
         guess = round((shown_ns - self.offset_ns) / (1.0 + self.drift_ppm * 1e-6))
         while self.shown(guess) < shown_ns:
             guess += 1
@@ -93,6 +99,8 @@ class NetworkConditions:
     loss, duplication, reordering : float
         Probabilities: that a message is lost, that it arrives twice, that it is held back by
         `reorder_ns` and others may overtake it.
+    rate_mbps : float
+        Of each path of a lane: a message begins its transmission when the one before has ended.
     stalled : bool
         Whether messages wait until this is lifted; the oldest beyond `waiting` are dropped.
     """
@@ -102,19 +110,9 @@ class NetworkConditions:
     duplication: float = 0.0
     reordering: float = 0.0
     reorder_ns: int = 1_000_000
+    rate_mbps: float = inf
     stalled: bool = False
     waiting: int = STALLED_MESSAGES
-
-
-@dataclass(frozen=True, slots=True)
-class Delivery:
-    """One message that arrived, as `Network.log` keeps it."""
-
-    at_ns: int
-    source: str
-    target: str
-    lane: Lane
-    key: str
 
 
 @dataclass(eq=False, slots=True)
@@ -146,6 +144,8 @@ class _Path:
 
     random: Random
     last_ns: int = 0
+    #: When the last transmission at a limited rate ends.
+    free_ns: int = 0
     held: deque[_Message] = field(default_factory=deque)
 
 
@@ -159,7 +159,9 @@ class MemoryTransport:
         self.closed = False
         self.frozen = False
         self._network = network
-        self.subscriptions: list[tuple[Callable[[str], bool], Receive]] = []
+        self._subscriptions: list[tuple[Callable[[str], bool], Receive]] = []
+        #: By key: who is called with a message under it.
+        self._receivers: dict[str, tuple[Receive, ...]] = {}
         #: Messages, and then wakes, that are put off until it thaws.
         self.inbox: deque[_Message] = deque(maxlen=STALLED_MESSAGES)
         self.wakes: list[Callable[[], None]] = []
@@ -181,13 +183,24 @@ class MemoryTransport:
         """Have `receive` called with every message under a key expression (``*``, ``**``)."""
         matches = matcher(key)
         if not self.closed:
-            self.subscriptions.append((matches, receive))
+            self._subscriptions.append((matches, receive))
+            self._receivers.clear()
+            self._network.rewire()
+
+    def receivers(self, key: str) -> tuple[Receive, ...]:
+        """Return what was subscribed with key expressions that a key is under, in order."""
+        found = self._receivers.get(key)
+        if found is None:
+            found = tuple(receive for matches, receive in self._subscriptions if matches(key))
+            self._receivers[key] = found
+        return found
 
     def close(self) -> None:
         """Send and deliver nothing more; safe to call twice."""
         if not self.closed:
             self.closed = True
-            self.subscriptions.clear()
+            self._subscriptions.clear()
+            self._receivers.clear()
             self.inbox.clear()
             self.wakes.clear()
             self._network.forget(self)
@@ -220,10 +233,12 @@ class Network:
         self.now_ns = start_ns
         self.seed = seed
         self.delay_ns = delay_ns
-        self.reach = reach
-        #: What was delivered, in order; empty it when it grows too long.
-        self.log: list[Delivery] = []
+        #: Called with every message that is put, at its instant.
+        self.taps: list[Receive] = []
         self.lost = 0
+        self._reach = reach
+        #: By sender, lane and key: who hears it, and the path there.
+        self._audiences: dict[tuple[str, Lane, str], list[tuple[MemoryTransport, _Path]]] = {}
         self._transports: dict[str, MemoryTransport] = {}
         self._rules: list[_Rule] = []
         self._paths: dict[tuple[str, str, Lane], _Path] = {}
@@ -257,10 +272,20 @@ class Network:
         self._transports[who] = end
         return end
 
+    @property
+    def reach(self) -> Reach | None:
+        """Says who may hear whom; None where everybody hears everybody."""
+        return self._reach
+
+    @reach.setter
+    def reach(self, reach: Reach | None) -> None:
+        self._reach = reach
+        self.rewire()
+
     def attach(self, end: MemoryTransport, participant: Participant) -> None:
         """Drive a participant: hand it what it subscribes to, and wake it when it wants.
 
-        It is woken once at the present instant, and after every message, as a real host does.
+        It is woken once at the present instant, then when it has asked for it, as by a real host.
         """
         drive = _Drive(self, end, participant)
         for key in participant.subscriptions():
@@ -346,6 +371,10 @@ class Network:
         for wake in wakes:
             wake()
 
+    def end(self, who: str) -> MemoryTransport | None:
+        """Return the end of a process; None where it is dead."""
+        return self._transports.get(who)
+
     def kill(self, who: str) -> None:
         """End a process; what is on the way to it is lost, what it sent is not."""
         self._transports[who].close()
@@ -354,16 +383,17 @@ class Network:
 
     def advance(self, until_ns: int) -> None:
         """Let everything happen that is due by an instant, which then is the present one."""
-        while self._events and self._events[0][0] <= until_ns:
-            self.step()
+        events = self._events
+        while events and events[0][0] <= until_ns:
+            self.now_ns, _, call = heapq.heappop(events)
+            call()
         self.now_ns = max(self.now_ns, until_ns)
 
     def step(self) -> bool:
         """Let the next thing happen; return whether there was one."""
         if not self._events:
             return False
-        at_ns, _, call = heapq.heappop(self._events)
-        self.now_ns = max(self.now_ns, at_ns)
+        self.now_ns, _, call = heapq.heappop(self._events)
         call()
         return True
 
@@ -376,17 +406,32 @@ class Network:
 
     def send(self, source: MemoryTransport, sample: Arrival, lane: Lane) -> None:
         """Send a message to everybody who subscribed to it, the sender left out."""
-        for target in list(self._transports.values()):
-            if target is source or not any(hit(sample.key) for hit, _ in target.subscriptions):
-                continue
-            if self.reach and not self.reach(source.who, target.who, lane, sample.key):
-                continue
-            path = self._path(source.who, target.who, lane)
+        for tap in self.taps:
+            tap(sample)
+        key = source.who, lane, sample.key
+        audience = self._audiences.get(key)
+        if audience is None:
+            audience = self._audiences[key] = list(self._audience(*key))
+        for target, path in audience:
             self._forward(path, _Message(source, target, lane, sample))
+
+    def _audience(
+        self, source: str, lane: Lane, key: str
+    ) -> Iterator[tuple[MemoryTransport, _Path]]:
+        for target in self._transports.values():
+            if target.who == source or not target.receivers(key):
+                continue
+            if self.reach is None or self.reach(source, target.who, lane, key):
+                yield target, self._path(source, target.who, lane)
+
+    def rewire(self) -> None:
+        """Look anew who hears what: somebody has come, gone, or subscribed."""
+        self._audiences.clear()
 
     def forget(self, end: MemoryTransport) -> None:
         """Take a closed transport out."""
         del self._transports[end.who]
+        self.rewire()
         for path in self._paths.values():
             path.held = deque(message for message in path.held if message.target is not end)
 
@@ -399,6 +444,10 @@ class Network:
 
     def _forward(self, path: _Path, message: _Message) -> None:
         """Apply every condition to a message and put what is left of it on the agenda."""
+        if not self._rules:
+            path.last_ns = max(self.now_ns + self.delay_ns, path.last_ns)
+            self.call_at(path.last_ns, lambda: self._arrive(message))
+            return
         random, copies, delay_ns, overtaken_ns = path.random, 1, self.delay_ns, 0
         for rule in self._rules:
             if not rule.holds(message.source, message.target, message.sample.key):
@@ -411,6 +460,10 @@ class Network:
             lost, twice, later = random.random(), random.random(), random.random()
             extra = conditions.delay_ns
             delay_ns += extra if isinstance(extra, int) else extra(random)
+            if conditions.rate_mbps < inf:
+                took_ns = round(8e3 * len(message.sample.payload) / conditions.rate_mbps)
+                path.free_ns = max(path.free_ns, self.now_ns) + took_ns
+                delay_ns += path.free_ns - self.now_ns
             if lost < conditions.loss:
                 copies = 0
             elif twice < conditions.duplication:
@@ -443,11 +496,8 @@ class Network:
             target.inbox.append(message)
         else:
             sample = message.sample
-            self.log.append(
-                Delivery(self.now_ns, message.source.who, target.who, message.lane, sample.key)
-            )
-            for hit, receive in list(target.subscriptions):
-                if hit(sample.key) and not target.closed:
+            for receive in target.receivers(sample.key):
+                if not target.closed:
                     receive(sample)
 
 
@@ -462,28 +512,33 @@ class _Drive:
         self.due_ns: int | None = None
 
     def receive(self, sample: Arrival) -> None:
-        """Hand over a message, and see what that makes due."""
-        self.participant.receive(sample, self.end.now_ns)
-        self._arrange()
+        """Hand over a message, and see whether that makes something due sooner."""
+        wanted_ns = self.participant.receive(sample, self.end.clock.shown(self.network.now_ns))
+        if wanted_ns is not None:
+            due_ns = self._instant(wanted_ns)
+            if self.due_ns is None or due_ns < self.due_ns:
+                self._arrange(due_ns)
 
     def wake(self, due_ns: int | None) -> None:
         """Wake the participant unless it has asked for another instant since."""
-        if self.end.closed or (due_ns is not None and due_ns != self.due_ns):
+        if self.end.closed or due_ns != self.due_ns:
             return
         if self.end.frozen:
             self.end.wakes.append(lambda: self.wake(due_ns))
             return
-        self._arrange()
+        self.due_ns = None
+        wanted_ns = self.participant.wake(self.end.clock.shown(self.network.now_ns))
+        if wanted_ns is not None:
+            self._arrange(self._instant(wanted_ns))
 
-    def _arrange(self) -> None:
-        if self.end.closed:
-            return
-        wanted = self.participant.wake(self.end.now_ns)
-        if wanted is None:
-            self.due_ns = None
-            return
+    def _instant(self, wanted_ns: int) -> int:
+        """Return the network's instant for one of the node's clock; a host never sleeps long."""
+        now_ns = self.network.now_ns
+        latest_ns = now_ns + LONGEST_SLEEP_NS
         # A wake at the present instant would be followed by itself for ever.
-        due_ns = max(self.end.clock.instant(wanted), self.network.now_ns + 1)
-        if due_ns != self.due_ns:
+        return min(max(self.end.clock.instant(wanted_ns), now_ns + 1), latest_ns)
+
+    def _arrange(self, due_ns: int) -> None:
+        if not self.end.closed:
             self.due_ns = due_ns
             self.network.call_at(due_ns, lambda: self.wake(due_ns))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence, Set
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -27,6 +27,36 @@ from dwell.testbed.chaos.strike import strike as strike_by
 from dwell.testbed.loopback import Loopback, on_this_machine
 
 
+def wrong_record(
+    cycles: Sequence[int],
+    windows: Sequence[int],
+    ordered: Sequence[int],
+    told: Iterable[int],
+    applied: Set[int],
+) -> list[str]:
+    """Return what is wrong with the record of a run.
+
+    Parameters
+    ----------
+    ordered : sequence of int
+        Windows after which the controller has migrated.
+    told, applied : of int
+        Cycles that were actuated, by the record and by the actuator.
+    """
+    found = []
+    for name, numbers in (("number", cycles), ("window", windows)):
+        if any(later <= before for before, later in pairwise(numbers)):
+            found.append(f"{name} does not grow")
+    found += [
+        f"migrations after windows {before} and {later}"
+        for before, later in pairwise(ordered)
+        if later - before < MIN_DWELL + 1
+    ]
+    if unknown := set(told) - applied:
+        found.append(f"actuated by the record, not by the actuator: {sorted(unknown)[:5]}")
+    return found
+
+
 class RealCell(Harness):
     """A cell on this machine whose controller wants to be at one place; `more` of its file."""
 
@@ -49,27 +79,18 @@ class RealCell(Harness):
         if len(self.runs) != 1:
             return [f"{len(self.runs)} runs instead of one"]
         run = dwell.open_run(self.runs[0])
-        found = []
-        for table, column in ((run.cycles, "number"), (run.windows, "window")):
-            numbers = table[column].to_list()
-            if any(later <= before for before, later in pairwise(numbers)):
-                found.append(f"{column} does not grow")
         ordered = run.decisions.filter(
             run.decisions["migrated"] & (run.decisions["reason"] != "guard")
         )
-        windows = ordered["window"].to_list()
-        found += [
-            f"migrations after windows {before} and {later}"
-            for before, later in pairwise(windows)
-            if later - before < MIN_DWELL + 1
-        ]
-        self.actuations.look()
-        applied = {seen.cycle for seen in self.actuations.applied}
         told = run.cycles.filter(run.cycles["actuated"].cast(bool, strict=False))
-        unknown = set(told["number"].to_list()) - applied
-        if unknown:
-            found.append(f"actuated by the record, not by the actuator: {sorted(unknown)[:5]}")
-        return found
+        self.actuations.look()
+        return wrong_record(
+            run.cycles["number"].to_list(),
+            run.windows["window"].to_list(),
+            ordered["window"].to_list(),
+            told["number"].to_list(),
+            {seen.cycle for seen in self.actuations.applied},
+        )
 
     def too_old(self) -> list[str]:
         """Return what was applied when it was too old."""

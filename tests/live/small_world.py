@@ -10,20 +10,20 @@ from typing import Any
 import dwell
 from dwell.control import Controller
 from dwell.live.agent import Agent, CpuCount
-from dwell.live.controlled_cell import ControlledCell
+from dwell.live.controlled_cell import ControlledCell, Recorder
 from dwell.live.keys import CONTROLLER, Keys
 from dwell.live.messages import Ask, Order, encode
 from dwell.live.recording import RunRecorder
 from dwell.live.role import RolePlace
 from dwell.live.run_rows import Resume, Rows, columns_of
 from dwell.live.sink import Sink
-from dwell.live.stage import Message
+from dwell.live.stage import Actuator, Message, Stage
 from dwell.live.stamper import Stamper, StamperState
 from dwell.live.supervision import Supervisor
 from dwell.live.transport.transport import Arrival
 from dwell.live.trust.signing import Seals
-from dwell.live.wiring import roles, wire
-from dwell.live.worker import Worker
+from dwell.live.wiring import Role, roles, wire
+from dwell.live.worker import Job, Worker
 from dwell.model import Host, Problem, QoS
 from dwell.policies import MinimalPolicy
 from tests.live.memory_transport import Clock, MemoryTransport, Network, NetworkConditions
@@ -170,44 +170,63 @@ class MemoryRecorder:
 
 
 class Bench:
-    """Drives a worker: runs its jobs for as long as they take."""
+    """Drives a worker: runs its jobs for as long as they take.
+
+    Its beats are woken for; what the thread of its jobs waits for, it waits for by itself.
+    """
 
     def __init__(
         self, network: Network, end: MemoryTransport, worker: Worker, exec_ns: int
     ) -> None:
         self.network, self.end, self.worker, self.exec_ns = network, end, worker, exec_ns
         worker.started = True
+        #: Instant of the network at which it looks next whether there is something to do.
+        self._look_ns = -1
 
     def subscriptions(self) -> Iterable[str]:
         return self.worker.subscriptions()
 
     def receive(self, sample: Arrival, now_ns: int) -> None:
         self.worker.receive(sample, now_ns)
-        self.work(now_ns)
+        if self.worker.has_work:
+            self.work()
 
     def wake(self, now_ns: int) -> int:
-        self.work(now_ns)
         return self.worker.wake(now_ns)
 
-    def work(self, now_ns: int) -> None:
-        while (chore := self.worker.next_chore()) is not None:
-            self.worker.do_chore(chore)
-        job = self.worker.next_job(now_ns)
-        if job is None:
+    def work(self) -> None:
+        if self.end.closed:
             return
-        output, age = self.worker.run(job, now_ns)
+        if self.end.frozen:
+            self.end.wakes.append(self.work)
+            return
+        worker, now_ns = self.worker, self.end.now_ns
+        while (chore := worker.next_chore()) is not None:
+            worker.do_chore(chore)
+        job = worker.next_job(now_ns)
+        if job is not None:
+            output, age = worker.run(job, now_ns)
+            ended_ns = self.network.now_ns + self.exec_ns
+            self.network.call_at(ended_ns, lambda: self._finish(job, output, now_ns, age))
+        elif worker.has_work:
+            rest_ns = max(round(worker.rest_s(now_ns) * 1e9), 1)
+            look_ns = self.network.now_ns + rest_ns
+            if look_ns != self._look_ns:
+                self._look_ns = look_ns
+                self.network.call_at(look_ns, lambda: self._look(look_ns))
 
-        def finish() -> None:
-            if self.end.closed:
-                return
-            if self.end.frozen:
-                self.end.wakes.append(finish)
-                return
-            ended_ns = self.end.now_ns
-            self.worker.finish(job, output, now_ns, ended_ns, age)
-            self.work(ended_ns)
+    def _look(self, look_ns: int) -> None:
+        if look_ns == self._look_ns:
+            self.work()
 
-        self.network.call_at(self.network.now_ns + self.exec_ns, finish)
+    def _finish(self, job: Job, output: Message | None, started_ns: int, age: int) -> None:
+        if self.end.closed:
+            return
+        if self.end.frozen:
+            self.end.wakes.append(lambda: self._finish(job, output, started_ns, age))
+            return
+        self.worker.finish(job, output, started_ns, self.end.now_ns, age)
+        self.work()
 
 
 class World:
@@ -222,6 +241,8 @@ class World:
         Of every message.
     seals : mapping of str to Seals, optional
         By subject: each node and the controller.
+    seed : int
+        Seed of what the network draws.
     """
 
     def __init__(
@@ -235,6 +256,7 @@ class World:
         policy: str | MinimalPolicy | None = None,
         seals: Mapping[str, Seals] | None = None,
         jobs: bool = False,
+        seed: int = 0,
     ) -> None:
         hosts = {
             node: Host("127.0.0.1", 10_000 + 1_000 * i)
@@ -244,8 +266,11 @@ class World:
         self.problem = problem = replace(problem, live=live)
         # Nobody hears anybody that it would have no connection to.
         reach = wire(problem).hears
-        self.network = Network(delay_ns=round(delay_ms * MS), start_ns=MS, reach=reach)
-        self.clocks = clocks or {}
+        delay_ns = round(delay_ms * MS)
+        self.network = Network(seed=seed, delay_ns=delay_ns, start_ns=MS, reach=reach)
+        self.clocks = dict(clocks or {})
+        self.keys = Keys(problem.name)
+        self._roles = {role.who: role for role in roles(problem)}
         self.exec_ms = exec_ms
         self.stages = stages or {}
         self.book = MemoryBook()
@@ -260,14 +285,14 @@ class World:
         self.policy = policy
         self.seals = seals or {}
         self.recorder = MemoryRecorder(jobs=jobs)
-        for role in roles(problem):
+        for role in self._roles.values():
             if role.kind != "controller" or policy is not None:
                 self.start(role.who)
 
     def start(self, who: str) -> None:
         """Start a process, or start it again."""
         self.lives += 1
-        role = next(role for role in roles(self.problem) if role.who == who)
+        role = self._roles[who]
         clock = self.clocks.get(role.node, Clock())
         end = self.network.transport(who, role.node, clock=clock)
         subject = CONTROLLER if role.kind == "controller" else role.node
@@ -277,22 +302,40 @@ class World:
         if role.kind == "stamper":
             made = Stamper(place, self.book, self.run_id, end.now_ns)
         elif role.kind == "sink":
-            made = Sink(place, role.task, self.arms[role.task], self.highest[role.task])
+            made = Sink(place, role.task, self.actuator_of(role), self.highest[role.task])
         elif role.kind == "agent":
             made = Quiet(place)
         elif role.kind == "controller":
             controller = Controller(self.problem, self.policy)
-            made = ControlledCell(place, controller, self.recorder, f"c{self.lives}", end.now_ns)
+            recorder = self.recorder_of(controller)
+            made = ControlledCell(place, controller, recorder, f"c{self.lives}", end.now_ns)
         else:
-            stage = self.stages.get(role.task, Passing)(role.task)
+            stage = self.stage_of(role)
             standby = f"{role.task}@{role.node}" if role.kind == "standby" else ""
             worker = Worker(
                 place, role.task, stage, shadow=role.kind == "shadow", stands_by=standby
             )
-            exec_ns = round(self.exec_ms[role.task] * MS)
-            made = Bench(self.network, end, worker, exec_ns)
+            # All that it reads is the network's: a run is the same whatever the machine does.
+            worker.cpu_clock = lambda: self.network.now_ns
+            made = Bench(self.network, end, worker, self.exec_ns_of(role))
         self.roles[who] = made
         self.network.attach(end, made)
+
+    def stage_of(self, role: Role) -> Stage:
+        """Make the stage of a worker."""
+        return self.stages.get(role.task, Passing)(role.task)
+
+    def exec_ns_of(self, role: Role) -> int:
+        """How long a job of a worker takes."""
+        return round(self.exec_ms[role.task] * MS)
+
+    def actuator_of(self, role: Role) -> Actuator:
+        """Make the actuator of a sink."""
+        return self.arms[role.task]
+
+    def recorder_of(self, controller: Controller) -> Recorder:
+        """Make what keeps the runs of a controller."""
+        return self.recorder
 
     def kill(self, who: str) -> None:
         """End a process."""
@@ -335,10 +378,6 @@ class World:
         return self.cell.place.complained - before
 
     @property
-    def keys(self) -> Keys:
-        return Keys(self.problem.name)
-
-    @property
     def cell(self) -> ControlledCell:
         """What the controller's process runs now."""
         role = self.roles[f"controller@{self.problem.controller_node}"]
@@ -348,7 +387,8 @@ class World:
     @property
     def status(self) -> dict[str, Any]:
         """What the controller says of the cell."""
-        return self.cell.status(self.network.now_ns)
+        clock = self.clocks.get(self.problem.controller_node, Clock())
+        return self.cell.status(clock.shown(self.network.now_ns))
 
     @property
     def stamper(self) -> Stamper:
@@ -390,13 +430,10 @@ class Recorded(World):
         self.log: list[str] = []
         super().__init__(problem, policy="LOC")
 
-    def start(self, who: str) -> None:
-        if who.startswith("controller"):
-            controller = Controller(self.problem, self.policy)
-            kept = self.out, self.problem, controller, self.log.append
-            self.kept = RunRecorder(*kept, **self.recording)
-            self.recorder = self.kept  # type: ignore[assignment]
-        super().start(who)
+    def recorder_of(self, controller: Controller) -> Recorder:
+        kept = self.out, self.problem, controller, self.log.append
+        self.kept = RunRecorder(*kept, **self.recording)
+        return self.kept
 
     @property
     def windows(self) -> int:
@@ -413,8 +450,19 @@ class Recorded(World):
         return folder
 
 
+class IdleCpu(CpuCount):
+    """A CPU that does nothing."""
+
+    def __init__(self) -> None:
+        pass
+
+    def busy_ns(self) -> int:
+        return 0
+
+
 class Quiet(Agent):
     """An agent without processes to look after."""
 
     def __init__(self, place: RolePlace) -> None:
-        super().__init__(place, Supervisor(None, print), CpuCount())  # type: ignore[arg-type]
+        super().__init__(place, Supervisor(None, print), IdleCpu())  # type: ignore[arg-type]
+        self.cpu_clock = lambda: 0

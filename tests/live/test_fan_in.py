@@ -36,7 +36,7 @@ def world_of(problem: Problem, clocks: dict[str, Clock] | None = None, **more: A
 @pytest.mark.parametrize("offset_s", [0, 777])
 def test_both_sources_begin_a_cycle_together(problem: Problem, offset_s: int) -> None:
     world = world_of(problem, {"R2": Clock(offset_s * 1_000 * MS, 30.0)})
-    world.run(3_000)
+    world.run(3_010)
     for arm in world.arms.values():
         cycles = [cycle for cycle, _ in arm.applied]
         assert len(cycles) > 50

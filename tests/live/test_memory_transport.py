@@ -174,6 +174,30 @@ def test_only_those_within_reach_hear() -> None:
     assert far.payloads == []
 
 
+def test_a_lane_that_is_too_slow_is_later_with_every_message() -> None:
+    network = Network()
+    listener, sender = Listener(network, "b@E"), network.transport("a@R1")
+    slow = network.impair(NetworkConditions(rate_mbps=8.0), "R1", "E", key="image")
+    for _ in range(3):
+        sender.put("image", bytes(5_000), lane="images")
+        sender.put("k", b"small")
+    network.advance(14 * MS)
+    assert [at_ms for at_ms, payload in listener.heard if payload == b"small"] == [0.0, 0.0, 0.0]
+    assert [at_ms for at_ms, payload in listener.heard if payload != b"small"] == [5.0, 10.0]
+    network.heal(slow)
+    network.advance(20 * MS)
+    assert listener.heard[-1][0] == 15.0
+
+
+def test_a_tap_hears_all_that_is_put_whoever_else_does() -> None:
+    network, heard = Network(delay_ns=MS), list[tuple[int, str]]()
+    network.taps.append(lambda sample: heard.append((network.now_ns, sample.key)))
+    network.cut()
+    sender = network.transport("a@R1")
+    sender.put("k", b"lost")
+    assert heard == [(0, "k")]
+
+
 class Metronome:
     """Puts a beat every period of its own clock, and counts what it hears."""
 

@@ -102,7 +102,8 @@ def test_a_command_that_the_actuator_refuses_is_not_applied(refused: World, arm:
     assert all(cycles[place][1:] == (True, False) for place in told)
     # Every placement ends there: neither the guard nor the policy has a reason to move.
     rates = columns(refused, "windows", "violation_rate", "seen_violation_rate")
-    assert max(rate for rate, _ in rates) > 0.9
+    # 29 cycles in a row make up most of some window of 20.
+    assert max(rate for rate, _ in rates) > 0.7
     assert max(seen for _, seen in rates) == 0.0
     assert not refused.stamper.moves
 

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from dwell.live.hosting import work
-from dwell.live.messages import Beat, decode
+from dwell.live.messages import Beat, Header, Stamp, decode, encode
 from dwell.live.role import RolePlace
+from dwell.live.routing import STAMPER
 from dwell.live.stage import Message
-from dwell.live.transport.transport import Receive
+from dwell.live.transport.transport import Arrival, Receive
 from dwell.live.worker import Worker
 from dwell.model import Problem
 from tests.live.small_world import MS, Bench, Passing, World, canonical
@@ -194,3 +195,15 @@ def test_frames_begin_cycles(problem: Problem, stage: Passing) -> None:
 
 
 # ---------------------------------------------------------------------------- the agent
+
+
+def test_a_source_at_work_is_woken_for_its_beats_only(problem: Problem) -> None:
+    world = World(problem)
+    world.run(1_000)
+    worker, stamper, now_ns = world.worker("sensing@R1"), world.stamper, world.network.now_ns
+    worker.busy_since_ns = now_ns
+    stamp = Stamp(stamper.run, stamper.cycle + 1, stamper.term, stamper.placement, now_ns)
+    key = world.keys.inputs("sensing", "R1")
+    head = encode(Header(stamp, STAMPER, "R1", "none"))
+    worker.receive(Arrival(key, b"", head), now_ns)
+    assert worker.wake(now_ns + MS) > now_ns + MS

@@ -121,6 +121,7 @@ class Agent:
     ) -> None:
         self.place, self.supervisor = place, supervisor
         self._cpu, self._accelerator = cpu, accelerator
+        self.cpu_clock: Callable[[], int] = time.process_time_ns
         # No guard waits for it: it carries nothing that a cycle needs.
         self.pulse = Pulse(place, self._state, every=AGENT_BEAT)
         self._relays = place.node == place.problem.relay_node
@@ -223,6 +224,6 @@ class Agent:
         busy_ns = self._cpu.busy_ns()
         used = -1.0 if self._accelerator is None else self._accelerator.value()
         spent = busy_ns, self._spent["own"], self._spent["shadow"]
-        each = *processes.items(), (place.who, time.process_time_ns())
+        each = *processes.items(), (place.who, self.cpu_clock())
         load = Load(place.node, place.life, now_ns, *spent, used, each)
         place.put_twice(place.keys.load(place.node), load)

@@ -14,6 +14,7 @@ class Keys:
 
     def __init__(self, cell: str) -> None:
         self.root = f"dwell/{cell}"
+        self._below, self._detoured = f"{self.root}/", f"{self.root}/detour/"
 
     def inputs(self, task: str, node: str, kind: str = MAIN) -> str:
         """Inputs of a task's worker; of its shadow worker where `kind` is `SHADOW`."""
@@ -89,11 +90,11 @@ class Keys:
 
     def came_directly(self, key: str) -> bool:
         """Whether a message did not come over the detour."""
-        return not key.startswith(f"{self.root}/detour/")
+        return not key.startswith(self._detoured)
 
     def word(self, key: str) -> str:
         """Return the first word of a key, whichever way its message came: its kind."""
-        return key.removeprefix(f"{self.root}/").removeprefix("detour/").partition("/")[0]
+        return key.removeprefix(self._below).removeprefix("detour/").partition("/")[0]
 
     def carried(self) -> str:
         """All copies of a while, together."""

@@ -26,6 +26,7 @@ from typing import NamedTuple, TypeAlias
 
 from dwell.live.continuity import OvershootDetector
 from dwell.live.messages import Beat
+from dwell.model.instants import NEVER_NS
 
 #: Bound of an instant that could be anything.
 UNBOUNDED_NS = 1 << 62
@@ -40,6 +41,8 @@ ANCHOR_NS = 2_000_000_000
 
 #: Nodes whose clocks are compared; what names more of them is none of the cell's.
 MAX_NODES = 64
+#: Processes whose last beats are remembered.
+MAX_SENDERS = 1_024
 
 PPB = 1_000_000_000
 
@@ -105,15 +108,17 @@ class _Pair:
 
     def _reach(self, t_ns: int, value_ns: int, fastest: int, slowest: int) -> int:
         """Bring the interval and an upper bound at `t_ns` to the same instant, the later one."""
-        if not self.known:
+        if self.low_ns is None and self.high_ns is None:
             self.t_ns = t_ns
-        if t_ns < self.t_ns - MEMORY_NS:
-            if self._overshoot.behind(t_ns):
-                # No message is that late: the instant that was believed was false.
-                self._begin(t_ns)
-        else:
-            self._overshoot.advanced()
         if t_ns >= self.t_ns:
+            self._overshoot.advanced()
+            self._advance(t_ns)
+            return value_ns
+        if t_ns >= self.t_ns - MEMORY_NS:
+            self._overshoot.advanced()
+        elif self._overshoot.behind(t_ns):
+            # No message is that late: the instant that was believed was false.
+            self._begin(t_ns)
             self._advance(t_ns)
             return value_ns
         return value_ns + _grown(self.t_ns - t_ns, fastest, slowest)
@@ -192,6 +197,8 @@ class Offsets:
         self._system_bound_ns = system_bound_ns
         self._pairs: dict[tuple[str, str], _Pair] = {}
         self._known: set[str] = set()
+        #: By its sender: when the last beat that came here was sent.
+        self._said_ns: dict[str, int] = {}
 
     def hear(self, beat: Beat, at_ns: int) -> None:
         """Take in a beat that arrived here; copies and late ones do no harm.
@@ -202,26 +209,31 @@ class Offsets:
             When it arrived, on this node's clock.
         """
         self.sample(beat.node, self.node, beat.sent_ns, at_ns)
+        # What its sender had heard by its last beat, that has said, unless its clock has gone back.
+        said_ns = self._said_ns.get(beat.who, -NEVER_NS)
+        again_ns = said_ns if said_ns < beat.sent_ns else -NEVER_NS
+        if len(self._said_ns) > MAX_SENDERS:
+            self._said_ns.clear()
+        self._said_ns[beat.who] = beat.sent_ns
         for heard in beat.heard:
-            self.sample(heard.node, beat.node, heard.beat_ns, heard.at_ns)
+            if heard.at_ns > again_ns and heard.node != beat.node:
+                self.sample(heard.node, beat.node, heard.beat_ns, heard.at_ns)
 
     def sample(self, source: str, target: str, sent_ns: int, arrived_ns: int) -> None:
         """Take in one message between two nodes, each instant on its own node's clock."""
         if source == target or self._system_bound_ns is not None:
             return
-        if len({source, target} - self._known) + len(self._known) > MAX_NODES:
-            return
-        if source < target:
-            self._pair(source, target).at_most(sent_ns, arrived_ns - sent_ns)
-        else:
-            self._pair(target, source).at_least(arrived_ns, sent_ns - arrived_ns)
-
-    def _pair(self, one: str, other: str) -> _Pair:
-        pair = self._pairs.get((one, other))
+        ends = (source, target) if source < target else (target, source)
+        pair = self._pairs.get(ends)
         if pair is None:
-            pair = self._pairs[one, other] = _Pair()
-            self._known.update((one, other))
-        return pair
+            if len(self._known.union(ends)) > MAX_NODES:
+                return
+            pair = self._pairs[ends] = _Pair()
+            self._known.update(ends)
+        if source < target:
+            pair.at_most(sent_ns, arrived_ns - sent_ns)
+        else:
+            pair.at_least(arrived_ns, sent_ns - arrived_ns)
 
     @property
     def breaks(self) -> int:

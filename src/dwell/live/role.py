@@ -97,20 +97,15 @@ class RolePlace:
     seals: Seals | None = None
     complained: int = 0
     last_complaint: str = ""
+    #: Keys of its cell, and P.
+    keys: Keys = field(init=False)
+    period_ns: int = field(init=False)
 
     def __post_init__(self) -> None:
         phase_ms = self.problem.pipeline.phase_ms
         require(phase_ms == 0, "phase_ms", phase_ms, "0 in a live cell, which begins when it is up")
-
-    @property
-    def keys(self) -> Keys:
-        """Keys of its cell."""
-        return Keys(self.problem.name)
-
-    @property
-    def period_ns(self) -> int:
-        """P."""
-        return round(self.problem.pipeline.period_ms * 1e6)
+        self.keys = Keys(self.problem.name)
+        self.period_ns = round(self.problem.pipeline.period_ms * 1e6)
 
     @property
     def patience_ns(self) -> int:
@@ -385,7 +380,7 @@ class Pulse:
                 f"{beat.who} has another cell file ({beat.cell}) than {place.who} "
                 f"({self._digest}); copy one file to all nodes"
             )
-        strange = any(heard.node not in self._nodes for heard in beat.heard)
+        strange = {heard.node for heard in beat.heard} - self._nodes
         if self._known.get(beat.who) != beat.node or strange:
             return f"{beat.who} on {beat.node} is no process of cell {place.problem.name!r}"
         return ""

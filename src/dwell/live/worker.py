@@ -657,8 +657,7 @@ class Worker:
     def wake(self, now_ns: int) -> int:
         """Beat; returns when the next beat is due."""
         self._now_ns = max(self._now_ns, now_ns)
-        due_ns = self.pulse.wake(now_ns)
-        return due_ns if self._source is None else min(due_ns, self._source.due_ns)
+        return self.pulse.wake(now_ns)
 
 
 def _too_long(what: str, longest: int, declared: str = "") -> str:

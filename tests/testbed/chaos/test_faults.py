@@ -8,7 +8,7 @@ import pytest
 
 from dwell.cellfile import from_document
 from dwell.model import Problem
-from dwell.testbed.chaos.faults import Fault, bound_of, faults_of, planned
+from dwell.testbed.chaos.faults import Fault, bound_of, faults_of, planned, struck
 from dwell.testbed.chaos.light_cell import document
 
 
@@ -100,3 +100,10 @@ def test_every_fault_has_its_turn(problem: Problem) -> None:
     rounds = max(sum(f.kind == kind for f in faults) for kind in kinds)
     everything = {one.fault.name for one in islice(planned(1, faults), rounds * len(kinds))}
     assert everything == {fault.name for fault in faults}
+
+
+def test_a_node_is_struck_with_all_its_processes_its_agent_first(problem: Problem) -> None:
+    first, *others = struck(problem, of(problem, "kill all of E"))
+    assert first == "agent@E"
+    assert {"perception@E", "planning@E", "controller@E"} <= set(others)
+    assert struck(problem, of(problem, "kill planning@E")) == ["planning@E"]

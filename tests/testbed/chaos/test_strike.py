@@ -11,9 +11,12 @@ import polars as pl
 import pytest
 
 import dwell
+from dwell.cellfile import from_document
 from dwell.testbed.chaos.faults import Fault, faults_of
+from dwell.testbed.chaos.invariants import Judge, Term
+from dwell.testbed.chaos.light_cell import document
 from dwell.testbed.chaos.stages import APPLY, HOLD
-from dwell.testbed.chaos.strike import Outcome, beyond
+from dwell.testbed.chaos.strike import Outcome, beyond, moved_in_vain
 from tests.live.real_cell import RealCell
 from tests.waiting import wait_until
 
@@ -38,6 +41,25 @@ def test_more_cycles_than_the_bound_are_said(
 ) -> None:
     outcome = Outcome("kill all of E", 1, 0.5, lost=lost, lost_after=lost_after, bound=bound)
     assert beyond(outcome) == said
+
+
+@pytest.mark.parametrize(
+    ("name", "ordered", "found"),
+    [
+        ("fail the actuator of sink.control@R2", False, 1),
+        ("fail the actuator of sink.control@R2", True, 0),
+        ("kill planning@R2", False, 0),
+    ],
+)
+def test_the_guard_has_no_reason_to_move_for_an_actuator_that_raises(
+    name: str, ordered: bool, found: int
+) -> None:
+    problem = from_document(document("LOC"))
+    refuses = next(one for one in faults_of(problem) if one.name == name)
+    terms = {1: Term(1, "LOC", 0, 0), 2: Term(2, "SO", 9, 9, ordered=ordered)}
+    judge = Judge(problem, terms=terms)
+    assert len(moved_in_vain(judge, refuses, 1)) == found
+    assert moved_in_vain(judge, refuses, 2) == []
 
 
 # ------------------------------------------------------------------------- real processes

@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from typing import Literal, Protocol, TypeAlias
 
@@ -74,6 +75,7 @@ class Transport(Protocol):
         ...
 
 
+@lru_cache(1_024)
 def require_key(key: str) -> None:
     """Raise a LiveError unless a message can be sent under a key."""
     for chunk in key.split("/"):

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Self
 
 from dwell.testbed.chaos.light_cell import CANDIDATES
 from dwell.testbed.chaos.stages import APPLY, HOLD, NODES, RECORD, ZERO
@@ -41,6 +42,12 @@ class Seen:
     released_ns: int
     at_ns: int
 
+    @classmethod
+    def of(cls, what: int, perception: int, planning: int, pid: int, *numbers: int) -> Self:
+        """Read a record of the actuator (see `stages.RECORD`)."""
+        where = _PLACEMENTS.get((NODES[perception], NODES[planning]), "?")
+        return cls(what, where, pid, *numbers)
+
     @property
     def age_ms(self) -> float:
         """Time since the release."""
@@ -64,9 +71,7 @@ class Actuations:
         whole = len(data) - len(data) % RECORD.size
         self._read += whole
         for at in range(0, whole, RECORD.size):
-            what, perception, planning, pid, *numbers = RECORD.unpack_from(data, at)
-            where = _PLACEMENTS.get((NODES[perception], NODES[planning]), "?")
-            self.all.append(Seen(what, where, pid, *numbers))
+            self.all.append(Seen.of(*RECORD.unpack_from(data, at)))
 
     @property
     def applied(self) -> list[Seen]:

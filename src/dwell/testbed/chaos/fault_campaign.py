@@ -18,12 +18,18 @@ from dwell.cellfile.yaml_text import yaml_of
 from dwell.errors import DwellError, LiveError
 from dwell.model import FrozenDict, Problem
 from dwell.testbed.chaos.disk import may_mount
-from dwell.testbed.chaos.faults import Fault, PlannedFault, bound_of, faults_of, planned
+from dwell.testbed.chaos.faults import PlannedFault, bound_of, faults_of, planned
 from dwell.testbed.chaos.harness import CLOCK_FILE, STARVING_THREADS, Harness, environment_of
 from dwell.testbed.chaos.light_cell import PATIENT_MS, document, exec_ms
-from dwell.testbed.chaos.stages import APPLY
 from dwell.testbed.chaos.stalls import StallDetector
-from dwell.testbed.chaos.strike import Outcome, beyond, strike
+from dwell.testbed.chaos.strike import (
+    Outcome,
+    beyond,
+    moved_in_vain,
+    recovered,
+    strike,
+    too_old,
+)
 from dwell.testbed.chaos.wiretap import ActuatorObserver
 from dwell.testbed.loopback import Loopback, on_this_machine
 from dwell.testbed.netns_testbed import NetnsTestbed
@@ -248,7 +254,7 @@ class FaultCampaign:
         """Have a fault befall a cell; returns whether the cell can go on."""
         fault = one.fault
         outcome = Outcome(fault.name, self._seed, one.phase)
-        usable = True
+        usable, term = True, -1
         try:
             _settle(cell, one.rests_s, outcome)
             outcome.wrong += observer.look()
@@ -266,16 +272,17 @@ class FaultCampaign:
             )
             time.sleep(HEARD_S)
             outcome.wrong += cell.ended(fault)
-            if fault.kind == "refuse" and judge.moved_by_guard(term):
-                outcome.late.append("the guard has moved, though each placement ends at that sink")
         except DwellError as error:
             outcome.wrong += [str(error), *cell.ended(fault)]
             outcome.stall_ms = stalls.worst_ms(outcome.begin_ns, time.monotonic_ns())
             usable = False
         outcome.wrong += observer.look()
         if usable:
-            _recovered(observer, outcome, cell.home)
-            outcome.late += [*beyond(outcome), *_old(cell, observer, fault, outcome)]
+            recovered(observer.judge, outcome, cell.home)
+            outcome.late += [*beyond(outcome), *moved_in_vain(observer.judge, fault, term)]
+            if fault.how not in ("jump", "drift"):
+                seen = cell.actuations.since(outcome.begin_ns)
+                outcome.late += too_old(cell.problem, seen, observer.judge.stamped_ns)
         self._keep(cell, one, outcome)
         return usable
 
@@ -300,21 +307,6 @@ class FaultCampaign:
         self.result.actuated += len(cell.actuations.applied)
 
 
-def _recovered(observer: ActuatorObserver, outcome: Outcome, home: str | None) -> None:
-    """Take the recovery from the wire: the first cycle that an order stands behind.
-
-    None follows where the guard's own move has brought the cell home; that is said beside it.
-    """
-    judge = observer.judge
-    at_ns = judge.ordered_since(outcome.end_ns)
-    if at_ns is not None:
-        outcome.recovery_ms = (at_ns - outcome.end_ns) / 1e6
-    elif home is not None and judge.terms[max(judge.terms)].placement == home:
-        outcome.note = f"{outcome.note} brought home by the guard, not by an order".strip()
-    else:
-        outcome.wrong.append("no cycle was stamped by an order after it has ended")
-
-
 def _settle(cell: Harness, rests_s: float, outcome: Outcome) -> None:
     """Wait until a cell is whole and at home, and has been left alone for a while.
 
@@ -327,22 +319,6 @@ def _settle(cell: Harness, rests_s: float, outcome: Outcome) -> None:
         if not (missing := cell.at_home()):
             return
         outcome.note = f"left alone, it had to be waited for: {missing}"
-
-
-def _old(cell: Harness, observer: ActuatorObserver, fault: Fault, outcome: Outcome) -> list[str]:
-    """Return commands that were applied too long after their stamp was heard."""
-    if fault.how in ("jump", "drift"):
-        return []
-    stamped_ns = observer.judge.stamped_ns
-    # The gate looks a little before the actuator is called, which may be scheduled out between.
-    limit_ms = cell.problem.max_age_ms + cell.problem.pipeline.period_ms
-    return [
-        f"cycle {seen.cycle} was actuated {age_ms:.0f} ms after it was stamped"
-        for seen in cell.actuations.since(outcome.begin_ns)
-        if seen.what == APPLY and seen.cycle in stamped_ns
-        for age_ms in [(seen.at_ns - stamped_ns[seen.cycle]) / 1e6]
-        if age_ms > limit_ms
-    ]
 
 
 def _unread(cell: Harness) -> Sequence[str]:

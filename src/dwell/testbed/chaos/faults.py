@@ -127,6 +127,19 @@ def _clocks(nodes: Sequence[str]) -> Iterator[Fault]:
             yield Fault(f"drift {ppm:+g} ppm {node}", "drift", (node,), ppm)
 
 
+def struck(problem: Problem, fault: Fault) -> list[str]:
+    """Return the processes that a fault strikes."""
+    names = []
+    for who in fault.whom:
+        if not who.startswith("*"):
+            names.append(who)
+            continue
+        # The agent first: it must not bring back what dies next.
+        there = [role.who for role in roles(problem) if role.node == who[1:]]
+        names += sorted(there, key=lambda one: not one.startswith("agent"))
+    return names
+
+
 def hit_by(problem: Problem, fault: Fault) -> frozenset[str] | None:
     """Return the parts of placements that a fault takes away (see `parts_of`).
 

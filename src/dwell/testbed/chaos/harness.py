@@ -18,9 +18,9 @@ from dwell.live.hosting import clock_of
 from dwell.live.supervision import survivor
 from dwell.model import Problem
 from dwell.testbed.burner import Burner
-from dwell.testbed.chaos.actuations import Actuations
+from dwell.testbed.chaos.actuations import Actuations, Seen
 from dwell.testbed.chaos.disk import DiskHog, SmallDisk, limit_file_size
-from dwell.testbed.chaos.faults import Fault
+from dwell.testbed.chaos.faults import Fault, struck
 from dwell.testbed.chaos.stages import APPLY, TOLD
 from dwell.testbed.child import Started
 from dwell.testbed.clocks import ClockFile
@@ -32,6 +32,8 @@ from dwell.testbed.timeline import Change, NodeState
 OBSERVED, CLOCK_FILE, FAILING = "observed", "clocks", "failing"
 #: Ten windows without a fault make the next one no relapse; of long ones, no more than this.
 HEALTH_S = 5.0
+#: Periods of which the actuations are looked at, to see whether a cell works.
+RECENT_PERIODS = 6
 #: Busy threads beside the processes of a node that starves.
 STARVING_THREADS = 32
 
@@ -47,6 +49,52 @@ def pid_of(mark: Path) -> int | None:
     """Return the process that an agent's mark tells of, if it lives."""
     process = survivor(mark)
     return None if process is None else process.pid
+
+
+def away_from_home(
+    problem: Problem,
+    home: str | None,
+    applied: Sequence[Seen],
+    status: Callable[[], Mapping[str, Any]],
+) -> str:
+    """Return what keeps a cell from being whole, watched, and where its controller wants it.
+
+    It may be the guard that has moved it home: its controller has nothing to order then.
+
+    Parameters
+    ----------
+    applied : sequence of Seen
+        Commands of the last `RECENT_PERIODS`.
+    status : callable
+        Returns the controller's status; nothing where it does not answer.
+    """
+    if len(applied) < 4:
+        return f"{len(applied)} actuations in six periods"
+    if home is not None and applied[-1].placement != home:
+        return f"it is at {applied[-1].placement}"
+    told = status()
+    if not told:
+        return "the controller does not answer"
+    wanted: dict[str, object] = {"wanted": None, "moving_to": None, "resting": False}
+    if home is not None:
+        wanted["placement"] = home
+    else:
+        wanted["fallback"] = False
+    for key, value in wanted.items():
+        if told[key] != value:
+            return f"{key} is {told[key]}"
+    return "; ".join(_unwell(problem, told["processes"]))
+
+
+def _unwell(problem: Problem, processes: Mapping[str, Any]) -> Iterator[str]:
+    for who in expected(problem):
+        process = processes.get(who)
+        if process is None:
+            yield f"{who} has not been heard"
+        elif not process["ready"]:
+            yield f"{who} is not ready: {process['note']}"
+        elif process["age_ms"] > 15 * problem.pipeline.period_ms:
+            yield f"{who} was heard {process['age_ms']:.0f} ms ago"
 
 
 class Harness(Started):
@@ -166,11 +214,11 @@ class Harness(Started):
     def ended(self, fault: Fault) -> list[str]:
         """Return the processes that have ended since a fault began, and that it has not ended."""
         running = self._running()
-        struck = self.names(fault) if fault.how == "kill" else []
+        ended = struck(self.problem, fault) if fault.how == "kill" else []
         return [
             f"{who} has ended by itself"
             for who, pid in self._living.items()
-            if who not in struck and running.get(who) != pid
+            if who not in ended and running.get(who) != pid
         ]
 
     def signal(self, names: Sequence[str], number: int) -> None:
@@ -192,17 +240,6 @@ class Harness(Started):
     def stop_controller(self) -> None:
         """End the controller and wait until it has written its run."""
         self.testbed.processes.stop_controllers()
-
-    def names(self, fault: Fault) -> list[str]:
-        """Return the processes that a fault strikes."""
-        names = []
-        for who in fault.whom:
-            if not who.startswith("*"):
-                names.append(who)
-                continue
-            # The agent first: it must not bring back what dies next.
-            names += sorted(self._all_of(who[1:]), key=lambda one: not one.startswith("agent"))
-        return names
 
     def _all_of(self, node: str) -> list[str]:
         """Return the processes of a node, its controller included."""
@@ -281,7 +318,9 @@ class Harness(Started):
         if fault.how == "cut":
             ways = [way.split("->") for way in fault.whom]
             return min(self.testbed.cut(source, target, at_ns) for source, target in ways)
-        pids = [self.pid(who) for who in self.names(fault)] if fault.how in _SIGNALS else []
+        pids = (
+            [self.pid(who) for who in struck(self.problem, fault)] if fault.how in _SIGNALS else []
+        )
         wait_s = (at_ns - time.monotonic_ns()) / 1e9 - 0.001
         if wait_s > 0:
             time.sleep(wait_s)
@@ -322,9 +361,9 @@ class Harness(Started):
             case "fail":
                 (self.folder / FAILING).unlink()
             case "freeze":
-                self.signal(self.names(fault), signal.SIGCONT)
+                self.signal(struck(self.problem, fault), signal.SIGCONT)
             case "kill":
-                for who in self.names(fault):
+                for who in struck(self.problem, fault):
                     if who.startswith(("agent", "controller")):
                         self.start_again(who)
             case "drift":
@@ -365,29 +404,10 @@ class Harness(Started):
             return {}
 
     def at_home(self) -> str:
-        """Look whether all are well and the cell is watched and where its controller wants it.
-
-        It may be the guard that has moved it home: its controller has nothing to order then.
-        """
-        now_ns = time.monotonic_ns()
-        seen = self.actuations.since(now_ns - 6 * self.period_ns)
+        """Return what keeps the cell from being at home; nothing where it is."""
+        seen = self.actuations.since(time.monotonic_ns() - RECENT_PERIODS * self.period_ns)
         applied = [one for one in seen if one.what == APPLY]
-        if len(applied) < 4:
-            return f"{len(applied)} actuations in six periods"
-        if self.home is not None and applied[-1].placement != self.home:
-            return f"it is at {applied[-1].placement}"
-        status = self.status()
-        if not status:
-            return "the controller does not answer"
-        wanted: dict[str, object] = {"wanted": None, "moving_to": None, "resting": False}
-        if self.home is not None:
-            wanted["placement"] = self.home
-        else:
-            wanted["fallback"] = False
-        for key, value in wanted.items():
-            if status[key] != value:
-                return f"{key} is {status[key]}"
-        return "; ".join(self._unwell(status["processes"]))
+        return away_from_home(self.problem, self.home, applied, self.status)
 
     def healthy(self) -> str:
         """Look whether the guard takes the next fault for no relapse."""
@@ -395,16 +415,6 @@ class Harness(Started):
         needed = min(ten, round(HEALTH_S * 1e9 / self.period_ns))
         count = self.actuations.healthy(self.home)
         return "" if count >= needed else f"{count} of {needed} cycles"
-
-    def _unwell(self, processes: Mapping[str, Any]) -> Iterator[str]:
-        for who in self.everybody:
-            process = processes.get(who)
-            if process is None:
-                yield f"{who} has not been heard"
-            elif not process["ready"]:
-                yield f"{who} is not ready: {process['note']}"
-            elif process["age_ms"] > 15 * self.problem.pipeline.period_ms:
-                yield f"{who} was heard {process['age_ms']:.0f} ms ago"
 
 
 _SIGNALS = {"kill": signal.SIGKILL, "freeze": signal.SIGSTOP}

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
-from dwell.testbed.chaos.actuations import out_of_order, unsafe
+from dwell.model import Problem
+from dwell.testbed.chaos.actuations import Seen, out_of_order, unsafe
 from dwell.testbed.chaos.faults import Fault, hit_by
 from dwell.testbed.chaos.harness import Harness
+from dwell.testbed.chaos.invariants import Judge
 from dwell.testbed.chaos.stages import APPLY, HOLD, ZERO
 from dwell.testbed.chaos.stalls import StallDetector
 
@@ -128,7 +130,9 @@ def strike(
     # What is on its way when the cell is back is seen, too. A node with a small quota waits for
     # processes that still start.
     cell.wait_for("five more cycles", lambda: _few(cell, found.back_ns, 5), PATIENCE_S)
-    _weigh(cell, fault, stalls, found, cpus)
+    period_ns = cell.period_ns
+    found.stall_ms = stalls.worst_ms(found.begin_ns - period_ns, found.back_ns, but=cpus)
+    weigh(cell.problem, [fault], cell.actuations.since(found.begin_ns - 10 * period_ns), found)
     return found
 
 
@@ -165,11 +169,19 @@ def _few(cell: Harness, since_ns: int, count: int) -> str:
     return "" if actuated >= count else f"{actuated} of {count} cycles actuated"
 
 
-def _weigh(
-    cell: Harness, fault: Fault, stalls: StallDetector, outcome: Outcome, cpus: Collection[int]
+def weigh(
+    problem: Problem, faults: Sequence[Fault], seen: Sequence[Seen], outcome: Outcome
 ) -> None:
-    begin_ns, period_ns, problem = outcome.begin_ns, cell.period_ns, cell.problem
-    seen = cell.actuations.since(begin_ns - 10 * period_ns)
+    """Fill in what faults at one time have cost, and what was wrong at the actuator.
+
+    Parameters
+    ----------
+    seen : sequence of Seen
+        Calls of the actuator, from ten periods before the first fault on at least.
+    outcome : Outcome
+        With its instants and the machine's stall.
+    """
+    begin_ns = outcome.begin_ns
     applied = [one for one in seen if one.what == APPLY]
     for before, later in pairwise(applied):
         if later.at_ns < begin_ns:
@@ -184,16 +196,54 @@ def _weigh(
     outcome.silences = sum(one.what in (HOLD, ZERO) for one in seen if one.at_ns >= begin_ns)
     steps = [one.placement for one in applied]
     outcome.moved = " ".join(b for a, b in pairwise(["", *steps]) if a != b)
-    outcome.stall_ms = stalls.worst_ms(begin_ns - period_ns, outcome.back_ns, but=cpus)
     stamper = f"*{problem.stamper_node}", f"stamper@{problem.stamper_node}"
-    if fault.how == "kill" and set(fault.whom) & set(stamper):
+    if any(fault.how == "kill" and set(fault.whom) & set(stamper) for fault in faults):
         outcome.lost = -1
     outcome.wrong += out_of_order(applied)
-    if hit_by(problem, fault) is not None or not _strikes_sink(fault):
-        during = [one for one in seen if one.at_ns >= begin_ns - period_ns]
-        outcome.late += unsafe(
-            during, problem.max_age_ms + problem.pipeline.period_ms + outcome.stall_ms
-        )
+    if all(hit_by(problem, fault) is not None or not _strikes_sink(fault) for fault in faults):
+        period_ms = problem.pipeline.period_ms
+        during = [one for one in seen if one.at_ns >= begin_ns - period_ms * 1e6]
+        outcome.late += unsafe(during, problem.max_age_ms + period_ms + outcome.stall_ms)
+
+
+def too_old(problem: Problem, seen: Sequence[Seen], stamped_ns: Mapping[int, int]) -> list[str]:
+    """Return commands that were applied too long after their stamp was heard.
+
+    Parameters
+    ----------
+    stamped_ns : mapping of int to int
+        Instants, by cycle, on the true clock.
+    """
+    # The gate looks a little before the actuator is called, which may be scheduled out between.
+    limit_ms = problem.max_age_ms + problem.pipeline.period_ms
+    return [
+        f"cycle {one.cycle} was actuated {age_ms:.0f} ms after it was stamped"
+        for one in seen
+        if one.what == APPLY and one.cycle in stamped_ns
+        for age_ms in [(one.at_ns - stamped_ns[one.cycle]) / 1e6]
+        if age_ms > limit_ms
+    ]
+
+
+def recovered(judge: Judge, outcome: Outcome, home: str | None) -> None:
+    """Take the recovery from the wire: the first cycle that an order stands behind.
+
+    None follows where the guard's own move has brought the cell home; that is said beside it.
+    """
+    at_ns = judge.ordered_since(outcome.end_ns)
+    if at_ns is not None:
+        outcome.recovery_ms = (at_ns - outcome.end_ns) / 1e6
+    elif home is not None and judge.terms[max(judge.terms)].placement == home:
+        outcome.note = f"{outcome.note} brought home by the guard, not by an order".strip()
+    else:
+        outcome.wrong.append("no cycle was stamped by an order after it has ended")
+
+
+def moved_in_vain(judge: Judge, fault: Fault, term: int) -> list[str]:
+    """Return whether the guard has moved since a term for an actuator that raises."""
+    if fault.kind == "refuse" and judge.moved_by_guard(term):
+        return ["the guard has moved, though each placement ends at that sink"]
+    return []
 
 
 def _strikes_sink(fault: Fault) -> bool:

@@ -1,0 +1,681 @@
+"""Faults by seed: whole cells in memory, what befalls them drawn, the chaos's judge on every run.
+
+``python -m tests.live.seeded_faults --seed 7`` plays the faults of a seed on the light cell, for
+some hundred cycles. Where something is wrong, it looks for fewer and shorter faults that show it
+too, and prints the command that plays those.
+
+``--faults 100000 --out FOLDER`` plays seed after seed until there were so many faults, goes on
+where it was stopped, and ends with a table by kind.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import hashlib
+import json
+import re
+import shlex
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
+from functools import cache
+from itertools import islice, takewhile
+from pathlib import Path
+from random import Random
+from typing import Any, Self
+
+from dwell.cellfile import from_document
+from dwell.control import Controller
+from dwell.errors import UnwritableError
+from dwell.live.controlled_cell import Recorder
+from dwell.live.failures import described
+from dwell.live.recording import RunRecorder
+from dwell.live.run_rows import Rows
+from dwell.live.stage import Actuator, Message, Stage
+from dwell.live.transport.transport import Arrival
+from dwell.live.wiring import Role
+from dwell.model import Problem, QoS
+from dwell.testbed.chaos.actuations import Seen
+from dwell.testbed.chaos.faults import Fault, PlannedFault, bound_of, faults_of, planned, struck
+from dwell.testbed.chaos.harness import RECENT_PERIODS, away_from_home
+from dwell.testbed.chaos.invariants import Judge
+from dwell.testbed.chaos.light_cell import CANDIDATES, document, exec_ms
+from dwell.testbed.chaos.stages import APPLY, FRAME_BYTES, HOLD, NODES, SAID, ZERO
+from dwell.testbed.chaos.strike import (
+    RECOVERED_S,
+    Outcome,
+    beyond,
+    moved_in_vain,
+    recovered,
+    too_old,
+    weigh,
+)
+from tests.live.memory_transport import Clock, MemoryTransport, NetworkConditions
+from tests.live.real_cell import wrong_record
+from tests.live.small_world import MS, World, columns, on
+
+#: How many faults a run has, and how often.
+COUNTS, SHARES = (1, 2, 3, 4), (6, 2, 1, 1)
+#: Which candidate the controller wants to be at; nothing where it goes round all of them.
+WISHES = ("LOC", "SO", "HYB", "")
+#: Time in which a cell has to be at home after its start.
+STARTED_S = 10.0
+#: How soon a killed process is back, if its agent lives.
+BACK_MS = 100.0, 400.0
+#: How long the processes of a node that starves get no CPU, and then get one.
+STARVED_MS, FED_MS = (20.0, 200.0), (2.0, 20.0)
+#: What befalls the messages of a direction, by kind and amount: ms, or probability.
+ON_THE_WAY = {
+    "delay": (5.0, 60.0, 300.0),
+    "lose": (0.05, 0.3, 0.9),
+    "double": (0.5,),
+    "reorder": (0.5,),
+}
+#: Words of the keys that the judge hears.
+HEARD = frozenset({"stamped", "order", "accepted", "done", "in"})
+
+
+@cache
+def light_cell() -> Problem:
+    """Return the light cell."""
+    return from_document(document("SO"))
+
+
+@cache
+def faults_in_memory() -> tuple[Fault, ...]:
+    """Return every fault that can be brought about in memory."""
+    problem = light_cell()
+    faults = [fault for fault in faults_of(problem, disks=False) if fault.how != "hog"]
+    for link in problem.fabric.links.values():
+        for kind, amounts in ON_THE_WAY.items():
+            for amount in amounts:
+                name = f"{kind} {link.name} {amount:g}"
+                faults.append(Fault(name, "slow", (link.name,), amount, kind))
+    return tuple(faults)
+
+
+# ------------------------------------------------------------------------------------ the draw
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Faults of one run.
+
+    Parameters
+    ----------
+    wish : str
+        One of `WISHES`.
+    delay_ms : float
+        Of every message.
+    """
+
+    seed: int
+    wish: str
+    delay_ms: float
+    faults: tuple[PlannedFault, ...]
+
+    @classmethod
+    def of(cls, seed: int) -> Self:
+        """Draw the faults of a seed; most often one, which has a bound."""
+        draw = Random(f"plan {seed}")
+        wish, delay_ms = draw.choice(WISHES), draw.choice((0.2, 1.0, 4.0))
+        (count,) = draw.choices(COUNTS, SHARES)
+        return cls(seed, wish, delay_ms, tuple(islice(planned(seed, faults_in_memory()), count)))
+
+    def command(self) -> str:
+        """Return the command that plays it."""
+        words = ["python", "-m", "tests.live.seeded_faults", "--seed", str(self.seed)]
+        if self != Plan.of(self.seed):
+            words += ["--wish", self.wish, "--delay-ms", str(self.delay_ms)]
+            words += ["--play", *map(_written, self.faults)]
+        return shlex.join(words)
+
+
+def _written(one: PlannedFault) -> str:
+    return f"{one.number};{one.fault.name};{one.phase!r};{one.lasts_s!r};{one.rests_s!r}"
+
+
+def _read(text: str) -> PlannedFault:
+    """Read a fault as `_written` gives it; a ValueError where it is none."""
+    number, name, phase, lasts_s, rests_s = text.split(";")
+    (fault,) = (fault for fault in faults_in_memory() if fault.name == name)
+    return PlannedFault(int(number), fault, float(phase), float(lasts_s), float(rests_s))
+
+
+# ----------------------------------------------------------------------------------- the cell
+
+
+class Touring:
+    """A policy that goes round all candidates, and stays at each for a while."""
+
+    STAY = 4
+
+    def __init__(self) -> None:
+        self.names = tuple(CANDIDATES)
+        self.place = self.stayed = 0
+
+    def start(self, problem: Problem) -> None:
+        self.place = self.names.index(problem.initial)
+
+    def adopt(self, name: str) -> None:
+        self.stayed = 0
+
+    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
+        self.stayed += 1
+        if self.stayed > self.STAY:
+            self.place, self.stayed = (self.place + 1) % len(self.names), 0
+        return self.names[self.place]
+
+
+class TellingStage:
+    """A stage of the light cell: passes on what the source says of the cycle, and where it ran."""
+
+    def __init__(self, role: Role, failing: set[str]) -> None:
+        self.role, self.failing = role, failing
+
+    def process(self, inputs: Mapping[str, Message]) -> Message:
+        if self.role.who in self.failing:
+            raise RuntimeError("told to fail")
+        message = next(iter(inputs.values()))
+        if self.role.task == "sensing":
+            said = SAID.pack(message.cycle, message.released_ns, 0, 0)
+            return Message(said.ljust(FRAME_BYTES, b"\0"))
+        cycle, released_ns, perception, planning = SAID.unpack_from(message.payload)
+        node = NODES.index(self.role.node)
+        if self.role.task == "perception":
+            perception = node
+        elif self.role.task == "planning":
+            planning = node
+        return Message(SAID.pack(cycle, released_ns, perception, planning))
+
+
+class SeeingActuator:
+    """The actuator: notes every call, on the true clock, as the chaos's witness does."""
+
+    def __init__(self, world: FaultyWorld, who: str) -> None:
+        self.world, self.who = world, who
+
+    def apply(self, command: Message) -> None:
+        cycle, released_ns, perception, planning = SAID.unpack(command.payload)
+        self._note(APPLY, perception, planning, command.cycle, cycle, released_ns)
+        if self.who in self.world.failing:
+            raise RuntimeError("told to fail")
+
+    def hold(self) -> None:
+        self._note(HOLD, 0, 0, 0, 0, 0)
+
+    def zero(self) -> None:
+        self._note(ZERO, 0, 0, 0, 0, 0)
+
+    def _note(self, what: int, perception: int, planning: int, *numbers: int) -> None:
+        at_ns = self.world.network.now_ns
+        self.world.seen.append(Seen.of(what, perception, planning, 0, *numbers, at_ns))
+
+
+class MemoryJournal:
+    """A run's journal that outlives its controller, on a disk that can be full."""
+
+    folder = Path("memory")
+
+    def __init__(self) -> None:
+        self.full = False
+        self.rows: dict[str, list[tuple[Any, ...]]] = {}
+        self.meta: dict[str, Any] = {}
+
+    def following(self, table: str) -> int:
+        return max((row[0] + 1 for row in self.rows.get(table, [])), default=0)
+
+    def append(self, rows: Rows, **meta: object) -> None:
+        if self.full:
+            raise UnwritableError("no space left")
+        self.meta |= meta
+        for table, found in rows.items():
+            self.rows.setdefault(table, []).extend(found)
+
+
+class MemoryRunRecorder(RunRecorder):
+    """Keeps the runs of a controller in a `MemoryJournal`."""
+
+    def __init__(self, journal: MemoryJournal, problem: Problem, controller: Controller) -> None:
+        super().__init__(journal.folder, problem, controller, lambda _: None)
+        self._kept = journal
+
+    def _opened(self, run: int, *, new: bool = False) -> Any:
+        return self._kept
+
+
+class FaultyWorld(World):
+    """The light cell in memory, which faults befall; what it says and does is held against it."""
+
+    def __init__(self, plan: Plan) -> None:
+        self.seen: list[Seen] = []
+        self.failing: set[str] = set()
+        self.journal = MemoryJournal()
+        self.exec_of = exec_ms("SO")
+        self._freezes: Counter[MemoryTransport] = Counter()
+        problem = on(light_cell(), plan.wish or "SO")
+        super().__init__(
+            problem, delay_ms=plan.delay_ms, policy=plan.wish or Touring(), seed=plan.seed
+        )
+        self.recorder.rows = self.journal.rows
+        self.judge = Judge(self.problem)
+        self.wrong: list[str] = []
+        self.network.taps.append(self._hear)
+
+    def stage_of(self, role: Role) -> Stage:
+        return TellingStage(role, self.failing)
+
+    def exec_ns_of(self, role: Role) -> int:
+        return round(self.exec_of[role.task][role.node] * MS)
+
+    def actuator_of(self, role: Role) -> Actuator:
+        return SeeingActuator(self, role.who)
+
+    def recorder_of(self, controller: Controller) -> Recorder:
+        return MemoryRunRecorder(self.journal, self.problem, controller)
+
+    def _hear(self, sample: Arrival) -> None:
+        if self.keys.word(sample.key) in HEARD:
+            heard = self.network.now_ns, sample.key, sample.payload, sample.header
+            self.wrong += self.judge.hear(*heard)
+
+    def away(self, home: str | None) -> str:
+        """Return what keeps it from being whole, watched, and where its controller wants it."""
+        since_ns = self.network.now_ns - RECENT_PERIODS * self.period_ns
+        recent = takewhile(lambda one: one.at_ns >= since_ns, reversed(self.seen))
+        applied = [one for one in recent if one.what == APPLY]
+        return away_from_home(self.problem, home, applied[::-1], self._status)
+
+    def _status(self) -> Mapping[str, Any]:
+        end = self.network.end(f"controller@{self.problem.controller_node}")
+        return {} if end is None or end.frozen else self.status
+
+    @property
+    def period_ns(self) -> int:
+        """P."""
+        return round(self.problem.pipeline.period_ms * MS)
+
+    # ------------------------------------------------------------------------------- faults
+
+    def begin(self, one: PlannedFault, draw: Random) -> Callable[[], None]:
+        """Have a fault befall it now; returns what ends it."""
+        fault = one.fault
+        match fault.how:
+            case "kill":
+                return self._kill(struck(self.problem, fault), draw)
+            case "freeze":
+                return self._freeze(struck(self.problem, fault))
+            case "starve":
+                names = struck(self.problem, replace(fault, whom=(f"*{fault.whom[0]}",)))
+                return self._starve(names, draw)
+            case "cut" | "slow":
+                conditions = _conditions(fault)
+                rules = [self.network.impair(conditions, *way.split("->")) for way in fault.whom]
+
+                def heal() -> None:
+                    for rule in rules:
+                        self.network.heal(rule)
+
+                return heal
+            case "fail":
+                self.failing.update(fault.whom)
+                return lambda: self.failing.difference_update(fault.whom)
+            case "jump":
+                self._set_clock(fault.whom[0], jump_ns=round(fault.amount * MS))
+                return lambda: None
+            case "drift":
+                self._set_clock(fault.whom[0], drift_ppm=fault.amount)
+                return lambda: self._set_clock(fault.whom[0])
+            case "fill":
+                self.journal.full = True
+                return lambda: setattr(self.journal, "full", False)
+        raise ValueError(f"{fault.name}: not in memory")
+
+    def _kill(self, names: Sequence[str], draw: Random) -> Callable[[], None]:
+        """End processes; those whose agent lives are back soon, the others at the end."""
+        for who in names:
+            if self.network.end(who) is not None:
+                self.kill(who)
+        soon = [who for who in names if not who.startswith(("agent", "controller"))]
+        for who in soon:
+            at_ns = self.network.now_ns + round(draw.uniform(*BACK_MS) * MS)
+            self.network.call_at(at_ns, lambda who=who: self._come_back(who))  # type: ignore[misc]
+
+        def bring_back() -> None:
+            for who in names:
+                if self.network.end(who) is None:
+                    self.start(who)
+
+        return bring_back
+
+    def _come_back(self, who: str) -> None:
+        node = who.partition("@")[2].partition(".")[0]
+        agent = self.network.end(f"agent@{node}")
+        if self.network.end(who) is None and agent is not None:
+            self.start(who)
+
+    def _freeze(self, names: Sequence[str]) -> Callable[[], None]:
+        ends = [end for who in names if (end := self.network.end(who)) is not None]
+        for end in ends:
+            self._freezes[end] += 1
+            self.network.freeze(end.who)
+
+        def thaw() -> None:
+            for end in ends:
+                self._freezes[end] -= 1
+                if not self._freezes[end] and not end.closed:
+                    self.network.thaw(end.who)
+
+        return thaw
+
+    def _starve(self, names: Sequence[str], draw: Random) -> Callable[[], None]:
+        """Have processes wait for a CPU most of the time, each by itself."""
+        hungry = True
+
+        def wait(who: str) -> None:
+            if not hungry:
+                return
+            thaw = self._freeze([who])
+            run_ns = self.network.now_ns + round(draw.uniform(*STARVED_MS) * MS)
+
+            def go_on() -> None:
+                thaw()
+                wait_ns = self.network.now_ns + round(draw.uniform(*FED_MS) * MS)
+                self.network.call_at(wait_ns, lambda: wait(who))
+
+            self.network.call_at(run_ns, go_on)
+
+        def fed() -> None:
+            nonlocal hungry
+            hungry = False
+
+        for who in names:
+            wait(who)
+        return fed
+
+    def _set_clock(self, node: str, *, jump_ns: int = 0, drift_ppm: float = 0.0) -> None:
+        now_ns, clock = self.network.now_ns, self.clocks.get(node, Clock())
+        changed = Clock(0, drift_ppm)
+        offset_ns = clock.shown(now_ns) + jump_ns - changed.shown(now_ns)
+        self.clocks[node] = changed = replace(changed, offset_ns=offset_ns)
+        self.network.set_clock(node, changed)
+
+
+def _conditions(fault: Fault) -> NetworkConditions:
+    """Return what a fault has messages meet on their way."""
+    match fault.kind:
+        case "slow":
+            return NetworkConditions(rate_mbps=fault.amount)
+        case "delay":
+            return NetworkConditions(delay_ns=round(fault.amount * MS))
+        case "lose":
+            return NetworkConditions(loss=fault.amount)
+        case "double":
+            return NetworkConditions(duplication=fault.amount)
+        case "reorder":
+            return NetworkConditions(reordering=fault.amount, reorder_ns=30 * MS)
+    return NetworkConditions(loss=1.0)
+
+
+# ------------------------------------------------------------------------------------ the run
+
+
+class MissingError(Exception):
+    """What is waited for does not come."""
+
+
+@dataclass(slots=True)
+class Played:
+    """What came of a run.
+
+    Parameters
+    ----------
+    wrong : list of str
+        Violations.
+    digest : str
+        Of all that the actuator was told and the judge heard.
+    """
+
+    plan: Plan
+    outcome: Outcome
+    cycles: int = 0
+    digest: str = ""
+    wrong: list[str] = field(default_factory=list)
+
+
+def play(plan: Plan) -> Played:
+    """Play the faults of a plan, until the cell has recovered, and judge all of it."""
+    names = " + ".join(one.fault.name for one in plan.faults)
+    played = Played(plan, Outcome(names, plan.seed, plan.faults[0].phase if plan.faults else 0.0))
+    world = FaultyWorld(plan)
+    try:
+        _play(world, played)
+    except MissingError as error:
+        played.wrong.append(str(error))
+    except Exception as error:  # a role that fails ends its process
+        played.wrong.append(f"a process has ended by itself: {described(error)}")
+    played.wrong = [*world.wrong, *played.wrong, *played.outcome.wrong, *played.outcome.late]
+    played.cycles = world.judge.counts["stamped"]
+    heard = world.seen, sorted(world.judge.counts.items()), world.judge.stamped_ns
+    played.digest = hashlib.sha256(repr(heard).encode()).hexdigest()[:16]
+    return played
+
+
+def _wait(world: FaultyWorld, what: str, home: str | None, patience_s: float) -> None:
+    until_ns = world.network.now_ns + round(patience_s * 1e9)
+    while missing := world.away(home):
+        if world.network.now_ns > until_ns:
+            raise MissingError(f"waited {patience_s:g} s for {what}: {missing}")
+        world.network.advance(world.network.now_ns + world.period_ns)
+
+
+def _play(world: FaultyWorld, played: Played) -> None:
+    plan, outcome, network = played.plan, played.outcome, world.network
+    problem, judge, home = world.problem, world.judge, plan.wish or None
+    _wait(world, "the whole cell at home", home, STARTED_S)
+    network.advance(network.now_ns + 2 * RECENT_PERIODS * world.period_ns)
+    term = max(judge.terms)
+    faults = [one.fault for one in plan.faults]
+    if len(faults) == 1 and home is not None:
+        outcome.bound = bound_of(problem, faults[0], judge.terms[term].placement)
+    begin_ns = network.now_ns
+    agenda: list[tuple[int, list[Callable[[], None]]]] = []
+    for one in plan.faults:
+        phase_ns = round(one.phase * world.period_ns)
+        begin_ns += phase_ns + (round(one.rests_s * 1e9) if agenda else 0)
+        end_ns = begin_ns + round(one.lasts_s * 1e9)
+        agenda.append((end_ns, _staged(world, one, begin_ns)))
+        outcome.begin_ns = outcome.begin_ns or begin_ns
+    for end_ns, end in sorted(agenda, key=lambda item: item[0]):
+        network.advance(end_ns)
+        end[0]()
+    outcome.end_ns = network.now_ns
+    _wait(world, "the whole cell at home after it", home, RECOVERED_S)
+    outcome.back_ns = network.now_ns
+    network.advance(network.now_ns + 5 * world.period_ns)
+    weigh(problem, faults, world.seen, outcome)
+    recovered(judge, outcome, home)
+    outcome.late += beyond(outcome)
+    if len(faults) == 1:
+        outcome.late += moved_in_vain(judge, faults[0], term)
+    if not any(fault.how in ("jump", "drift") for fault in faults):
+        outcome.late += too_old(problem, world.seen, judge.stamped_ns)
+    world.wrong += judge.migrations()
+    played.wrong += _wrong_record(world)
+
+
+def _staged(world: FaultyWorld, one: PlannedFault, at_ns: int) -> list[Callable[[], None]]:
+    """Have a fault begin at an instant; returns where what ends it will be found."""
+    draw = Random(f"fault {world.network.seed} {one.number}")
+    ends: list[Callable[[], None]] = []
+    world.network.call_at(at_ns, lambda: ends.append(world.begin(one, draw)))
+    return ends
+
+
+def _wrong_record(world: FaultyWorld) -> list[str]:
+    """Return what is wrong with the record of the run."""
+    cycles = columns(world, "cycles", "number", "actuated")
+    decisions = columns(world, "decisions", "window", "migrated", "reason")
+    return wrong_record(
+        [number for number, _ in cycles],
+        [window for (window,) in columns(world, "windows", "window")],
+        [window for window, migrated, reason in decisions if migrated and reason != "guard"],
+        [number for number, actuated in cycles if actuated],
+        {one.cycle for one in world.seen if one.what == APPLY},
+    )
+
+
+# ------------------------------------------------------------------------------------ shrinking
+
+
+def _signature(wrong: str) -> str:
+    """Return a violation without its numbers and names of candidates."""
+    return re.sub(r"\d+|LOC|SO|HYB|\(.*\)|: .*", "#", wrong)
+
+
+def shrunk(plan: Plan, found: Sequence[str]) -> Plan:
+    """Return fewer and shorter faults that show one of the same violations."""
+    wanted = {_signature(wrong) for wrong in found}
+
+    def shows(smaller: Plan) -> bool:
+        return any(_signature(wrong) in wanted for wrong in play(smaller).wrong)
+
+    changed = True
+    while changed:
+        changed = False
+        for smaller in _smaller(plan):
+            if shows(smaller):
+                plan, changed = smaller, True
+                break
+    return plan
+
+
+def _smaller(plan: Plan) -> Iterator[Plan]:
+    faults = plan.faults
+    for index in range(len(faults)):
+        yield replace(plan, faults=faults[:index] + faults[index + 1 :])
+    for index, one in enumerate(faults):
+        rest = faults[:index], faults[index + 1 :]
+        if one.rests_s:
+            yield replace(plan, faults=(*rest[0], replace(one, rests_s=0.0), *rest[1]))
+        if one.lasts_s > 0.05:
+            shorter = round(one.lasts_s / 2, 3)
+            yield replace(plan, faults=(*rest[0], replace(one, lasts_s=shorter), *rest[1]))
+        if one.phase:
+            yield replace(plan, faults=(*rest[0], replace(one, phase=0.0), *rest[1]))
+
+
+# ---------------------------------------------------------------------------------- the campaign
+
+
+def campaign(out: Path, faults: int) -> list[dict[str, Any]]:
+    """Play seed after seed until there were so many faults; goes on where it was stopped."""
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / "runs.jsonl"
+    rows = read(path)
+    count = sum(len(row["kinds"]) for row in rows)
+    seed = max((row["seed"] for row in rows), default=-1) + 1
+    gc.collect()
+    gc.freeze()
+    with path.open("a", encoding="utf-8") as file:
+        while count < faults:
+            played = play(Plan.of(seed))
+            row = _row(played)
+            file.write(json.dumps(row) + "\n")
+            file.flush()
+            rows.append(row)
+            count += len(played.plan.faults)
+            if played.wrong:
+                tell(played)
+            seed += 1
+    return rows
+
+
+def _row(played: Played) -> dict[str, Any]:
+    outcome = asdict(played.outcome)
+    kept = ("lost", "lost_after", "bound", "gap_ms", "gap_after_ms", "recovery_ms", "silences")
+    return {
+        "seed": played.plan.seed,
+        "kinds": [one.fault.kind for one in played.plan.faults],
+        "wish": played.plan.wish,
+        "cycles": played.cycles,
+        **{name: outcome[name] for name in kept},
+        "wrong": played.wrong,
+    }
+
+
+def read(path: Path) -> list[dict[str, Any]]:
+    """Return the runs of a file; a line that was being written is left out."""
+    rows = []
+    with suppress(FileNotFoundError):
+        for line in path.read_text(encoding="utf-8").splitlines():
+            with suppress(ValueError):
+                rows.append(json.loads(line))
+    return rows
+
+
+def table(rows: Iterable[Mapping[str, Any]]) -> Iterator[str]:
+    """Yield a table by kind, of faults alone and beside others."""
+    yield (
+        "| kind | faults | alone | with a bound | most cycles lost, where bounded | "
+        "slowest recovery, s | runs with a violation |"
+    )
+    yield "|---|---|---|---|---|---|---|"
+    rows = list(rows)
+    kinds = sorted({kind for row in rows for kind in row["kinds"]})
+    for kind in [*kinds, "all"]:
+        mine = [row for row in rows if kind in (*row["kinds"], "all")]
+        alone = [row for row in mine if len(row["kinds"]) == 1]
+        bounded = [row for row in alone if row["bound"] is not None]
+        most = max((max(row["lost"], row["lost_after"]) for row in bounded), default=0)
+        slowest_s = max((row["recovery_ms"] for row in mine), default=0.0) / 1e3
+        count = sum(len(row["kinds"]) if kind == "all" else 1 for row in mine)
+        wrong = sum(bool(row["wrong"]) for row in mine)
+        yield (
+            f"| {kind} | {count} | {len(alone)} | {len(bounded)} | {most} | "
+            f"{slowest_s:.1f} | {wrong} |"
+        )
+
+
+def tell(played: Played) -> None:
+    """Print what was wrong, and the command that shows it with fewer and shorter faults."""
+    smaller = shrunk(played.plan, played.wrong)
+    print(f"seed {played.plan.seed}: {played.outcome.fault}")
+    for wrong in played.wrong[:5]:
+        print(f"    VIOLATION {wrong}")
+    print(f"    again: {smaller.command()}", flush=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """See the module."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seed", type=int, help="play the faults of this seed")
+    parser.add_argument("--wish", choices=WISHES, help="where the controller wants to be")
+    parser.add_argument("--delay-ms", type=float, help="of every message")
+    parser.add_argument("--play", nargs="*", type=_read, help="play these faults instead")
+    parser.add_argument("--faults", type=int, default=0, help="so many, seed after seed")
+    parser.add_argument("--out", type=Path, default=Path("build/seeded-faults"))
+    asked = parser.parse_args(arguments)
+    if asked.seed is None:
+        rows = campaign(asked.out, asked.faults)
+        print("\n".join(table(rows)))
+        return int(any(row["wrong"] for row in rows))
+    plan = Plan.of(asked.seed)
+    plan = replace(
+        plan,
+        wish=plan.wish if asked.wish is None else asked.wish,
+        delay_ms=plan.delay_ms if asked.delay_ms is None else asked.delay_ms,
+        faults=plan.faults if asked.play is None else tuple(asked.play),
+    )
+    played = play(plan)
+    print(json.dumps({**_row(played), "digest": played.digest}, indent=1))
+    if played.wrong:
+        tell(played)
+    return int(bool(played.wrong))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
