@@ -19,8 +19,10 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
     signal.signal(signal.SIGHUP, lambda *_: None)
 
-settings.register_profile("dwell", deadline=None)
-settings.load_profile("dwell")
+# Chosen by `--hypothesis-profile`.
+settings.register_profile("ci", deadline=None, max_examples=25)
+settings.register_profile("night", deadline=None, max_examples=200)
+settings.load_profile("ci")
 
 HERE = Path(__file__).parent
 ALONE = (
