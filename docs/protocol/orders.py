@@ -96,11 +96,11 @@ class Told(NamedTuple):
 
 
 ALL, LIMITS = Rules(), Limits()
-#: Two controllers of one mind, one that changes it, and one whose proof takes long.
+#: One controller whose proof takes long, one that changes its mind, and two of one mind.
 CASES = (
-    LIMITS,
-    Limits(fires=2, lapses=0, whims=1, controllers=1),
     Limits(fires=2, lapses=0, controllers=1, probes=3),
+    Limits(fires=2, lapses=0, whims=1, controllers=1),
+    LIMITS,
 )
 NOTHING = Told(0, "", False)
 

@@ -82,7 +82,7 @@ def _outcome(read: Callable[[], Problem]) -> Problem | ProblemError:
         return error
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(suppress_health_check=list(HealthCheck))
 @given(st.data())
 def test_a_mutated_document_is_read_or_refused_with_paths(data: st.DataObject) -> None:
     document = copy.deepcopy(RICH)
@@ -99,7 +99,7 @@ def test_a_mutated_document_is_read_or_refused_with_paths(data: st.DataObject) -
         assert str(outcome).encode()
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(suppress_health_check=list(HealthCheck))
 @given(data=st.data())
 def test_a_mutated_file_is_read_or_refused(data: st.DataObject, tmp_path: Path) -> None:
     text = bytearray(EXAMPLE.read_bytes())
@@ -115,7 +115,7 @@ def test_a_mutated_file_is_read_or_refused(data: st.DataObject, tmp_path: Path) 
         assert str(outcome).startswith(str(path))
 
 
-@settings(max_examples=30, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(suppress_health_check=list(HealthCheck))
 @given(data=st.data())
 def test_a_file_is_read_as_its_document_is(data: st.DataObject, tmp_path: Path) -> None:
     document = copy.deepcopy(DOCUMENT)

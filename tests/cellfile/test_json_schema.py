@@ -44,7 +44,7 @@ def test_it_accepts_cells(document: dict[str, Any]) -> None:
     _validator().validate(document)
 
 
-@settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=12, suppress_health_check=list(HealthCheck))
 @given(problems())
 def test_it_accepts_the_document_of_any_problem(problem: Problem) -> None:
     jsonschema.Draft202012Validator(schema()).validate(to_document(problem))

@@ -474,9 +474,7 @@ ODDER = ODD | st.lists(ODD, max_size=2) | st.dictionaries(st.text(max_size=3), O
 KEYS = ("dwell-study", "name", "traces", "scenarios", "windows", "seeds", "references", "policies")
 
 
-@settings(
-    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.dictionaries(
         st.sampled_from((*KEYS, "parameters", "zip", "labels", "odd")), ODDER, max_size=4

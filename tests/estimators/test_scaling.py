@@ -10,7 +10,7 @@ from random import Random
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -271,7 +271,6 @@ def underestimates(case: Case, witness: Witness) -> list[tuple[int, str, float, 
     return found
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.integers(0, 10**9))
 def test_with_true_ratios_it_never_underestimates(seed: int) -> None:
     """L95 and V_D are no less than those of the window's cycles, each queue-free.

@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import integrate, signal
@@ -180,7 +180,6 @@ def _root(function: Any, low: float, high: float) -> float:
     return float(brentq(function, low, high, xtol=1e-14))
 
 
-@settings(max_examples=25, deadline=None)
 @given(
     gaps=st.lists(st.floats(1e-4, 0.4), min_size=1, max_size=12),
     lates=st.lists(st.floats(0, 0.3), min_size=12, max_size=12),

@@ -96,7 +96,7 @@ SINGLE_FAULTS: dict[str, tuple[str, Fault]] = {
 
 
 @pytest.mark.parametrize("name", SINGLE_FAULTS)
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=4)
 @given(phase=st.floats(0, 1))
 def test_rule_5_bounds_what_a_single_fault_costs(problem: Problem, name: str, phase: float) -> None:
     candidate, fault = SINGLE_FAULTS[name]
@@ -120,7 +120,7 @@ SECOND_FAULTS: dict[str, tuple[Fault, str]] = {
 
 
 @pytest.mark.parametrize("name", SECOND_FAULTS)
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=4)
 @given(phase=st.floats(0, 1))
 def test_rule_5_bounds_a_fault_after_the_guards_own_move_too(
     problem: Problem, name: str, phase: float

@@ -60,7 +60,7 @@ def test_what_is_whole_is_read(name: str) -> None:
 
 @pytest.mark.parametrize("name", TARGETS)
 def test_any_bytes_are_read_or_refused(name: str) -> None:
-    @settings(max_examples=50, deadline=None, database=None)
+    @settings(database=None)
     @given(inputs(name))
     def check(data: bytes) -> None:
         TARGETS[name](data)
@@ -73,7 +73,7 @@ def test_reading_takes_no_more_memory_than_the_message_is_long(name: str) -> Non
     target = TARGETS[name]
     target(b"")
 
-    @settings(max_examples=40, deadline=None, database=None)
+    @settings(database=None)
     @given(inputs(name))
     def check(data: bytes) -> None:
         assert peak(target, data) <= BYTES_AT_ALL + BYTES_A_BYTE * len(data)

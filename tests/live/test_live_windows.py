@@ -17,7 +17,7 @@ import numpy as np
 import polars as pl
 import polars.testing
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import dwell
@@ -977,7 +977,6 @@ def test_memory_is_bounded() -> None:
     assert len(windows._by_key) < 4000
 
 
-@settings(max_examples=60, deadline=None)
 @given(data=st.data())
 def test_in_any_order_and_with_any_losses_windows_are_w_cycles_apart(data: st.DataObject) -> None:
     """Stamps and completions lost, doubled and late: releases never go back, nothing is twice."""

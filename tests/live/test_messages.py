@@ -115,7 +115,6 @@ def values_of(kind: type[msgspec.Struct]) -> st.SearchStrategy[list[Any]]:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(max_examples=25, deadline=None)
 @given(data=st.data())
 def test_any_bytes_are_decoded_or_refused(kind: type[msgspec.Struct], data: st.DataObject) -> None:
     raw = data.draw(st.one_of(st.binary(max_size=300), values_of(kind).map(msgspec.msgpack.encode)))
@@ -196,9 +195,7 @@ def sample(data: st.DataObject, key: str) -> Arrival:
     return Arrival(key, data.draw(junk), header)
 
 
-@settings(
-    max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_no_role_falls_over_what_nobody_meant(world: World, data: st.DataObject) -> None:
     now_ns = world.network.now_ns

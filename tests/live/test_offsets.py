@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from random import Random
 
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from dwell.live.messages import Beat, Heard
@@ -127,7 +127,6 @@ def world(
     return World(clocks, Offsets("E", "R1"), delay, Random(seed), processes)
 
 
-@settings(max_examples=40, deadline=None)
 @given(
     offsets_ns=st.tuples(*[st.integers(-10 * YEAR, 10 * YEAR)] * 3),
     drifts_ppb=st.tuples(*[st.integers(-100_000, 100_000)] * 3),
@@ -164,7 +163,6 @@ def test_the_true_instant_is_inside_the_bound(
 
 
 @given(least_us=st.integers(20, 5000), seed=st.integers(0, 100))
-@settings(max_examples=20, deadline=None)
 def test_the_bound_is_close_to_half_the_best_round_trip(least_us: int, seed: int) -> None:
     cell = world(jittery(least_us * US, 3 * MS), seed=seed)
     for _ in cell.play(0, 20 * S):

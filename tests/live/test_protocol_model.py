@@ -17,6 +17,18 @@ from dwell.model import Problem
 from tests.live.small_world import World, canonical
 
 MODELS = {"fallbacks": fallbacks, "gate": gate, "orders": orders, "states": states}
+#: The case that shows that a rule is needed, where that is not the first.
+SHOWN = {
+    ("orders", "proof"): 1,
+    ("orders", "fresh proof"): 1,
+    ("orders", "answer"): 1,
+    ("states", "early"): 1,
+    ("states", "hello"): 1,
+    ("states", "number"): 3,
+    ("states", "later"): 4,
+    ("states", "asked"): 4,
+    ("states", "stamped"): 4,
+}
 WALKS = 6
 STEPS = 24
 
@@ -49,9 +61,10 @@ def test_nothing_goes_wrong_and_there_is_always_a_way_back(model: ModuleType, li
 def test_every_rule_is_needed(name: str, rule: str) -> None:
     model = MODELS[name]
     limits = getattr(model, "CASES", (model.LIMITS,))
-    cases = [partial(model.successors, limits=one) for one in limits]
     # It keeps two controllers from pulling the cell to and fro; terms alone keep it safe.
     needless = rule == "charge"
+    looked_at = limits if needless else [limits[SHOWN.get((name, rule), 0)]]
+    cases = [partial(model.successors, limits=one) for one in looked_at]
     assert (without(rule, model.initial(), cases, model.good) is None) == needless
 
 

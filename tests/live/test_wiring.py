@@ -9,7 +9,7 @@ from random import Random
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dwell.errors import LiveError
@@ -281,7 +281,6 @@ def test_an_endpoint_reads_as_a_locator(address: str, text: str) -> None:
     assert str(Locator(address, 7)) == text
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32))
 def test_any_cell_is_wired_without_clashes(seed: int) -> None:
     problem = random_problem(Random(seed))

@@ -47,7 +47,7 @@ def _problem(exec_ms: Process) -> Problem:
     )
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=SLOW)
+@settings(suppress_health_check=SLOW)
 @given(problems())
 def test_a_document_gives_an_equal_problem(problem: Problem) -> None:
     text = json.dumps(to_document(problem), allow_nan=False)
@@ -60,11 +60,7 @@ def test_a_document_gives_an_equal_problem(problem: Problem) -> None:
     assert to_document(again) == to_document(problem)
 
 
-@settings(
-    max_examples=10,
-    deadline=None,
-    suppress_health_check=[*SLOW, HealthCheck.function_scoped_fixture],
-)
+@settings(max_examples=10, suppress_health_check=[*SLOW, HealthCheck.function_scoped_fixture])
 @given(problem=problems())
 def test_a_document_written_as_json_is_a_cell_file(problem: Problem, tmp_path: Path) -> None:
     path = tmp_path / "cell.yaml"

@@ -231,7 +231,7 @@ def test_the_controller_sits_on_the_first_edge_node() -> None:
     assert problem.initial == "LOC"
 
 
-@settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=12, suppress_health_check=list(HealthCheck))
 @given(problems())
 def test_problems_can_be_copied_pickled_and_hashed(problem: Problem) -> None:
     assert pickle.loads(pickle.dumps(problem)) == problem
@@ -256,7 +256,6 @@ def test_faults_are_printed_with_their_lines() -> None:
     assert (again.faults, again.source) == (error.faults, error.source)
 
 
-@settings(max_examples=20)
 @given(problem=problems())
 def test_a_placement_that_never_moves_begins_on_itself(problem: Problem) -> None:
     for name in problem.candidates:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -589,7 +589,6 @@ def test_what_is_no_foreign_load_is_told_apart_from_what_is() -> None:
     candidates=st.integers(1, 4),
     share=st.floats(1e-6, 1),
 )
-@settings(max_examples=60, deadline=None)
 def test_cycles_are_chosen_by_the_golden_ratio(
     first: int, active: int, candidates: int, share: float
 ) -> None:
@@ -606,7 +605,6 @@ def test_cycles_are_chosen_by_the_golden_ratio(
     length=st.integers(1, 500),
     fraction=st.floats(1e-6, 1 / 3),
 )
-@settings(max_examples=60, deadline=None)
 def test_every_alternative_gets_its_fraction_of_any_stretch(
     first: int, length: int, fraction: float
 ) -> None:

@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -84,7 +84,6 @@ def cases(
     return costs, switching, draw(st.integers(0, candidates - 1)), min_dwell, counts, decides
 
 
-@settings(max_examples=250, deadline=None)
 @given(cases())
 def test_no_sequence_of_all_is_cheaper(
     case: tuple[Floats, Floats, int, int, Floats, tuple[bool, ...]],
@@ -176,7 +175,6 @@ def shown(draw: st.DrawFn) -> tuple[list[list[float]], list[list[float]]]:
     return draw(rows), draw(rows)
 
 
-@settings(max_examples=80, deadline=None)
 @given(shown(), st.integers(0, 4))
 def test_algorithm_1_is_never_cheaper_whatever_it_is_shown(
     windows: tuple[list[list[float]], list[list[float]]], min_dwell: int
@@ -194,7 +192,6 @@ def test_algorithm_1_is_never_cheaper_whatever_it_is_shown(
 HUNDREDTHS = st.integers(0, 10_000).map(lambda units: units / 100)
 
 
-@settings(max_examples=100, deadline=None)
 @given(
     st.lists(HUNDREDTHS, min_size=1, max_size=4),
     HUNDREDTHS,

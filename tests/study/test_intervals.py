@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -71,7 +71,6 @@ def test_the_same_values_have_the_same_interval() -> None:
     st.floats(0.1, 10),
     st.floats(-10, 10),
 )
-@settings(max_examples=25)
 def test_limits_follow_the_unit(values: Sequence[float], scale: float, shift: float) -> None:
     assume(np.ptp(values) > 1e-3)
     low, high = studentised_limits(values, 0.025)

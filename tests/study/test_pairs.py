@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -193,7 +193,6 @@ def test_no_difference_is_found_as_often_as_stated() -> None:
 
 
 @given(st.lists(st.floats(-1, 1), min_size=2, max_size=16), st.floats(0.01, 100))
-@settings(max_examples=50)
 def test_p_does_not_know_the_unit(differences: Sequence[float], scale: float) -> None:
     assume(np.abs(differences).max() > 1e-6)
     scaled = sign_flip_p(np.asarray(differences) * scale)

@@ -114,7 +114,7 @@ def test_whatever_a_cell_says_may_be_said(
     assert not denied
 
 
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 @given(st.integers(0, 2**32))
 def test_any_cell_may_say_what_it_has_to(seed: int) -> None:
     problem = random_problem(Random(seed))
@@ -125,7 +125,6 @@ def test_any_cell_may_say_what_it_has_to(seed: int) -> None:
     assert not denied
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32), st.data())
 def test_nobody_else_may(seed: int, data: st.DataObject) -> None:
     problem = random_problem(Random(seed))

@@ -6,7 +6,7 @@ import json
 import os
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dwell.errors import TrustError
@@ -14,7 +14,6 @@ from dwell.live.trust.authority import Authority
 from dwell.live.trust.roster import ROLES, Roster, Subject
 
 
-@settings(max_examples=60, deadline=None)
 @given(where=st.floats(0, 1, exclude_max=True), change=st.integers(1, 255))
 def test_no_changed_roster_is_accepted(
     tmp_path_factory: pytest.TempPathFactory, where: float, change: int

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dwell.errors import TrustError
@@ -181,7 +181,6 @@ def test_a_signature_is_for_one_cell(
         other.require("order", CONTROLLER, sealed)
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_a_changed_order_is_none(
     problem: Problem, seals: dict[str, Seals], data: st.DataObject
