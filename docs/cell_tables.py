@@ -53,16 +53,12 @@ def _lines(shape: Shape) -> Iterator[str]:
 
 
 def _value(key: FormKey) -> str:
-    words = key.form.words
-    if len(words) <= 60:
-        return words
-    return (
-        "names"
-        if isinstance(key.form, MappingForm)
-        else "list"
-        if isinstance(key.form, ListForm)
-        else "keys"
-    )
+    form = key.form
+    if len(form.words) <= 60 or not isinstance(form, MappingForm | ListForm | Shape):
+        return form.words
+    if isinstance(form, Shape):
+        return "keys"
+    return "names" if isinstance(form, MappingForm) else "list"
 
 
 def _usual(key: FormKey) -> str:

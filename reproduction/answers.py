@@ -14,7 +14,7 @@ import polars as pl
 import vl_convert
 from markdown_it import MarkdownIt
 
-from reproduction.verdicts import COLUMNS
+from reproduction.verdicts import COLUMNS, brief
 
 FOLDER = Path(__file__).parent
 WORDS = FOLDER / "ANSWERS.md"
@@ -150,7 +150,8 @@ WIDTH_PX = 460
 
 def svg(rows: pl.DataFrame) -> str:
     """Draw the effects of an answer with their intervals: where, then against whom."""
-    return str(vl_convert.vegalite_to_svg(_drawing(rows)))
+    drawn = str(vl_convert.vegalite_to_svg(_drawing(brief(rows))))
+    return re.sub(r' (?:role|aria-[\w-]+)="[^"]*"', "", drawn)
 
 
 def _drawing(rows: pl.DataFrame) -> dict[str, object]:

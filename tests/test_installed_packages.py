@@ -154,6 +154,6 @@ def test_the_pages_list_every_name_of_ours(registry: Mapping[str, object], page:
 
 
 def test_the_schema_offers_the_names_of_ours() -> None:
-    controller = schema()["$defs"]["ControllerEntry"]["properties"]
-    assert controller["policy"]["examples"] == list(REGISTRY)
-    assert controller["estimator"]["examples"] == list(ESTIMATORS)
+    controller = schema()["$defs"]["Controller"]["properties"]
+    assert controller["policy"]["anyOf"][0]["enum"] == list(REGISTRY)
+    assert controller["estimator"]["anyOf"][0]["enum"] == list(ESTIMATORS)

@@ -101,7 +101,7 @@ def test_a_kernel_that_is_missing_is_a_note_and_a_damaged_one_is_broken(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(library, "files", lambda _: tmp_path)
-    monkeypatch.setattr("dwell.cli.doctor.files", lambda _: tmp_path)
+    monkeypatch.setattr(library, "__file__", str(tmp_path / "library.py"))
     library.library.cache_clear()
     try:
         found = doctor()

@@ -392,11 +392,17 @@ def test_helpers_end_with_their_process_at_an_orderly_end(
 
 
 def test_the_last_words_are_those_of_the_life_that_has_ended(
-    supervisor: Supervisor, said: list[str]
+    supervisor: Supervisor, said: list[str], tmp_path: Path
 ) -> None:
-    child = keep(supervisor, "worker@E", "raise SystemExit('no camera here')")
+    once = tmp_path / "once"
+    child = keep(
+        supervisor,
+        "worker@E",
+        f"import pathlib, time; once = pathlib.Path({str(once)!r})\n"
+        "if not once.exists(): once.touch(); raise SystemExit('no camera here')\n"
+        "time.sleep(60)",
+    )
     until(supervisor, lambda: child.failures >= 1)
-    child.command = [sys.executable, "-c", "import time; time.sleep(60)"]
     until(supervisor, lambda: child.pid is not None and child.starts == 2)
     assert child.pid is not None
     os.kill(child.pid, signal.SIGKILL)

@@ -132,7 +132,8 @@ class TextForm(Form):
     @property
     def words(self) -> str:
         """What it may be, as a table of the docs has it."""
-        return "text" if self.bound is None else str(self.bound).removeprefix("a ")
+        text = "text" if self.bound is None else str(self.bound).removeprefix("a ")
+        return ", ".join([*(f"`{name}`" for name in self.known), text])
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return the text; that of a key which is no text, where it stands for one."""
