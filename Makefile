@@ -16,7 +16,7 @@ COMPILE := $(UV) pip compile --quiet --python $(BIN)/python --universal --python
 	--generate-hashes --custom-compile-command "make lock" $(if $(UPGRADE),--upgrade)
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test check bench paper deadlines faults chaos soak fuzz audit sbom lock clean again
+.PHONY: help env demo test check bench paper deadlines planted faults chaos soak fuzz audit sbom lock clean again
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' Makefile
@@ -82,6 +82,9 @@ deadlines: env ## Play the study behind the demo's figure of deadlines again; mi
 	$(BIN)/dwell study examples/studies/deadline.yaml --out build/deadline
 	$(BIN)/dwell report build/deadline --figures build/deadline/figures
 	cp build/deadline/figures/violation_rate-0.csv examples/studies/deadline.csv
+
+planted: env ## Plant faults in copies of the tree; each must be found (ARGS="--only NAME -n 4")
+	$(BIN)/python -m tests.planted $(ARGS)
 
 faults: env ## Kill, freeze and cut real processes, 60 times each way; goes on where it was stopped
 	$(BIN)/python -m tests.live.faults $(ARGS)

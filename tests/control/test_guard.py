@@ -454,6 +454,20 @@ def test_after_a_return_that_fails_it_goes_back_to_what_carried_the_cell() -> No
     assert cell.moves == ["LOC", "LOC", "HYB"]
 
 
+@pytest.mark.parametrize(("completed", "next_one"), [(9, "LOC"), (10, "HYB")])
+def test_what_carried_the_cell_comes_first_until_probe_cycles_after_the_return_have_completed(
+    completed: int, next_one: str
+) -> None:
+    mine = guard("HYB", "LOC", h=5)
+    mine.adopt("LOC", fallback=True)
+    released(mine, range(5))
+    mine.completed(4, 4 * P)
+    mine.adopt("SO")
+    released(mine, range(5, 13), start=5 * P)
+    mine.completed(completed, 12 * P)
+    assert mine.check(20 * P, WHOLE) == next_one
+
+
 def test_an_order_begins_anew() -> None:
     cell = Cell(guard("LOC", "HYB", h=1000))
     cell.play(20)
@@ -552,7 +566,10 @@ def test_a_candidate_is_whole_while_all_of_it_is_heard_within_g_periods() -> Non
     presence.gone("E")
     assert presence.whole("LOC", 3 * P)
     assert presence.missing("SO", 3 * P) == {"E"}
-    assert not Presence.of(cell()).whole("LOC", 10**12)
+    problem = cell()
+    assert not Presence.of(problem).whole("LOC", 10**12)
+    period_ns = round(problem.pipeline.period_ms * 1e6)
+    assert Presence.of(problem).within_ns == (problem.controller.guard_cycles - 1) * period_ns
 
 
 # ----------------------------------------------------------------------------------- the return

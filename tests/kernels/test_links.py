@@ -8,9 +8,11 @@ from dwell.model import (
     Execution,
     Flow,
     Link,
+    LinkDisturbance,
     Node,
     Task,
 )
+from tests.cells.deterministic import cell
 from tests.cells.generated import MS, make_problem
 
 
@@ -31,3 +33,9 @@ def test_a_flow_waits_for_its_link() -> None:
         0,
         2 * MS,
     )
+
+
+def test_each_message_is_lost_by_itself() -> None:
+    problem = cell(estimator="profile", scenario=[LinkDisturbance("R", "E", loss=0.5)])
+    run = dwell.simulate(problem, scenario="disturbed", policy="OFF", seed=1, windows=4)
+    assert 0.3 < (run.cycles["outcome"] == "dropped").mean() < 0.7  # type: ignore[operator]

@@ -148,6 +148,24 @@ def test_an_order_that_was_asked_for_anew_before_its_answer_came_is_no_move_of_t
     assert "guard" not in {why for (why,) in columns(world, "decisions", "reason")}
 
 
+def test_an_order_that_is_refused_for_now_is_asked_for_anew(problem: Problem) -> None:
+    world = alternating(problem)
+    world.run(3_000)
+    cell, numbers = world.cell, list[int]()
+    send = cell._send
+
+    def sent(order: Order) -> None:
+        send(order)
+        if order.placement:
+            numbers.append(order.number)
+
+    cell._send = sent  # type: ignore[method-assign]
+    world.kill("perception@E")
+    world.run(2_000)
+    # The stamper answers an order that it has answered as it did before.
+    assert len(set(numbers)) == len(numbers) > 10
+
+
 def test_whom_the_stamper_tells_that_no_guard_moved_needs_no_proof(problem: Problem) -> None:
     world = alternating(problem)
     world.run(4_000)

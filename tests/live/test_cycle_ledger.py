@@ -245,3 +245,11 @@ def test_where_clocks_cannot_be_believed_one_alone_counts(
     ledger.settle(one)
     assert one.bound_ns >= UNBOUNDED_NS
     assert one.latency_ns == (NEVER_NS if latency_ms is None else latency_ms * MS)
+
+
+@pytest.mark.parametrize("outcome", ["actuated", "not_applied", "stale", "behind"])
+def test_a_cycle_is_actuated_where_its_command_was(outcome: str) -> None:
+    one = cycle()
+    assert not one.actuated
+    one.take(completion(one, outcome), None)
+    assert one.actuated == (outcome == "actuated")

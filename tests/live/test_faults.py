@@ -17,7 +17,7 @@ from dwell.live.messages import Completion, Order, Stamp, State, encode
 from dwell.live.stage import Message
 from dwell.live.transport.transport import Arrival
 from dwell.model import Problem
-from tests.live.memory_transport import Clock
+from tests.live.memory_transport import Clock, NetworkConditions
 from tests.live.small_world import MS, Counting, Passing, World, canonical, on, stateful
 
 EDGE = ("perception@E", "perception@E.shadow", "planning@E", "planning@E.shadow", "agent@E")
@@ -429,8 +429,13 @@ def test_rule_12_a_standby_takes_over(problem: Problem, who: str) -> None:
     world.run(1_000)
     assert not world.worker(f"{who}.1").active
     world.network.freeze(who)
+    frozen_ns = world.network.now_ns
+    while not world.worker(f"{who}.1").active:
+        world.run(1)
+    # Its last beat is up to a period old, and the standby looks with the next input.
+    silent = (world.network.now_ns - frozen_ns) / (problem.pipeline.period_ms * MS)
+    assert 1 <= silent <= 3
     world.run(1_000)
-    assert world.worker(f"{who}.1").active
     assert world.stamper.placement == "LOC"
     assert lost(world) <= 4
     world.network.thaw(who)
@@ -472,6 +477,18 @@ def test_rule_8_a_state_moves_without_losing_a_cycle(problem: Problem) -> None:
     world.run(2_000)
     assert world.stamper.placement == "SO"
     assert lost(world) == 0
+    require_whole(world)
+
+
+def test_rule_8_what_is_in_a_state_already_is_not_replayed(problem: Problem) -> None:
+    world = counting(problem, "LOC")
+    world.run(2_000)
+    # The state is asked for late, so that inputs of cycles that are in it have been forked.
+    late = NetworkConditions(delay_ns=300 * MS)
+    world.network.impair(late, "controller@E", "planning@R2", key="**/snapshot/**")
+    world.pin("SO")
+    world.run(3_000)
+    assert world.stamper.placement == "SO"
     require_whole(world)
 
 
@@ -525,6 +542,10 @@ def test_rule_8_a_state_that_comes_too_late_replaces_nothing(problem: Problem) -
     late = State(run, cycle - 5, "planning", "R2", number=7)
     key = world.stamper.place.keys.state("planning", "E", "R2")
     worker.receive(Arrival(key, b"3", encode(late)), world.network.now_ns)
+    world.run(1_000)
+    require_whole(world)
+    # Nor where it is handed to the worker itself.
+    worker.do_chore((late, b"3"))
     world.run(1_000)
     require_whole(world)
 
@@ -593,6 +614,23 @@ def test_rule_8_no_false_checkpoint_keeps_a_good_one_from_being_used(
     assert world.stamper.placement == "LOC"
     cycle, count = world.arm.counts[-1]
     assert cycle + 1 - 2 * every <= count <= cycle + 1
+
+
+def test_rule_8_a_checkpoint_of_a_cycle_to_come_is_not_used(problem: Problem) -> None:
+    world = counting(problem, "SO")
+    world.run(3_000)
+    state = State(world.stamper.run, world.stamper.cycle + 1_000, "planning", "E")
+    key = world.keys.state("planning", "R2", "E")
+    world.worker("planning@R2").receive(
+        Arrival(key, b"1000000", encode(state)), world.network.now_ns
+    )
+    cycle = world.stamper.cycle
+    kill(*EDGE)(world)
+    world.run(1_000)
+    assert world.stamper.placement == "LOC"
+    last, count = world.arm.counts[-1]
+    assert last >= count - 1
+    assert last > cycle + 10
 
 
 @pytest.mark.parametrize("state_bytes", [100, 100_000])

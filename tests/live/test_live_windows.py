@@ -764,6 +764,7 @@ def test_a_stamper_whose_clock_begins_anew() -> None:
     hand.record()
     # The record goes on at the controller's clock.
     assert hand.column("cycles", "release_ns") == [i * P for i in (0, 1, 2, 5, 6, 7, 8, 9)]
+    assert hand.column("windows", "lead") == [3]
 
 
 def test_every_sink_has_to_report() -> None:

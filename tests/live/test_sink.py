@@ -8,8 +8,10 @@ import pytest
 
 import dwell
 from dwell.live.hosting import Hosted
+from dwell.live.messages import Header, Stamp
 from dwell.live.sink import Sink
 from dwell.live.stage import Message
+from dwell.live.transport.transport import Arrival
 from tests.live.small_world import MS, Arm, World, canonical, columns
 
 HOUR_NS = 3_600_000 * MS
@@ -139,3 +141,61 @@ def test_a_hold_that_has_been_heard_is_not_repeated(refused: World, arm: Refusin
     refused.run(1_000)
     assert arm.silences == told
     refused.network.heal(cut)
+
+
+def test_the_highest_cycle_is_remembered_before_the_actuator_is_called(world: World) -> None:
+    remembered: list[tuple[int, int]] = []
+
+    class Looking(Arm):
+        def apply(self, command: Message) -> None:
+            super().apply(command)
+            remembered.append((command.cycle, memory.load()[1]))
+
+    (memory,) = world.highest.values()
+    world.sink.actuator = Looking()
+    world.run(500)
+    assert len(remembered) > 5
+    assert all(cycle == highest for cycle, highest in remembered)
+
+
+def test_a_command_is_as_old_as_the_clocks_bound_allows() -> None:
+    cell = canonical()
+    world = World(replace(cell, live=replace(cell.live, clock="system")))
+    world.run(500)
+    sink = world.sink
+    now_ns = world.network.now_ns
+    stamp = Stamp(world.stamper.run, world.stamper.cycle, 1, "LOC", now_ns - 5 * MS)
+    # Clocks that are kept synchronous by others are so to 1 ms.
+    assert sink.age_ns(Header(stamp, "control", "R2", "none"), now_ns) == 6 * MS
+
+
+def test_a_command_that_comes_twice_is_applied_once(world: World) -> None:
+    sink, samples = world.sink, list[Arrival]()
+    receive = sink.receive
+
+    def twice(sample: Arrival, now_ns: int) -> None:
+        receive(sample, now_ns)
+        samples.append(sample)
+        receive(sample, now_ns)
+
+    sink.receive = twice  # type: ignore[method-assign]
+    world.run(500)
+    assert len(samples) > 5
+    assert len(world.cycles) == len(set(world.cycles))
+
+
+def test_the_actuator_is_told_what_the_cell_says_about_silence() -> None:
+    class Told(Arm):
+        zeros = 0
+
+        def zero(self) -> None:
+            self.zeros += 1
+
+    cell = canonical()
+    for silence in ("hold", "zero"):
+        made = World(replace(cell, live=replace(cell.live, silence=silence)))
+        arm = made.sink.actuator = Told()
+        made.run(1_000)
+        made.kill("control@R2")
+        made.run(1_000)
+        assert (arm.silences, arm.zeros) == ((1, 0) if silence == "hold" else (0, 1))

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import pytest
 
+from dwell.control import Probation
 from dwell.live.stamper import Stamper
 from dwell.live.transport.transport import Arrival
 from dwell.model import Problem
@@ -36,6 +37,29 @@ def test_the_stamper_beats_between_two_releases(
     since = [(at_ns - stamper._next_ns) % period_ns / period_ns for at_ns in beats[10:]]
     assert since == pytest.approx([0.5] * len(since), abs=0.01)
     assert max(b - a for a, b in pairwise(beats)) <= 1.5 * period_ns
+
+
+def test_both_copies_of_a_completion_are_one_cycle(
+    problem: Problem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = World(problem)
+    world.run(1_000)
+    completed: list[int] = []
+    monkeypatch.setattr(Probation, "healthy", lambda _, cycles=1: completed.append(cycles))
+    before = world.stamper.cycle
+    world.run(2_000)
+    assert world.stamper.cycle - before == pytest.approx(sum(completed), abs=1)
+
+
+def test_a_beat_says_how_long_ago_its_sender_has_heard_others(problem: Problem) -> None:
+    world = World(problem)
+    world.run(1_000)
+    presence = world.stamper.presence
+    assert not presence.missing("SO", world.network.now_ns)
+    world.network.cut("R1", "E")
+    world.run(500)
+    # E is heard, and tells of the last that it has heard of R1.
+    assert presence.missing("SO", world.network.now_ns) == {"R1->E"}
 
 
 def test_a_flood_of_frames_makes_two_cycles_a_period(problem: Problem) -> None:

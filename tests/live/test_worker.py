@@ -50,6 +50,7 @@ class Moody(Passing):
     ("mood", "words"),
     [
         (ValueError("no light"), "process() raised ValueError: no light"),
+        (MemoryError("for an image"), "process() raised MemoryError: for an image"),
         (b"bytes", "process() returned a bytes, not a Message"),
         (Message("text"), "a str cannot be sent; send bytes, an array, or a msgspec.Struct"),
         (Message(np.array([None])), "an array of object cannot be sent"),

@@ -30,6 +30,7 @@ from dwell.model.document import to_document
 from dwell.policies import DTP
 from dwell.policies.registry import REGISTRY as POLICIES
 from dwell.sim import describe
+from tests.cells import deterministic
 from tests.cells.examples import CELLS
 from tests.cells.two_nodes import TABLES, Script, assert_same
 
@@ -198,6 +199,27 @@ def test_stress_on_the_edge_is_no_reason_to_leave_it(canonical: Problem) -> None
 
 
 # -------------------------------------------------------------------------------- migrations
+
+
+@pytest.mark.parametrize(
+    ("delay_ms", "lead", "first"), [(0, 0, 50), (0, 2, 52), (80, 0, 52), (100, 2, 53)]
+)
+def test_an_order_takes_effect_after_its_delay_and_its_lead(
+    delay_ms: float, lead: int, first: int
+) -> None:
+    problem = deterministic.cell(estimator="profile")
+    orders = replace(problem.controller, order_delay_ms=delay_ms, order_lead_cycles=lead)
+    problem = replace(problem, controller=orders)
+    run = dwell.simulate(problem, policy=Script("OFF"), seed=1, windows=4)
+    # Cycles are 40 ms apart; window 0 closes at the release of cycle 50.
+    assert (run.cycles["placement"] == "LOC").to_list() == [
+        cycle < first for cycle in range(run.cycles.height)
+    ]
+    assert run.windows["first_cycle"].to_list()[:3] == [0, first, first + 50]
+    assert not run.windows["mixed"].any()
+    # A window's work is counted from its first cycle on.
+    used = run.windows["u_R"].to_list()
+    assert used[1] == pytest.approx(used[2])
 
 
 @pytest.mark.parametrize("min_dwell", [0, 1, 3, 10])

@@ -348,3 +348,13 @@ def test_it_covers_where_a_part_seldom_shows_what_it_can() -> None:
         low, high = share_difference_interval(first, rng.beta(20, 580, 12))[1:]
         held += low <= truth <= high
     assert held >= 190
+
+
+def test_what_is_open_of_either_part_is_open_of_their_difference() -> None:
+    some, none = np.linspace(0.09, 0.11, 20), np.zeros(20)
+    least, most = studentised_limits(some, 0.025)
+    unseen = share_interval(none, windows=400).high
+    _, low, high = share_difference_interval(some, none, windows=400)
+    assert (low, high) == pytest.approx((least - unseen, most))
+    _, low, high = share_difference_interval(none, some, windows=400)
+    assert (low, high) == pytest.approx((-most, unseen - least))

@@ -171,6 +171,16 @@ def test_a_row_holds_what_the_tables_show() -> None:
     assert row == expected
 
 
+def test_moves_of_the_guard_are_counted_apart() -> None:
+    made = make_run()
+    moves = made.decisions["migrated"].to_list()
+    reasons = ["guard" if moved and i == 1 else "hold" for i, moved in enumerate(moves)]
+    decisions = made.decisions.with_columns(reason=pl.Series(reasons))
+    run = Run({}, {"cycles": made.cycles, "windows": made.windows, "decisions": decisions})
+    row = summarise(run, make_problem(warmup_windows=1, window_cycles=W), LABELS).row
+    assert (row["migrations"], row["returns"], row["guard_moves"]) == (1, 0, 1)
+
+
 def on_gpu(**objective: Any) -> Problem:
     """The fan-in example with another objective."""
     problem = dwell.load(EXAMPLES / "fan-in.yaml")
