@@ -114,7 +114,7 @@ TRACE = Shape(
             WrittenForm(
                 "text, list of texts",
                 _columns,
-                {
+                shown={
                     "anyOf": [
                         {"type": "string"},
                         {"type": "array", "items": {"type": "string"}, "minItems": 1},
