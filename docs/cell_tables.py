@@ -14,7 +14,7 @@ from dwell.cellfile.forms import FormKey, ListForm, MappingForm, Shape
 
 FILE = Path(__file__).parent / "cells.md"
 SHAPES = {
-    "the file": cell_form.CELL_SHAPE,
+    "the file": cell_form.CELL.shape,
     "a trace": cell_form.TRACE,
     "a node": cell_form.NODE,
     "a quota": cell_form.QUOTA,

@@ -14,6 +14,7 @@ import polars as pl
 import vl_convert
 from markdown_it import MarkdownIt
 
+from reproduction.page import SHARES
 from reproduction.verdicts import COLUMNS, brief
 
 FOLDER = Path(__file__).parent
@@ -74,7 +75,6 @@ PRIMARY: Mapping[str, Compared] = {
 
 #: What a figure shows of a row: the primary comparison, the same one elsewhere, others there.
 PARTS = PRIMARY_PART, ELSEWHERE, OTHERS = "primary", "elsewhere", "others"
-SHARES = ("violation_rate",)
 
 
 def found(verdicts: Mapping[str, pl.DataFrame]) -> dict[str, pl.DataFrame]:
@@ -156,7 +156,7 @@ def svg(rows: pl.DataFrame) -> str:
 
 def _drawing(rows: pl.DataFrame) -> dict[str, object]:
     primary = rows.row(0, named=True)
-    share = primary["metric"] in SHARES
+    share = primary["metric"].startswith(SHARES)
     unit, heading = (100.0, ", points") if share else (1.0, "")
     shown = rows.with_columns(pl.col("effect", "low", "high") * unit)
     pair = pl.format("{} less {}", "first", "second")

@@ -32,10 +32,10 @@ def test_every_shape_of_the_file_has_a_table() -> None:
 
 @pytest.mark.parametrize("shape", [one for one in SHAPES if one.kind], ids=lambda one: one.title)
 def test_a_shape_has_the_keys_that_its_class_declares(shape: Shape) -> None:
-    declared = {one.name: one for one in declared_fields(shape.kind)}
-    for key in shape.keys:
-        if key.name in declared and key.named == declared[key.name].named:
-            assert key.says
+    left_out = {"NodeBursts": {"add_delay_ms"}, "LinkBursts": {"threads"}}.get(shape.title, set())
+    declared = {one.name for one in declared_fields(shape.kind)} - left_out
+    assert declared <= {key.name for key in shape.keys}
+    assert all(key.says.endswith(".") for key in shape.keys)
 
 
 def test_editors_complete_policies_and_estimators_and_take_a_users() -> None:

@@ -17,7 +17,6 @@ from reproduction.answers import (
     OTHERS,
     PRIMARY,
     PRIMARY_PART,
-    SHARES,
     Compared,
     found,
     page_of,
@@ -26,6 +25,7 @@ from reproduction.answers import (
     words,
     write,
 )
+from reproduction.page import SHARES
 from reproduction.verdicts import SCHEMA
 from tests.regression.paper import FULL, read
 
@@ -116,7 +116,7 @@ def section(name: str) -> str:
 
 def line(row: Mapping[str, Any]) -> str:
     """A row of an answer as the page has it."""
-    unit = 100 if row["metric"] in SHARES else 1
+    unit = 100 if row["metric"].startswith(SHARES) else 1
     effect, low, high = (
         f"{unit * row[name]:+.2f}".replace("-", "−") for name in ("effect", "low", "high")
     )

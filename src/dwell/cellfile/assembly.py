@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, TypeVar, cast
 
 from dwell.cellfile.cell_form import LINK_KEYS, NODE_KEYS, OBJECTIVE, STAND_IN, TRACE
 from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.forms import Entry
 from dwell.cellfile.traces import Source, Tables
-from dwell.errors import Fault, ProblemError
+from dwell.errors import Fault
 from dwell.estimators import registry as estimators
 from dwell.model import (
     Caps,
@@ -36,7 +37,7 @@ from dwell.model import (
     Weights,
 )
 from dwell.model.bounds import require
-from dwell.model.declaration import declared_fields, within_path
+from dwell.model.declaration import declared_fields, made_at
 from dwell.model.fabric import accelerator_tiers
 from dwell.model.frozen import FrozenDict
 from dwell.model.process import DRAWN, UnreadTrace
@@ -180,14 +181,8 @@ class Assembly:
     ) -> T | None:
         given = {name: self._value(value) for name, value in values.items()}
         given = {name: value for name, value in given.items() if value is not None}
-        try:
-            return kind(*first, **given)
-        except ProblemError as error:
-            for fault in error.faults:
-                path = within_path(entry.path, entry.shape.kind, fault.path)
-                if not self.faults.at(path):
-                    self.faults.add(path, fault.message)
-            return None
+        make = partial(made_at, entry.path, entry.shape.kind, kind, *first, **given)
+        return self.faults.attempt("", make)
 
     def _value(self, value: object) -> Any:
         """Return what a value that was read is in the model."""
@@ -215,8 +210,7 @@ class Assembly:
 
     def _links(self) -> Iterator[tuple[str, Link]]:
         for entry in self.entry.links or ():
-            further = entry and {"both_ways": None}
-            link = self._made(entry, **further) if entry is not None else None
+            link = self._made(entry, both_ways=None)
             if link is not None:
                 yield entry.path, link
                 if entry.both_ways:

@@ -24,7 +24,10 @@ from dwell.cellfile.forms import (
     WrittenForm,
     form_of,
     key_of,
+    not_allowed,
+    optional,
     refused,
+    required,
     shape_of,
     unquoted,
 )
@@ -57,7 +60,7 @@ from dwell.model import (
     Task,
     Weights,
 )
-from dwell.model.bounds import LARGEST, MAX_COUNT, NOT_EMPTY, VALUE, Bound, Pattern, as_read
+from dwell.model.bounds import LARGEST, MAX_COUNT, NOT_EMPTY, VALUE, Bound, Pattern
 from dwell.model.declaration import DeclaredField, declared_fields
 from dwell.model.document import VERSION
 from dwell.model.pipeline import WORKERS
@@ -74,47 +77,38 @@ def _columns(value: Any) -> str | tuple[str, ...]:
         return value
     if isinstance(value, list) and value and all(isinstance(name, str) for name in value):
         return tuple(value)
-    has = as_read(value)
-    raise ValueError(f"{has} is not allowed; it must be a column name, or a list of them")
-
-
-def _optional(name: str, form: Form, says: str, usual: str = "") -> FormKey:
-    return FormKey(name, name, form, says, False, usual)
-
-
-def _required(name: str, form: Form, says: str, stand_in: Any = FAULTY) -> FormKey:
-    return FormKey(name, name, form, says, True, "", stand_in)
+    raise ValueError(not_allowed(value, "a column name, or a list of them"))
 
 
 TRACE = Shape(
     "Trace",
     "A recorded column, replayed in order; columns of one file share their rows.",
     (
-        _required(
+        required(
             "file",
             TextForm(NOT_EMPTY),
             "A .parquet or .csv file, relative to the cell file's folder.",
         ),
-        _required("column", NAME, "Column with the values: milliseconds, or bare factors."),
-        _optional(
+        required("column", NAME, "Column with the values: milliseconds, or bare factors."),
+        optional(
             "by",
             ChoiceForm(("row", "time")),
             "`row`: each cycle takes the next row. `time`: each cycle takes the latest row sent at "
             "or before its release.",
             "row",
         ),
-        _optional(
+        optional(
             "time",
             NAME,
             "Column with the instant of each row, ms; only with `by: time`.",
             "sent_ms",
         ),
-        _optional(
+        optional(
             "group",
             WrittenForm(
                 "text, list of texts",
                 _columns,
-                {
+                shown={
                     "anyOf": [
                         {"type": "string"},
                         {"type": "array", "items": {"type": "string"}, "minItems": 1},
@@ -125,17 +119,17 @@ TRACE = Shape(
             "within one.",
             "none",
         ),
-        _optional(
+        optional(
             "on_negative",
             ChoiceForm(("error", "drop", "clip")),
             "What to do with rows whose value is negative, missing or not finite: `error`, `drop` "
             "the row for all columns, or `clip` negative values to 0.",
             "error",
         ),
-        _optional(
+        optional(
             "wrap", FlagForm(), "Whether to go on at the beginning when the rows end.", "false"
         ),
-        _optional(
+        optional(
             "sha256",
             TextForm(Pattern("[0-9a-f]{64}", "64 hexadecimal digits, as they were recorded")),
             "Digest of the data that a recorded problem used; other data are refused.",
@@ -193,12 +187,12 @@ PROCESS = ProcessForm(
         "Process",
         "A number, or one named random process.",
         (
-            _optional("constant", NumberForm(VALUE), CONSTANT.key.says),
+            optional("constant", NumberForm(VALUE), CONSTANT.key.says),
             *(
-                _optional(name, shape_of(kind, {}), (kind.__doc__ or "").partition("\n")[0])
+                optional(name, shape_of(kind, {}), (kind.__doc__ or "").partition("\n")[0])
                 for name, kind in DRAWN.items()
             ),
-            _optional("trace", TRACE, TRACE.says),
+            optional("trace", TRACE, TRACE.says),
         ),
     )
 )
@@ -211,9 +205,10 @@ def _field(kind: type, name: str) -> DeclaredField:
     return next(one for one in declared_fields(kind) if one.name == name)
 
 
-def _with_stand_in(kind: type, name: str, stand_in: object) -> FormKey:
+def _key(kind: type, name: str, **more: Any) -> FormKey:
+    """Return the key of a field, in the form of its type; see `key_of`."""
     one = _field(kind, name)
-    return key_of(one, form_of(one, PROCESSES), stand_in=stand_in)
+    return key_of(one, form_of(one, PROCESSES), **more)
 
 
 # ---------------------------------------------------------------------------------- fabric
@@ -232,15 +227,14 @@ LINK_BURSTS = shape_of(
     without=("threads",),
     says="Episodes of extra delay on a link.",
 )
-_ACCELERATORS = _field(Node, "accelerators")
 QUOTA = shape_of(Quota, {})
 NODE = shape_of(
     Node,
     {Quota: QUOTA, Bursts: NODE_BURSTS},
     instead={
-        "tier": _with_stand_in(Node, "tier", "robot"),
+        "tier": _key(Node, "tier", stand_in="robot"),
         # A node without its accelerators, as if tasks named unknown ones.
-        "accelerators": key_of(_ACCELERATORS, form_of(_ACCELERATORS, {}), breaks=True),
+        "accelerators": _key(Node, "accelerators", breaks=True),
     },
 )
 
@@ -290,7 +284,7 @@ ON_LOSS = WordsForm(
     Shape(
         "Retransmit",
         "How long after a lost attempt the next one follows.",
-        (_required("retransmit_ms", form_of(_RETRANSMIT, {}), _RETRANSMIT.key.says),),
+        (required("retransmit_ms", form_of(_RETRANSMIT, {}), _RETRANSMIT.key.says),),
     ),
     "`drop` (default) or `{retransmit_ms: 20}`",
 )
@@ -298,18 +292,17 @@ LINK = shape_of(
     Link,
     {**PROCESSES, Bursts: LINK_BURSTS},
     instead={
-        "delay_ms": _with_stand_in(Link, "delay_ms", STAND_IN),
-        "retransmit_ms": FormKey(
+        "delay_ms": _key(Link, "delay_ms", stand_in=STAND_IN),
+        "retransmit_ms": optional(
             "retransmit_ms",
-            "on_loss",
             ON_LOSS,
             "What happens to a lost message: `drop` or retransmission.",
-            False,
             "drop",
+            named="on_loss",
         ),
     },
     further=(
-        _optional(
+        optional(
             "both_ways",
             FlagForm(),
             "Whether there is the same link back too, drawn independently.",
@@ -323,21 +316,19 @@ LINK = shape_of(
 EXECUTION = shape_of(
     Execution,
     PROCESSES,
-    instead={"exec_ms": _with_stand_in(Execution, "exec_ms", STAND_IN)},
+    instead={"exec_ms": _key(Execution, "exec_ms", stand_in=STAND_IN)},
 )
-_DEPTH = _field(Task, "depth")
 INPUT = WordsForm(
     {"queue": 0, "latest": 1},
     Shape(
         "Input",
         "How many complete input sets may wait.",
         (
-            FormKey(
+            required(
                 "depth",
-                "queue",
                 NumberForm(Bound(1, MAX_COUNT, whole=True)),
                 "Input sets that may wait; beyond it the oldest is replaced.",
-                True,
+                named="queue",
             ),
         ),
     ),
@@ -347,24 +338,17 @@ TASK = shape_of(
     Task,
     {},
     instead={
-        "on": FormKey(
-            "on",
-            "on",
-            MappingForm(EXECUTION, keeps=True, least=1),
-            _field(Task, "on").key.says,
-            True,
-        ),
-        "depth": FormKey(
+        "on": MappingForm(EXECUTION, keeps=True, least=1),
+        "depth": optional(
             "depth",
-            "input",
             INPUT,
             "What waits for a worker: `queue` without a bound, `latest` only, or a bounded queue.",
-            False,
             "queue",
+            named="input",
         ),
     },
     further=(
-        _optional(
+        optional(
             "workers",
             NumberForm(WORKERS),
             "Jobs that may run at a time on each node that does not say.",
@@ -386,10 +370,10 @@ def _disturbance() -> Shape:
     node = shape_of(NodeDisturbance, TIMED)
     link = shape_of(LinkDisturbance, TIMED)
     known = {key.name: key for key in (*node.keys, *link.keys)}
-    first = _optional("node", NAME, known.pop("node").says)
+    first = optional("node", NAME, known.pop("node").says)
     further = (
-        _optional("link", NAME, "Link that it happens to, as `R1->E`."),
-        _optional("both_ways", FlagForm(), "Whether it happens to the link back as well.", "false"),
+        optional("link", NAME, "Link that it happens to, as `R1->E`."),
+        optional("both_ways", FlagForm(), "Whether it happens to the link back as well.", "false"),
     )
     return Shape(
         "Disturbance",
@@ -405,10 +389,10 @@ OBJECTIVE = shape_of(
     Objective,
     {},
     instead={
-        "weights": _optional("weights", WEIGHTS, "Weights of the terms of J."),
-        "targets": _optional("targets", TARGETS, "Design targets."),
-        "caps": _optional("caps", CAPS, "Hard caps."),
-        "accelerators": _optional(
+        "weights": optional("weights", WEIGHTS, "Weights of the terms of J."),
+        "targets": optional("targets", TARGETS, "Design targets."),
+        "caps": optional("caps", CAPS, "Hard caps."),
+        "accelerators": optional(
             "accelerators",
             FlagForm(),
             "Whether accelerators of these nodes count in their tiers, too.",
@@ -435,44 +419,46 @@ LIVE = shape_of(LiveSettings, {Host: HOST}, title="Live")
 
 # ------------------------------------------------------------------------------------ cell
 
-_STAND_INS = {"period_ms": LARGEST}
-_PIPELINE = {
-    one.name: key_of(one, form_of(one, PROCESSES), stand_in=_STAND_INS.get(one.name, FAULTY))
-    for one in declared_fields(Pipeline)
-}
 _SECTIONS = ("tasks", "flows", "scales")
-_TIMING = {name: key for name, key in _PIPELINE.items() if name not in _SECTIONS}
-_PLACES = {one.name: key_of(one, form_of(one, {})) for one in declared_fields(Fabric)}
-_WHOLE = {one.name: key_of(one, form_of(one, {})) for one in declared_fields(Problem)}
+_TIMING = [
+    _key(Pipeline, one.name, stand_in=LARGEST if one.name == "period_ms" else FAULTY)
+    for one in declared_fields(Pipeline)
+    if one.name not in _SECTIONS
+]
+_SAYS = {
+    one.name: one.key.says for kind in (Pipeline, Fabric, Problem) for one in declared_fields(kind)
+}
 
 
-def _section(name: str, form: Form, stand_in: object = FAULTY) -> FormKey:
+def _section(name: str, form: Form) -> FormKey:
     """A section of the file, with what the model says of it."""
-    says = {**_PIPELINE, **_PLACES, **_WHOLE}[name].says
-    return FormKey(name, name, form, says, stand_in is not FAULTY, "", stand_in)
+    return optional(name, form, _SAYS[name])
 
 
-CELL_SHAPE = Shape(
+def _needed(name: str, form: Form) -> FormKey:
+    """A section that has to be there."""
+    return required(name, form, _SAYS[name], {})
+
+
+CELL = FileKind.of(
+    "cell",
+    "dwell",
+    VERSION,
     "Cell",
     "A pipeline on its robots: tasks, flows, nodes, links, candidates, scenarios, objective.",
-    (
-        _required("dwell", ChoiceForm((VERSION,)), "Version of this format.", VERSION),
-        _WHOLE["name"],
-        *_TIMING.values(),
-        _WHOLE["window_cycles"],
-        _WHOLE["warmup_windows"],
-        _section("nodes", MappingForm(NODE, keeps=True, least=1), {}),
-        _section("links", ListForm(LINK, keeps=True)),
-        _section("tasks", MappingForm(TASK, keeps=True, least=1), {}),
-        _section("flows", ListForm(FLOW, keeps=True)),
-        _section("scales", MappingForm(PROCESS, keeps=True)),
-        _section("candidates", MappingForm(MappingForm(NAME), keeps=True, least=1), {}),
-        _section("scenarios", MappingForm(ListForm(DISTURBANCE, keeps=True), keeps=True)),
-        _section("objective", OBJECTIVE),
-        _section("controller", CONTROLLER),
-        _section("servo", SERVO),
-        _section("live", LIVE),
-    ),
+    _key(Problem, "name"),
+    *_TIMING,
+    _key(Problem, "window_cycles"),
+    _key(Problem, "warmup_windows"),
+    _needed("nodes", MappingForm(NODE, keeps=True, least=1)),
+    _section("links", ListForm(LINK, keeps=True)),
+    _needed("tasks", MappingForm(TASK, keeps=True, least=1)),
+    _section("flows", ListForm(FLOW, keeps=True)),
+    _section("scales", MappingForm(PROCESS, keeps=True)),
+    _needed("candidates", MappingForm(MappingForm(NAME), keeps=True, least=1)),
+    _section("scenarios", MappingForm(ListForm(DISTURBANCE, keeps=True), keeps=True)),
+    _section("objective", OBJECTIVE),
+    _section("controller", CONTROLLER),
+    _section("servo", SERVO),
+    _section("live", LIVE),
 )
-
-CELL = FileKind(CELL_SHAPE, "cell", "dwell", VERSION)

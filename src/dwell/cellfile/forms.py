@@ -12,12 +12,12 @@ import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, field
-from typing import Any, ClassVar, Final, TypeAlias, get_args, get_origin
+from typing import Any, Final, TypeAlias, get_args, get_origin
 
 from dwell.cellfile.document_faults import Faults
 from dwell.model.bounds import Bound, Pattern, as_read
 from dwell.model.declaration import DeclaredField, declared_fields
-from dwell.model.dotted_paths import Step
+from dwell.model.dotted_paths import Step, beneath
 from dwell.model.semantics import closest, nearest
 
 JsonSchema: TypeAlias = dict[str, Any]
@@ -30,19 +30,14 @@ FAULTY: Final = object()
 MISSPELT = 0.7
 
 
-def beneath(path: str, step: Step) -> str:
-    """Return the path of what stands at a key or an index."""
-    if isinstance(step, int):
-        return f"{path}[{step}]"
-    name = step or "''"
-    return f"{path}.{name}" if path else name
+def removing(step: Step) -> str:
+    """Return a remedy for a key or an item without a value."""
+    what = f"the key {step!r}" if isinstance(step, str) else "the item"
+    return f"give a value, or remove {what}"
 
 
 class Form(ABC):
     """What may stand at a place."""
-
-    #: Whether a key or an item at fault is kept as a bare name or place, None.
-    is_kept: ClassVar[bool] = False
 
     @property
     @abstractmethod
@@ -58,10 +53,24 @@ class Form(ABC):
         """Return the JSON Schema; what has a name is put into the definitions."""
 
 
+def not_allowed(value: object, bound: str) -> str:
+    """Return what is wrong with a value that must be something else."""
+    return f"{as_read(value)} is not allowed; it must be {bound}"
+
+
 def refused(value: object, bound: str, path: str, faults: Faults) -> Any:
     """Record that a value is not allowed."""
-    faults.add(path, f"{as_read(value)} is not allowed; it must be {bound}")
+    faults.add(path, not_allowed(value, bound))
     return FAULTY
+
+
+def _read_by(reader: Callable[[Any], Any], value: Any, path: str, faults: Faults) -> Any:
+    """Return what a reader makes of a value, or record what its ValueError says."""
+    try:
+        return reader(value)
+    except ValueError as error:
+        faults.add(path, str(error))
+        return FAULTY
 
 
 # ------------------------------------------------------------------------------ single values
@@ -80,18 +89,26 @@ class NumberForm(Form):
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return the number, a float where the bound is none of whole numbers."""
+        return _read_by(self.number, value, path, faults)
+
+    def number(self, value: Any) -> Any:
+        """Return the number.
+
+        Raises
+        ------
+        ValueError
+            With what is wrong.
+        """
         if isinstance(value, bool) or not isinstance(value, int | float):
             remedy = unquoted(value) if isinstance(value, str) else ""
-            return refused(value, f"{self.bound}{remedy}", path, faults)
+            raise ValueError(not_allowed(value, f"{self.bound}{remedy}"))
         if abs(value) > sys.float_info.max and self.bound.high == math.inf:
-            message = f"{as_read(value)} is not allowed; leave the key out for no limit"
-            faults.add(path, message)
-            return FAULTY
+            raise ValueError(f"{as_read(value)} is not allowed; leave the key out for no limit")
         # A whole number may be written 6e4; JSON Schema says the same of its integers.
         if self.bound.whole and isinstance(value, float) and value.is_integer():
             value = int(value)
         if not self.bound.holds(value):
-            return refused(value, str(self.bound), path, faults)
+            raise ValueError(not_allowed(value, str(self.bound)))
         return value if self.bound.whole else float(value)
 
     def schema(self, definitions: Definitions) -> JsonSchema:
@@ -228,13 +245,8 @@ class WrittenForm(Form):
         for place, step in _empty_places(value, path):
             within = place.removeprefix(path)
             if not (self.may_be_empty and within == f".{step}") and not faults.at(place):
-                what = f"the key {step!r}" if isinstance(step, str) else "the item"
-                faults.add(place, f"nothing is given; give a value, or remove {what}")
-        try:
-            return self.reader(value)
-        except ValueError as error:
-            faults.add(path, str(error))
-            return FAULTY
+                faults.add(place, f"nothing is given; {removing(step)}")
+        return _read_by(self.reader, value, path, faults)
 
     def schema(self, definitions: Definitions) -> JsonSchema:
         """Return the schema as given."""
@@ -299,13 +311,7 @@ class MappingForm(Form):
         if not isinstance(value, dict):
             return refused(value, "a mapping", path, faults)
         found = {
-            name: take(
-                self.form,
-                item,
-                beneath(path, name),
-                faults,
-                f"give a value, or remove the key {name!r}",
-            )
+            name: take(self.form, item, beneath(path, name), faults, removing(name))
             for name, item in value.items()
         }
         if self.keeps:
@@ -337,9 +343,8 @@ class ListForm(Form):
         """Return a list of what they say."""
         if not isinstance(value, list):
             return refused(value, "a list; for none, write []", path, faults)
-        remedy = "give a value, or remove the item"
         found = [
-            take(self.form, item, beneath(path, index), faults, remedy)
+            take(self.form, item, beneath(path, index), faults, removing(index))
             for index, item in enumerate(value)
         ]
         if self.keeps:
@@ -384,6 +389,18 @@ class FormKey:
     def described(self) -> str:
         """The sentence, with what is usual."""
         return f"{self.says[:-1]}; default: {self.usual}." if self.usual else self.says
+
+
+def optional(name: str, form: Form, says: str, usual: str = "", *, named: str = "") -> FormKey:
+    """Return a key that may be left out; `named` where the file has another name for it."""
+    return FormKey(name, named or name, form, says, usual=usual)
+
+
+def required(
+    name: str, form: Form, says: str, stand_in: Any = FAULTY, *, named: str = ""
+) -> FormKey:
+    """Return a key that has to be there; see `optional`."""
+    return FormKey(name, named or name, form, says, is_required=True, stand_in=stand_in)
 
 
 class Entry:
@@ -453,13 +470,14 @@ class Shape(Form):
         """Return an `Entry` with what is given."""
         if not isinstance(value, dict):
             return refused(value, f"a mapping of {', '.join(self.names)}", path, faults)
+        names = self.names
         missing = [key.named for key in self.keys if key.is_required and key.named not in value]
         for name in value:
-            if name not in self.names:
+            if name not in names:
                 here = beneath(path, name)
                 if not faults.at(here):
-                    faults.add(here, f"unknown key {name!r}; {nearest(name, self.names)}")
-                meant = closest(name, self.names, MISSPELT)
+                    faults.add(here, f"unknown key {name!r}; {nearest(name, names)}")
+                meant = closest(name, names, MISSPELT)
                 if meant in missing:
                     faults.excuse(beneath(path, meant))
         values = {}
@@ -480,9 +498,7 @@ class Shape(Form):
             if key.is_required and not faults.at(path):
                 faults.add(path, f"missing; add it: {says}")
             return FAULTY
-        remedy = f"give a value, or remove the key {key.named!r}"
-        if key.is_required:
-            remedy = f"give a value: {says}"
+        remedy = f"give a value: {says}" if key.is_required else removing(key.named)
         return take(key.form, value[key.named], path, faults, remedy)
 
     def schema(self, definitions: Definitions) -> JsonSchema:
@@ -564,7 +580,6 @@ def shape_of(
     instead: Mapping[str, Form | FormKey] | None = None,
     further: tuple[FormKey, ...] = (),
     says: str = "",
-    extra: Mapping[str, Any] | None = None,
 ) -> Shape:
     """Return the shape of a class of the model.
 
@@ -591,7 +606,7 @@ def shape_of(
         else:
             keys.append(key_of(one, given or form_of(one, forms)))
     first = (kind.__doc__ or "").partition("\n")[0]
-    return Shape(title or kind.__name__, says or first, (*keys, *further), kind, extra or {})
+    return Shape(title or kind.__name__, says or first, (*keys, *further), kind)
 
 
 def entries_of(value: Any) -> Iterator[Entry]:

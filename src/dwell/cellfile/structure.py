@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dwell.cellfile.document_faults import Faults
-from dwell.cellfile.forms import Entry, Shape
+from dwell.cellfile.forms import ChoiceForm, Entry, FormKey, Shape, required
 from dwell.model.bounds import as_read, shown
 from dwell.model.dotted_paths import Step, dotted
 
@@ -37,6 +37,16 @@ class FileKind:
     what: str
     key: str
     version: int
+
+    @classmethod
+    def of(
+        cls, what: str, key: str, version: int, title: str, says: str, *keys: FormKey
+    ) -> FileKind:
+        """Return a kind of file with these keys behind that of its version."""
+        first = required(
+            "version", ChoiceForm((version,)), "Version of this format.", version, named=key
+        )
+        return cls(Shape(title, says, (first, *keys)), what, key, version)
 
     @property
     def begin(self) -> str:

@@ -5,15 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 from dwell.cellfile.forms import (
-    ChoiceForm,
     FlagForm,
-    FormKey,
     ListForm,
     MappingForm,
     NumberForm,
-    Shape,
     TextForm,
     WrittenForm,
+    not_allowed,
+    optional,
+    required,
 )
 from dwell.cellfile.structure import FileKind
 from dwell.model.bounds import MAX_COUNT, NOT_EMPTY, SEEDS, Bound, as_read
@@ -21,15 +21,7 @@ from dwell.model.bounds import MAX_COUNT, NOT_EMPTY, SEEDS, Bound, as_read
 VERSION = 1
 
 WINDOWS = Bound(1, MAX_COUNT, whole=True)
-SEED = Bound(0, 10**15, whole=True)
-
-
-def _number(value: object, bound: Bound) -> int:
-    if isinstance(value, float) and value.is_integer():
-        value = int(value)
-    if not bound.holds(value):
-        raise ValueError(f"{as_read(value)} is not allowed; it must be {bound}")
-    return int(value)  # type: ignore[call-overload, no-any-return]
+SEED, COUNT = NumberForm(Bound(0, 10**15, whole=True)), NumberForm(SEEDS)
 
 
 def _seeds(value: Any) -> tuple[int, ...]:
@@ -39,11 +31,11 @@ def _seeds(value: Any) -> tuple[int, ...]:
     if isinstance(value, list):
         if not value:
             raise ValueError("the list is empty; name at least one seed")
-        return tuple(_each_once([_number(seed, SEED) for seed in value]))
+        return tuple(_each_once([SEED.number(seed) for seed in value]))
     if isinstance(value, bool) or not isinstance(value, int | float):
         ways = "a number of seeds, a list of seeds, or {from: 101, count: 20}"
-        raise ValueError(f"{as_read(value)} is not allowed; it must be {ways}")
-    return tuple(range(1, _number(value, SEEDS) + 1))
+        raise ValueError(not_allowed(value, ways))
+    return tuple(range(1, COUNT.number(value) + 1))
 
 
 def _seeds_from(value: dict[str, object]) -> tuple[int, ...]:
@@ -53,7 +45,7 @@ def _seeds_from(value: dict[str, object]) -> tuple[int, ...]:
     missing = [key for key in ("from", "count") if value.get(key) is None]
     if missing:
         raise ValueError(f"`{missing[0]}` is missing; write it as {{from: 101, count: 20}}")
-    first, count = _number(value["from"], SEED), _number(value["count"], SEEDS)
+    first, count = SEED.number(value["from"]), COUNT.number(value["count"])
     return tuple(range(first, first + count))
 
 
@@ -69,8 +61,7 @@ def _each_once(values: list[Any]) -> list[Any]:
 def _names(value: object, what: str) -> list[str]:
     """Return a list of names, each given once."""
     if not isinstance(value, list) or not all(isinstance(name, str) and name for name in value):
-        has = as_read(value)
-        raise ValueError(f"{has} is not allowed; it must be a list of {what}, or a mapping")
+        raise ValueError(not_allowed(value, f"a list of {what}, or a mapping"))
     if not value:
         raise ValueError(f"the list is empty; name at least one of {what}")
     return _each_once(value)
@@ -96,103 +87,61 @@ def _parameters(value: object) -> dict[str, object]:
     """Return a mapping of paths."""
     if isinstance(value, dict):
         return value
-    raise ValueError(
-        f"{as_read(value)} is not allowed; it must be a mapping of paths in the cell to lists of "
-        "values"
-    )
+    raise ValueError(not_allowed(value, "a mapping of paths in the cell to lists of values"))
 
 
 NAME, NO_TEXT = TextForm(), TextForm(NOT_EMPTY)
-STUDY = FileKind(
-    Shape(
-        "Study",
-        "Scenarios, policies, parameters and seeds, of which every combination is simulated.",
-        (
-            FormKey(
-                "version",
-                "dwell-study",
-                ChoiceForm((VERSION,)),
-                "Version of this format.",
-                is_required=True,
-                stand_in=VERSION,
-            ),
-            FormKey("name", "name", NAME, "Name of the study.", usual="the file's"),
-            FormKey(
-                "cell",
-                "cell",
-                NAME,
-                "The cell file, relative to this file's folder.",
-                is_required=True,
-                stand_in="",
-            ),
-            FormKey(
-                "traces",
-                "traces",
-                NO_TEXT,
-                "Folder where the cell's trace files are, relative to this file's.",
-                usual="the cell's",
-            ),
-            FormKey(
-                "scenarios",
-                "scenarios",
-                WrittenForm(
-                    "list of names, name → list of disturbances", _scenarios, may_be_empty=True
-                ),
-                "Scenarios of the cell, or a mapping of names to disturbances.",
-                usual="all of the cell's",
-            ),
-            FormKey(
-                "windows",
-                "windows",
-                NumberForm(WINDOWS),
-                "Length of every run, the warm-up included.",
-                usual="300",
-            ),
-            FormKey(
-                "seeds",
-                "seeds",
-                WrittenForm("number, list, `{from, count}`", _seeds),
-                "A number of seeds, or which.",
-                usual="20",
-            ),
-            FormKey(
-                "references",
-                "references",
-                FlagForm(),
-                "Whether to play the references in hindsight as well.",
-                usual="false",
-            ),
-            FormKey(
-                "policies",
-                "policies",
-                WrittenForm("list of names, name → policy", _policies),
-                "Policies and candidates, or a mapping of names to what they are.",
-                is_required=True,
-                stand_in={},
-            ),
-            FormKey(
-                "parameters",
-                "parameters",
-                WrittenForm("path → list of values", _parameters),
-                "Values by their path in the cell; every combination is a point.",
-            ),
-            FormKey(
-                "zip",
-                "zip",
-                ListForm(ListForm(NAME)),
-                "Groups of parameters whose values go together, the first with the first.",
-                usual="none",
-            ),
-            FormKey(
-                "labels",
-                "labels",
-                MappingForm(NO_TEXT),
-                "MappingForm of parameters in figures and tables, by their paths.",
-                usual="the paths",
-            ),
-        ),
-    ),
+STUDY = FileKind.of(
     "study",
     "dwell-study",
     VERSION,
+    "Study",
+    "Scenarios, policies, parameters and seeds, of which every combination is simulated.",
+    optional("name", NAME, "Name of the study.", "the file's"),
+    required("cell", NAME, "The cell file, relative to this file's folder.", ""),
+    optional(
+        "traces",
+        NO_TEXT,
+        "Folder where the cell's trace files are, relative to this file's.",
+        "the cell's",
+    ),
+    optional(
+        "scenarios",
+        WrittenForm("list of names, name → list of disturbances", _scenarios, may_be_empty=True),
+        "Scenarios of the cell, or a mapping of names to disturbances.",
+        "all of the cell's",
+    ),
+    optional("windows", NumberForm(WINDOWS), "Length of every run, the warm-up included.", "300"),
+    optional(
+        "seeds",
+        WrittenForm("number, list, `{from, count}`", _seeds),
+        "A number of seeds, or which.",
+        "20",
+    ),
+    optional(
+        "references", FlagForm(), "Whether to play the references in hindsight as well.", "false"
+    ),
+    required(
+        "policies",
+        WrittenForm("list of names, name → policy", _policies),
+        "Policies and candidates, or a mapping of names to what they are.",
+        {},
+    ),
+    optional(
+        "parameters",
+        WrittenForm("path → list of values", _parameters),
+        "Values by their path in the cell; every combination is a point.",
+    ),
+    optional(
+        "zip",
+        ListForm(ListForm(NAME)),
+        "Groups of parameters whose values go together, the first with the first.",
+        "none",
+    ),
+    optional(
+        "labels",
+        MappingForm(NO_TEXT),
+        "Names of parameters in figures and tables, by their paths.",
+        "the paths",
+    ),
 )

@@ -22,6 +22,7 @@ from typing import (
     get_type_hints,
 )
 
+from dwell.errors import Fault, ProblemError
 from dwell.model.bounds import Bound, Pattern, require
 from dwell.model.frozen import FrozenDict
 
@@ -112,6 +113,21 @@ def within_path(path: str, kind: type, fault: str) -> str:
     return f"{around}.{fault}" if around and fault else around or fault
 
 
+def made_at(path: str, kind: Any, make: Callable[..., T], *args: object, **values: object) -> T:
+    """Make something of a declared class at a path, which its faults then say.
+
+    Raises
+    ------
+    ProblemError
+        With the faults of `make`, each at its path (`within_path`).
+    """
+    try:
+        return make(*args, **values)
+    except ProblemError as error:
+        faults = [Fault(within_path(path, kind, one.path), one.message) for one in error.faults]
+        raise ProblemError(faults) from None
+
+
 def is_declared(kind: Any) -> bool:
     """Whether a class, or that of an object, was made by `declared`."""
     return (kind if isinstance(kind, type) else type(kind)) in _sections
@@ -167,8 +183,8 @@ def _read_fields(kind: Any) -> tuple[DeclaredField, ...]:
     return tuple(
         DeclaredField(
             one.name,
-            bare(hints[one.name]),
-            _choices(bare(hints[one.name])),
+            _bare(hints[one.name]),
+            _choices(_bare(hints[one.name])),
             one.default if one.default_factory is MISSING else one.default_factory(),
             one.metadata[KEY],
         )
@@ -177,7 +193,7 @@ def _read_fields(kind: Any) -> tuple[DeclaredField, ...]:
     )
 
 
-def bare(annotation: Any) -> Any:
+def _bare(annotation: Any) -> Any:
     """Return a type without ``| None``."""
     if get_origin(annotation) in (Union, types.UnionType):
         kinds = [one for one in get_args(annotation) if one is not type(None)]

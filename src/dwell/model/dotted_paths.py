@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
+from functools import reduce
 from typing import TypeAlias
 
 from dwell.errors import Fault, ProblemError
@@ -21,14 +22,15 @@ KEY = re.compile(r"[^.\[\]]+")
 
 def dotted(steps: Iterable[Step]) -> str:
     """Return ``links[0].from`` for ("links", 0, "from")."""
-    path = ""
-    for step in steps:
-        if isinstance(step, int):
-            path += f"[{step}]"
-        else:
-            key = step or "''"
-            path += f".{key}" if path else key
-    return path
+    return reduce(beneath, steps, "")
+
+
+def beneath(path: str, step: Step) -> str:
+    """Return the path of what stands at a key or an index of what is at a path."""
+    if isinstance(step, int):
+        return f"{path}[{step}]"
+    key = step or "''"
+    return f"{path}.{key}" if path else key
 
 
 def steps_of(path: str, document: object) -> tuple[Step, ...]:

@@ -8,9 +8,9 @@ from typing import Any, TypeAlias, get_args
 
 from dwell.errors import Fault, ProblemError
 from dwell.model.bounds import Bound
-from dwell.model.declaration import DeclaredField, declared_fields, is_declared, within_path
+from dwell.model.declaration import DeclaredField, declared_fields, is_declared, made_at
 from dwell.model.document import to_document
-from dwell.model.dotted_paths import Step, dotted, steps_of
+from dwell.model.dotted_paths import Step, beneath, steps_of
 from dwell.model.problem import Problem
 from dwell.model.process import Constant, Process
 from dwell.model.semantics import nearest
@@ -46,33 +46,31 @@ def evolve(problem: Problem, changes: Mapping[str, object]) -> Problem:
     document = to_document(problem)
     trees: dict[str, _Tree] = {}
     for path, value in changes.items():
+        given = value
+        if path == "objective.targets" and isinstance(value, Mapping):
+            # As a file's, which need not say the deadline again.
+            given = {"latency_ms": problem.pipeline.deadline_ms, **value}
         *before, last = steps_of(path, document)
         first = before[0] if before else last
-        home = next((name for name in AT_TOP if first in _keys(getattr(problem, name))), "")
+        home = next((name for name in AT_TOP if first in _keys(type(getattr(problem, name)))), "")
         tree: Any = trees.setdefault(home, {})
         for step in before:
             tree = tree.setdefault(step, {})
-        tree[last] = _Value(value)
-    targets = trees.get("", {}).get("objective", {})
-    if isinstance(targets, dict) and isinstance(whole := targets.get("targets"), _Value):
-        # What a file leaves out is the deadline.
-        usual = {"latency_ms": problem.pipeline.deadline_ms}
-        if isinstance(whole.value, Mapping):
-            targets["targets"] = _Value({**usual, **whole.value})
-    given = _arguments(problem, trees.pop("", {}), "")
+        tree[last] = _Value(given)
+    whole = _arguments(problem, trees.pop("", {}), "")
     parts = {name: _changed(getattr(problem, name), tree, None, "") for name, tree in trees.items()}
-    return replace(problem, **parts, **given)
+    return replace(problem, **parts, **whole)
 
 
-def _keys(part: Any) -> dict[str, DeclaredField]:
-    return {one.named: one for one in declared_fields(type(part))}
+def _keys(kind: type) -> dict[str, DeclaredField]:
+    return {one.named: one for one in declared_fields(kind)}
 
 
 def _arguments(part: Any, tree: _Tree, path: str) -> dict[str, Any]:
-    keys = _keys(part)
+    keys = _keys(type(part))
     given = {}
     for step, inner in tree.items():
-        here, one = dotted((path, step) if path else (step,)), keys.get(str(step))
+        here, one = beneath(path, step), keys.get(str(step))
         if one is None:
             message = f"unknown key {step!r}; {nearest(str(step), keys)}"
             raise ProblemError([Fault(here, message)])
@@ -83,24 +81,15 @@ def _arguments(part: Any, tree: _Tree, path: str) -> dict[str, Any]:
 def _changed(part: Any, tree: _Tree | _Value, one: DeclaredField | None, path: str) -> Any:
     """Return a part with what a tree has for it; `one` is what it is, or is within."""
     if isinstance(tree, _Value):
-        return tree.value if one is None else _attempt(path, one.kind, _made, one, tree.value)
+        return tree.value if one is None else made_at(path, one.kind, _made, one, tree.value)
     if isinstance(part, Mapping | tuple):
         names = list(part) if isinstance(part, Mapping) else range(len(part))
         items = dict(part) if isinstance(part, Mapping) else dict(enumerate(part))
         for step, inner in tree.items():
             name = names[step] if isinstance(step, int) else step
-            items[name] = _changed(items.get(name), inner, one, dotted((path, step)))
+            items[name] = _changed(items.get(name), inner, one, beneath(path, step))
         return items if isinstance(part, Mapping) else tuple(items.values())
-    return _attempt(path, type(part), replace, part, **_arguments(part, tree, path))
-
-
-def _attempt(path: str, kind: Any, make: Any, *args: object, **values: object) -> Any:
-    """Make something at a path, which its faults then say."""
-    try:
-        return make(*args, **values)
-    except ProblemError as error:
-        faults = [Fault(within_path(path, kind, one.path), one.message) for one in error.faults]
-        raise ProblemError(faults) from None
+    return made_at(path, type(part), replace, part, **_arguments(part, tree, path))
 
 
 def _made(one: DeclaredField, value: object) -> Any:
@@ -112,6 +101,6 @@ def _made(one: DeclaredField, value: object) -> Any:
     if kind is Process and isinstance(value, int | float) and not isinstance(value, bool):
         return Constant(float(value))
     if isinstance(value, Mapping) and isinstance(kind, type) and is_declared(kind):
-        keys = {field.named: field for field in declared_fields(kind)}
+        keys = _keys(kind)
         return kind(**{keys[name].name: _made(keys[name], item) for name, item in value.items()})
     return value

@@ -24,18 +24,18 @@ from typing import Any
 
 from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.forms import (
-    ChoiceForm,
     Entry,
-    FormKey,
     MappingForm,
-    Shape,
     WrittenForm,
+    not_allowed,
+    optional,
+    required,
     shape_of,
 )
 from dwell.cellfile.structure import FileKind, read_structure
 from dwell.cellfile.yaml_text import read_yaml
 from dwell.model import Problem
-from dwell.model.bounds import NOT_EMPTY, Bound, Pattern, as_read, require
+from dwell.model.bounds import NOT_EMPTY, Bound, Pattern, require
 from dwell.model.declaration import declared, key
 from dwell.model.semantics import nearest
 
@@ -101,7 +101,7 @@ def _wrong_places(line: str) -> str:
 def _impairing(value: Any) -> str:
     wrong = _wrong_places(value) if isinstance(value, str) and value else "a line for a shell"
     if wrong:
-        raise ValueError(f"{as_read(value)} is not allowed; it must be {wrong}")
+        raise ValueError(not_allowed(value, wrong))
     return str(value)
 
 
@@ -114,47 +114,20 @@ def _words(value: Any) -> tuple[str, ...]:
     except ValueError as error:
         remedy, words = f"{remedy} ({error})", ()
     if not words:
-        raise ValueError(f"{as_read(value)} is not allowed; it must be {remedy}")
+        raise ValueError(not_allowed(value, remedy))
     return words
 
 
 _HOST = shape_of(RealHost, {}, instead={"run": WrittenForm("text, list of texts", _words)})
-INVENTORY = FileKind(
-    Shape(
-        "Inventory",
-        "The hosts that the nodes of a cell are.",
-        (
-            FormKey(
-                "version",
-                FORMAT,
-                ChoiceForm((VERSION,)),
-                "Version of this format.",
-                is_required=True,
-                stand_in=VERSION,
-            ),
-            FormKey(
-                "hosts",
-                "hosts",
-                MappingForm(_HOST, keeps=True),
-                "The host of each node.",
-                is_required=True,
-                stand_in={},
-            ),
-            FormKey(
-                "links",
-                "links",
-                MappingForm(
-                    shape_of(LinkCommands, {}, instead={"begin": WrittenForm("text", _impairing)}),
-                    keeps=True,
-                ),
-                "What impairs a directed link.",
-                usual="none",
-            ),
-        ),
-    ),
+_LINK = shape_of(LinkCommands, {}, instead={"begin": WrittenForm("text", _impairing)})
+INVENTORY = FileKind.of(
     "inventory",
     FORMAT,
     VERSION,
+    "Inventory",
+    "The hosts that the nodes of a cell are.",
+    required("hosts", MappingForm(_HOST, keeps=True), "The host of each node.", {}),
+    optional("links", MappingForm(_LINK, keeps=True), "What impairs a directed link.", "none"),
 )
 
 
