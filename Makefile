@@ -16,10 +16,10 @@ COMPILE := $(UV) pip compile --quiet --python $(BIN)/python --universal --python
 	--generate-hashes --custom-compile-command "make lock" $(if $(UPGRADE),--upgrade)
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test check bench paper deadlines faults chaos soak fuzz audit sbom lock clean again
+.PHONY: help env demo test test-all check bench paper deadlines faults chaos soak fuzz audit sbom lock clean again
 
 help: ## Show this list
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' Makefile
 
 env: $(VENV)/.installed ## Make .venv from the lock files (only when they changed)
 
@@ -58,9 +58,16 @@ demo: env ## Simulate and report an example into demo-out/ (REAL=path: on a real
 
 # Most tests run side by side; those that need the machine to themselves follow, one after another.
 # pytest ends with 5 where ARGS leave nothing to run.
-test: env ## Run the tests (ARGS="-k name" passes options to pytest)
-	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder -m "not alone" $(ARGS) || [ $$? -eq 5 ]
-	$(BIN)/python -m pytest -m alone $(ARGS) || [ $$? -eq 5 ]
+TESTS := $(BIN)/python -m pytest
+BESIDE := -n auto --dist loadgroup --no-loadscope-reorder
+
+test: env ## Run the tests (ARGS="-k name" passes options to pytest, "--hypothesis-profile night" tries more)
+	$(TESTS) $(BESIDE) -m "not exhaustive and not alone" $(ARGS) || [ $$? -eq 5 ]
+	$(TESTS) -m "not exhaustive and alone" $(ARGS) || [ $$? -eq 5 ]
+
+test-all: env ## Run the tests that `make test` leaves out (tests/conftest.py)
+	$(TESTS) $(BESIDE) -m "exhaustive and not alone" $(ARGS) || [ $$? -eq 5 ]
+	$(TESTS) -m "exhaustive and alone" $(ARGS) || [ $$? -eq 5 ]
 
 # clang-tidy reads the headers of the system's own C++ library.
 check: env ## Lint, formatting, types and the borders between packages

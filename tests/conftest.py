@@ -1,14 +1,17 @@
 """What all tests share: no test fails because the machine is slow.
 
 `make test` runs most tests side by side, and one after another those that need the machine to
-themselves: real processes whose faults and deadlines are counted, and ports that are looked for.
+themselves. `make test-all` does the same with what takes longest.
 """
 
 from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
+from typing import TypeAlias
 
 import pytest
 from hypothesis import settings
@@ -25,31 +28,57 @@ settings.register_profile("night", deadline=None, max_examples=200)
 settings.load_profile("ci")
 
 HERE = Path(__file__).parent
-ALONE = (
-    "testbed/chaos",
-    "cli/test_background.py",
-    "cli/test_live.py",
-    "cli/test_live_run.py",
-    "cli/test_testbed.py",
-    "live/test_real_faults.py",
-    "live/test_security.py",
-    "live/transport",
-    "testbed/test_execution.py",
-    "testbed/test_netns_testbed.py",
-    "testbed/test_run.py",
-    "test_two_computers.py",
-)
 
+#: Tests by file or folder: those whose names have one of these parts, or all.
+Chosen: TypeAlias = Mapping[str, tuple[str, ...]]
 
-#: Files that take longest: side by side, they begin first, so that none is left over at the end.
-LONGEST = (
+#: Real processes that have to keep to a period, or to shares of the machine, or that prove a
+#: placement with what is left of it.
+ALONE: Chosen = {
+    "cli/test_live.py": (),
+    "cli/test_live_run.py": ("test_any_cell_with_stages_runs",),
+    "live/test_real_faults.py": (),
+    "test_package.py": ("test_a_robot_runs_and_moves_a_cell",),
+    "testbed/chaos/test_fault_campaign.py": (),
+    "testbed/chaos/test_strike.py": (),
+    "testbed/test_execution.py": (),
+    "testbed/test_netns_testbed.py": (),
+}
+
+#: Files and folders whose tests one process has, one after another: real processes that may take
+#: their time, but look for free ports, or for free CPUs.
+TOGETHER = {
+    "cells": (
+        "cli/test_background.py",
+        "cli/test_live_run.py",
+        "cli/test_live_secure.py",
+        "cli/test_new.py",
+        "live/test_security.py",
+        "live/transport",
+    ),
+    "testbeds": ("cli/test_testbed.py", "testbed/test_run.py", "test_two_computers.py"),
+}
+
+#: What only `make test-all` runs.
+EXHAUSTIVE: Chosen = {
+    "live/test_protocol_model.py": (
+        "test_nothing_goes_wrong_and_there_is_always_a_way_back[states 3]",
+        *(f"test_the_stamper_does_what_the_model_does[{seed}]" for seed in (3, 4, 5)),
+    ),
+    "live/test_real_faults.py": ("test_cell_survives[freeze",),
+    "reference/test_against.py": ("the others",),
+    "test_compilers.py": (),
+    "test_package.py": (),
+    "test_sanitizers.py": (),
+    "testbed/chaos/test_fault_campaign.py": (),
+}
+
+#: Files whose tests share nothing, and take longest: any process has any of them.
+APART = (
     "reference/test_against.py",
     "live/test_protocol_model.py",
     "reproduction/test_questions.py",
     "live/test_continuity.py",
-    "test_package.py",
-    "cli/test_doctor.py",
-    "cli/test_new.py",
 )
 
 
@@ -59,10 +88,34 @@ def pytest_xdist_auto_num_workers() -> int:
     return cpus + (cpus + 1) // 2
 
 
+def below(item: pytest.Item, names: Sequence[str]) -> str:
+    """Return the name that a test is below, or nothing."""
+    return next((name for name in names if item.path.is_relative_to(HERE / name)), "")
+
+
+def among(item: pytest.Item, chosen: Chosen) -> bool:
+    """Whether a test is one of those."""
+    name = below(item, tuple(chosen))
+    return bool(name) and any(part in item.name for part in chosen[name] or ("",))
+
+
+def group(item: pytest.Item) -> str:
+    """Return what a test stays with: its file, or files that it would be in the way of."""
+    for name, files in TOGETHER.items():
+        if below(item, files):
+            return name
+    return str(item.path.relative_to(HERE))
+
+
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that need the machine to themselves; the longest files come first."""
-    first = {HERE / name: place for place, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: first.get(item.path, len(first)))
+    """Mark the tests that are listed here; what takes longest begins first."""
+    longest = (*chain(*TOGETHER.values()), *APART)
+    items.sort(key=lambda item: [*longest, ""].index(below(item, longest)))
     for item in items:
-        if any(item.path.is_relative_to(HERE / name) for name in ALONE):
+        if among(item, ALONE):
             item.add_marker(pytest.mark.alone)
+        if among(item, EXHAUSTIVE):
+            item.add_marker(pytest.mark.exhaustive)
+        if not below(item, APART):
+            item.add_marker(pytest.mark.xdist_group(group(item)))

@@ -97,7 +97,7 @@ def options(command: str) -> set[str]:
 
 @pytest.mark.parametrize("page", PAGES, ids=page_name)
 def test_commands_exist(page: Path) -> None:
-    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     lines = [text for language, text, _ in blocks(page) if language == "sh"]
     prose = FENCE.sub("", page.read_text(encoding="utf-8"))
     lines += re.findall(r"`((?:dwell|make) [a-z][^`]*)`", prose)

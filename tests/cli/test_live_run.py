@@ -104,7 +104,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
 def demo(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     """A cell that has begun to be played on."""
     one = subprocess.Popen(
-        [*LIVE_RUN, str(CELL), "--out", str(tmp_path / "out"), "--json"],
+        [*LIVE_RUN, str(CELL), "--scenario", "baseline", "--out", str(tmp_path / "out"), "--json"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -143,8 +143,8 @@ def test_interrupted_it_seals_its_run_and_ends_everything(
     assert found["interrupted"]
     run = dwell.open_run(found["run"])
     assert run.meta["recovered"]["sealed"]
-    assert run.meta["scenario"] == "demo"
-    # Nothing had been played, and no window may have closed.
+    assert run.meta["scenario"] == "baseline"
+    # No window may have closed.
     assert run.meta.get("played", []) == []
     # Everything had ended before it told so.
     assert not [process for process in of_it if process.is_running()]
