@@ -61,6 +61,8 @@ TOGETHER = {
 
 #: What only `make test-all` runs.
 EXHAUSTIVE: Chosen = {
+    "cli/test_live_run.py": ("test_it_needs_no_more_than_the_extra_live[sim]",),
+    "cli/test_testbed.py": ("test_interrupted_it_takes_everything_down[15]",),
     "live/test_protocol_model.py": (
         "test_nothing_goes_wrong_and_there_is_always_a_way_back[states 3]",
         *(f"test_the_stamper_does_what_the_model_does[{seed}]" for seed in (3, 4, 5)),
@@ -71,6 +73,7 @@ EXHAUSTIVE: Chosen = {
     "test_package.py": (),
     "test_sanitizers.py": (),
     "testbed/chaos/test_fault_campaign.py": (),
+    "testbed/test_execution.py": (),
 }
 
 #: Files whose tests share nothing, and take longest: any process has any of them.

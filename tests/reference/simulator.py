@@ -617,8 +617,9 @@ class NodeState:
         """Let the time since the last change pass."""
         elapsed = now - self.since
         self.since = now
-        speeds, rate = {cell: self.speed(cell) for cell in (ITSELF, SHADOW)}, self.rate
-        for job in self.running:
+        running, rate = self.running, self.rate
+        speeds = {cell: self.speed(cell) for cell in {job.cell for job in running}}
+        for job in running:
             before = max(job.left, Fraction(0))
             job.left -= speeds[job.cell] * self.part(job) * elapsed
             received = before - max(job.left, Fraction(0))
