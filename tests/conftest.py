@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Mapping, Sequence
-from itertools import chain
+from itertools import chain, permutations
 from pathlib import Path
 from typing import TypeAlias
 
@@ -42,7 +42,6 @@ ALONE: Chosen = {
     "testbed/chaos/test_fault_campaign.py": (),
     "testbed/chaos/test_strike.py": (),
     "testbed/test_execution.py": (),
-    "testbed/test_netns_testbed.py": (),
 }
 
 #: Files and folders whose tests one process has, one after another: real processes that may take
@@ -56,7 +55,12 @@ TOGETHER = {
         "live/test_security.py",
         "live/transport",
     ),
-    "testbeds": ("cli/test_testbed.py", "testbed/test_run.py", "test_two_computers.py"),
+    "testbeds": (
+        "cli/test_testbed.py",
+        "testbed/test_netns_testbed.py",
+        "testbed/test_run.py",
+        "test_two_computers.py",
+    ),
 }
 
 #: What only `make test-all` runs.
@@ -67,8 +71,14 @@ EXHAUSTIVE: Chosen = {
         "test_nothing_goes_wrong_and_there_is_always_a_way_back[states 3]",
         *(f"test_the_stamper_does_what_the_model_does[{seed}]" for seed in (3, 4, 5)),
     ),
-    "live/test_real_faults.py": ("test_cell_survives[freeze",),
+    "live/test_real_faults.py": (
+        "test_cell_survives[freeze",
+        *(f"test_cell_survives[cut {a}->{b}]" for a, b in permutations(("R1", "E", "R2"), 2)),
+    ),
     "reference/test_against.py": ("the others",),
+    "reproduction/test_questions.py": tuple(
+        f"test_a_question_is_answered[{name}]" for name in ("dynamic", "concurrent", "reversion")
+    ),
     "test_compilers.py": (),
     "test_package.py": (),
     "test_sanitizers.py": (),
