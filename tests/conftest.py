@@ -83,6 +83,7 @@ EXHAUSTIVE: Chosen = {
     "test_package.py": (),
     "test_sanitizers.py": (),
     "testbed/chaos/test_fault_campaign.py": (),
+    "testbed/chaos/test_strike.py": ("actuator", "clock", "process", "terminal"),
     "testbed/test_execution.py": (),
 }
 
