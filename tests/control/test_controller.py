@@ -67,7 +67,7 @@ def test_a_candidate_may_have_a_plus_in_its_name() -> None:
     problem = cell()
     name = next(iter(problem.candidates))
     both = replace(problem, candidates={**problem.candidates, "a+b": problem.candidates[name]})
-    assert Controller(both, "a+b").incumbent == "a+b"
+    assert Controller(both, "a+b").course.placement == "a+b"
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """The Controller: windows, estimator, policy and order, the same in both engines."""
 
-from dwell.control.controller import ClosedWindow, Controller, DecisionLog
+from dwell.control.controller import ClosedWindow, Controller, Proposal
+from dwell.control.course import Course
 from dwell.control.guard import (
     Failures,
     FallbackRound,
@@ -19,7 +20,7 @@ from dwell.policies import MinimalPolicy
 __all__ = [
     "ClosedWindow",
     "Controller",
-    "DecisionLog",
+    "Course",
     "Estimator",
     "Evidence",
     "Failures",
@@ -29,6 +30,7 @@ __all__ = [
     "MinimalPolicy",
     "Presence",
     "Probation",
+    "Proposal",
     "ShadowPlan",
     "final_l95_ms",
     "parts_of",
