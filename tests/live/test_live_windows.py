@@ -364,7 +364,8 @@ def test_the_present_of_a_live_cell_is_the_simulators(
         estimator = controller.estimator
         assert isinstance(estimator, Corrected)
         for window, of in zip(windows, shown, strict=False):
-            controller.close(dataclasses.replace(window, evidence=giving(of)))
+            shown_again = dataclasses.replace(window, evidence=giving(of))
+            controller.settle(controller.propose(shown_again))
         presents.append(estimator.present)
     live, simulated = presents
     assert live.down == simulated.down == frozenset()

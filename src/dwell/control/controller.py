@@ -232,10 +232,6 @@ class Controller:
         """
         return bool(self._policy.guarded and self.problem.controller.fallbacks)
 
-    def close(self, window: ClosedWindow, *, proven: str | None = None) -> str:
-        """Propose on a closed window, and carry that out at once (see `settle`)."""
-        return self.settle(self.propose(window), proven=proven)
-
     def propose(self, window: ClosedWindow) -> Proposal:
         """Look at a closed window and say what the cycles after it shall be placed on.
 

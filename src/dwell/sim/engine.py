@@ -102,12 +102,11 @@ def simulate_realisation(
     """
     _check_fit(problem, realisation)
     require_apart(tuple(resources_of(problem.fabric.nodes)), tuple(problem.candidates))
-    try:
-        played = _play(problem, realisation, policy, estimator, jobs, guard, by_window)
-    except _ProbesWantedError:
-        # Until the first probe is sent a shadow changes nothing, so that this repeats what has been
-        # played. Drawing shadows for every run that may want probes would cost all runs more.
-        played = _play(problem, realisation, policy, estimator, jobs, guard, by_window, shadow=True)
+    asked = problem, realisation, policy, estimator, jobs, guard, by_window
+    # Until the first probe is sent a shadow changes nothing, so that the second one repeats what
+    # the first has played. Shadows in every run that may want probes would cost all runs more.
+    played = _play(*asked) or _play(*asked, shadow=True)
+    assert played is not None
     meta = partial(
         _meta,
         problem,
@@ -149,10 +148,6 @@ def describe(
     return Run(meta, {}).meta
 
 
-class _ProbesWantedError(Exception):
-    """Probes are to be sent in a run that was laid out without a shadow."""
-
-
 def _play(
     problem: Problem,
     realisation: Realisation,
@@ -163,8 +158,8 @@ def _play(
     by_window: bool,
     *,
     shadow: bool = False,
-) -> PlayedRealisation:
-    """Play a realisation with or without a shadow."""
+) -> PlayedRealisation | None:
+    """Play a realisation with or without a shadow; None where probes are wanted and it has none."""
     controller = Controller(problem, policy, estimator)
     fraction = controller.shadow_fraction
     shadow = shadow or fraction > 0
@@ -185,6 +180,8 @@ def _play(
             stamper.step()
         else:
             stamper.close_window()
+        if stamper.lacks_shadow:
+            return None
     return PlayedRealisation(problem, realisation, controller, arrays, stamper.metrics)
 
 
@@ -239,6 +236,8 @@ class _Stamper:
         self.host_at_ns, self.host_down = table[:, 0].tolist(), table[:, 3].tolist()
         self.cold = ColdMigration(problem, realisation) if settings.migration == "cold" else None
         self.plan = plan
+        #: Whether probes are wanted of a run that was laid out without a shadow.
+        self.lacks_shadow = False
         self.course = controller.course
         #: L95 (ms), violation rate and cost of every window, as the controller saw them.
         self.metrics: list[tuple[float | None, ...]] = []
@@ -339,9 +338,8 @@ class _Stamper:
             controller.commit(proposal)
             return
         controller.settle(proposal, proven=watch.proven(close_ns))
-        if self.course.wanted is not None and len(self.closed) < 2:
-            raise _ProbesWantedError
-        if self.course.by_guard:
+        self.lacks_shadow = self.course.wanted is not None and self.plan is None
+        if self.course.by_guard and not self.lacks_shadow:
             first = self._takes_effect(boundary, close_ns)
             watch.want(self.course.wanted, first)
             # A cycle that is released at the very close has been stamped before.
