@@ -696,7 +696,7 @@ def test_while_an_order_is_under_way_no_window_begins() -> None:
     hand = Hand()
     hand.release(range(W + 1))
     hand.close()
-    hand.windows.ordered()
+    hand.windows.ordered(1, 1)
     hand.release(range(W + 1, 4 * W))
     assert hand.windows.due_ns(0) is None
     hand.release(range(4 * W, 5 * W + 1), 2)
@@ -704,11 +704,22 @@ def test_while_an_order_is_under_way_no_window_begins() -> None:
     hand.record()
     assert hand.column("windows", "lead") == [0, 15]
     # One that is refused: windows were contiguous all the time.
-    hand.windows.ordered()
+    hand.windows.ordered(1, 2)
     hand.release(range(5 * W + 1, 7 * W + 1), 2)
     assert hand.windows.due_ns(0) is None
     hand.windows.refused()
     assert hand.close() == [30, 31, 32, 33, 34]
+
+
+def test_an_order_for_where_the_guard_has_moved_the_cell_by_then_keeps_no_window_open() -> None:
+    """Its cycles were heard before anybody said so."""
+    hand = Hand()
+    hand.release(range(W + 1))
+    hand.close()
+    hand.release(range(W + 1, 3 * W), 2)
+    hand.windows.ordered(1, 1)
+    hand.release(range(3 * W, 4 * W + 2), 2)
+    assert hand.close() == [16, 17, 18, 19, 20]
 
 
 def test_cycles_are_known_by_stamp_or_by_completion_and_doubles_are_dropped() -> None:
@@ -985,7 +996,7 @@ def test_memory_is_bounded() -> None:
     assert len(windows.record._windows) < 2000 / W
     assert len(windows.record._in_flight) < 2000
     # Nobody says what has become of an order.
-    windows.ordered()
+    windows.ordered(1, 1)
     hand.release(range(4_000, 12_000))
     assert len(windows._by_key) < 4000
 

@@ -455,7 +455,7 @@ class ControlledCell:
         self._move = _Move(name, now_ns, phase, forks, proposal=proposal)
         self.refused = ""
         if self.windows is not None:
-            self.windows.ordered()
+            self.windows.ordered(self.course.run, self.course.term)
         self._push(self._move, now_ns)
 
     def _push(self, move: _Move, now_ns: int) -> None:

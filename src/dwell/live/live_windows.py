@@ -99,7 +99,8 @@ class LiveWindows:
         self._line: list[LiveCycle] = []
         self._by_key: dict[tuple[int, int], LiveCycle] = {}
         self._newest: tuple[LiveCycle, int | None] | None = None
-        self._ordered = False
+        # The term that a migration leaves, while it is under way.
+        self._left: tuple[int, int] | None = None
         # What `_begin` found, as long as nothing has changed that.
         self._beginning: tuple[int, bool] | None = None
         self._lead = 0
@@ -174,13 +175,19 @@ class LiveWindows:
         if self._keeps_jobs:
             self._processes.report(node, at_ns, [(who, cpu_ns)])
 
-    def ordered(self) -> None:
-        """A migration is under way: the next window begins with it, or goes on when `refused`."""
-        self._ordered, self._beginning = True, None
+    def ordered(self, run: int, term: int) -> None:
+        """A migration is under way: the next window begins with it, or goes on when `refused`.
+
+        Parameters
+        ----------
+        run, term : int
+            The term that it leaves.
+        """
+        self._left, self._beginning = (run, term), None
 
     def refused(self) -> None:
         """The migration will not come about: windows go on where they were."""
-        self._ordered, self._beginning = False, None
+        self._left = self._beginning = None
 
     def forget(self, run: int, cycle: int) -> None:
         """Take a cycle, and those after it, for never released: what told of them was wrong."""
@@ -293,16 +300,20 @@ class LiveWindows:
     def _begin(self) -> tuple[int, bool]:
         """Place in the line where the open window starts, and whether an order is awaited."""
         if self._beginning is None:
-            start, ordered = 0, self._ordered
-            segment = self._line[0].segment if self._line else None
+            start, segment = 0, self._line[0].segment if self._line else None
+            ordered = self._is_left(self._line[0]) if self._line else self._left is not None
             for place, cycle in enumerate(self._line):
                 if not cycle.heard or cycle.segment == segment:
                     continue
                 if place - start >= self._size and not ordered:
                     break
-                start, segment, ordered = place, cycle.segment, False
+                start, segment, ordered = place, cycle.segment, self._is_left(cycle)
             self._beginning = start, ordered
         return self._beginning
+
+    def _is_left(self, cycle: LiveCycle) -> bool:
+        """Whether a cycle is of a term that a migration leaves, or of one before it."""
+        return self._left is not None and (cycle.run, cycle.term) <= self._left
 
     def due_ns(self, now_ns: int) -> int | None:
         """Return when the next window closes, on the controller's clock; None if that is not known.
@@ -347,7 +358,7 @@ class LiveWindows:
         if ordered or len(self._line) <= start + self._size:
             raise LiveError("no window is due")
         self._drop(start)
-        self._ordered = False
+        self._left = None
         cycles = self._line[: self._size]
         close_ns = self._close_ns(0)
         for cycle, following in pairwise(self._line[: self._size + 1]):
