@@ -61,6 +61,8 @@ from tests.live.small_world import MS, World, columns, on
 COUNTS, SHARES = (1, 2, 3, 4), (6, 2, 1, 1)
 #: Which candidate the controller wants to be at; nothing where it goes round all of them.
 WISHES = ("LOC", "SO", "HYB", "")
+#: What the clocks show at first: none is set back beyond 0.
+START_NS = 1_000_000_000_000
 #: Time in which a cell has to be at home after its start.
 STARTED_S = 10.0
 #: How soon a killed process is back, if its agent lives.
@@ -258,7 +260,11 @@ class FaultyWorld(World):
         self._freezes: Counter[MemoryTransport] = Counter()
         problem = on(light_cell(), plan.wish or "SO")
         super().__init__(
-            problem, delay_ms=plan.delay_ms, policy=plan.wish or Touring(), seed=plan.seed
+            problem,
+            delay_ms=plan.delay_ms,
+            policy=plan.wish or Touring(),
+            seed=plan.seed,
+            start_ns=START_NS,
         )
         self.recorder.rows = self.journal.rows
         self.judge = Judge(self.problem)
@@ -493,6 +499,8 @@ def _play(world: FaultyWorld, played: Played) -> None:
         network.advance(end_ns)
         end[0]()
     outcome.end_ns = network.now_ns
+    # The guard may still move for cycles that were lost.
+    network.advance(network.now_ns + (problem.controller.guard_cycles + 1) * world.period_ns)
     _wait(world, "the whole cell at home after it", home, RECOVERED_S)
     outcome.back_ns = network.now_ns
     network.advance(network.now_ns + 5 * world.period_ns)

@@ -243,6 +243,8 @@ class World:
         By subject: each node and the controller.
     seed : int
         Seed of what the network draws.
+    start_ns : int
+        What the clocks show at first.
     """
 
     def __init__(
@@ -257,6 +259,7 @@ class World:
         seals: Mapping[str, Seals] | None = None,
         jobs: bool = False,
         seed: int = 0,
+        start_ns: int = MS,
     ) -> None:
         hosts = {
             node: Host("127.0.0.1", 10_000 + 1_000 * i)
@@ -267,7 +270,7 @@ class World:
         # Nobody hears anybody that it would have no connection to.
         reach = wire(problem).hears
         delay_ns = round(delay_ms * MS)
-        self.network = Network(seed=seed, delay_ns=delay_ns, start_ns=MS, reach=reach)
+        self.network = Network(seed=seed, delay_ns=delay_ns, start_ns=start_ns, reach=reach)
         self.clocks = dict(clocks or {})
         self.keys = Keys(problem.name)
         self._roles = {role.who: role for role in roles(problem)}
