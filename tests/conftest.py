@@ -69,6 +69,7 @@ EXHAUSTIVE: Chosen = {
     ),
     "live/test_real_faults.py": ("test_cell_survives[freeze",),
     "reference/test_against.py": ("the others",),
+    "reference/test_guarded.py": ("the others",),
     "test_compilers.py": (),
     "test_package.py": (),
     "test_sanitizers.py": (),
@@ -79,6 +80,7 @@ EXHAUSTIVE: Chosen = {
 #: Files whose tests share nothing, and take longest: any process has any of them.
 APART = (
     "reference/test_against.py",
+    "reference/test_guarded.py",
     "live/test_protocol_model.py",
     "reproduction/test_questions.py",
     "live/test_continuity.py",
