@@ -76,7 +76,9 @@ class Guard:
         """Note that a cycle is released; with another placement an order takes effect."""
         if active != self.stay.placement:
             if self.stay.by_guard:
-                self.carrier, self.returned = self.stay.placement, cycle
+                carried = self.newest >= self.stay.first
+                self.carrier = self.stay.placement if carried else None
+                self.returned = cycle
             self.stay = Stay(active, cycle, by_guard=False, watched=cycle)
             self.rests = 0
             self.begin_anew()
@@ -161,6 +163,7 @@ class Guard:
         if left in self.fallbacks:
             self.failed = [*(name for name in self.failed if name != left), left]
         self.tried.append(fallback)
+        self.carrier = None
         first = len(self.released)
         self.stay = Stay(fallback, first, by_guard=True, watched=first)
         self.spent = False
