@@ -60,7 +60,7 @@ class Guard:
         self.failed: list[str] = []
         # Everything that is heard has been tried.
         self.spent = False
-        # What carried the cell before an order left it, and the first cycle under that order.
+        # What carried the cell before an order left it, and the first cycle since that return.
         self.carrier: str | None = None
         self.returned = 0
         self.through = {name: Through() for name in problem.candidates}

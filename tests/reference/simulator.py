@@ -1257,7 +1257,7 @@ class Simulation:
             self.guard.hear_through(through, cycle)
         if cell == ITSELF:
             self.guard.hear(cycle)
-            if not self.guard.on_fallback and cycle >= self.guard.stay.first:
+            if not self.guard.on_fallback and cycle >= self.guard.returned:
                 self.proof.complete()
         elif self.is_probe(cycle):
             self.proof.hear(cycle, self.now)
