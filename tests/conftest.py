@@ -78,6 +78,7 @@ EXHAUSTIVE: Chosen = {
         *(f"test_cell_survives[cut {a}->{b}]" for a, b in permutations(("R1", "E", "R2"), 2)),
     ),
     "reference/test_against.py": ("the others",),
+    "reference/test_guarded.py": ("the others",),
     "reproduction/test_questions.py": tuple(
         f"test_a_question_is_answered[{name}]" for name in ("dynamic", "concurrent", "reversion")
     ),
@@ -92,6 +93,7 @@ EXHAUSTIVE: Chosen = {
 #: Files whose tests share nothing, and take longest: any process has any of them.
 APART = (
     "reference/test_against.py",
+    "reference/test_guarded.py",
     "live/test_protocol_model.py",
     "reproduction/test_questions.py",
     "live/test_continuity.py",

@@ -1,7 +1,6 @@
 """A second, slow simulator of the page docs/background/simulator.md, for one cell, on SimPy.
 
-It shares no code with the kernels (the guard is the one that a live cell has, told of every event)
-and is written to be compared with the page, sentence by
+It shares no code with the kernels and is written to be compared with the page, sentence by
 sentence: every node looks at all of its jobs after every event, remaining work is an exact
 fraction, a link is a SimPy process that takes messages out of a queue. What the page leaves open is
 read as the comments marked "Reading:" say.
@@ -20,9 +19,9 @@ from typing import Any
 
 import simpy
 
-from dwell.control import Failures, Guard, Presence, Probation
 from dwell.kernels.realisation import LinkSegment, NodeChange, Realisation
 from dwell.model import Execution, Flow, Node, Pipeline, Placement, Problem, Quota, Task
+from tests.reference.guard import NEVER, Guard, Proof
 
 #: Of the changes of one instant, the place of what quotas do then.
 LAST_CHANGE = 900_000
@@ -111,13 +110,23 @@ class WindowResult:
 
 
 @dataclass(frozen=True)
+class Decision:
+    """What is decided on a window, or a move of the guard before that window's own."""
+
+    window: int
+    incumbent: str
+    placement: str
+    by_guard: bool
+
+
+@dataclass(frozen=True)
 class Result:
     """The record of a run.
 
     `cycles` are those up to the last close. `jobs` and `shadow_jobs` are by cycle and task;
     `arrived` is when a message was handed to its target, by cell, cycle, source and target.
     `stamps` are the candidates that every released cycle runs under, and is also sent through.
-    `guarded` are the moves of the guard: when, from which candidate, to which.
+    `decisions` are those of the controller, and the moves of the guard.
     `closest_ns` is the least distance, below a microsecond, of two events that have nothing to do
     with each other (see `closest_unrelated`); None where there is no such pair.
     """
@@ -128,7 +137,7 @@ class Result:
     arrived: Mapping[tuple[int, int, str, str], int]
     windows: tuple[WindowResult, ...]
     stamps: tuple[tuple[str, str | None], ...]
-    guarded: tuple[tuple[int, str, str], ...]
+    decisions: tuple[Decision, ...]
     closest_ns: int | None
 
     @property
@@ -753,7 +762,7 @@ class Simulation:
 
     Cycles are stamped as `given` says, or else as a controller does that orders what the `script`
     says, one name at each close that it sees. With a guard the cell has one, and a name that it
-    holds back is said again at the next close.
+    holds back is said again at the next close, unless the controller is `fickle`.
     """
 
     def __init__(
@@ -766,6 +775,7 @@ class Simulation:
         script: Sequence[str] = (),
         fraction: float = 0.0,
         guarded: bool = False,
+        fickle: bool = False,
     ) -> None:
         self.env = simpy.Environment()
         self.problem = problem
@@ -782,6 +792,7 @@ class Simulation:
         self.given = given
         self.script = list(script)
         self.fraction = fraction
+        self.fickle = fickle
         # Candidates that were ordered, with the first cycle that each stamps.
         self.moves = [(0, problem.initial)]
         self.stamps: list[tuple[str, str | None]] = []
@@ -791,12 +802,11 @@ class Simulation:
         self.windows: list[WindowResult] = []
         self.migration = 0
 
-        self.guard = Guard.of(problem) if guarded else None
-        self.presence, self.probation = Presence.of(problem), Probation.of(problem)
-        self.failures = Failures.of(problem)
-        self.guarded: list[tuple[int, str, str]] = []
-        # First cycle that is under orders; candidates that cycles are probes of, from which on.
-        self.ordered = 0
+        self.patience = self.settings.guard_cycles * nanoseconds(self.pipeline.period_ms)
+        self.guard = Guard(problem, self.patience) if guarded else None
+        self.proof = Proof(problem, self.patience)
+        self.decisions: list[Decision] = []
+        # Candidates that cycles are probes of, from which on.
         self.wishes: list[tuple[int, str | None]] = []
         self.heard_of: set[tuple[int, int]] = set()
 
@@ -979,7 +989,7 @@ class Simulation:
         for k in range(self.number):
             self.at(self.release[k], RELEASE, k, -1, self.releaser(k), fixed=True)
         if self.guard is not None:
-            for time in sorted(self.looks(self.guard)):
+            for time in sorted(self.looks()):
                 self.at(time, GUARD, -1, -1, self.look, fixed=True)
         self.open_window(0)
         while not self.over and self.env.peek() <= self.end:
@@ -992,7 +1002,7 @@ class Simulation:
             arrived=self.arrived,
             windows=tuple(self.windows),
             stamps=tuple(self.stamps),
-            guarded=tuple(self.guarded),
+            decisions=tuple(self.decisions),
             closest_ns=closest_unrelated(self.log),
         )
 
@@ -1058,28 +1068,34 @@ class Simulation:
             self.move(order, boundary, self.now + delay)
 
     def ordered_at_close(self, active: str, boundary: int) -> str:
-        """Return what the script says, unless the guard holds it back."""
+        """Return what the policy says, unless the guard holds it back."""
         name = self.script[0]
-        if self.guard is None or not self.guard.on_fallback:
-            return self.script.pop(0)
-        if name != active and self.probation.proven(name, self.now):
-            return self.script.pop(0)
-        wish = None if name == active else name
-        if wish is None:
+        held = self.held_back(name, active, boundary)
+        if not held or self.fickle:
             self.script.pop(0)
-        if wish != self.probation.wanted:
-            self.probation.want(wish)
+        order = active if held else name
+        self.decisions.append(Decision(len(self.windows) - 1, active, order, by_guard=held))
+        return order
+
+    def held_back(self, name: str, active: str, boundary: int) -> bool:
+        """Whether an order has to wait for its proof, which begins with the wish."""
+        if self.guard is None or not self.guard.on_fallback:
+            return False
+        if name != active and self.proof.proven(name, self.now):
+            return False
+        wish = None if name == active else name
+        if wish != self.proof.wanted:
+            self.proof.want(wish)
             delay = nanoseconds(self.settings.order_delay_ms)
             self.wishes.append((self.first_stamped(boundary, self.now + delay), wish))
-        return active
+        return wish is not None
 
     def move(self, order: str, boundary: int, ready: int) -> None:
         """Stamp cycles with what was ordered once it is ready, and open a window with them."""
         first = self.first_stamped(boundary, ready)
         self.moves.append((first, order))
         if self.guard is not None and self.guard.on_fallback:
-            self.probation.left()
-            self.ordered = first
+            self.proof.returns()
             self.wishes.append((first, None))
         self.open_window(first)
 
@@ -1156,55 +1172,69 @@ class Simulation:
 
     # --------------------------------------------------------------------------------- the guard
 
-    def looks(self, guard: Guard) -> set[int]:
-        """Instants at which the guard may fire: patience ends, or something is there again."""
+    def looks(self) -> set[int]:
+        """Instants at which the guard may move: patience ends, or something is there again."""
         back = {change.at_ns for change in self.reals[ITSELF].node_changes}
         started = {
             at + nanoseconds(task.start_ms) for at in back for task in self.pipeline.tasks.values()
         }
         links = {segment.at_ns for segments in self.segments.values() for segment in segments}
-        return {release + guard.patience_ns for release in self.release} | back | started | links
+        return {release + self.patience for release in self.release} | back | started | links
 
-    def hear(self) -> None:
-        """Hear of everything that is there."""
-        for name, node in self.nodes.items():
-            if not node.down:
-                self.presence.heard(name, self.now)
-        for link, segments in self.segments.items():
-            heard = self.now
-            for segment in reversed([s for s in segments if s.at_ns <= self.now]):
-                if not segment.down:
-                    break
-                heard = segment.at_ns
-            self.presence.heard(link, heard)
-        for (cell, task, name), pool in self.pools.items():
-            if cell == ITSELF and not pool.starting:
-                self.presence.heard(f"{task}@{name}", self.now)
+    def node_down_since(self, node: str, start: int = 0) -> int | None:
+        """Since when a node is down; with a `start`, a worker on it that takes as long to be ready.
+
+        None where it is there.
+        """
+        since, there = None, 0
+        for change in self.reals[ITSELF].node_changes:
+            if change.node != node or change.at_ns > self.now:
+                continue
+            if change.down:
+                # A worker that is not ready by then has not been there in between.
+                since = since if since is not None and change.at_ns <= there else change.at_ns
+                there = NEVER
+            elif there == NEVER:
+                there = change.at_ns + start
+        return None if there <= self.now else since
+
+    def link_down_since(self, link: str) -> int | None:
+        """Since when a link is down; None where it is up."""
+        since = None
+        for segment in self.segments[link]:
+            if segment.at_ns <= self.now:
+                since = None if not segment.down else segment.at_ns if since is None else since
+        return since
+
+    def is_there(self, candidate: str) -> bool:
+        """Whether nothing of a candidate is missing."""
+        placement = self.problem.candidates[candidate]
+        since = [self.node_down_since(node) for node in placement.values()]
+        for name, task in self.pipeline.tasks.items():
+            since.append(self.node_down_since(placement[name], nanoseconds(task.start_ms)))
+        for flow in self.pipeline.flows:
+            source, target = placement[flow.source], placement[flow.target]
+            if source != target:
+                since.append(self.link_down_since(f"{source}->{target}"))
+        longest = (self.settings.guard_cycles - 1) * nanoseconds(self.pipeline.period_ms)
+        return all(down is None or self.now - down < longest for down in since)
 
     def look(self) -> None:
         """Let the guard look whether to move."""
-        self.hear()
         if self.guard is None or self.nodes[self.problem.stamper_node].down:
             return
-
-        def heard(name: str) -> bool:
-            return self.presence.whole(name, self.now)
-
-        def whole(name: str) -> bool:
-            return heard(name) and not self.failures.failing(name, self.now)
-
-        fallback = self.guard.check(self.now, whole, heard)
+        fallback = self.guard.look(self.now, self.is_there)
         if fallback is None:
             return
         first = [*(k for k in range(self.number) if self.release[k] >= self.now), self.number][0]
-        left = self.guard.placement
-        self.guard.adopt(fallback, fallback=True)
-        self.probation.fell()
+        left = self.guard.stay.placement
+        self.guard.move(fallback)
+        self.proof.relapse()
         self.migration += 1
         self.moves = [*(move for move in self.moves if move[0] < first), (first, fallback)]
         self.open_window(first)
         if not self.over:
-            self.guarded.append((self.now, left, fallback))
+            self.decisions.append(Decision(len(self.windows), left, fallback, by_guard=True))
 
     def hear_back(self, cell: int, cycle: int) -> None:
         """Let the guard hear of a cycle or a probe if it has completed, after the way back."""
@@ -1224,14 +1254,13 @@ class Simulation:
             return
         through = self.stamps[cycle][cell]
         if through is not None:
-            self.failures.completed(through, cycle)
-        if cell == SHADOW:
-            if self.is_probe(cycle):
-                self.probation.completed(cycle, self.now)
-            return
-        self.guard.completed(cycle, self.now)
-        if cycle >= self.ordered:
-            self.probation.healthy()
+            self.guard.hear_through(through, cycle)
+        if cell == ITSELF:
+            self.guard.hear(cycle)
+            if not self.guard.on_fallback and cycle >= self.guard.returned:
+                self.proof.complete()
+        elif self.is_probe(cycle):
+            self.proof.hear(cycle, self.now)
 
     def is_probe(self, cycle: int) -> bool:
         """Whether a cycle that is released is sent through what is wanted now."""
@@ -1270,14 +1299,9 @@ class Simulation:
             self.stamps.append((active, other))
             self.placed[ITSELF, cycle] = self.problem.candidates[active]
             if self.guard is not None:
-                if active != self.guard.placement:
-                    self.guard.adopt(active)
-                self.guard.released(cycle, self.now)
-                for through in (active, other):
-                    if through is not None:
-                        self.failures.released(through, cycle, self.now)
+                self.guard.release(cycle, self.now, active, other)
                 if self.is_probe(cycle):
-                    self.probation.released(cycle, self.now)
+                    self.proof.released[cycle] = self.now
             for name in self.sources:
                 offset = nanoseconds(self.pipeline.tasks[name].offset_ms)
                 if offset == 0:
@@ -1541,7 +1565,6 @@ class Simulation:
             node.touched = True
             node.looked_at |= set(node.served)
             if change.down and not node.down:
-                self.hear()
                 node.down = True
                 self.go_down(change.node)
             elif node.down and not change.down:
@@ -1778,12 +1801,20 @@ def control(
     shadows: Realisation | None = None,
     fraction: float = 0.0,
     guarded: bool = False,
+    fickle: bool = False,
 ) -> Result:
     """Play a realisation under a controller that orders one name of a script at each close.
 
     `fraction` is the share of cycles that are also sent through each alternative. If it is
-    `guarded`, the cell's guard acts, and `shadows` are what its probes meet.
+    `guarded`, the cell's guard acts, and `shadows` are what its probes meet; a name that it holds
+    back is said again at the next close, unless the controller is `fickle`.
     """
     return Simulation(
-        problem, realisation, shadows, script=script, fraction=fraction, guarded=guarded
+        problem,
+        realisation,
+        shadows,
+        script=script,
+        fraction=fraction,
+        guarded=guarded,
+        fickle=fickle,
     ).run()
