@@ -19,6 +19,7 @@ import dwell
 from dwell.control import (
     ClosedWindow,
     Controller,
+    CellGuard,
     Failures,
     FallbackRound,
     Guard,
@@ -147,7 +148,7 @@ def objects(
         *(estimator_by_name(name, canonical) for name in ("profile", "shadow", "scaling")),
         *(controller, controller.estimator, controller.log, Presence.of(canonical)),
         *(FallbackRound(["LOC"]), Failures.of(canonical), ShadowPlan(0, 9, 3, 0.05)),
-        Guard(["LOC"], placement="SO", **guard),
+        *(Guard(["LOC"], placement="SO", **guard), CellGuard(canonical)),
         Probation(30, health_cycles=10, patience_ns=1),
         ClosedWindow(ints[:, 0], ints[:, 0], 1, 0, np.zeros((3, 3))),
         Evidence(1, ints[:, 0], ints[:, 0], instants, ints[:, 0], instants),

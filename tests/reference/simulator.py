@@ -20,7 +20,7 @@ from typing import Any
 
 import simpy
 
-from dwell.control import Failures, Guard, Presence, Probation
+from dwell.control import CellGuard, Failures, Guard, Presence, Probation
 from dwell.kernels.realisation import LinkSegment, NodeChange, Realisation
 from dwell.model import Execution, Flow, Node, Pipeline, Placement, Problem, Quota, Task
 
@@ -791,7 +791,7 @@ class Simulation:
         self.windows: list[WindowResult] = []
         self.migration = 0
 
-        self.guard = Guard.of(problem) if guarded else None
+        self.guard = CellGuard(problem) if guarded else None
         self.presence, self.probation = Presence.of(problem), Probation.of(problem)
         self.failures = Failures.of(problem)
         self.guarded: list[tuple[int, str, str]] = []

@@ -2,13 +2,13 @@
 
 from dwell.control.controller import ClosedWindow, Controller, DecisionLog
 from dwell.control.guard import (
+    CellGuard,
     Failures,
     FallbackRound,
     Guard,
     Presence,
     Probation,
     parts_of,
-    rest_cycles,
 )
 from dwell.control.plain_rule import plain_rule
 from dwell.control.windows import final_l95_ms
@@ -17,6 +17,7 @@ from dwell.model.shadow_plan import ShadowPlan, shadow_stamps
 from dwell.policies import MinimalPolicy
 
 __all__ = [
+    "CellGuard",
     "ClosedWindow",
     "Controller",
     "DecisionLog",
@@ -33,6 +34,5 @@ __all__ = [
     "final_l95_ms",
     "parts_of",
     "plain_rule",
-    "rest_cycles",
     "shadow_stamps",
 ]
