@@ -17,9 +17,9 @@ import pytest
 
 import dwell
 from dwell.control import (
+    CellGuard,
     ClosedWindow,
     Controller,
-    CellGuard,
     Failures,
     FallbackRound,
     Guard,

@@ -251,8 +251,8 @@ class Guard:
 
     def __repr__(self) -> str:
         how = ", resting" if self.resting else ", on a fallback" if self.on_fallback else ""
-        where = f"{self.placement!r}{how}"
-        return f"{type(self).__name__}({', '.join(self.fallbacks)}; at {where}, newest={self.newest})"
+        where = f"{', '.join(self.fallbacks)}; at {self.placement!r}{how}"
+        return f"{type(self).__name__}({where}, newest={self.newest})"
 
     @property
     def fallbacks(self) -> tuple[str, ...]:

@@ -177,7 +177,8 @@ class SimulatedGuard:
         heard to complete, or that is too old; but for probes, as all are counted.
         """
         oldest = self._released(now - max(EVIDENCE_NS, self.guard.patience_ns))
-        stamps, heard = self.arrays.tables.stamps[:, oldest:stop], self._heard_ns(oldest, stop) <= now
+        stamps = self.arrays.tables.stamps[:, oldest:stop]
+        heard = self._heard_ns(oldest, stop) <= now
         own = np.arange(len(stamps))[:, np.newaxis] == 0
         first = stop
         for sent in (own, *(stamps == code for code in range(len(self.names)))):
