@@ -707,14 +707,16 @@ class CellGuard(Guard):
         self.presence, self.failures = Presence.of(problem), Failures.of(problem)
         self.probation = Probation.of(problem)
 
-    def sent(self, cycle: int, at_ns: int, candidate: str, shadow: str = "") -> None:
-        """Note that a cycle has been released through a candidate, and its shadow, if any."""
+    def sent(self, cycle: int, at_ns: int, candidate: str) -> None:
+        """Note that a cycle has been released through a candidate."""
         self.released(cycle, at_ns)
         self.failures.released(candidate, cycle, at_ns)
-        if shadow:
-            self.failures.released(shadow, cycle, at_ns)
-            if shadow == self.probation.wanted:
-                self.probation.released(cycle, at_ns)
+
+    def shadow_sent(self, cycle: int, at_ns: int, candidate: str) -> None:
+        """Note that a cycle has also been released through another candidate."""
+        self.failures.released(candidate, cycle, at_ns)
+        if candidate == self.probation.wanted:
+            self.probation.released(cycle, at_ns)
 
     def arrived(self, cycle: int, at_ns: int, candidate: str) -> None:
         """Note that the completion of a cycle through a candidate has been heard."""

@@ -378,7 +378,9 @@ class Stamper:
         early, self._ahead = self._ahead, None
         stamp = early or self._stamp(self.cycle, released_ns)
         self.cycle += 1
-        self.guard.sent(stamp.cycle, released_ns, stamp.placement, stamp.shadow)
+        self.guard.sent(stamp.cycle, released_ns, stamp.placement)
+        if stamp.shadow:
+            self.guard.shadow_sent(stamp.cycle, released_ns, stamp.shadow)
         self._send(stamp, here=True, elsewhere=early is None)
         # A beat wakes every process, and would take the source's turn.
         self.pulse.put_off(released_ns + self.place.period_ns // 2)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import cached_property
-from itertools import pairwise
+from itertools import pairwise, repeat, zip_longest
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,8 +45,10 @@ class SimulatedGuard:
         self._moved = 0
         # The guard has been told of the releases of so many cycles, and of all until this instant.
         self._told, self._told_ns = 0, -1
-        # From which cycles on probes are sent, and through which candidate; -1 for none.
+        # From which cycles on probes are sent, and through which candidate; -1 for none. The
+        # probation has been told of those before a cycle, and of all until an instant.
         self._wishes: list[tuple[int, int]] = []
+        self._probed, self._probed_ns = 0, -1
         self._cell["patience_ns"] = min(self.guard.patience_ns, HORIZON_NS)
         self._arm(-1)
 
@@ -145,36 +147,35 @@ class SimulatedGuard:
                 self.guard.restart()
 
     def _tell_until(self, now: int) -> None:
-        """Tell the guard what matters of a time without orders, in the order of time."""
+        """Tell the guard what matters of a time without orders.
+
+        Within it the order of what has happened changes nothing, nor does telling it twice.
+        """
         guard, stamps = self.guard, self.arrays.tables.stamps
-        told, stop = self._told, self._released(now)
+        stop = self._released(now)
         first = self._first_to_tell(stop, now)
-        guard.passed(max(first - told, 0))
-        release_ns, heard_ns = self.release_ns[first:stop].tolist(), self._heard_ns(first, stop)
-        known, completed = slice(0, max(told - first, 0)), heard_ns <= now
-        completed[:, known] &= heard_ns[:, known] > self._told_ns
-        happened = [(at, 1, first + i, -1) for i, at in enumerate(release_ns) if first + i >= told]
-        for row, i in np.argwhere(completed).tolist():
-            at = int(heard_ns[row, i])
-            # At one instant completions come first, but for those of cycles released then.
-            happened.append((at, 2 if at == release_ns[i] else 0, first + i, row))
-        for at, _, cycle, row in sorted(happened):
-            through = [self.names[code] if code >= 0 else "" for code in stamps[:, cycle].tolist()]
+        guard.passed(max(first - self._told, 0))
+        for cycle in range(max(first, self._told), stop):
+            at_ns, (own, *shadows) = int(self.release_ns[cycle]), stamps[:, cycle].tolist()
+            if self.names[own] != guard.placement:
+                guard.adopt(self.names[own])
+            guard.sent(cycle, at_ns, self.names[own])
+            for code in shadows:
+                if code >= 0:
+                    guard.failures.released(self.names[code], cycle, at_ns)
+        for row, i in np.argwhere(self._heard_ns(first, stop) <= now).tolist():
+            cycle, candidate = first + i, self.names[stamps[row, first + i]]
             if row == 0:
-                guard.arrived(cycle, at, through[0])
-            elif row == 1:
-                guard.shadow_arrived(cycle, at, through[1])
+                guard.arrived(cycle, now, candidate)
             else:
-                if through[0] != guard.placement:
-                    guard.adopt(through[0])
-                guard.sent(cycle, at, *through)
+                guard.failures.completed(candidate, cycle)
         self._told, self._told_ns = stop, now
 
     def _first_to_tell(self, stop: int, now: int) -> int:
         """Return the first cycle that matters of those before one.
 
         None does that is followed by a cycle, or a shadow, through the same candidate that has been
-        heard to complete, or that is too old; but for probes, as all are counted.
+        heard to complete, nor one that is too old.
         """
         oldest = self._released(now - max(EVIDENCE_NS, self.guard.patience_ns))
         stamps = self.arrays.tables.stamps[:, oldest:stop]
@@ -186,8 +187,6 @@ class SimulatedGuard:
             missing = np.flatnonzero((sent & ~heard).any(axis=0))[:1]
             matter = completed if len(completed) else missing
             first = min([first, *(oldest + matter).tolist()])
-        if self.guard.probation.wanted is not None:
-            first = min(first, max(self._wishes[-1][0], self._told - MOST_OPEN))
         return first
 
     def _released(self, now: int) -> int:
@@ -213,14 +212,35 @@ class SimulatedGuard:
         wanted = self.guard.probation.wanted
         if not self.on_fallback or wanted is None:
             return None
-        self._tell(now)
+        self._tell_probes(now)
         return wanted if self.guard.probation.proven(wanted, now) else None
+
+    def _tell_probes(self, now: int) -> None:
+        """Tell the probation what has happened to probes until now, in the order of time."""
+        probation, told, stop = self.guard.probation, self._probed, self._released(now)
+        first = max(self._wishes[-1][0], told - MOST_OPEN)
+        cycles = np.arange(first, stop)
+        release_ns, heard_ns = self.release_ns[first:stop], self._heard_ns(first, stop)[1]
+        new = (heard_ns <= now) & ((heard_ns > self._probed_ns) | (cycles >= told))
+        # At one instant completions come first, but for those of cycles released then.
+        after = np.where(heard_ns == release_ns, 2, 0)
+        sent = zip(release_ns[told - first :].tolist(), repeat(1), range(told, stop))
+        completed = zip(
+            *(column[new].tolist() for column in (heard_ns, after, cycles)), strict=True
+        )
+        for at_ns, when, cycle in sorted([*sent, *completed]):
+            if when == 1:
+                probation.released(cycle, at_ns)
+            else:
+                probation.completed(cycle, at_ns)
+        self._probed, self._probed_ns = max(told, stop), now
 
     def want(self, name: str | None, first: int) -> None:
         """Send every cycle from `first` on through the wanted candidate, too."""
         if name != self.guard.probation.wanted:
             self.guard.probation.want(name, first)
             self._probe(name, first)
+            self._probed = first
 
     def _probe(self, name: str | None, first: int) -> None:
         """Send cycles from `first` on through another candidate, or no longer."""
@@ -239,40 +259,43 @@ class SimulatedGuard:
     @cached_property
     def _outages(self) -> dict[str, list[tuple[int, int]]]:
         """Outages of nodes, links and workers: from when, until when."""
-        changes, segments = self.realisation.node_changes, self.realisation.link_segments
-        nodes, links = NodeChanges.of(changes), LinkSegments.of(segments)
-        found = {}
-        for part in frozenset[str]().union(*self.guard.presence.parts.values()):
-            task, at, node = part.partition("@")
-            if "->" in part:
-                table = links.table[links.table[:, 1] == _row(links.links, part)][:, [0, 2]]
-                start_ms = 0.0
-            else:
-                table = nodes.table[nodes.table[:, 1] == _row(nodes.nodes, node or part)][:, [0, 3]]
-                start_ms = self.problem.pipeline.tasks[task].start_ms if at else 0.0
-            found[part] = _outages(table.tolist(), round(start_ms * 1e6))
-        return found
+        nodes = NodeChanges.of(self.realisation.node_changes)
+        links = LinkSegments.of(self.realisation.link_segments)
+        away = {
+            **_outages(nodes.nodes, nodes.table[:, [0, 1, 3]]),
+            **_outages(links.links, links.table[:, [0, 1, 2]]),
+        }
+        for name, task in self.problem.pipeline.tasks.items():
+            for node in task.on:
+                start_ns = round(task.start_ms * 1e6)
+                back = [(down, min(up + start_ns, LAST_NS)) for down, up in away.get(node, ())]
+                away[f"{name}@{node}"] = _joined(back)
+        parts = frozenset[str]().union(*self.guard.presence.parts.values())
+        return {part: away.get(part, []) for part in parts}
 
 
-def _row(names: tuple[str, ...], name: str) -> int:
-    return names.index(name) if name in names else -1
-
-
-def _outages(changes: Iterable[tuple[int, int]], start_ns: int) -> list[tuple[int, int]]:
-    """Return from when until when something is away that takes a time to be back.
+def _outages(names: Sequence[str], changes: NDArray[np.int64]) -> dict[str, list[tuple[int, int]]]:
+    """Return from when until when each of some nodes or links is down.
 
     Parameters
     ----------
-    changes : iterable of (int, int)
-        Instants, ascending, and whether it is down from then on.
+    changes : int64 array, shape (changes, 3)
+        Instants, ascending for each of them; its row in `names`; whether it is down from then on.
     """
-    outages: list[tuple[int, int]] = []
-    for at_ns, down in changes:
-        if not down:
-            if outages and outages[-1][1] == LAST_NS:
-                outages[-1] = outages[-1][0], at_ns + start_ns
-        elif outages and at_ns <= outages[-1][1]:
-            outages[-1] = outages[-1][0], LAST_NS
-        else:
-            outages.append((at_ns, LAST_NS))
+    outages = {}
+    for row, name in enumerate(names):
+        at_ns, _, down = changes[changes[:, 1] == row].T
+        turns_ns = at_ns[np.diff(down, prepend=0) != 0].tolist()
+        outages[name] = _joined(zip_longest(turns_ns[::2], turns_ns[1::2], fillvalue=LAST_NS))
     return outages
+
+
+def _joined(outages: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Join outages of which one begins before the other has ended."""
+    joined: list[tuple[int, int]] = []
+    for down, up in outages:
+        if joined and down <= joined[-1][1]:
+            joined[-1] = joined[-1][0], up
+        else:
+            joined.append((down, up))
+    return joined
