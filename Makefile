@@ -16,7 +16,7 @@ COMPILE := $(UV) pip compile --quiet --python $(BIN)/python --universal --python
 	--generate-hashes --custom-compile-command "make lock" $(if $(UPGRADE),--upgrade)
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test check bench paper deadlines planted faults chaos soak fuzz audit sbom lock clean again seeds test-all
+.PHONY: help env demo test test-all check bench paper deadlines planted faults seeds chaos soak fuzz audit sbom lock clean again
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' Makefile
@@ -59,7 +59,7 @@ demo: env ## Simulate and report an example into demo-out/ (REAL=path: on a real
 # Most tests run side by side; those that need the machine to themselves follow, one after another.
 # pytest ends with 5 where ARGS leave nothing to run.
 TESTS := $(BIN)/python -m pytest
-BESIDE := -n auto --dist loadgroup --no-loadscope-reorder
+BESIDE := -n auto --no-loadscope-reorder
 
 test: env ## Run the tests (ARGS="-k name" passes options to pytest, "--hypothesis-profile night" tries more)
 	$(TESTS) $(BESIDE) -m "not exhaustive and not alone" $(ARGS) || [ $$? -eq 5 ]

@@ -85,6 +85,6 @@ def _close_all(problem: Problem, closed: list[ClosedWindow]) -> Took:
 
     def work() -> None:
         for window in closed:
-            controller.close(window)
+            controller.settle(controller.propose(window))
 
     return took(work)

@@ -9,12 +9,14 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Mapping, Sequence
-from itertools import chain
+from itertools import chain, permutations
 from pathlib import Path
 from typing import TypeAlias
 
 import pytest
 from hypothesis import settings
+from xdist.remote import Producer
+from xdist.scheduler import LoadScopeScheduling
 
 # Under nohup, and in the background of a shell, these are ignored, and so they would be by all
 # processes that tests start and signal.
@@ -42,7 +44,6 @@ ALONE: Chosen = {
     "testbed/chaos/test_fault_campaign.py": (),
     "testbed/chaos/test_strike.py": (),
     "testbed/test_execution.py": (),
-    "testbed/test_netns_testbed.py": (),
 }
 
 #: Files and folders whose tests one process has, one after another: real processes that may take
@@ -56,7 +57,12 @@ TOGETHER = {
         "live/test_security.py",
         "live/transport",
     ),
-    "testbeds": ("cli/test_testbed.py", "testbed/test_run.py", "test_two_computers.py"),
+    "testbeds": (
+        "cli/test_testbed.py",
+        "testbed/test_netns_testbed.py",
+        "testbed/test_run.py",
+        "test_two_computers.py",
+    ),
 }
 
 #: What only `make test-all` runs.
@@ -67,12 +73,19 @@ EXHAUSTIVE: Chosen = {
         "test_nothing_goes_wrong_and_there_is_always_a_way_back[states 3]",
         *(f"test_the_stamper_does_what_the_model_does[{seed}]" for seed in (3, 4, 5)),
     ),
-    "live/test_real_faults.py": ("test_cell_survives[freeze",),
+    "live/test_real_faults.py": (
+        "test_cell_survives[freeze",
+        *(f"test_cell_survives[cut {a}->{b}]" for a, b in permutations(("R1", "E", "R2"), 2)),
+    ),
     "reference/test_against.py": ("the others",),
+    "reproduction/test_questions.py": tuple(
+        f"test_a_question_is_answered[{name}]" for name in ("dynamic", "concurrent", "reversion")
+    ),
     "test_compilers.py": (),
     "test_package.py": (),
     "test_sanitizers.py": (),
     "testbed/chaos/test_fault_campaign.py": (),
+    "testbed/chaos/test_strike.py": ("actuator", "clock", "process", "terminal"),
     "testbed/test_execution.py": (),
 }
 
@@ -91,34 +104,38 @@ def pytest_xdist_auto_num_workers() -> int:
     return cpus + (cpus + 1) // 2
 
 
-def below(item: pytest.Item, names: Sequence[str]) -> str:
-    """Return the name that a test is below, or nothing."""
-    return next((name for name in names if item.path.is_relative_to(HERE / name)), "")
+def below(file: Path, names: Sequence[str]) -> str:
+    """Return the name that a file is below, or nothing."""
+    return next((name for name in names if file.is_relative_to(HERE / name)), "")
 
 
 def among(item: pytest.Item, chosen: Chosen) -> bool:
     """Whether a test is one of those."""
-    name = below(item, tuple(chosen))
+    name = below(item.path, tuple(chosen))
     return bool(name) and any(part in item.name for part in chosen[name] or ("",))
 
 
-def group(item: pytest.Item) -> str:
-    """Return what a test stays with: its file, or files that it would be in the way of."""
-    for name, files in TOGETHER.items():
-        if below(item, files):
-            return name
-    return str(item.path.relative_to(HERE))
+class InGroups(LoadScopeScheduling):  # type: ignore[misc]
+    """Gives each process a group of tests after another: a file, or files that stay together."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        file = HERE.parent / nodeid.partition("::")[0]
+        if below(file, APART):
+            return nodeid
+        return next((name for name, files in TOGETHER.items() if below(file, files)), str(file))
 
 
-@pytest.hookimpl(tryfirst=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> InGroups:
+    """Return who deals tests out where they run side by side."""
+    return InGroups(config, log)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests that are listed here; what takes longest begins first."""
     longest = (*chain(*TOGETHER.values()), *APART)
-    items.sort(key=lambda item: [*longest, ""].index(below(item, longest)))
+    items.sort(key=lambda item: [*longest, ""].index(below(item.path, longest)))
     for item in items:
         if among(item, ALONE):
             item.add_marker(pytest.mark.alone)
         if among(item, EXHAUSTIVE):
             item.add_marker(pytest.mark.exhaustive)
-        if not below(item, APART):
-            item.add_marker(pytest.mark.xdist_group(group(item)))

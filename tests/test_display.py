@@ -33,6 +33,7 @@ from dwell.estimators import by_name as estimator_by_name
 from dwell.model import (
     FrozenDict,
     Problem,
+    QoS,
     Trace,
     TraceTable,
 )
@@ -57,7 +58,7 @@ LINES, CHARACTERS = 19, 700
 SCREEN_LINES, SCREEN_COLUMNS = 24, 80
 #: Not made here: tuples of a few numbers and names.
 FEW_NUMBERS = {
-    *("Decision", "Endpoint", "Episodes", "Family", "PairedDifference", "PairedMedian", "Phase"),
+    *("Endpoint", "Episodes", "Family", "PairedDifference", "PairedMedian", "Phase"),
     *("QoS", "Support"),
 }
 
@@ -136,6 +137,8 @@ def objects(
     ints = np.zeros((100, 4), np.int64)
     instants = Instants(ints, ints, ints)
     controller = Controller(canonical, "cusum+corrected")
+    known = QoS(20.0, 0.0, dict.fromkeys(canonical.fabric.nodes, 0.5))
+    proposal = controller.propose_by(known, dict.fromkeys(canonical.fabric.nodes, 0.5))
     table = TraceTable("drive.csv", {"rtt_ms": np.arange(5_000.0)})
     guard = {"guard_cycles": 3, "period_ns": 1, "probe_cycles": 30}
     policies = ("dtp", "latency-first", "work-function", "atp", "atp-thresholds", "cusum", "LOC")
@@ -146,7 +149,8 @@ def objects(
         dwell.draw(canonical, seed=1, windows=40, scenario="network-impairment"),
         *(policy_by_name(name, canonical) for name in policies),
         *(estimator_by_name(name, canonical) for name in ("profile", "shadow", "scaling")),
-        *(controller, controller.estimator, controller.log, Presence.of(canonical)),
+        *(controller, controller.estimator, controller.course, proposal),
+        Presence.of(canonical),
         *(FallbackRound(["LOC"]), Failures.of(canonical), ShadowPlan(0, 9, 3, 0.05)),
         *(Guard(["LOC"], placement="SO", **guard), CellGuard(canonical)),
         Probation(30, health_cycles=10, patience_ns=1),

@@ -67,7 +67,7 @@ def test_a_candidate_may_have_a_plus_in_its_name() -> None:
     problem = cell()
     name = next(iter(problem.candidates))
     both = replace(problem, candidates={**problem.candidates, "a+b": problem.candidates[name]})
-    assert Controller(both, "a+b").incumbent == "a+b"
+    assert Controller(both, "a+b").course.placement == "a+b"
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def test_neither_own_jobs_nor_shadow_jobs_are_foreign() -> None:
 
     controller = Controller(cell(), policy="LOC", estimator=Listener())
     core_ns = np.array([[8.0, 4.0], [3.0, 0.0], [1.0, 4.0]]) * 1e6
-    controller.close(
+    controller.propose(
         ClosedWindow(
             latency_ns=np.array([10_000_000, 20_000_000]),
             release_ns=np.array([0, 40_000_000]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import heapq
 import itertools
 from collections.abc import Callable, Mapping, Sequence
@@ -688,43 +689,51 @@ SEEN = QoS(10.0, 0.0, FrozenDict({"R": 0.1, "E": 0.1}))
 OWN = {"R": 0.1, "E": 0.1}
 
 
+def decide(controller: Controller, seen: QoS = SEEN, *, proven: str | None = None) -> str:
+    """Have it decide on a window, and carry that out."""
+    return controller.settle(controller.propose_by(seen, OWN), proven=proven)
+
+
+def where(controller: Controller) -> tuple[str, str, int]:
+    """Return the incumbent, the one before, and n_d."""
+    course = controller.course
+    return course.placement, course.previous, course.dwell
+
+
 def shown(controller: Controller) -> list[tuple[object, ...]]:
-    return [row[:6] for row in controller.log.decisions]
+    return [row[:6] for row in controller.decisions]
 
 
 def test_the_guards_move_is_in_the_log_and_in_the_next_windows_cost() -> None:
     controller = Controller(cell(estimator="profile"), policy="dtp")
-    initial = controller.decide(SEEN, OWN)
+    initial = decide(controller)
     assert initial == "LOC"
     controller.adopt("OFF")
-    assert (controller.incumbent, controller.previous, controller.dwell) == ("OFF", "LOC", 0)
-    assert controller.on_fallback
-    controller.decide(SEEN, OWN)
+    assert where(controller) == ("OFF", "LOC", 0)
+    assert controller.course.by_guard
+    moved = controller.propose_by(SEEN, OWN)
+    controller.settle(moved)
     assert shown(controller) == [
         (0, "LOC", "LOC", False, "dwell", 1),
         (1, "LOC", "OFF", True, "guard", 0),
         (1, "OFF", "OFF", False, "dwell", 1),
     ]
     names = controller.decision_columns
-    assert {len(row) for row in controller.log.decisions} == {len(names)}
-    moved = [row[2] for row in controller.log.seen]
-    controller.decide(SEEN, OWN)
-    stayed = controller.log.seen[-1][2]
-    assert moved[1] is not None
-    assert stayed is not None
+    assert {len(row) for row in controller.decisions} == {len(names) + 1}
+    stayed = controller.propose_by(SEEN, OWN)
     candidates = controller.problem.candidates
     switching = controller.problem.objective.weights.switching
-    assert moved[1] - stayed == pytest.approx(
+    assert moved.seen[2] - stayed.seen[2] == pytest.approx(
         switching * hamming(candidates["OFF"], candidates["LOC"])
     )
 
 
 def test_an_order_under_way_is_void() -> None:
     controller = Controller(cell(estimator="profile"), policy=Wishful("FAR"))
-    assert controller.decide(SEEN, OWN) == "FAR"
+    assert decide(controller) == "FAR"
     controller.adopt("OFF", left="LOC")
     assert shown(controller)[-1] == (1, "LOC", "OFF", True, "guard", 0)
-    assert (controller.previous, controller.incumbent) == ("LOC", "OFF")
+    assert where(controller) == ("OFF", "LOC", 0)
     policy = controller.policy
     assert isinstance(policy, Wishful)
     assert policy.told == ["LOC", "OFF"]
@@ -733,11 +742,11 @@ def test_an_order_under_way_is_void() -> None:
 def test_a_fallback_is_left_only_for_what_is_proven() -> None:
     controller = Controller(cell(estimator="profile"), policy=Wishful("FAR"))
     controller.adopt("OFF")
-    assert controller.decide(SEEN, OWN) == "OFF"
-    assert (controller.wanted, controller.on_fallback) == ("FAR", True)
-    assert controller.decide(SEEN, OWN, proven="LOC") == "OFF"
-    assert controller.decide(SEEN, OWN, proven="FAR") == "FAR"
-    assert (controller.wanted, controller.on_fallback) == (None, False)
+    assert decide(controller) == "OFF"
+    assert (controller.course.wanted, controller.course.by_guard) == ("FAR", True)
+    assert decide(controller, proven="LOC") == "OFF"
+    assert decide(controller, proven="FAR") == "FAR"
+    assert (controller.course.wanted, controller.course.by_guard) == (None, False)
     assert shown(controller) == [
         (0, "LOC", "OFF", True, "guard", 0),
         (0, "OFF", "OFF", False, "guard", 0),
@@ -751,7 +760,7 @@ def test_a_decision_that_is_held_back_has_not_been_made() -> None:
     controller = Controller(cell(estimator="profile"), policy=policy)
     controller.adopt("OFF")
     for _ in range(3):
-        controller.decide(SEEN, OWN)
+        decide(controller)
     held = controller.policy
     assert isinstance(held, Wishful)
     # The second telling settles the switching term of the move, which one window has paid for.
@@ -766,12 +775,12 @@ def test_after_the_guard_dtp_dwells_then_wants_and_leaves_once_proven() -> None:
     controller.adopt("FAR")
     bad = replace(SEEN, l95_ms=60.0, violation_rate=1.0)
     for _ in range(4):
-        controller.decide(bad, OWN)
-    wanted = controller.wanted
+        decide(controller, bad)
+    wanted = controller.course.wanted
     assert wanted is not None
-    assert [row[4] for row in controller.log.decisions[1:]] == ["dwell", "dwell", "guard", "guard"]
-    assert [row[5] for row in controller.log.decisions[1:]] == [1, 2, 2, 2]
-    assert controller.decide(bad, OWN, proven=wanted) == wanted
+    assert [row[4] for row in controller.decisions[1:]] == ["dwell", "dwell", "guard", "guard"]
+    assert [row[5] for row in controller.decisions[1:]] == [1, 2, 2, 2]
+    assert decide(controller, bad, proven=wanted) == wanted
     assert shown(controller)[-1] == (4, "FAR", wanted, True, "migrate", 0)
 
 
@@ -780,20 +789,44 @@ def test_an_order_that_was_refused_has_moved_nothing() -> None:
     settings = replace(problem.controller, min_dwell=1)
     controller = Controller(replace(problem, controller=settings), policy="dtp")
     bad = replace(SEEN, l95_ms=60.0, violation_rate=1.0)
-    controller.decide(bad, OWN)
-    wanted = controller.decide(bad, OWN)
+    first = controller.propose_by(bad, OWN)
+    controller.commit(first)
+    refused = controller.propose_by(bad, OWN)
+    wanted = refused.decision.name
     assert wanted != "LOC"
-    controller.resume("LOC")
-    assert (controller.incumbent, controller.previous, controller.dwell) == ("LOC", "LOC", 0)
-    controller.decide(bad, OWN)
+    controller.reject(refused, "no answer")
+    assert where(controller) == ("LOC", "LOC", 0)
+    assert controller.decisions[-1][-1] == f"{wanted}: no answer"
+    third = controller.propose_by(bad, OWN)
+    controller.commit(third)
     # The same window costs the same as the first one, and the policy dwells on LOC again.
-    assert controller.log.seen[2] == controller.log.seen[0]
-    assert shown(controller)[2:] == [(2, "LOC", "LOC", False, "dwell", 1)]
+    assert third.seen == first.seen
+    assert shown(controller)[1:] == [
+        (1, "LOC", "LOC", False, "migrate", 0),
+        (2, "LOC", "LOC", False, "dwell", 1),
+    ]
     controller.adopt("OFF")
-    controller.decide(bad, OWN)
-    assert controller.decide(bad, OWN, proven=wanted) == wanted
-    controller.resume("OFF", fallback=True)
-    assert (controller.incumbent, controller.on_fallback) == ("OFF", True)
+    decide(controller, bad)
+    proven = controller.propose_by(bad, OWN)
+    assert proven.decision.name == wanted
+    controller.reject(proven)
+    assert (controller.course.placement, controller.course.by_guard) == ("OFF", True)
+    assert shown(controller)[-1] == (4, "OFF", wanted, True, "migrate", 0)
+
+
+def test_a_proposal_changes_nothing_until_it_is_known_what_comes_of_it() -> None:
+    problem = cell(estimator="profile")
+    settings = replace(problem.controller, min_dwell=1)
+    for policy in ("dtp", "cusum", "work-function", "atp", "latency-first", "LOC"):
+        controller = Controller(replace(problem, controller=settings), policy=policy)
+        bad = replace(SEEN, l95_ms=60.0, violation_rate=1.0)
+        for _ in range(4):
+            before = copy.deepcopy(vars(controller.policy)["_standing"]), where(controller)
+            proposal = controller.propose_by(bad, OWN)
+            again = controller.propose_by(bad, OWN)
+            assert (proposal.decision, proposal.after) == (again.decision, again.after)
+            assert (vars(controller.policy)["_standing"], where(controller)) == before
+            controller.commit(proposal)
 
 
 def test_a_fallback_that_is_no_candidate_is_refused() -> None:
@@ -810,7 +843,7 @@ def test_a_policy_that_cannot_be_told_hears_what_it_lacks() -> None:
             return Decision(problem.candidates["LOC"], "LOC", False, "hold")
 
     controller = Controller(problem, policy=Deaf())
-    controller.decide(SEEN, OWN)
+    decide(controller)
     controller.adopt("OFF")
     with pytest.raises(PolicyError, match=r"needs adopt\(name\)"):
-        controller.decide(SEEN, OWN)
+        decide(controller)

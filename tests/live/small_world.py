@@ -445,7 +445,7 @@ class Recorded(World):
         """End the run as its controller does."""
         assert self.cell.windows is not None
         self.cell.write()
-        folder = self.kept.finish(self.cell.windows.record.rows(last=True))
+        folder = self.kept.finish(self.cell.finish())
         assert folder is not None
         return folder
 

@@ -110,7 +110,7 @@ def goes_on(world: World) -> None:
     found = world.status
     assert found["placement"] == target
     assert (found["run"], found["term"]) == (world.stamper.run, world.stamper.term)
-    assert world.cell.controller.incumbent == target
+    assert world.cell.course.placement == target
     windows_go_on(world)
     assert world.cycles == list(range(world.cycles[0], world.cycles[-1] + 1))
 

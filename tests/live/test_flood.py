@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import random
 import tracemalloc
 from dataclasses import replace
@@ -180,12 +181,12 @@ def test_the_controller_believes_no_placement_that_is_no_candidate() -> None:
     world = World(cell(), policy="dtp")
     world.run(500)
     controller: Any = next(r for who, r in world.roles.items() if who.startswith("controller"))
-    held = controller.held
-    stamp = Stamped(held.run, 99, held.term + 5, "none", 0)
+    course = copy.copy(controller.course)
+    stamp = Stamped(course.run, 99, course.term + 5, "none", 0)
     controller.receive(
         Arrival(controller.place.keys.stamped(), encode(stamp)), world.network.now_ns
     )
-    assert controller.held == held
+    assert controller.course == course
     assert "'none' holds, which is no candidate" in controller.place.last_complaint
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from dwell.control import Controller
+from dwell.control import Controller, Proposal
 from dwell.live.run_rows import columns_of, decision_values, sends_shadows
 from dwell.model import Problem, QoS
 from dwell.record import row_of
@@ -16,36 +16,39 @@ from tests.cells.small import make_problem
 PROBLEM = make_problem()
 
 
-def decided(controller: Controller) -> tuple[object, ...]:
-    """Have a controller decide that the cell moves from LOC; return the row of its log."""
+def proposed(controller: Controller) -> Proposal:
+    """Have a controller propose that the cell moves from LOC."""
     used = dict.fromkeys(controller.problem.fabric.nodes, 0.5)
     late = QoS(3 * controller.problem.pipeline.deadline_ms, 1.0, used)
-    while not (row := (controller.decide(late, used), controller.log.decisions[-1]))[1][3]:
-        assert len(controller.log.decisions) < 10
-    return row[1]
+    while not (proposal := controller.propose_by(late, used)).decision.migrated:
+        controller.commit(proposal)
+        assert len(controller.decisions) < 10
+    return proposal
 
 
 def test_what_was_decided_and_not_done_is_no_migration() -> None:
-    controller = Controller(PROBLEM, "latency-first")
-    row = decided(controller)
-    types = columns_of(controller)["decisions"]
-    done = decision_values(controller, row, None, 5)
-    refused = decision_values(controller, row, "nobody answered", 5)
-    assert done["window"] == 5 + len(controller.log.decisions) - 1
-    assert done["migrated"]
-    assert not refused["migrated"]
-    assert refused["placement"] == done["incumbent"] == "LOC"
-    assert refused["refused"] == f"{done['placement']}: nobody answered"
-    assert done["refused"] is None
-    assert refused["reason"] == done["reason"]
-    for values in (done, refused):
+    done, refused = (Controller(PROBLEM, "latency-first") for _ in range(2))
+    for controller in (done, refused):
+        controller.window = 5
+    done.commit(proposed(done))
+    refused.reject(proposed(refused), "nobody answered")
+    rows = [decision_values(one, one.decisions[-1]) for one in (done, refused)]
+    assert rows[0]["window"] == 5 + len(done.decisions) - 1
+    assert [row["migrated"] for row in rows] == [True, False]
+    assert rows[1]["placement"] == rows[0]["incumbent"] == "LOC"
+    assert rows[1]["refused"] == f"{rows[0]['placement']}: nobody answered"
+    assert rows[0]["refused"] is None
+    assert rows[1]["reason"] == rows[0]["reason"]
+    types = columns_of(done)["decisions"]
+    for values in rows:
         assert list(row_of(types, values)) == [values[name] for name in types]
 
 
 def test_what_is_no_number_is_null() -> None:
     controller = Controller(PROBLEM, "latency-first")
-    row = [math.nan if isinstance(one, float) else one for one in decided(controller)]
-    values = decision_values(controller, row, None, 0)
+    controller.commit(proposed(controller))
+    row = [math.nan if isinstance(one, float) else one for one in controller.decisions[-1]]
+    values = decision_values(controller, row)
     assert not any(isinstance(one, float) and math.isnan(one) for one in values.values())
 
 

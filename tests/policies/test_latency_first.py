@@ -102,6 +102,6 @@ def test_errors() -> None:
     with pytest.raises(MetricError, match="nothing for candidate SO"):
         policy.decide(observed=qos(), estimates={"LOC": qos(), "HYB": qos()})
     with pytest.raises(MetricError, match="estimates is None"):
-        policy.decide(observed=qos(), estimates=None)  # type: ignore[arg-type]
+        policy.decide(observed=qos(), estimates=None)
     with pytest.raises(MetricError, match="the estimate of HYB is 3"):
         policy.decide(observed=qos(), estimates={**estimates(qos(), qos(), qos()), "HYB": 3})  # type: ignore[dict-item]

@@ -533,12 +533,12 @@ def play_stamped(
     arrays.tables.stamps[1] = [codes[name] for name in others]
     assert advance_to_end(arrays) == Status.FINISHED
     controller = Controller(problem, problem.initial)
-    controller.log.seen += [
+    metrics: list[tuple[float | None, ...]] = [
         (l95_ms, missed / problem.window_cycles, None)
         for _, missed, l95_ms, _ in arrays.tables.seen[0].tolist()
     ]
     tables, _ = make_tables(
-        sim_tables.PlayedRealisation(problem, real, controller, arrays), jobs=True
+        sim_tables.PlayedRealisation(problem, real, controller, arrays, metrics), jobs=True
     )
     flows = [(flow.source, flow.target) for flow in ordered_flows(problem.pipeline)]
     log = arrays.tables.log_arrived.reshape(2, real.cycles, len(flows)).tolist()

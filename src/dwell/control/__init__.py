@@ -1,6 +1,7 @@
 """The Controller: windows, estimator, policy and order, the same in both engines."""
 
-from dwell.control.controller import ClosedWindow, Controller, DecisionLog
+from dwell.control.controller import ClosedWindow, Controller, Proposal
+from dwell.control.course import Course
 from dwell.control.guard import (
     CellGuard,
     Failures,
@@ -20,7 +21,7 @@ __all__ = [
     "CellGuard",
     "ClosedWindow",
     "Controller",
-    "DecisionLog",
+    "Course",
     "Estimator",
     "Evidence",
     "Failures",
@@ -30,6 +31,7 @@ __all__ = [
     "MinimalPolicy",
     "Presence",
     "Probation",
+    "Proposal",
     "ShadowPlan",
     "final_l95_ms",
     "parts_of",

@@ -5,13 +5,14 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from operator import add
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.control.course import Course
 from dwell.control.windows import missed_cycles, seen_l95_ms, utilisation
 from dwell.cost import excess
 from dwell.errors import Fault, MetricError, PolicyError, ProblemError
@@ -23,9 +24,11 @@ from dwell.model.qos import NO_ERROR
 from dwell.model.semantics import too_many_shadows
 from dwell.model.table_columns import DECISIONS, Feature, columns_of, those_with
 from dwell.model.user_classes import is_class_path
-from dwell.policies import MinimalPolicy, Static, parameters_of
+from dwell.policies import MinimalPolicy, parameters_of
 from dwell.policies import by_name as policy_by_name
 from dwell.policies.pricing import Pricing
+from dwell.policies.protocol import Proposer
+from dwell.policies.user_policy import as_proposer
 
 Ints: TypeAlias = NDArray[np.int64]
 Floats: TypeAlias = NDArray[np.float64]
@@ -62,31 +65,46 @@ class ClosedWindow:
 
 
 @dataclass(slots=True)
-class DecisionLog:
-    """Log of the metrics seen and the decisions made: one row of plain values a window.
+class Proposal:
+    """What is decided on a window, until it is known what comes of it.
 
-    Rows are tuples of numbers and names, not the objects they came from: a run has many windows,
-    and the garbage collector need not look at such tuples again.
-
-    Attributes
+    Parameters
     ----------
-    seen : list of tuple
-        ``(l95_ms, violation_rate, cost)`` of every window; None thrice where the controller did
-        not see the close, because its node was down.
-    decisions : list of tuple
-        As `Controller.decision_columns` has it. A move of the guard is a row of its own, with
-        nothing priced, before the row of the window that it began.
+    seen : tuple of float
+        L95 (ms) and violation rate of the window, and its cost.
+    decision : Decision
+        The policy's.
+    priced : tuple
+        What was known of the candidates, for the row of ``decisions``.
+    after : object
+        What the policy is once this counts (`dwell.policies.protocol.Proposer.commit`).
     """
 
-    seen: list[tuple[float | None, ...]] = field(default_factory=list)
-    decisions: list[tuple[object, ...]] = field(default_factory=list)
+    seen: tuple[float, float, float]
+    decision: Decision
+    priced: tuple[object, ...]
+    after: object
 
     def __repr__(self) -> str:
-        return f"<DecisionLog: {len(self.seen)} windows, {len(self.decisions)} decisions>"
+        return f"<Proposal: {self.decision.reason}, {self.decision.name}>"
 
 
 class Controller:
     """Windows in, orders out: aggregation, estimator and policy in one object.
+
+    A window is decided on by `propose`, which changes nothing but what the estimator has learnt.
+    What becomes of the proposal is told once, when it is known:
+
+    ==========  ======================================  ========================================
+    told by     when                                    the policy is
+    ==========  ======================================  ========================================
+    `commit`    it is carried out                       as after its decision
+    `reject`    people or the stamper do otherwise      as after its decision, then told twice
+                                                        where the cell is: no switching term
+                                                        remains
+    `hold`      it would leave the guard's fallback     as before; told where the cell is, so
+                for what is not proven                  that one window alone pays for the move
+    ==========  ======================================  ========================================
 
     Parameters
     ----------
@@ -120,7 +138,7 @@ class Controller:
         self._own = tuple(
             name if isinstance(name, str) and is_class_path(name) else None for name in named
         )
-        self.policy = _prepared_policy(policy, problem)
+        self._policy = _prepared_policy(policy, problem)
         if estimator is None or isinstance(estimator, str):
             name = estimator or problem.controller.estimator
             self.estimator = estimator_by_name(name, problem)
@@ -135,42 +153,45 @@ class Controller:
         self._learner = self.estimator if isinstance(self.estimator, Learner) else None
         #: Share of the cycles that the estimator wants sent through each alternative.
         self.shadow_fraction = _shadow_fraction(self.estimator, problem)
-        initial = getattr(self.policy, "initial", None)
+        initial = self._policy.initial
         known = isinstance(initial, str) and initial in problem.candidates
-        self.incumbent = str(initial) if known else problem.initial
-        self.previous = self.incumbent
-        self.dwell = 0
-        #: Whether the guard's own move holds (see `adopt`).
-        self.on_fallback = False
-        #: What the policy would leave the fallback for, had it been proven by probes; else None.
-        self.wanted: str | None = None
+        #: Where the cell is, as far as is known here.
+        self.course = Course(str(initial) if known else problem.initial)
+        #: Number of the next window.
+        self.window = 0
+        #: Rows of ``decisions``: `decision_columns`, then why it was not carried out, or None.
+        self.decisions: list[tuple[object, ...]] = []
         resources = problem.fabric.resources.values()
         #: Names of the cell's resources: its nodes, then their accelerators.
         self.resources = tuple(one.name for one in resources)
         self._has_accelerators = any(one.kind for one in resources)
         self._names = tuple(problem.candidates)
-        #: What the log has where nothing is known of the candidates.
+        #: What a row has where nothing is known of the candidates.
         self._none: list[float | bool | None] = [None] * len(self._names)
-        self.log = DecisionLog()
         self._capacity = np.array([one.capacity for one in resources], float)
         self._pricing = Pricing(problem.candidates, problem.objective)
         self._deadline_ns = round(problem.pipeline.deadline_ms * 1e6)
         self._censor_ms = problem.censor_ms
         #: By which caps candidates are eligible: the policy's own, where it has any.
-        self.objective: Objective = getattr(self.policy, "objective", None) or problem.objective
+        self.objective: Objective = self._policy.objective or problem.objective
         #: Whether it has any.
         self.has_caps = self.objective.caps != Caps()
 
     def __repr__(self) -> str:
         policy, estimator = type(self.policy).__name__, type(self.estimator).__name__
         return (
-            f"<Controller of {self.problem.name}: {policy}, {estimator}; at {self.incumbent} after "
-            f"{len(self.log.seen)} windows>"
+            f"<Controller of {self.problem.name}: {policy}, {estimator}; at "
+            f"{self.course.placement} after {self.window} windows>"
         )
 
     @property
+    def policy(self) -> object:
+        """The policy that decides: a copy of what was given."""
+        return self._policy.given
+
+    @property
     def decision_columns(self) -> tuple[str, ...]:
-        """Names of the columns of `Log.decisions`.
+        """Names of the columns of ``decisions``, but the last.
 
         J of every candidate (null where the policy prices none), what was estimated of it (L95 in
         ms, violation rate, their standard errors, utilisation of every resource), whether it is
@@ -204,27 +225,15 @@ class Controller:
 
     @property
     def guarded(self) -> bool:
-        """Whether a guard may move the cell: it has fallbacks, and a policy that moves.
+        """Whether a guard may move the cell: it has fallbacks, and the policy lets it.
 
         A policy whose attribute `guarded` is false is left alone, as is the placement that never
         moves.
         """
-        moves = type(self.policy) is not Static and getattr(self.policy, "guarded", True)
-        return bool(moves and self.problem.controller.fallbacks)
+        return bool(self._policy.guarded and self.problem.controller.fallbacks)
 
-    def close(self, window: ClosedWindow, *, proven: str | None = None) -> str:
-        """Look at a closed window and decide the placement of the cycles after it.
-
-        Parameters
-        ----------
-        proven : str, optional
-            Candidate that enough probes have completed through, for a cell that is on a fallback;
-            it is left for no other (see `adopt`).
-
-        Returns
-        -------
-        str
-            Name of the candidate; the incumbent's where nothing moves.
+    def propose(self, window: ClosedWindow) -> Proposal:
+        """Look at a closed window and say what the cycles after it shall be placed on.
 
         Raises
         ------
@@ -237,19 +246,12 @@ class Controller:
         shares = self.utilisation(window)
         if window.evidence is not None:
             self.learn(window.evidence)
-        rate = missed / len(age_ns)
-        return self.decide_on(float(l95_ms), rate, float(uncut_ms), shares, proven=proven)
+        return self.propose_on(float(l95_ms), missed / len(age_ns), float(uncut_ms), shares)
 
-    def decide_on(
-        self,
-        l95_ms: float,
-        violation_rate: float,
-        uncut_ms: float,
-        shares: Floats,
-        *,
-        proven: str | None = None,
-    ) -> str:
-        """Decide on a window that an engine has measured itself (see `close`).
+    def propose_on(
+        self, l95_ms: float, violation_rate: float, uncut_ms: float, shares: Floats
+    ) -> Proposal:
+        """Propose on a window that an engine has measured itself (see `propose`).
 
         Parameters
         ----------
@@ -264,9 +266,24 @@ class Controller:
         mine = dict(zip(self.resources, map(add, own, shadow), strict=True))
         if self._has_accelerators:
             seen, mine = _measured(seen), _measured(mine)
-        utilisation = FrozenDict(seen)
-        observed = QoS(l95_ms, violation_rate, utilisation, uncut_ms)
-        return self.decide(observed, mine, proven=proven)
+        return self.propose_by(QoS(l95_ms, violation_rate, FrozenDict(seen), uncut_ms), mine)
+
+    def propose_by(self, observed: QoS, own: Mapping[str, float]) -> Proposal:
+        """Propose on metrics that are already aggregated (see `propose`)."""
+        course = self.course
+        incumbent = course.placement
+        # With the switching term of the decision that led to it.
+        measured = self._pricing.cost(observed, incumbent, course.previous)
+        estimates = dict(self.estimator.estimate(observed=observed, incumbent=incumbent, own=own))
+        if self._learner is None:
+            # It knows no more of the incumbent than the window shows.
+            estimates[incumbent] = observed
+        decision, after = self._policy.propose(
+            observed=observed, estimates=estimates, tentative=course.by_guard
+        )
+        decision = self._checked(decision)
+        seen = observed.l95_ms, observed.violation_rate, measured
+        return Proposal(seen, decision, self._priced(decision, estimates), after)
 
     def learn(self, evidence: Callable[[], Evidence]) -> None:
         """Have the estimator learn from a window, if it learns, before it is decided on."""
@@ -277,57 +294,77 @@ class Controller:
         """Busy, own and shadow share of every resource, shape (3, resources)."""
         return utilisation(window.core_ns, self._capacity, window.close_ns - window.open_ns)
 
-    def decide(self, observed: QoS, own: Mapping[str, float], *, proven: str | None = None) -> str:
-        """Decide on metrics that are already aggregated (see `close`)."""
-        incumbent = self.incumbent
-        # With the switching term of the decision that led to it.
-        measured = self._pricing.cost(observed, incumbent, self.previous)
-        estimates = dict(self.estimator.estimate(observed=observed, incumbent=incumbent, own=own))
-        if self._learner is None:
-            # It knows no more of the incumbent than the window shows.
-            estimates[incumbent] = observed
-        before = copy.deepcopy(self.policy) if self.on_fallback else self.policy
-        decision = self._checked(self.policy.decide(observed=observed, estimates=estimates))
-        self.wanted = None
-        if self.on_fallback and decision.migrated:
-            if decision.name == proven:
-                self.on_fallback = False
-            else:
-                decision = self._held_back(decision, before)
-        self._record(observed, measured, decision, estimates)
-        self.previous = incumbent
-        self.incumbent = decision.name
-        self.dwell = decision.dwell
-        return decision.name
+    # ------------------------------------------------------------- what becomes of a proposal
 
-    def _held_back(self, decision: Decision, before: MinimalPolicy) -> Decision:
-        """Stay on the fallback: what is wanted has not been proven.
+    def settle(self, proposal: Proposal, *, proven: str | None = None) -> str:
+        """Carry a proposal out, unless the guard's fallback would be left for what is not proven.
 
-        A decision that cannot be carried out has not been made: the policy is put back to where it
-        was, and says at the next close what it wants then.
+        Parameters
+        ----------
+        proven : str, optional
+            Candidate that enough probes have completed through.
+
+        Returns
+        -------
+        str
+            Candidate of the cycles that follow.
         """
-        self.policy, self.wanted = before, decision.name
-        if self.previous != self.incumbent:
-            # Nothing has been decided since the guard moved; this window has paid for the move.
-            self._tell(self.incumbent)
-        return Decision(
-            placement=self.problem.candidates[self.incumbent],
-            name=self.incumbent,
+        if self.course.leaves_unproven(proposal.decision.name, proven):
+            self.hold(proposal)
+        else:
+            self.commit(proposal)
+        return self.course.placement
+
+    def commit(self, proposal: Proposal) -> None:
+        """Take note that a proposal has been carried out."""
+        decision = proposal.decision
+        self._policy.commit(proposal.after)
+        self._record(proposal)
+        if decision.migrated:
+            self.course.move(decision.name, decision.dwell)
+        else:
+            self.course.stay(decision.dwell)
+
+    def reject(self, proposal: Proposal, why: str | None = None) -> None:
+        """Take note that a proposal is not carried out, and why, if that is to be recorded."""
+        self._policy.commit(proposal.after)
+        self._record(proposal, why)
+        self._find(self.course.placement, proposal.decision.name)
+        self.course.find(self.course.placement, by_guard=self.course.by_guard)
+
+    def hold(self, proposal: Proposal, why: str | None = None) -> None:
+        """Stay on the guard's fallback: what is proposed has not been proven.
+
+        A decision that cannot be carried out has not been made: the policy is as it was, and says
+        at the next close what it wants then. `Course.wanted` names it, and probes are to be sent
+        through it.
+        """
+        course, wanted = self.course, proposal.decision
+        proposal.decision = replace(
+            wanted,
+            placement=self.problem.candidates[course.placement],
+            name=course.placement,
             migrated=False,
             reason="guard",
-            costs=decision.costs,
-            dwell=self.dwell,
-            delta_j=decision.delta_j,
+            dwell=course.dwell,
         )
+        self._record(proposal, why)
+        if course.previous != course.placement:
+            # Nothing has been decided since the guard moved; this window has paid for the move.
+            self._policy.adopt(course.placement)
+        course.hold(wanted.name)
+
+    def miss(self) -> None:
+        """Count a window whose close was not seen, because the controller's node was down."""
+        self.window += 1
+        self.course.miss()
 
     def adopt(self, name: str, *, left: str | None = None) -> None:
         """Take note that the guard has moved the cell to a fallback (rules 5 and 6 of the guard).
 
         The fallback is the incumbent with n_d = 0, and the next window, which begins with the first
-        cycle stamped with it, carries the switching term of the move. The log has a row for it,
-        with reason ``guard``, and so has every close at which the policy would have left the
-        fallback for a candidate that is not proven: `wanted` names it then, and probes are to be
-        sent through it.
+        cycle stamped with it, carries the switching term of the move. ``decisions`` has a row for
+        it, with reason ``guard``.
 
         Parameters
         ----------
@@ -342,27 +379,26 @@ class Controller:
         PolicyError
             If one of them is no candidate.
         """
-        left = self.incumbent if left is None else left
+        left = self.course.placement if left is None else left
         for who in (name, left):
             if who not in self.problem.candidates:
                 raise PolicyError(
                     f"the guard cannot have moved the cell from {left!r} to {name!r}: {who!r} is "
                     f"no candidate (candidates here: {', '.join(self.problem.candidates)})"
                 )
-        if left != self.incumbent:
-            self._tell(left)
-        self._tell(name)
-        self.previous, self.incumbent, self.dwell = left, name, 0
-        self.on_fallback, self.wanted = True, None
-        fixed = (len(self.log.seen), left, name, name != left, "guard", 0, None)
+        if left != self.course.placement:
+            self._policy.adopt(left)
+        self._policy.adopt(name)
+        self.course.fall(name, left)
+        fixed = (self.window, left, name, name != left, "guard", 0, None)
         priced = [None] * (len(self.decision_columns) - len(fixed))
-        self.log.decisions.append((*fixed, *priced))
+        self.decisions.append((*fixed, *priced, None))
 
     def resume(self, name: str, *, fallback: bool = False) -> None:
-        """Take note of where the cell is, though something else was decided, or nothing yet.
+        """Take note of where the cell is, though nothing here was decided.
 
-        An order was not carried out, or this controller takes over from another one. It counts as
-        a decision to be there: n_d is 0, and nothing has been switched.
+        A person has moved it, or this controller takes over from another one. It counts as a
+        decision to be there: n_d is 0, and nothing has been switched.
 
         Parameters
         ----------
@@ -371,52 +407,42 @@ class Controller:
         fallback : bool
             Whether that is the guard's own move.
         """
-        if name != self.incumbent:
+        self._find(name, self.course.placement)
+        self.course.find(name, by_guard=fallback)
+
+    def _find(self, name: str, believed: str) -> None:
+        """Tell a policy that believes the cell elsewhere where it is."""
+        if name != believed:
             # The second time there is no move to tell of, so that no switching term remains.
-            self._tell(name)
-            self._tell(name)
-        self.previous = self.incumbent = name
-        self.dwell, self.on_fallback = 0, fallback
+            self._policy.adopt(name)
+            self._policy.adopt(name)
 
-    def _tell(self, name: str) -> None:
-        """Tell the policy where the cell is, if it wants to know."""
-        adopt = getattr(self.policy, "adopt", None)
-        if adopt is not None:
-            adopt(name)
+    def _record(self, proposal: Proposal, why: str | None = None) -> None:
+        """Write a row of ``decisions``: a move that was not carried out is none."""
+        decision, incumbent = proposal.decision, self.course.placement
+        name, migrated = decision.name, decision.migrated
+        if why is not None and migrated:
+            why, name, migrated = f"{name}: {why}", incumbent, False
+        fixed = (self.window, incumbent, name, migrated)
+        rule = (decision.reason, decision.dwell, decision.delta_j)
+        self.decisions.append((*fixed, *rule, *proposal.priced, why))
+        self.window += 1
 
-    def _record(
-        self,
-        observed: QoS,
-        measured: float,
-        decision: Decision,
-        estimates: Mapping[str, QoS],
-    ) -> None:
-        log, names, costs = self.log, self._names, decision.costs
-        fixed = (
-            len(log.seen),
-            self.incumbent,
-            decision.name,
-            decision.migrated,
-            decision.reason,
-            decision.dwell,
-            decision.delta_j,
-        )
-        log.seen.append((observed.l95_ms, observed.violation_rate, measured))
+    def _priced(self, decision: Decision, estimates: Mapping[str, QoS]) -> tuple[object, ...]:
+        """Return what a row of ``decisions`` says of every candidate."""
+        names, costs = self._names, decision.costs
         known = [estimates[name] for name in names]
         errors = [estimate.error or NO_ERROR for estimate in known]
         used = [estimate.utilisation for estimate in known]
-        log.decisions.append(
-            (
-                *fixed,
-                *(map(costs.get, names) if costs else self._none),
-                *[estimate.l95_ms for estimate in known],
-                *[estimate.violation_rate for estimate in known],
-                *[l95_ms for l95_ms, _ in errors],
-                *[violation_rate for _, violation_rate in errors],
-                *[shares.get(name) for name in self.resources for shares in used],
-                *self._capped(known),
-                *self._supported(),
-            )
+        return (
+            *(map(costs.get, names) if costs else self._none),
+            *[estimate.l95_ms for estimate in known],
+            *[estimate.violation_rate for estimate in known],
+            *[l95_ms for l95_ms, _ in errors],
+            *[violation_rate for _, violation_rate in errors],
+            *[shares.get(name) for name in self.resources for shares in used],
+            *self._capped(known),
+            *self._supported(),
         )
 
     def _capped(self, known: Iterable[QoS]) -> list[float | bool | None]:
@@ -444,11 +470,6 @@ class Controller:
             )
         return [known.samples for known in behind] + [known.age_windows for known in behind]
 
-    def miss(self) -> None:
-        """Record a window whose close the controller did not see, because its node was down."""
-        self.log.seen.append((None, None, None))
-        self.previous = self.incumbent
-
     def _checked(self, decision: Decision | str) -> Decision:
         """Bring what a policy returned into the form of a decision."""
         candidates = self.problem.candidates
@@ -456,27 +477,27 @@ class Controller:
         name = decision.name if isinstance(decision, Decision) else decision
         if not isinstance(name, str) or name not in candidates:
             raise PolicyError(
-                f"{who}.decide returned {decision!r} at window {len(self.log.seen)}; "
+                f"{who}.decide returned {decision!r} at window {self.window}; "
                 f"it must be a Decision or a candidate's name: {', '.join(candidates)}"
             )
         if isinstance(decision, Decision):
             if decision.placement != candidates[name] or decision.migrated != (
-                name != self.incumbent
+                name != self.course.placement
             ):
                 raise PolicyError(
                     f"{who}.decide returned a decision for {name!r} at window "
-                    f"{len(self.log.seen)} whose placement or `migrated` contradicts its "
-                    f"name (incumbent: {self.incumbent!r}; a policy that remembers it needs "
+                    f"{self.window} whose placement or `migrated` contradicts its "
+                    f"name (incumbent: {self.course.placement!r}; a policy that remembers it needs "
                     "adopt(name), by which it is told of moves of the guard)"
                 )
             return decision
-        migrated = name != self.incumbent
+        migrated = name != self.course.placement
         return Decision(
             placement=candidates[name],
             name=name,
             migrated=migrated,
             reason="migrate" if migrated else "hold",
-            dwell=0 if migrated else self.dwell + 1,
+            dwell=0 if migrated else self.course.dwell + 1,
         )
 
 
@@ -495,19 +516,12 @@ def _without_estimator(
     return policy, named or estimator
 
 
-def _prepared_policy(policy: MinimalPolicy | str | None, problem: Problem) -> MinimalPolicy:
+def _prepared_policy(policy: MinimalPolicy | str | None, problem: Problem) -> Proposer:
     """Return a started copy of a policy."""
     if policy is None or isinstance(policy, str):
-        prepared: MinimalPolicy = policy_by_name(policy or problem.controller.policy, problem)
-    else:
-        if not callable(getattr(policy, "decide", None)):
-            raise PolicyError(
-                f"{policy!r} is no policy: it has no method decide(observed=..., estimates=...)"
-            )
-        prepared = copy.deepcopy(policy)
-    start = getattr(prepared, "start", None)
-    if start is not None:
-        start(problem)
+        policy = policy_by_name(policy or problem.controller.policy, problem)
+    prepared = as_proposer(policy)
+    prepared.start(problem)
     return prepared
 
 

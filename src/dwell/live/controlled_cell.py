@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, TypeAlias
 
-from dwell.control import Controller
+from dwell.control import Controller, Proposal
 from dwell.errors import LiveError
 from dwell.live.agent import AGENT_BEAT
 from dwell.live.continuity import Continuity, SetbackDetector
@@ -79,6 +79,8 @@ class _Move:
     refused: str = ""
     # Whether its order has been refused for now, and is to be asked for anew.
     anew: bool = False
+    # What it carries out, where the policy has decided it.
+    proposal: Proposal | None = None
 
 
 class ControlledCell:
@@ -103,7 +105,9 @@ class ControlledCell:
         agent = relay, f"agent@{relay}"
         self.pulse = Pulse(place, lambda: (True, recorder.trouble), hears=[agent], every=AGENT_BEAT)
         self._keys = place.keys
-        self.held: Accepted | None = None
+        # Where the cell is, by the stamper's answers and stamps; and its last answer in this term.
+        self.course = controller.course
+        self._told: Accepted | None = None
         # The cycles that are believed; and the numbers of the last orders that were sent before the
         # newest cycle, and before the term that holds, were heard of.
         self.continuity = Continuity(place.period_ns)
@@ -226,8 +230,8 @@ class ControlledCell:
         """Whether a cycle goes on from those before it; complains of the first that does not."""
         continuity, cycle = self.continuity, stamp.key
         newest, ahead = continuity.newest, continuity.ahead(now_ns)
-        held = self.held
-        terms = 0 if held is None or held.run != stamp.run else stamp.term - held.term
+        course = self.course
+        terms = stamp.term - course.term if course.run == stamp.run else 0
         if terms <= ahead and continuity.takes(cycle, now_ns, alone=alone):
             if continuity.newest == cycle != newest:
                 self._cycle_asked = self._number
@@ -238,8 +242,8 @@ class ControlledCell:
             self.place.complain(
                 LiveError(
                     f"{who} speaks of run {stamp.run}, cycle {stamp.cycle}, term {stamp.term}, "
-                    f"after {newest} and term {held.term if held is not None else None}; at most "
-                    f"{ahead} more are believed (damaged, or made up)"
+                    f"after {newest} and term {course.term}; at most {ahead} more are believed "
+                    "(damaged, or made up)"
                 )
             )
         self._doubted_until_ns = now_ns + REPEATED_NS
@@ -247,20 +251,19 @@ class ControlledCell:
 
     def _stamped(self, stamp: Stamped, now_ns: int) -> None:
         self._require_candidate(stamp.placement)
-        held = self.held
-        if held is None or not self._goes_on(stamp, self.place.stamper[1], now_ns):
+        windows, course = self.windows, self.course
+        if windows is None or not self._goes_on(stamp, self.place.stamper[1], now_ns):
             return
-        if self.windows is not None:
-            self.windows.stamped(stamp, now_ns)
-            self.windows.measured(stamp.run, stamp.intervals)
-        if (stamp.run, stamp.term) <= (held.run, held.term):
+        windows.stamped(stamp, now_ns)
+        windows.measured(stamp.run, stamp.intervals)
+        if (stamp.run, stamp.term) <= (course.run, course.term):
             self._unconfirmed = None
             return
         move = self._move
         ours = (
             move is not None
             and move.order is not None
-            and stamp.run == held.run
+            and stamp.run == course.run
             and stamp.term == move.order.term + 1
             and stamp.placement == move.name
         )
@@ -278,37 +281,46 @@ class ControlledCell:
 
     def _now_at(self, run: int, term: int, placement: str, *, by_guard: bool) -> None:
         """Take note of the placement that holds since a term began."""
-        held, self._unconfirmed = self.held, None
+        controller, course, move = self.controller, self.course, self._move
+        left = course.placement
+        self._unconfirmed = self._told = None
         self._term_asked = self._number
-        before = held.placement if held is not None else placement
-        self.held = Accepted(
-            *(0, self.name, "", run, term, placement, 0), fallback=by_guard, resting=by_guard
-        )
-        self._unwritten = True
-        move, self._move = self._move, None
         self.refused = ""
-        if self.windows is not None:
-            if not by_guard and (move is None or move.name == placement):
-                self.windows.record.end_order()
-            else:
-                self.windows.refused(f"the placement became {placement} meanwhile")
+        if move is not None and move.name == placement and not by_guard:
+            self._move, self._unwritten = None, True
+            if move.proposal is not None:
+                controller.commit(move.proposal)
+        else:
+            self._stay(f"the placement became {placement} meanwhile")
         if by_guard:
             self.guard_moves += 1
-            self.controller.adopt(placement, left=before)
-            return
-        self.migrations += 1
-        if placement != self.controller.incumbent:
-            # A person's choice, not the policy's.
-            self.controller.resume(placement)
-        self.controller.on_fallback = False
+            controller.adopt(placement, left=left)
+        else:
+            self.migrations += 1
+            if placement != course.placement:
+                # A person's choice, not the policy's.
+                controller.resume(placement)
+            course.credit(by_guard=False)
+        course.enter(run, term)
 
     def _begin_run(self, answer: Accepted) -> None:
         """Begin where the stamper says that the cell is."""
         self._term_asked = self._number
-        self.controller.resume(answer.placement, fallback=answer.fallback)
         resume = self._recorder.open(answer.run)
+        self._follow(answer)
+        self.controller.window = resume.window
         self.windows = LiveWindows(self.place.problem, self.offsets, self.controller, resume=resume)
-        self.held = answer
+
+    def _follow(self, answer: Accepted) -> None:
+        """Be where the stamper says."""
+        self.controller.resume(answer.placement, fallback=answer.fallback)
+        self.course.enter(answer.run, answer.term)
+        self._told = answer
+
+    @property
+    def _proven(self) -> str:
+        """Candidate that the stamper has said is proven; none where empty."""
+        return "" if self._told is None else self._told.proven
 
     # ------------------------------------------------------------------------- orders
 
@@ -318,25 +330,25 @@ class ControlledCell:
         self._require_candidate(answer.placement)
         if answer.number > self._number:
             raise LiveError(f"an answer to order {answer.number}, which was never sent")
-        held = self.held
-        if held is None:
+        begins = self.windows is None
+        if begins:
             self._begin_run(answer)
-        elif not self._corrected(answer, held, now_ns):
+        elif not self._corrected(answer, now_ns):
             return
         # One that asked before had a clock that is ahead of this one.
         self._number = max(self._number, answer.newest)
-        if held is None:
+        if begins:
             return
-        held, move = self.held or held, self._move
+        course, move, proven = self.course, self._move, self._proven
         of_move = move is not None and move.order is not None and answer.number == move.order.number
-        if (answer.run, answer.term) > (held.run, held.term):
+        if (answer.run, answer.term) > (course.run, course.term):
             # What was accepted may be an order before the one that waits for its answer.
             self._now_at(answer.run, answer.term, answer.placement, by_guard=answer.fallback)
-        elif not answer.fallback:
+        else:
             # A stamp says where the cell is, and not who has moved it.
-            self.controller.on_fallback = False
-        self.held = answer
-        if self._move is None and answer.proven and answer.proven != held.proven:
+            course.credit(by_guard=answer.fallback)
+        self._told = answer
+        if self._move is None and answer.proven and answer.proven != proven:
             self._follow_operators(now_ns)
         if not of_move or move is None or move is not self._move:
             return
@@ -348,13 +360,13 @@ class ControlledCell:
         elif move.phase == "fork":
             self._ask_for_states(move, answer)
 
-    def _corrected(self, answer: Accepted, held: Accepted, now_ns: int) -> bool:
+    def _corrected(self, answer: Accepted, now_ns: int) -> bool:
         """Believe the stamper's own word over what was heard before; False where it is an old one.
 
         An answer to an order that was sent after something was heard is later than that: where it
         says less, what was heard was wrong.
         """
-        if (answer.run, answer.term) < (held.run, held.term):
+        if (answer.run, answer.term) < (self.course.run, self.course.term):
             if answer.number <= self._term_asked:
                 return False
             self._take_back(answer)
@@ -382,17 +394,18 @@ class ControlledCell:
                 f"the stamper is in term {answer.term}, at {answer.placement}; so it was not moved"
             )
         )
-        self.held = answer
         self._term_asked = self._number
-        self._stay(answer, f"the stamper says that {answer.placement} holds")
+        self._stay(f"the stamper says that {answer.placement} holds")
+        self._follow(answer)
 
-    def _stay(self, held: Accepted, why: str) -> None:
+    def _stay(self, why: str) -> None:
         """Go on with the placement that holds: no migration has come about."""
-        self._move = None
-        self.controller.resume(held.placement, fallback=held.fallback)
+        move, self._move = self._move, None
+        if move is not None and move.proposal is not None:
+            self.controller.reject(move.proposal, why)
         self._unwritten = True
         if self.windows is not None:
-            self.windows.refused(why)
+            self.windows.refused()
 
     def _send(self, order: Order) -> None:
         if self.place.stamper[1] in self.pulse.strangers:
@@ -406,12 +419,12 @@ class ControlledCell:
 
     def _order(self, placement: str, now_ns: int) -> Order:
         """Return an order; whatever it is for, it says what is forked, and what is to be proven."""
-        held, move = self.held, self._move
-        run, term = (held.run, held.term) if held is not None else (0, 0)
+        course, move = self.course, self._move
+        where = course.run, course.term
         fraction = self.controller.shadow_fraction
         forks = () if move is None else move.forks
         want = self._desired(now_ns) if move is None else move.name
-        return Order(self._next_number(), self.name, run, term, placement, fraction, forks, want)
+        return Order(self._next_number(), self.name, *where, placement, fraction, forks, want)
 
     def _desired(self, now_ns: int) -> str:
         """Return what the guard's fallback shall be left for: people's choice, else the policy's.
@@ -419,30 +432,30 @@ class ControlledCell:
         It lasts until the cell is there, whatever windows close and orders are given up meanwhile:
         without it the stamper counts its probes anew.
         """
-        held, wanted = self.held, self.controller.wanted
-        if held is None or not held.fallback:
+        here, wanted = self.course.placement, self.course.wanted
+        if not self.course.by_guard:
             return ""
-        chosen = self._allowed(held.placement, now_ns)
-        if self.pinned or chosen != held.placement:
-            return "" if chosen == held.placement else chosen
+        chosen = self._allowed(here, now_ns)
+        if self.pinned or chosen != here:
+            return "" if chosen == here else chosen
         return wanted if wanted is not None and self._clear(wanted) else ""
 
-    def _begin(self, name: str, now_ns: int, *, decided: bool = False) -> None:
-        """Begin a migration that the policy has decided or a person has asked for."""
-        held = self.held
-        if held is None:
-            return
+    def _begin(self, name: str, now_ns: int, proposal: Proposal | None = None) -> None:
+        """Begin a migration that the policy has proposed or a person has asked for."""
+        if self._move is not None:
+            self._stay(self._overruled())
         problem = self.place.problem
-        old, new = problem.candidates[held.placement], problem.candidates[name]
+        old, new = problem.candidates[self.course.placement], problem.candidates[name]
         forks = tuple(
             (task.name, new[task.name])
             for task in problem.pipeline.tasks.values()
             if task.state_bytes and old[task.name] != new[task.name]
         )
-        self._move = _Move(name, now_ns, "fork" if forks else "order", forks)
+        phase: Phase = "fork" if forks else "order"
+        self._move = _Move(name, now_ns, phase, forks, proposal=proposal)
         self.refused = ""
         if self.windows is not None:
-            self.windows.ordered(decided=decided)
+            self.windows.ordered()
         self._push(self._move, now_ns)
 
     def _push(self, move: _Move, now_ns: int) -> None:
@@ -459,15 +472,15 @@ class ControlledCell:
             move.anew = False
         self._send(move.order)
 
-    def _ask_for_states(self, move: _Move, held: Accepted) -> None:
+    def _ask_for_states(self, move: _Move, answer: Accepted) -> None:
         """Have the states follow the inputs, which are forked."""
         move.phase = "state"
         keys = self.place.keys
-        old = self.place.problem.candidates[held.placement]
+        old = self.place.problem.candidates[answer.placement]
         for task, to in move.forks:
             number = self._next_number()
             move.awaited[number] = task
-            asked = Snapshot(number, task, old[task], to, held.run, held.cycle)
+            asked = Snapshot(number, task, old[task], to, answer.run, answer.cycle)
             # Where it goes, a state is taken for what is known to have been asked for alone.
             for node in (to, old[task]):
                 self.place.put(keys.snapshot(task, node), asked)
@@ -487,10 +500,10 @@ class ControlledCell:
 
     def _give_up(self, now_ns: int) -> None:
         """End a migration that has not come about: the cell is where it was."""
-        move, held = self._move, self.held
-        if held is None or move is None:
+        move = self._move
+        if move is None:
             return
-        self._stay(held, move.refused or "no answer")
+        self._stay(move.refused or "no answer")
         if move.forks:
             self._send(self._order("", now_ns))
 
@@ -528,26 +541,33 @@ class ControlledCell:
         closed = windows.close(unix_ns=time.time_ns())
         self._unwritten = True
         windows.spent(self.place.node, now_ns, self.place.who, time.process_time_ns())
-        held = self.held
-        if self._move is not None:
-            # The order before has not come about within a whole window.
-            self._give_up(now_ns)
+        # The order before has not come about within a whole window.
+        self._give_up(now_ns)
         # Of a window that was mostly not heard of, what was heard says little.
         last = windows.last
-        if held is None or last is None or 2 * last.heard < self.place.problem.window_cycles:
+        if last is None or 2 * last.heard < self.place.problem.window_cycles:
             self.controller.miss()
             return
-        wanted = self.controller.close(closed, proven=held.proven or None)
-        self._window, self._window_ns = self._shown(last), now_ns
-        target = self._allowed(wanted, now_ns)
-        if held.fallback and target != held.proven:
-            target = held.placement
-        if target != wanted:
-            self.controller.resume(held.placement, fallback=held.fallback)
-            if self.place.problem.live.mode == "control":
-                windows.record.overrule(self._overruled())
-        if target != held.placement:
-            self._begin(target, now_ns, decided=target == wanted)
+        course, proven = self.course, self._proven
+        proposal = self.controller.propose(closed)
+        last.seen = proposal.seen
+        wanted = proposal.decision.name
+        unproven = course.leaves_unproven(wanted, proven)
+        permitted = course.placement if unproven else wanted
+        target = self._allowed(permitted, now_ns)
+        if course.leaves_unproven(target, proven):
+            target = course.placement
+        overruled = target != permitted and self.place.problem.live.mode == "control"
+        why = self._overruled() if overruled else None
+        if unproven:
+            self.controller.hold(proposal, why)
+        elif target != permitted:
+            self.controller.reject(proposal, why)
+        elif target == course.placement:
+            self.controller.commit(proposal)
+        self._window, self._window_ns = self._shown(last, proposal), now_ns
+        if target != course.placement:
+            self._begin(target, now_ns, proposal if target == wanted else None)
 
     def write(self) -> None:
         """Record the windows that have closed since the last time."""
@@ -555,18 +575,26 @@ class ControlledCell:
         if self.windows is not None:
             self._recorder.append(self.windows.record.rows(), origin_ns=self.windows.origin_ns)
 
+    def finish(self) -> Rows | None:
+        """Return the rows that are left; an order without answer counts as carried out."""
+        if self.windows is None:
+            return None
+        if self._move is not None and self._move.proposal is not None:
+            self.controller.commit(self._move.proposal)
+        return self.windows.record.rows(last=True)
+
     def _allowed(self, wanted: str, now_ns: int) -> str:
         """Return what people let the policy have."""
-        held, problem = self.held, self.place.problem
+        here, problem = self.course.placement, self.place.problem
         if self.pinned:
             return self.pinned
-        if held is not None and problem.live.mode == "advise":
-            wanted = held.placement
+        if problem.live.mode == "advise":
+            wanted = here
         if self._clear(wanted):
             return wanted
-        if held is not None and self._clear(held.placement):
-            return held.placement
-        probed = (held.probed,) if held is not None and held.probed else ()
+        if self._clear(here):
+            return here
+        probed = (self._told.probed,) if self._told is not None and self._told.probed else ()
         order = (*probed, *problem.controller.fallbacks, *problem.candidates)
         clear: list[str] = [name for name in order if self._clear(name)]
         return next((name for name in clear if self._workers_ready(name, now_ns)), clear[0])
@@ -588,11 +616,10 @@ class ControlledCell:
             return f"pinned to {self.pinned}"
         return f"{', '.join(sorted(self.drained))} drained" if self.drained else "not proven"
 
-    def _shown(self, last: LiveWindow) -> dict[str, Any]:
+    def _shown(self, last: LiveWindow, proposal: Proposal) -> dict[str, Any]:
         """Return the last window as people look at it."""
-        log, problem = self.controller.log, self.place.problem
-        l95_ms, _, cost = log.seen[-1]
-        decision = dict(zip(self.controller.decision_columns, log.decisions[-1], strict=True))
+        decision, problem = proposal.decision, self.place.problem
+        l95_ms, _, cost = proposal.seen
         used = last.used[0].tolist()
         return {
             "number": last.number,
@@ -600,8 +627,8 @@ class ControlledCell:
             "l95_ms": l95_ms,
             "violation_rate": last.violation_rate(round(problem.pipeline.deadline_ms * 1e6)),
             "cost": cost,
-            "reason": decision["reason"],
-            "estimates": {name: decision[f"j_{name}"] for name in problem.candidates},
+            "reason": decision.reason,
+            "estimates": {name: decision.costs.get(name) for name in problem.candidates},
             "utilisation": {
                 name: None if math.isnan(share) else share
                 for name, share in zip(self.controller.resources, used, strict=True)
@@ -642,14 +669,14 @@ class ControlledCell:
 
     def _follow_operators(self, now_ns: int) -> None:
         """Begin to move where people want the cell; from a fallback, once that is proven."""
-        held = self.held
-        if held is None:
+        if self.windows is None:
             return
-        target = self._allowed(held.placement, now_ns)
+        here = self.course.placement
+        target = self._allowed(here, now_ns)
         under_way = None if self._move is None else self._move.name
-        if held.fallback and target != held.proven:
+        if self.course.leaves_unproven(target, self._proven):
             return
-        if target not in (held.placement, under_way):
+        if target not in (here, under_way):
             self._begin(target, now_ns)
 
     def _drain(self, node: str) -> str:
@@ -666,7 +693,7 @@ class ControlledCell:
 
     def status(self, now_ns: int) -> dict[str, Any]:
         """Return how the cell is, as plain values."""
-        held, move = self.held, self._move
+        known, course, told, move = self.windows is not None, self.course, self._told, self._move
         began_ns = now_ns if self._began_ns is None else self._began_ns
         age_ms = round((now_ns - self._window_ns) / 1e6, 1)
         joined_ns = self.pulse.detector.joined_age_ns(now_ns)
@@ -676,12 +703,12 @@ class ControlledCell:
             "up_ms": round((now_ns - began_ns) / 1e6, 1),
             "joined_ms": round((now_ns - began_ns if joined_ns is None else joined_ns) / 1e6, 1),
             "mode": self.place.problem.live.mode,
-            "run": held.run if held is not None else None,
-            "term": held.term if held is not None else None,
-            "placement": held.placement if held is not None else None,
-            "fallback": self.controller.on_fallback,
-            "resting": held is not None and held.resting,
-            "wanted": self.controller.wanted,
+            "run": course.run if known else None,
+            "term": course.term if known else None,
+            "placement": course.placement if known else None,
+            "fallback": course.by_guard,
+            "resting": course.by_guard if told is None else told.resting,
+            "wanted": course.wanted,
             "pinned": self.pinned or None,
             "drained": sorted(self.drained),
             "proving": self._proving(now_ns),
@@ -703,11 +730,11 @@ class ControlledCell:
 
     def _proving(self, now_ns: int) -> dict[str, Any] | None:
         """Return how far the proof is that the guard's fallback is waiting for."""
-        held, desired = self.held, self._desired(now_ns)
-        if held is None or not desired or self._move is not None:
+        told, desired = self._told, self._desired(now_ns)
+        if not desired or self._move is not None:
             return None
-        needed = held.needed or self.place.problem.controller.probe_cycles
-        done = held.probes if held.probed == desired else 0
+        needed = (told and told.needed) or self.place.problem.controller.probe_cycles
+        done = told.probes if told is not None and told.probed == desired else 0
         return {"candidate": desired, "done": done, "needed": needed}
 
     def _processes(self, now_ns: int) -> dict[str, dict[str, Any]]:

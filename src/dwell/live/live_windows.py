@@ -51,8 +51,8 @@ KEPT_CYCLES = 1_000
 class LiveWindows:
     """Closes the windows of one cell.
 
-    Every window that `close` returns goes to the controller's `close` or `miss`, one for one: the
-    record takes what the controller saw and decided from its log.
+    Every window that `close` returns goes to the controller's `propose` or `miss`, one for one;
+    what it saw is kept beside the window.
 
     Parameters
     ----------
@@ -174,23 +174,13 @@ class LiveWindows:
         if self._keeps_jobs:
             self._processes.report(node, at_ns, [(who, cpu_ns)])
 
-    def ordered(self, *, decided: bool = False) -> None:
-        """A migration is under way: the next window begins with it, or goes on when `refused`.
-
-        Parameters
-        ----------
-        decided : bool
-            Whether it is what the controller decided last. That is recorded only once it is known
-            what has become of it.
-        """
+    def ordered(self) -> None:
+        """A migration is under way: the next window begins with it, or goes on when `refused`."""
         self._ordered, self._beginning = True, None
-        if decided:
-            self.record.order_last()
 
-    def refused(self, why: str = "") -> None:
+    def refused(self) -> None:
         """The migration will not come about: windows go on where they were."""
         self._ordered, self._beginning = False, None
-        self.record.end_order(why)
 
     def forget(self, run: int, cycle: int) -> None:
         """Take a cycle, and those after it, for never released: what told of them was wrong."""

@@ -259,4 +259,4 @@ def _require_runs(out: Path) -> None:
 
 def _finished(recorder: RunRecorder, cell: ControlledCell) -> Path | None:
     cell.write()
-    return recorder.finish(cell.windows.record.rows(last=True) if cell.windows else None)
+    return recorder.finish(cell.finish())

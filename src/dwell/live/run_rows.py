@@ -12,7 +12,7 @@ import math
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias, cast
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,6 +67,8 @@ class LiveWindow:
         Whether that is more than 20 % of D, or nobody knows of a cycle whether it has completed.
     used : float64 array, shape (3, nodes)
         Busy, own and shadow share of the cores.
+    seen : tuple of float or None
+        What was decided on: L95 (ms), violation rate and cost; None where nobody has looked.
     """
 
     number: int
@@ -78,6 +80,7 @@ class LiveWindow:
     unproven: bool
     used: NDArray[np.float64]
     closed_unix_ns: int | None
+    seen: tuple[float | None, ...] = (None, None, None)
 
     def violation_rate(self, deadline_ns: int) -> float:
         """V_D: share of its cycles that missed, of those whose end is known."""
@@ -140,7 +143,6 @@ class RunRows:
         self._columns = columns_of(controller, jobs=resume.jobs)
         #: Row of the next cycle, and last cycle that is known to have completed.
         self.next_row, self.newest_done = resume.cycle, (-1, -1)
-        self._first_window = resume.window
         # First cycle whose jobs are not recorded yet, and windows whose processes are not.
         self._next_jobs = resume.cycle
         self._unwritten: deque[LiveWindow] = deque()
@@ -149,10 +151,6 @@ class RunRows:
         self._changed: dict[int, LiveCycle] = {}
         self._changed_windows: set[int] = set()
         self._in_flight: dict[int, LiveCycle] = {}
-        self._decisions_taken = 0
-        # Of the log's decisions: the one whose order is under way, and why some were not followed.
-        self._open_decision: int | None = None
-        self._refused: dict[int, str] = {}
 
     def add(self, cycles: Iterable[LiveCycle]) -> Iterator[LiveCycle]:
         """Record cycles; yields those of long ago, which are forgotten."""
@@ -166,7 +164,6 @@ class RunRows:
             self._in_flight.pop(old.row, None)
             if old.window is not None:
                 self._windows.pop(old.window, None)
-                self._controller.log.seen[old.window - self._first_window] = ()
             yield old
 
     def close(self, window: LiveWindow) -> None:
@@ -183,24 +180,6 @@ class RunRows:
             if cycle.window is not None:
                 self._changed_windows.add(cycle.window)
 
-    # ---------------------------------------------------------------------- decisions
-
-    def order_last(self) -> None:
-        """Hold the last decision back until it is known what has become of its order."""
-        self._open_decision = len(self._controller.log.decisions) - 1
-
-    def end_order(self, refused: str | None = None) -> None:
-        """Record the decision that was held back, with why it has not come about."""
-        if self._open_decision is not None and refused is not None:
-            self._refused[self._open_decision] = refused
-        self._open_decision = None
-
-    def overrule(self, why: str) -> None:
-        """Record why the last decision will not be ordered."""
-        self._refused[len(self._controller.log.decisions) - 1] = why
-
-    # --------------------------------------------------------------------------- rows
-
     def rows(self, *, last: bool = False) -> Rows:
         """Return the rows that are new, or have changed since the last call.
 
@@ -213,9 +192,6 @@ class RunRows:
         for row, cycle in self._in_flight.items():
             if self._outcome(cycle) != cycle.outcome:
                 self._changed[row] = cycle
-        log, begin = self._controller.log.decisions, self._decisions_taken
-        undecided = None if last else self._open_decision
-        self._decisions_taken = end = len(log) if undecided is None else undecided
         values: dict[str, Iterable[Values]] = {
             "cycles": [self._cycle_values(self._changed[row]) for row in sorted(self._changed)],
             "windows": [
@@ -224,18 +200,16 @@ class RunRows:
                 if number in self._windows
             ],
             "decisions": [
-                decision_values(
-                    self._controller, log[row], self._refused.pop(row, None), self._first_window
-                )
-                for row in range(begin, end)
+                decision_values(self._controller, row) for row in self._controller.decisions
             ],
             **(self._job_values(last=last) if self._jobs else {}),
         }
+        rows = {name: [row_of(self._columns[name], of) for of in values[name]] for name in values}
         # What is recorded is not kept: a controller runs for months.
-        log[begin:end] = [()] * (end - begin)
+        self._controller.decisions.clear()
         self._changed.clear()
         self._changed_windows.clear()
-        return {name: [row_of(self._columns[name], of) for of in values[name]] for name in values}
+        return rows
 
     def _outcome(self, cycle: LiveCycle) -> str:
         if cycle.came_to(NOT_APPLIED):
@@ -275,11 +249,9 @@ class RunRows:
         }
 
     def _window_values(self, window: LiveWindow) -> Values:
-        cycles, names, log = window.cycles, self._controller.resources, self._controller.log
+        cycles, names = window.cycles, self._controller.resources
         busy, _, by_shadows = window.used.tolist()
-        place = window.number - self._first_window
-        seen = log.seen[place] if place < len(log.seen) else (None, None, None)
-        seen_l95_ms, seen_violation_rate, cost = map(_known, seen)
+        seen_l95_ms, seen_violation_rate, cost = map(_known, window.seen)
         latency_ns = np.array([cycle.latency_ns for cycle in told(cycles)], np.int64)
         values: dict[str, object] = {
             "window": window.number,
@@ -331,22 +303,10 @@ class RunRows:
                 }
 
 
-def decision_values(
-    controller: Controller, row: Sequence[object], why: str | None, first_window: int
-) -> Values:
-    """Return a row of ``decisions``.
-
-    Parameters
-    ----------
-    why : str, optional
-        Why it was not followed; None where it was.
-    """
-    values = dict(zip(controller.decision_columns, map(_known, row), strict=True))
-    values["window"] = first_window + cast("int", values["window"])
-    if why is not None and values["migrated"]:
-        why = f"{values['placement']}: {why}"
-        values |= {"placement": values["incumbent"], "migrated": False}
-    return {**values, "refused": why}
+def decision_values(controller: Controller, row: Sequence[object]) -> Values:
+    """Return a row of ``decisions``, with why it was not carried out."""
+    columns = *controller.decision_columns, "refused"
+    return dict(zip(columns, map(_known, row), strict=True))
 
 
 def _known(value: object) -> object:

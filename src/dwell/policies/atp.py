@@ -59,6 +59,13 @@ class _Shown(NamedTuple):
     used: TierUtilisation
 
 
+class _Window(NamedTuple):
+    """A window: what was seen of it, and what was expected of every candidate."""
+
+    observed: _Shown
+    expected: Mapping[str, _Shown] | None
+
+
 def _mean(windows: Sequence[_Shown]) -> _Shown:
     # Added one after another: from Python 3.12 on, `sum` rounds floats otherwise.
     l95_ms = l95_error_ms = robot = edge = cloud = 0.0
@@ -111,7 +118,6 @@ class ATP(ATPThresholds):
         self.every_ms = check_parameter("every_ms", every_ms, EVERY_MS)
         #: Windows that a decision is made on.
         self.every_windows = 1
-        self._begin()
 
     def __repr__(self) -> str:
         return (
@@ -125,71 +131,48 @@ class ATP(ATPThresholds):
         super().start(problem)
         window_ms = problem.window_cycles * problem.pipeline.period_ms
         self.every_windows = max(1, round(self.every_ms / window_ms))
-        self._begin()
 
-    def adopt(self, name: str) -> None:
-        """Take over `name` as the incumbent with n_d = 0: somebody else moved the cell there."""
-        super().adopt(name)
-        self._begin()
+    def _blank(self) -> tuple[_Window, ...]:
+        return ()
 
-    def _begin(self) -> None:
-        """Forget the windows since the last decision."""
-        self._observed: tuple[_Shown, ...] = ()
-        self._estimated: tuple[Mapping[str, _Shown] | None, ...] = ()
-
-    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS] | None = None) -> Decision:
+    def _decide(
+        self, observed: QoS, estimates: Mapping[str, QoS] | None
+    ) -> tuple[Decision, tuple[_Window, ...]]:
         """Toggle the task if a threshold asks for it and the other side costs less.
 
-        Parameters
-        ----------
-        observed : QoS
-            Metrics of the window under the incumbent.
-        estimates : mapping of str to QoS, optional
-            Metrics by candidate; needed in every window of those that a question is answered on.
-
-        Returns
-        -------
-        Decision
-            `costs` are J of the window, as every policy records them; `delta_j` is what moving
-            saves in the three terms, NaN where no threshold asked.
-
-        Raises
-        ------
-        MetricError
-            If a metric, or the estimate of a candidate, is missing. Nothing has changed then.
+        Windows since the last decision are remembered. `costs` are J of the window, as every
+        policy records them; `delta_j` is what moving saves in the three terms, NaN where no
+        threshold asked. Estimates are needed in every window of those that a question is answered
+        on.
         """
-        incumbent = self._incumbent
-        shown = (*self._observed, self._shown(observed))
         costs = self._costs(estimates)
         expected: Mapping[str, _Shown] | None = None
         if estimates is not None:
             expected = {name: self._shown(estimates[name]) for name in self.candidates}
-        told = (*self._estimated, expected)
-        dwells = incumbent.dwell < self.min_dwell
-        if len(shown) < self.every_windows:
-            self._observed, self._estimated = shown, told
-            return incumbent.stay("dwell" if dwells else "hold", costs)
+        windows = (*self._standing.memory, _Window(self._shown(observed), expected))
+        dwells = self._standing.dwell < self.min_dwell
+        if len(windows) < self.every_windows:
+            return self._stay("dwell" if dwells else "hold", costs), windows
         if dwells:
-            self._begin()
-            return incumbent.stay("dwell", costs)
-        mean = _mean(shown)
+            return self._stay("dwell", costs), ()
+        mean = _mean([window.observed for window in windows])
         other, over = self._question(mean.l95_ms, mean.used)
         saved, least = math.nan, 0.0
         if over:
-            known = [one for one in told if one is not None]
-            if len(known) < len(told):
+            known = [window.expected for window in windows if window.expected is not None]
+            if len(known) < len(windows):
                 raise MetricError(
-                    f"estimates is None in {len(told) - len(known)} of the {len(told)} windows "
-                    f"decided on; give one for each of {', '.join(self.candidates)}"
+                    f"estimates is None in {len(windows) - len(known)} of the {len(windows)} "
+                    f"windows decided on; give one for each of {', '.join(self.candidates)}"
                 )
-            here, there = (_mean([one[name] for one in known]) for name in (incumbent.name, other))
-            moved = self._pricing.switching(incumbent.name)[other]
+            now = self.incumbent
+            here, there = (_mean([one[name] for one in known]) for name in (now, other))
+            moved = self._pricing.switching(now)[other]
             saved = self._cost(here, 0.0) - self._cost(there, moved)
             least = margin(self._error(here), self._error(there))
-        self._begin()
         if over and saved > least:
-            return incumbent.move(other, "migrate", costs, saved)
-        return incumbent.stay("hold", costs, saved)
+            return self._move(other, "migrate", costs, saved), ()
+        return self._stay("hold", costs, saved), ()
 
     def _shown(self, qos: QoS) -> _Shown:
         used = self._pricing.used(qos)

@@ -187,28 +187,16 @@ class ATPThresholds(PricingPolicy):
         """The candidate with the task on the edge or in the cloud."""
         return self.pair.offload
 
-    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS] | None = None) -> Decision:
-        """Toggle the task if a metric of the last window is above its threshold.
-
-        Parameters
-        ----------
-        observed : QoS
-            Metrics of the window under the incumbent; all that the rule looks at.
-        estimates : mapping of str to QoS, optional
-            Where given, J of every candidate is recorded.
-
-        Raises
-        ------
-        MetricError
-            If a metric, or the estimate of a candidate, is missing. Nothing has changed then.
-        """
-        incumbent = self._incumbent
+    def _decide(
+        self, observed: QoS, estimates: Mapping[str, QoS] | None
+    ) -> tuple[Decision, object]:
+        """Toggle the task if a metric of the window is above its threshold."""
         used = self._pricing.used(observed)
         costs = self._costs(estimates)
-        if incumbent.dwell < self.min_dwell:
-            return incumbent.stay("dwell", costs)
+        if self._standing.dwell < self.min_dwell:
+            return self._stay("dwell", costs), None
         other, over = self._question(observed.l95_ms, used)
-        return incumbent.move(other, "migrate", costs) if over else incumbent.stay("hold", costs)
+        return (self._move(other, "migrate", costs) if over else self._stay("hold", costs)), None
 
     def _question(self, l95_ms: float, used: TierUtilisation) -> tuple[str, bool]:
         """Return the other side of the pair, and whether a metric is above its threshold here."""

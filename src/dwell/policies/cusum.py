@@ -29,11 +29,9 @@ from types import MappingProxyType
 from dwell.model.bounds import MIN_IMPROVEMENT, Bound
 from dwell.model.objective import Objective
 from dwell.model.placement import Placement
-from dwell.model.problem import Problem
-from dwell.model.qos import Decision, QoS
+from dwell.model.qos import Decision, QoS, Reason
 from dwell.policies.dtp import cheapest
 from dwell.policies.incumbent import PricingPolicy, check_parameter
-from dwell.policies.pricing import check_metrics
 
 
 class Cusum(PricingPolicy):
@@ -77,7 +75,6 @@ class Cusum(PricingPolicy):
         self.threshold = check_parameter("threshold", threshold, MIN_IMPROVEMENT)
         self.slack = check_parameter("slack", slack, MIN_IMPROVEMENT)
         self.memory = check_parameter("memory", memory, Bound(0, 1, above=True))
-        self._sums = dict.fromkeys(self.candidates, 0.0)
 
     def __repr__(self) -> str:
         return (
@@ -88,49 +85,36 @@ class Cusum(PricingPolicy):
     @property
     def sums(self) -> Mapping[str, float]:
         """G of every candidate; the incumbent's is 0."""
-        return dict(self._sums)
+        return dict(zip(self.candidates, self._standing.memory, strict=True))
 
-    def start(self, problem: Problem) -> None:
-        """Begin again: the initial candidate, all sums 0."""
-        super().start(problem)
-        self._sums = dict.fromkeys(self.candidates, 0.0)
+    def _blank(self) -> tuple[float, ...]:
+        return (0.0,) * len(self.candidates)
 
-    def adopt(self, name: str) -> None:
-        """Take over `name` as the incumbent, all sums 0: somebody else moved the cell there."""
-        super().adopt(name)
-        self._sums = dict.fromkeys(self.candidates, 0.0)
+    def _decide(
+        self, observed: QoS, estimates: Mapping[str, QoS] | None
+    ) -> tuple[Decision, tuple[float, ...]]:
+        """Add a window to the sums, which are remembered, and compare them with the threshold.
 
-    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> Decision:
-        """Add a window to the sums and decide the placement for the next one.
-
-        Returns
-        -------
-        Decision
-            `delta_j` is the advantage of this window over the cheapest candidate whose sum is over
-            the threshold, 0 where there is none.
-
-        Raises
-        ------
-        MetricError
-            If a metric, or the estimate of a candidate, is missing. Nothing has changed then.
+        `delta_j` is the advantage of this window over the cheapest candidate whose sum is over the
+        threshold, 0 where there is none.
         """
-        incumbent, pricing = self._incumbent, self._pricing
-        now = incumbent.name
-        check_metrics(observed, "observed")
+        estimates = self._known(estimates)
+        now, pricing = self.incumbent, self._pricing
         costs = pricing.estimated(estimates, now)
         stays, known = costs[now], estimates[now]
         eligible, within_caps = pricing.eligible(estimates)
-        for name, value in self._sums.items():
+        sums = {}
+        for name, value in zip(self.candidates, self._standing.memory, strict=True):
             least = self.slack + pricing.margin(estimates[name], known)
             gain = stays - costs[name] - least
-            self._sums[name] = 0.0 if name == now else max(0.0, self.memory * value + gain)
-        due = [name for name in eligible if self._sums[name] > self.threshold]
-        if not due:
-            return incumbent.stay("hold" if within_caps else "infeasible", costs, 0.0)
-        best = cheapest(costs, due, now)
-        delta_j = stays - costs[best]
+            sums[name] = 0.0 if name == now else max(0.0, self.memory * value + gain)
+        due = [name for name in eligible if sums[name] > self.threshold]
+        delta_j = 0.0
+        if due:
+            best = cheapest(costs, due, now)
+            delta_j = stays - costs[best]
         if delta_j <= 0:
-            return incumbent.stay("hold" if within_caps else "infeasible", costs, delta_j)
-        self._sums = dict.fromkeys(self.candidates, 0.0)
+            reason: Reason = "hold" if within_caps else "infeasible"
+            return self._stay(reason, costs, delta_j), tuple(sums.values())
         reason = pricing.reason(best, costs, eligible, within_caps=within_caps)
-        return incumbent.move(best, reason, costs, delta_j)
+        return self._move(best, reason, costs, delta_j), self._blank()

@@ -35,7 +35,6 @@ from dwell.model.objective import Objective
 from dwell.model.placement import Placement
 from dwell.model.qos import Decision, QoS
 from dwell.policies.incumbent import PricingPolicy, check_parameter
-from dwell.policies.pricing import check_metrics
 
 
 class DTP(PricingPolicy):
@@ -88,56 +87,36 @@ class DTP(PricingPolicy):
             f"min_improvement={self.min_improvement:g}{', escape=True' if self.escape else ''})"
         )
 
-    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS] | None = None) -> Decision:
-        """Decide the placement for the next window (one pass of the loop of Algorithm 1).
-
-        Parameters
-        ----------
-        observed : QoS
-            Metrics of the window under the incumbent; the escape looks at them.
-        estimates : mapping of str to QoS, optional
-            Metrics by candidate; Algorithm 1 does without them in a dwell window, and so may the
-            caller.
-
-        Returns
-        -------
-        Decision
-            `delta_j` is NaN in a dwell window, where it is not computed.
-
-        Raises
-        ------
-        MetricError
-            If a metric, or the estimate of a candidate, is missing. Nothing has changed then.
-        """
-        incumbent, pricing = self._incumbent, self._pricing
-        check_metrics(observed, "observed")
+    def _decide(self, observed: QoS, estimates: Mapping[str, QoS] | None) -> tuple[Decision, None]:
+        """One pass of the loop of Algorithm 1, which does without estimates in a dwell window."""
+        now, dwell, pricing = self.incumbent, self._standing.dwell, self._pricing
         costs = self._costs(estimates)
         if self.escape and estimates is not None and excess(observed, self.objective) > 0:
-            eligible, within_caps = pricing.eligible({**estimates, incumbent.name: observed})
+            eligible, within_caps = pricing.eligible({**estimates, now: observed})
             if within_caps:
-                best = cheapest(costs, eligible, incumbent.name)
+                best = cheapest(costs, eligible, now)
                 reason = pricing.reason(best, costs, eligible, within_caps=True)
-                return incumbent.move(best, reason, costs, self._stays(estimates) - costs[best])
-        if incumbent.dwell < self.min_dwell:
-            return incumbent.stay("dwell", costs)
+                return self._move(best, reason, costs, self._stays(estimates) - costs[best]), None
+        if dwell < self.min_dwell:
+            return self._stay("dwell", costs), None
         if estimates is None:
             raise MetricError(
-                f"estimates is None after the dwell (n_d = {incumbent.dwell}, min_dwell = "
+                f"estimates is None after the dwell (n_d = {dwell}, min_dwell = "
                 f"{self.min_dwell}); give one for each of {', '.join(self.candidates)}"
             )
         eligible, within_caps = pricing.eligible(estimates)
-        best = cheapest(costs, eligible, incumbent.name)
+        best = cheapest(costs, eligible, now)
         delta_j = self._stays(estimates) - costs[best]
-        least = self.min_improvement + pricing.margin(estimates[best], estimates[incumbent.name])
-        if best != incumbent.name and delta_j > least:
+        least = self.min_improvement + pricing.margin(estimates[best], estimates[now])
+        if best != now and delta_j > least:
             reason = pricing.reason(best, costs, eligible, within_caps=within_caps)
-            return incumbent.move(best, reason, costs, delta_j)
-        return incumbent.stay("hold" if within_caps else "infeasible", costs, delta_j)
+            return self._move(best, reason, costs, delta_j), None
+        return self._stay("hold" if within_caps else "infeasible", costs, delta_j), None
 
     def _stays(self, estimates: Mapping[str, QoS]) -> float:
         """J of the incumbent, with the switching term of its own last decision."""
-        name, previous = self._incumbent.name, self._incumbent.previous
-        return self._pricing.cost(estimates[name], name, previous)
+        name = self.incumbent
+        return self._pricing.cost(estimates[name], name, self._standing.previous)
 
 
 def cheapest(costs: Mapping[str, float], eligible: Iterable[str], incumbent: str) -> str:

@@ -1,19 +1,21 @@
-"""The candidates of a policy, which of them is active, and for how long."""
+"""What our policies have in common: candidates, the active one among them, J, and a rule."""
 
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self, TypeVar
 
-from dwell.errors import PolicyError
+from dwell.errors import MetricError, PolicyError
 from dwell.model.bounds import Bound
 from dwell.model.frozen import FrozenDict
 from dwell.model.objective import Objective
 from dwell.model.placement import Placement
 from dwell.model.qos import Decision, QoS, Reason
 from dwell.model.semantics import nearest_of
-from dwell.policies.pricing import Pricing
+from dwell.policies.pricing import Pricing, check_metrics
+from dwell.policies.protocol import Proposer
 
 if TYPE_CHECKING:
     from dwell.model.problem import Problem
@@ -74,71 +76,31 @@ def check_parameter(field: str, value: Number, bound: Bound) -> Number:
     return value
 
 
-class Incumbent:
-    """The active candidate, the candidate before the last decision, and the windows since a move.
+class Standing(NamedTuple):
+    """All that changes of a policy, as one value.
 
     Parameters
-    ----------
-    name : str
-        The candidate to begin with.
-
-    Attributes
     ----------
     name : str
         The active candidate (pi_{k-1} when window k is decided).
     previous : str
         The one active before the last decision (pi_{k-2}).
     dwell : int
-        Windows since the last migration (n_d).
+        Windows since the last move (n_d).
+    memory : object
+        What it remembers of windows, where it does; unchangeable.
     """
 
-    __slots__ = ("candidates", "dwell", "name", "previous")
-
-    def __init__(self, candidates: Mapping[str, Placement], name: str) -> None:
-        self.candidates = candidates
-        self.begin(name)
-
-    def begin(self, name: str) -> None:
-        """Start anew with a candidate that nothing preceded."""
-        self.name = self.previous = name
-        self.dwell = 0
-
-    def adopt(self, name: str) -> None:
-        """Take over a candidate that somebody else moved the cell to.
-
-        Raises
-        ------
-        PolicyError
-            If no candidate has that name.
-        """
-        name = check_name("the adopted placement", name, self.candidates)
-        self.previous, self.name, self.dwell = self.name, name, 0
-
-    def stay(
-        self,
-        reason: Reason,
-        costs: Mapping[str, float] = NOT_PRICED,
-        delta_j: float = math.nan,
-    ) -> Decision:
-        """Decide for the incumbent; n_d grows."""
-        name = self.previous = self.name
-        self.dwell += 1
-        return Decision(self.candidates[name], name, False, reason, costs, self.dwell, delta_j)
-
-    def move(
-        self,
-        name: str,
-        reason: Reason,
-        costs: Mapping[str, float] = NOT_PRICED,
-        delta_j: float = math.nan,
-    ) -> Decision:
-        """Decide for another candidate; n_d restarts."""
-        self.previous, self.name, self.dwell = self.name, name, 0
-        return Decision(self.candidates[name], name, True, reason, costs, 0, delta_j)
+    name: str
+    previous: str
+    dwell: int
+    memory: Any
 
 
-class CandidatePolicy:
+class CandidatePolicy(Proposer):
     """Base of our policies: the candidates, the active one among them, and their J.
+
+    A subclass has a rule, `_decide`, which changes nothing.
 
     Parameters
     ----------
@@ -158,6 +120,8 @@ class CandidatePolicy:
     #: Arguments beside these that `from_problem` gives, with their names in ``problem.controller``.
     SETTINGS: ClassVar[Mapping[str, str]] = {}
 
+    initial: str
+
     def __init__(
         self,
         *,
@@ -169,7 +133,7 @@ class CandidatePolicy:
         self.initial = check_name("initial", initial, self.candidates)
         self.objective = objective
         self._pricing = None if objective is None else Pricing(self.candidates, objective)
-        self._incumbent = Incumbent(self.candidates, self.initial)
+        self._standing = self._first()
 
     @classmethod
     def from_problem(cls, problem: Problem) -> Self:
@@ -188,15 +152,107 @@ class CandidatePolicy:
     @property
     def incumbent(self) -> str:
         """Name of the active candidate."""
-        return self._incumbent.name
+        return self._standing.name
 
     def start(self, problem: Problem) -> None:
-        """Begin again on the initial candidate, n_d = 0."""
-        self._incumbent.begin(self.initial)
+        """Begin again on the initial candidate, n_d = 0, with no window seen."""
+        self._standing = self._first()
 
     def adopt(self, name: str) -> None:
-        """Take over `name` as the incumbent with n_d = 0: somebody else moved the cell there."""
-        self._incumbent.adopt(name)
+        """Take over `name` as the incumbent with n_d = 0: somebody else moved the cell there.
+
+        Raises
+        ------
+        PolicyError
+            If no candidate has that name.
+        """
+        name = check_name("the adopted placement", name, self.candidates)
+        self._standing = Standing(name, self._standing.name, 0, self._adopted())
+
+    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS] | None = None) -> Decision:
+        """Decide the placement for the next window.
+
+        Parameters
+        ----------
+        observed : QoS
+            Metrics of the window under the incumbent.
+        estimates : mapping of str to QoS, optional
+            Metrics by candidate; a rule that reads none does without.
+
+        Raises
+        ------
+        MetricError
+            If a metric, or the estimate of a candidate, is missing. Nothing has changed then.
+        """
+        decision, self._standing = self.propose(observed=observed, estimates=estimates)
+        return decision
+
+    def propose(
+        self,
+        *,
+        observed: QoS,
+        estimates: Mapping[str, QoS] | None = None,
+        tentative: bool = False,
+    ) -> tuple[Decision, Standing]:
+        """Return the decision on a window, and how the policy stands after it."""
+        check_metrics(observed, "observed")
+        decision, memory = self._decide(observed, estimates)
+        return decision, Standing(decision.name, self._standing.name, decision.dwell, memory)
+
+    def commit(self, after: Standing) -> None:
+        """Stand as after a decision that was proposed."""
+        self._standing = after
+
+    @abstractmethod
+    def _decide(
+        self, observed: QoS, estimates: Mapping[str, QoS] | None
+    ) -> tuple[Decision, object]:
+        """Return the decision on a window, and what is remembered after it (see `decide`)."""
+
+    def _blank(self) -> object:
+        """Return what it remembers where it has seen no window."""
+        return None
+
+    def _adopted(self) -> object:
+        """Return what it remembers where somebody else has moved the cell."""
+        return self._blank()
+
+    def _first(self) -> Standing:
+        return Standing(self.initial, self.initial, 0, self._blank())
+
+    def _stay(
+        self,
+        reason: Reason,
+        costs: Mapping[str, float] = NOT_PRICED,
+        delta_j: float = math.nan,
+    ) -> Decision:
+        """Decide for the incumbent; n_d grows."""
+        name, dwell = self._standing.name, self._standing.dwell + 1
+        return Decision(self.candidates[name], name, False, reason, costs, dwell, delta_j)
+
+    def _move(
+        self,
+        name: str,
+        reason: Reason,
+        costs: Mapping[str, float] = NOT_PRICED,
+        delta_j: float = math.nan,
+    ) -> Decision:
+        """Decide for another candidate; n_d restarts."""
+        return Decision(self.candidates[name], name, True, reason, costs, 0, delta_j)
+
+    def _known(self, estimates: Mapping[str, QoS] | None) -> Mapping[str, QoS]:
+        """Return the estimates of a rule that cannot do without.
+
+        Raises
+        ------
+        MetricError
+            If there are none.
+        """
+        if estimates is None:
+            raise MetricError(
+                f"estimates is None; give one for each of {', '.join(self.candidates)}"
+            )
+        return estimates
 
     def _costs(self, estimates: Mapping[str, QoS] | None) -> FrozenDict[str, float]:
         """J of every candidate against the incumbent, where it is priced and estimated.
@@ -208,7 +264,7 @@ class CandidatePolicy:
         """
         if self._pricing is None or estimates is None:
             return NOT_PRICED
-        return self._pricing.estimated(estimates, self._incumbent.name)
+        return self._pricing.estimated(estimates, self._standing.name)
 
 
 class PricingPolicy(CandidatePolicy):

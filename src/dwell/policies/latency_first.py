@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dwell.cost import margin
 from dwell.model.qos import NO_ERROR, Decision, QoS
 from dwell.policies.incumbent import CandidatePolicy
-from dwell.policies.pricing import check_metrics, explain_estimate
+from dwell.policies.pricing import explain_estimate
 
 
 class LatencyFirst(CandidatePolicy):
@@ -26,31 +26,23 @@ class LatencyFirst(CandidatePolicy):
         Where given, J of every candidate is recorded; it decides nothing.
     """
 
-    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> Decision:
-        """Choose the candidate with the lowest estimated L95.
-
-        Raises
-        ------
-        MetricError
-            If `observed` is no QoS, or an estimate is missing.
-        """
-        check_metrics(observed, "observed")
-        incumbent = self._incumbent
-        name = incumbent.name
+    def _decide(self, observed: QoS, estimates: Mapping[str, QoS] | None) -> tuple[Decision, None]:
+        known, now = self._known(estimates), self.incumbent
+        name = now
         try:
-            best, lowest = name, estimates[name].l95_ms
+            best, lowest = name, known[name].l95_ms
             for name in self.candidates:
-                latency = estimates[name].l95_ms
+                latency = known[name].l95_ms
                 if latency < lowest:
                     best, lowest = name, latency
         except (AttributeError, KeyError, TypeError):
-            explain_estimate(estimates, name, self.candidates)
+            explain_estimate(known, name, self.candidates)
             raise
-        costs = self._costs(estimates)
-        here, there = estimates[incumbent.name], estimates[best]
-        if best == incumbent.name or here.l95_ms - lowest <= _margin_ms(here, there):
-            return incumbent.stay("hold", costs)
-        return incumbent.move(best, "migrate", costs)
+        costs = self._costs(known)
+        here, there = known[now], known[best]
+        if best == now or here.l95_ms - lowest <= _margin_ms(here, there):
+            return self._stay("hold", costs), None
+        return self._move(best, "migrate", costs), None
 
 
 def _margin_ms(one: QoS, other: QoS) -> float:

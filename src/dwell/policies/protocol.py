@@ -1,10 +1,12 @@
-"""Protocols of policies: the least that one needs, and a full policy."""
+"""What a policy has to be, and what the controller makes of it."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
+from dwell.model.objective import Objective
 from dwell.model.problem import Problem
 from dwell.model.qos import Decision, QoS
 
@@ -48,3 +50,50 @@ class Policy(MinimalPolicy, Protocol):
     def start(self, problem: Problem) -> None:
         """Forget everything: a run of `problem` begins."""
         ...
+
+
+class Proposer(ABC):
+    """A policy as the controller works with it: it proposes, and changes by what is carried out.
+
+    Attributes
+    ----------
+    initial : str or None
+        Candidate that it starts on; the problem's where None.
+    objective : Objective or None
+        What it prices by; the problem's where None.
+    guarded : bool
+        Whether a guard may move the cell.
+    """
+
+    initial: str | None = None
+    objective: Objective | None = None
+    guarded: bool = True
+
+    @property
+    def given(self) -> object:
+        """The object that was given as the policy."""
+        return self
+
+    @abstractmethod
+    def start(self, problem: Problem) -> None:
+        """Forget everything: a run of `problem` begins."""
+
+    @abstractmethod
+    def propose(
+        self, *, observed: QoS, estimates: Mapping[str, QoS], tentative: bool = False
+    ) -> tuple[Decision | str, Any]:
+        """Return the decision on a window, and what `commit` takes where it counts.
+
+        Parameters
+        ----------
+        tentative : bool
+            Whether it may not count: the policy is as before then.
+        """
+
+    @abstractmethod
+    def commit(self, after: Any) -> None:
+        """Be as after a decision that was proposed."""
+
+    @abstractmethod
+    def adopt(self, name: str) -> None:
+        """Take note that somebody else has moved the cell to a candidate."""

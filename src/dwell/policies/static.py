@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 from dwell.model.qos import Decision, QoS
 from dwell.policies.incumbent import CandidatePolicy
-from dwell.policies.pricing import check_metrics
 
 
 class Static(CandidatePolicy):
@@ -22,16 +21,10 @@ class Static(CandidatePolicy):
         Where given, J of every estimated candidate is recorded; it decides nothing.
     """
 
-    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS] | None = None) -> Decision:
-        """Hold, or return to the candidate.
+    guarded = False
 
-        Raises
-        ------
-        MetricError
-            If `observed` is no QoS, or (with an objective) an estimate is missing.
-        """
-        check_metrics(observed, "observed")
+    def _decide(self, observed: QoS, estimates: Mapping[str, QoS] | None) -> tuple[Decision, None]:
         costs = self._costs(estimates)
-        if self._incumbent.name != self.initial:
-            return self._incumbent.move(self.initial, "migrate", costs)
-        return self._incumbent.stay("hold", costs)
+        if self.incumbent != self.initial:
+            return self._move(self.initial, "migrate", costs), None
+        return self._stay("hold", costs), None

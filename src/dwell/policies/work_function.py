@@ -46,10 +46,8 @@ from operator import add
 from dwell.model.frozen import FrozenDict
 from dwell.model.objective import Objective
 from dwell.model.placement import Placement
-from dwell.model.problem import Problem
 from dwell.model.qos import Decision, QoS
 from dwell.policies.incumbent import PricingPolicy
-from dwell.policies.pricing import check_metrics
 
 #: Sums whose relative difference is at most this are a tie: w_k carries rounding errors.
 TIE_TOLERANCE = 1e-9
@@ -88,49 +86,31 @@ class WorkFunction(PricingPolicy):
             tuple(weight * moved for moved in self._pricing.switching(name).values())
             for name in self.candidates
         )
-        self._work = self._distances[self._index[self.initial]]
 
     @property
     def work(self) -> FrozenDict[str, float]:
         """w_k less its minimum, by candidate, in units of J."""
         return FrozenDict(zip(self.candidates, self._work, strict=True))
 
-    def start(self, problem: Problem) -> None:
-        """Begin again: the initial candidate, and no window seen."""
-        super().start(problem)
-        self._work = self._distances[self._index[self.initial]]
+    @property
+    def _work(self) -> tuple[float, ...]:
+        work: tuple[float, ...] | None = self._standing.memory
+        return self._distances[self._index[self.initial]] if work is None else work
 
-    def adopt(self, name: str) -> None:
-        """Take over `name` as the incumbent: somebody else moved the cell there.
+    def _adopted(self) -> object:
+        """Keep w_k: it is about what was possible, not about where the cell was."""
+        return self._standing.memory
 
-        The work function stays: it is about what was possible, not about where the cell was.
+    def _decide(
+        self, observed: QoS, estimates: Mapping[str, QoS] | None
+    ) -> tuple[Decision, tuple[float, ...]]:
+        """Add a window to the work function, which is remembered, and choose by it.
+
+        Nothing is decided by what was observed. `delta_j` is NaN: the rule compares sums over all
+        windows, not J of one.
         """
-        super().adopt(name)
-
-    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> Decision:
-        """Add a window to the work function and decide the placement for the next one.
-
-        Parameters
-        ----------
-        observed : QoS
-            Metrics of the window under the incumbent; nothing is decided by them.
-        estimates : mapping of str to QoS
-            Metrics by candidate: r_k, and the caps.
-
-        Returns
-        -------
-        Decision
-            `costs` are estimated J against the incumbent, as every policy records them. `delta_j`
-            is NaN: the rule compares sums over all windows, not J of one.
-
-        Raises
-        ------
-        MetricError
-            If a metric, or the estimate of a candidate, is missing. Nothing has changed then.
-        """
-        incumbent, pricing = self._incumbent, self._pricing
-        now = incumbent.name
-        check_metrics(observed, "observed")
+        estimates = self._known(estimates)
+        now, pricing = self.incumbent, self._pricing
         costs = pricing.estimated(estimates, now)
         # From a candidate to itself: J of a window that no move preceded.
         window = [pricing.cost(estimates[name], name, name) for name in self.candidates]
@@ -138,17 +118,17 @@ class WorkFunction(PricingPolicy):
         # Subtracted before distances are added: large costs then round off nothing of w_k.
         least = min(served)
         reduced = [value - least for value in served]
-        self._work = tuple(min(map(add, reduced, row)) for row in self._distances)
+        work = tuple(min(map(add, reduced, row)) for row in self._distances)
         eligible, within_caps = pricing.eligible(estimates)
         best = self._choose(served, eligible)
         if best == now or (now in eligible and self._unsure(best, served, estimates)):
-            return incumbent.stay("hold" if within_caps else "infeasible", costs)
+            return self._stay("hold" if within_caps else "infeasible", costs), work
         reason = pricing.reason(best, costs, eligible, within_caps=within_caps)
-        return incumbent.move(best, reason, costs)
+        return self._move(best, reason, costs), work
 
     def _unsure(self, best: str, served: list[float], estimates: Mapping[str, QoS]) -> bool:
         """Whether what a move saves in the sums is no more than the margin of the estimates."""
-        now = self._incumbent.name
+        now = self.incumbent
         least = self._pricing.margin(estimates[best], estimates[now])
         here, there = self._index[now], self._index[best]
         # Without errors a tie is a move.
@@ -164,7 +144,7 @@ class WorkFunction(PricingPolicy):
         eligible : list of str
             At least one, in the candidates' order.
         """
-        now = self._incumbent.name
+        now = self.incumbent
         distances = self._distances[self._index[now]]
         totals = {
             name: served[self._index[name]] + distances[self._index[name]] for name in eligible

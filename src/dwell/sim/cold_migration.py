@@ -23,17 +23,15 @@ class ColdMigration:
 
     Attributes
     ----------
-    order : str
-        The candidate that was ordered.
     boundary : int
-        First cycle after the window at whose close it was.
+        First cycle after the window at whose close it was ordered.
     """
 
     def __init__(self, problem: Problem, realisation: Realisation) -> None:
         self.candidates = problem.candidates
         self.tasks = tuple(problem.pipeline.tasks.values())
         self.hop_row = {hop: row for row, hop in enumerate(realisation.hops)}
-        self.order, self.boundary, self.number = "", 0, 0
+        self.boundary = self.number = 0
         # Of the tasks that are not ready yet: the hop that their state takes, -1 for none.
         self.hops: dict[int, int] = {}
 
@@ -41,7 +39,7 @@ class ColdMigration:
         self, arrays: Arrays, incumbent: str, order: str, boundary: int, arrival_ns: int
     ) -> bool:
         """Start a worker of every task that an order moves; False if there is none."""
-        self.order, self.boundary, self.number = order, boundary, self.number + 1
+        self.boundary, self.number = boundary, self.number + 1
         old, new = self.candidates[incumbent], self.candidates[order]
         for row, task in enumerate(self.tasks):
             if old[task.name] != new[task.name]:

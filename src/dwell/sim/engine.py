@@ -102,12 +102,11 @@ def simulate_realisation(
     """
     _check_fit(problem, realisation)
     require_apart(tuple(resources_of(problem.fabric.nodes)), tuple(problem.candidates))
-    try:
-        played = _play(problem, realisation, policy, estimator, jobs, guard, by_window)
-    except _ProbesWantedError:
-        # Until the first probe is sent a shadow changes nothing, so that this repeats what has been
-        # played. Drawing shadows for every run that may want probes would cost all runs more.
-        played = _play(problem, realisation, policy, estimator, jobs, guard, by_window, shadow=True)
+    asked = problem, realisation, policy, estimator, jobs, guard, by_window
+    # Until the first probe is sent a shadow changes nothing, so that the second one repeats what
+    # the first has played. Shadows in every run that may want probes would cost all runs more.
+    played = _play(*asked) or _play(*asked, shadow=True)
+    assert played is not None
     meta = partial(
         _meta,
         problem,
@@ -149,10 +148,6 @@ def describe(
     return Run(meta, {}).meta
 
 
-class _ProbesWantedError(Exception):
-    """Probes are to be sent in a run that was laid out without a shadow."""
-
-
 def _play(
     problem: Problem,
     realisation: Realisation,
@@ -163,8 +158,8 @@ def _play(
     by_window: bool,
     *,
     shadow: bool = False,
-) -> PlayedRealisation:
-    """Play a realisation with or without a shadow."""
+) -> PlayedRealisation | None:
+    """Play a realisation with or without a shadow; None where probes are wanted and it has none."""
     controller = Controller(problem, policy, estimator)
     fraction = controller.shadow_fraction
     shadow = shadow or fraction > 0
@@ -185,7 +180,9 @@ def _play(
             stamper.step()
         else:
             stamper.close_window()
-    return PlayedRealisation(problem, realisation, controller, arrays)
+        if stamper.lacks_shadow:
+            return None
+    return PlayedRealisation(problem, realisation, controller, arrays, stamper.metrics)
 
 
 def _check_fit(problem: Problem, realisation: Realisation) -> None:
@@ -239,7 +236,11 @@ class _Stamper:
         self.host_at_ns, self.host_down = table[:, 0].tolist(), table[:, 3].tolist()
         self.cold = ColdMigration(problem, realisation) if settings.migration == "cold" else None
         self.plan = plan
-        self.placement = controller.incumbent
+        #: Whether probes are wanted of a run that was laid out without a shadow.
+        self.lacks_shadow = False
+        self.course = controller.course
+        #: L95 (ms), violation rate and cost of every window, as the controller saw them.
+        self.metrics: list[tuple[float | None, ...]] = []
         self.evidence = _evidence(problem, realisation, arrays) if controller.learns else None
         # What every close reads; these tables never grow.
         tables = arrays.tables
@@ -254,11 +255,11 @@ class _Stamper:
         self.stamped = self._reach(self.window_cycles)
         self._stamp(0, self.stamped)
 
-    def _stamp(self, start: int, stop: int) -> None:
-        """Stamp cycles with the placement, and with what they are also sent through."""
+    def _stamp(self, start: int, stop: int, placement: str | None = None) -> None:
+        """Stamp cycles with a placement, the course's where None, and with their shadows."""
         if start >= stop:
             return
-        stamps, code = self.stamps, self.code[self.placement]
+        stamps, code = self.stamps, self.code[placement or self.course.placement]
         stamps[0, start:stop] = code
         if self.plan is not None and start < self.cycles:
             stop = min(stop, self.cycles)
@@ -306,24 +307,24 @@ class _Stamper:
         index = self.closed.item(0) - 1
         boundary = self.seen[0].item(0, index) + self.window_cycles
         close_ns = self._close_ns(boundary)
+        left = self.course.placement
         if len(self.decided):
-            order = self.names[self.decided.item(0)]
+            self.course.move(self.names[self.decided.item(0)])
         elif self._host_down(close_ns):
             self.controller.miss()
-            order = self.placement
+            self.metrics.append((None, None, None))
         else:
-            order = self._decide(index, boundary, close_ns)
-        if order == self.placement:
+            self._decide(index, boundary, close_ns)
+        if left == self.course.placement:
             self._go_on(boundary)
             return
         earliest = self._takes_effect(boundary, close_ns)
         # Where no window can follow, the run is over, and it does not matter when tasks are ready.
-        if earliest + self.window_cycles > self.cycles or not self._begin(
-            order, boundary, close_ns
-        ):
-            self._move(order, earliest)
+        if earliest + self.window_cycles > self.cycles or not self._begin(left, boundary, close_ns):
+            self._stamp(self.stamped, earliest, left)
+            self._move(earliest)
 
-    def _decide(self, index: int, boundary: int, close_ns: int) -> str:
+    def _decide(self, index: int, boundary: int, close_ns: int) -> None:
         """Ask the controller, and send the probes that it wants."""
         watch, controller = self.watch, self.controller
         if self.evidence is not None:
@@ -331,27 +332,26 @@ class _Stamper:
             controller.learn(partial(self.evidence, first, boundary, close_ns))
         _, missed, l95_ms, uncut_ms = [column.item(0, index) for column in self.seen]
         seen = l95_ms, missed / self.window_cycles, uncut_ms, self.shares[0, index]
-        if watch is None or not watch.on_fallback:
-            return controller.decide_on(*seen)
-        order = controller.decide_on(*seen, proven=watch.proven(close_ns))
-        if controller.wanted is not None and len(self.closed) < 2:
-            raise _ProbesWantedError
-        if order == self.placement:
+        proposal = controller.propose_on(*seen)
+        self.metrics.append(proposal.seen)
+        if watch is None or not self.course.by_guard:
+            controller.commit(proposal)
+            return
+        controller.settle(proposal, proven=watch.proven(close_ns))
+        self.lacks_shadow = self.course.wanted is not None and self.plan is None
+        if self.course.by_guard and not self.lacks_shadow:
             first = self._takes_effect(boundary, close_ns)
-            watch.want(controller.wanted, first)
+            watch.want(self.course.wanted, first)
             # A cycle that is released at the very close has been stamped before.
             self._stamp(min(first, self.stamped), self.stamped)
-        return order
 
     def _go_on(self, boundary: int) -> None:
         """Stamp the next window with the placement that stays."""
         start, self.stamped = self.stamped, self._reach(boundary + self.window_cycles)
         self._stamp(start, self.stamped)
 
-    def _move(self, order: str, following: int) -> None:
-        """Begin the next window under another placement; cycles before it keep the old one."""
-        self._stamp(self.stamped, following)
-        self.placement = order
+    def _move(self, following: int) -> None:
+        """Begin the next window under the placement that has been ordered."""
         if self.watch is not None:
             self.watch.moved(following)
         self.first[0] = following
@@ -360,18 +360,18 @@ class _Stamper:
         self._stamp(following, self.stamped)
         self.rule_stamped[:] = self.stamped
 
-    def _begin(self, order: str, boundary: int, close_ns: int) -> bool:
+    def _begin(self, left: str, boundary: int, close_ns: int) -> bool:
         """Begin a cold migration, which ends with `step`; False if no task has to be waited for."""
         arrival_ns = close_ns + self.delay_ns
         if self.cold is None or not self.cold.begin(
-            self.arrays, self.placement, order, boundary, arrival_ns
+            self.arrays, left, self.course.placement, boundary, arrival_ns
         ):
             return False
         cell = self.arrays.tables.cells[0]
         # No window closes before the migration is over.
         cell["window_first"] = cell["close_cycle"] = self.cycles + 1
         cell["migrating"] = 1
-        self._stamp(self.stamped, self.cycles)
+        self._stamp(self.stamped, self.cycles, left)
         return True
 
     def step(self) -> None:
@@ -402,7 +402,6 @@ class _Stamper:
             # No window can follow, so that the run ended with the last close.
             return
         self.controller.adopt(fallback, left=active)
-        self.placement = fallback
         self.stamped = self._reach(first + self.window_cycles)
         self._stamp(first, self.stamped)
 
@@ -414,7 +413,7 @@ class _Stamper:
         tables.cells[0]["migrating"] = 0
         ready_ns = int(tables.clock[0]["step_ns"])
         self.stamped = self._takes_effect(cold.boundary, ready_ns - self.delay_ns)
-        self._move(cold.order, self.stamped)
+        self._move(self.stamped)
 
     def _takes_effect(self, boundary: int, close_ns: int) -> int:
         """First cycle that an order given at a close stamps; those before are out already."""

@@ -36,12 +36,16 @@ class PlayedRealisation:
     ----------
     problem, realisation, controller, arrays
         As they were used.
+    metrics : list of tuple
+        L95 (ms), violation rate and cost of every window as the controller saw them, None where
+        its node was down; empty where the kernel decided.
     """
 
     problem: Problem
     realisation: Realisation
     controller: Controller
     arrays: Arrays
+    metrics: list[tuple[float | None, ...]]
 
     @cached_property
     def seen(self) -> Rows:
@@ -233,18 +237,18 @@ def _seen(played: PlayedRealisation) -> dict[str, Floats]:
             "cost": tables.decided["measured"][: len(played.seen)],
         }
     else:
-        log = np.array(played.controller.log.seen, np.float64).reshape(-1, 3)
-        seen = dict(zip(("l95_ms", "violation_rate", "cost"), log.T, strict=True))
+        metrics = np.array(played.metrics, np.float64).reshape(-1, 3)
+        seen = dict(zip(("l95_ms", "violation_rate", "cost"), metrics.T, strict=True))
     used = played.shares[:, 0]
     return seen | {f"u_{name}": used[:, i] for i, name in enumerate(played.controller.resources)}
 
 
 def _decisions(controller: Controller) -> TableArrays:
-    """Decisions of the controller's log, their names found among those that there may be."""
-    columns, rows = controller.decision_columns, controller.log.decisions
-    decided: dict[str, object] = dict(
-        zip(columns, zip(*rows, strict=True) if rows else [()] * len(columns), strict=True)
-    )
+    """Decisions of the controller, their names found among those that there may be."""
+    columns, rows = controller.decision_columns, controller.decisions
+    # Last in a row is why it was not carried out: here every order is.
+    columns_of_rows = zip(*rows, strict=True) if rows else [()] * (len(columns) + 1)
+    decided: dict[str, object] = dict(zip(columns, columns_of_rows, strict=False))
     known = dict.fromkeys(("incumbent", "placement"), tuple(controller.problem.candidates))
     known["reason"] = REASONS
     names = {

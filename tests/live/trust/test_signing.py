@@ -391,8 +391,7 @@ def test_the_controller_believes_the_stamper_alone(world: World, seals: dict[str
     assert world.tell(keys.accepted(), encode(answer)) == 1
     gathered = encode(Carried(((keys.accepted(), seals["E"].seal("accepted", encode(answer))),)))
     assert world.tell(keys.gathered(), gathered) == 1
-    assert cell.held is not None
-    assert cell.held.placement == "SO"
+    assert cell.course.placement == "SO"
     stamped = encode(Carried(((keys.stamped(), b"anything"),)))
     assert world.tell(keys.gathered(), stamped) == 1
 
