@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from functools import cached_property
-from itertools import pairwise, repeat, zip_longest
+from itertools import repeat, zip_longest
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,9 +44,9 @@ class SimulatedGuard:
         self._moved = 0
         # The guard has been told of the releases of so many cycles, and of all until this instant.
         self._told, self._told_ns = 0, -1
-        # From which cycles on probes are sent, and through which candidate; -1 for none. The
-        # probation has been told of those before a cycle, and of all until an instant.
-        self._wishes: list[tuple[int, int]] = []
+        # Candidate that each cycle is sent through as a probe, -1 for none. The probation has been
+        # told of those before a cycle, and of all until an instant.
+        self._probes = np.full(self.cycles, -1, np.int16)
         self._probed, self._probed_ns = 0, -1
         self._cell["patience_ns"] = min(self.guard.patience_ns, HORIZON_NS)
         self._arm(-1)
@@ -56,11 +55,6 @@ class SimulatedGuard:
     def _cell(self) -> Row:
         """The cell's row in the kernel."""
         return self.arrays.tables.cells[0]
-
-    @property
-    def on_fallback(self) -> bool:
-        """Whether the guard's own move holds, and no order is under way."""
-        return self._ordered is None
 
     # --------------------------------------------------------------------------- waking
 
@@ -117,7 +111,7 @@ class SimulatedGuard:
         if self._ordered is None:
             # If the guard moves before that cycle, it is a relapse all the same.
             self.guard.probation.left()
-            self._probe(None, first)
+            self._probes[first:] = -1
             self._ordered = first
         self._moved = first
         cell = self._cell
@@ -210,7 +204,7 @@ class SimulatedGuard:
     def proven(self, now: int) -> str | None:
         """Return the candidate that probes have proven by now."""
         wanted = self.guard.probation.wanted
-        if not self.on_fallback or wanted is None:
+        if wanted is None:
             return None
         self._tell_probes(now)
         return wanted if self.guard.probation.proven(wanted, now) else None
@@ -218,7 +212,7 @@ class SimulatedGuard:
     def _tell_probes(self, now: int) -> None:
         """Tell the probation what has happened to probes until now, in the order of time."""
         probation, told, stop = self.guard.probation, self._probed, self._released(now)
-        first = max(self._wishes[-1][0], told - MOST_OPEN)
+        first = max(told - MOST_OPEN, 0)
         cycles = np.arange(first, stop)
         release_ns, heard_ns = self.release_ns[first:stop], self._heard_ns(first, stop)[1]
         new = (heard_ns <= now) & ((heard_ns > self._probed_ns) | (cycles >= told))
@@ -239,20 +233,15 @@ class SimulatedGuard:
         """Send every cycle from `first` on through the wanted candidate, too."""
         if name != self.guard.probation.wanted:
             self.guard.probation.want(name, first)
-            self._probe(name, first)
+            self._probes[first:] = -1 if name is None else self.names.index(name)
             self._probed = first
-
-    def _probe(self, name: str | None, first: int) -> None:
-        """Send cycles from `first` on through another candidate, or no longer."""
-        code = -1 if name is None else self.names.index(name)
-        self._wishes = [*(wish for wish in self._wishes if wish[0] < first), (first, code)]
 
     def stamp(self, start: int, stop: int) -> None:
         """Stamp the probes among some cycles; the others keep their shadows."""
-        stamps = self.arrays.tables.stamps
-        for (first, code), (until, _) in pairwise([*self._wishes, (self.cycles, -1)]):
-            if code >= 0:
-                stamps[1, max(start, first) : min(stop, until)] = code
+        if self._probed:
+            probes = self._probes[start:stop]
+            stamps = self.arrays.tables.stamps[1, start : start + len(probes)]
+            np.copyto(stamps, probes, where=probes >= 0)
 
     # -------------------------------------------------------------------------- outages
 
@@ -261,41 +250,36 @@ class SimulatedGuard:
         """Outages of nodes, links and workers: from when, until when."""
         nodes = NodeChanges.of(self.realisation.node_changes)
         links = LinkSegments.of(self.realisation.link_segments)
-        away = {
-            **_outages(nodes.nodes, nodes.table[:, [0, 1, 3]]),
-            **_outages(links.links, links.table[:, [0, 1, 2]]),
-        }
-        for name, task in self.problem.pipeline.tasks.items():
-            for node in task.on:
-                start_ns = round(task.start_ms * 1e6)
-                back = [(down, min(up + start_ns, LAST_NS)) for down, up in away.get(node, ())]
-                away[f"{name}@{node}"] = _joined(back)
-        parts = frozenset[str]().union(*self.guard.presence.parts.values())
-        return {part: away.get(part, []) for part in parts}
+        found = {}
+        for part in frozenset[str]().union(*self.guard.presence.parts.values()):
+            task, at, node = part.partition("@")
+            start_ms = self.problem.pipeline.tasks[task].start_ms if at else 0.0
+            if "->" in part:
+                changes = links.table[:, [0, 2]][links.table[:, 1] == _row(links.links, part)]
+            else:
+                row = _row(nodes.nodes, node or part)
+                changes = nodes.table[:, [0, 3]][nodes.table[:, 1] == row]
+            found[part] = _outages(changes, round(start_ms * 1e6))
+        return found
 
 
-def _outages(names: Sequence[str], changes: NDArray[np.int64]) -> dict[str, list[tuple[int, int]]]:
-    """Return from when until when each of some nodes or links is down.
+def _row(names: tuple[str, ...], name: str) -> int:
+    return names.index(name) if name in names else -1
+
+
+def _outages(changes: NDArray[np.int64], start_ns: int) -> list[tuple[int, int]]:
+    """Return from when until when something is away.
 
     Parameters
     ----------
-    changes : int64 array, shape (changes, 3)
-        Instants, ascending for each of them; its row in `names`; whether it is down from then on.
+    changes : int64 array, shape (changes, 2)
+        Instants, ascending, and whether it is down from then on.
+    start_ns : int
+        Time that it takes to be back.
     """
-    outages = {}
-    for row, name in enumerate(names):
-        at_ns, _, down = changes[changes[:, 1] == row].T
-        turns_ns = at_ns[np.diff(down, prepend=0) != 0].tolist()
-        outages[name] = _joined(zip_longest(turns_ns[::2], turns_ns[1::2], fillvalue=LAST_NS))
+    turns_ns = changes[np.diff(changes[:, 1], prepend=0) != 0, 0].tolist()
+    outages: list[tuple[int, int]] = []
+    for down, up in zip_longest(turns_ns[::2], turns_ns[1::2], fillvalue=LAST_NS):
+        begun = outages.pop()[0] if outages and down <= outages[-1][1] else down
+        outages.append((begun, min(up + start_ns, LAST_NS)))
     return outages
-
-
-def _joined(outages: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Join outages of which one begins before the other has ended."""
-    joined: list[tuple[int, int]] = []
-    for down, up in outages:
-        if joined and down <= joined[-1][1]:
-            joined[-1] = joined[-1][0], up
-        else:
-            joined.append((down, up))
-    return joined
