@@ -72,10 +72,8 @@ bool announce_close(S& s, i64 cell) {
   return of.close_pending || of.migrating;
 }
 
-// Whether the guard is woken now; if not, it may be when the cycle after the newest completed one
-// is g periods old.
-//
-// Nothing has to be done at completions: what has completed by then can be seen then.
+// Whether the guard is woken now: no cycle from `waited` on has been heard to complete, or the one
+// after the newest that has is g periods old. If not, this is asked again when that cycle is.
 template <class S>
 bool wakes_guard(S& s, i64 cell, i64 now) {
   Cell& of = s.cell(cell);
