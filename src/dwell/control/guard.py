@@ -721,8 +721,7 @@ class CellGuard(Guard):
     def arrived(self, cycle: int, at_ns: int, candidate: str) -> None:
         """Note that the completion of a cycle through a candidate has been heard."""
         self.failures.completed(candidate, cycle)
-        # One that was sent before a move, but is said to be released after it, says nothing of the
-        # placement that holds.
+        # One that was sent a cycle early, before a move, says nothing of the placement that holds.
         if candidate == self.placement or cycle <= self._since:
             self.completed(cycle, at_ns)
 

@@ -22,9 +22,9 @@ from dwell.model.instants import EVIDENCE_NS, HORIZON_NS, NEVER_NS
 class SimulatedGuard:
     """Tells a cell's guard what the kernel's tables say, whenever the kernel wakes it.
 
-    The kernel wakes it at an instant at which no cycle from one on has been heard to complete,
-    or once the cycle after the newest completed one is g periods old. That is never later than the
-    guard would fire, and often enough too early, as the kernel knows of no rest and no move.
+    The kernel wakes it at a given instant, if no cycle from a given one on has been heard to
+    complete by then, or else once the cycle after the newest completed one is g periods old. That
+    is never later than the guard would fire; it may be earlier, as the kernel knows of no rest.
 
     Parameters
     ----------
