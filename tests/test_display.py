@@ -17,6 +17,7 @@ import pytest
 
 import dwell
 from dwell.control import (
+    CellGuard,
     ClosedWindow,
     Controller,
     Failures,
@@ -151,7 +152,7 @@ def objects(
         *(controller, controller.estimator, controller.course, proposal),
         Presence.of(canonical),
         *(FallbackRound(["LOC"]), Failures.of(canonical), ShadowPlan(0, 9, 3, 0.05)),
-        Guard(["LOC"], placement="SO", **guard),
+        *(Guard(["LOC"], placement="SO", **guard), CellGuard(canonical)),
         Probation(30, health_cycles=10, patience_ns=1),
         ClosedWindow(ints[:, 0], ints[:, 0], 1, 0, np.zeros((3, 3))),
         Evidence(1, ints[:, 0], ints[:, 0], instants, ints[:, 0], instants),

@@ -319,6 +319,20 @@ def test_an_order_ends_its_rest() -> None:
     assert mine.due_ns == 7 * P
 
 
+def test_it_waits_for_the_first_cycle_after_its_rest() -> None:
+    mine = guard(h=5)
+    mine.adopt("LOC", fallback=True)
+    assert mine.waits_for == 0
+    # The first three are passed over, for the fourth has completed.
+    mine.passed(3)
+    mine.released(3, 3 * P)
+    assert mine.waits_for == 3
+    mine.completed(3, 4 * P)
+    assert (mine.resting, mine.waits_for) == (True, 5)
+    released(mine, [4, 5], start=4 * P)
+    assert (mine.resting, mine.waits_for, mine.due_ns) == (False, 5, 8 * P)
+
+
 def test_its_rest_doubles_with_every_rest_before_an_order_up_to_32_times() -> None:
     mine = guard(h=2)
     last = -1
@@ -585,7 +599,7 @@ def test_h_probes_prove_the_placement_that_is_wanted() -> None:
     mine.fell()
     mine.want("SO")
     released(mine, range(4))
-    for cycle in (0, 2, 1):
+    for cycle in (0, 2, 2, 1):
         assert not mine.proven("SO", 2 * P + cycle)
         mine.completed(cycle, 2 * P + cycle)
     assert mine.proven("SO", 3 * P)
@@ -599,6 +613,15 @@ def test_h_probes_prove_the_placement_that_is_wanted() -> None:
     mine.released(4, 4 * P)
     mine.completed(4, 4 * P)
     assert "1 of 3 through 'HYB'" in repr(mine)
+
+
+def test_the_probes_of_a_wish_begin_with_its_first_cycle() -> None:
+    mine = probation(1)
+    mine.want("SO", first=2)
+    released(mine, range(3))
+    for cycle, proven in ((0, False), (1, False), (2, True)):
+        mine.completed(cycle, 2 * P + cycle)
+        assert mine.proven("SO", 2 * P + cycle) == proven
 
 
 def test_a_silence_that_would_make_the_guard_fire_begins_the_count_anew() -> None:

@@ -184,7 +184,7 @@ def test_what_nobody_wants_any_more_is_probed_no_longer(problem: Problem) -> Non
     stamper.guard.adopt(stamper.placement, fallback=True)
     for number, want in enumerate(("SO", "SO", "", "HYB", "no candidate"), stamper._newest + 1):
         stamper._accept(Order(number, "other", stamper.run, stamper.term, want=want))
-        assert stamper.probation.wanted == (want if want in problem.candidates else None)
+        assert stamper.guard.probation.wanted == (want if want in problem.candidates else None)
 
 
 def test_a_lost_order_is_sent_again(problem: Problem) -> None:

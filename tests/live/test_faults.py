@@ -249,7 +249,7 @@ def test_rule_5_what_shadows_fail_through_is_not_whole(problem: Problem) -> None
     stamper._fraction = 0.4
     world.network.cut("E", "E", key="**/in/planning/E/shadow")
     world.run(2_000)
-    assert stamper.presence.whole("SO", world.network.now_ns)
+    assert stamper.guard.presence.whole("SO", world.network.now_ns)
     world.kill("perception@R1")
     world.run(1_000)
     assert [name for _, name, _ in stamper.moves] == ["HYB"]
@@ -289,7 +289,7 @@ def test_rule_6_leaves_a_fallback_only_by_proof(problem: Problem) -> None:
         world.network.heal(rule)
     world.run(500)
     assert world.order("SO").startswith("not proven")
-    probes = world.stamper.probation.needed
+    probes = world.stamper.guard.probation.needed
     world.run((probes - 5) * problem.pipeline.period_ms)
     assert world.order("SO").startswith("not proven")
     world.run(10 * problem.pipeline.period_ms)
@@ -301,7 +301,7 @@ def test_rule_6_leaves_a_fallback_only_by_proof(problem: Problem) -> None:
 
 def test_rule_6_doubles_the_proof_after_a_relapse(problem: Problem) -> None:
     world = running(problem, "SO")
-    before = world.stamper.probation.needed
+    before = world.stamper.guard.probation.needed
     world.network.freeze("perception@E")
     world.run(500)
     world.network.thaw("perception@E")
@@ -313,7 +313,7 @@ def test_rule_6_doubles_the_proof_after_a_relapse(problem: Problem) -> None:
     assert world.stamper.placement == "SO"
     world.network.freeze("perception@E")
     world.run(500)
-    assert world.stamper.probation.needed == 2 * before
+    assert world.stamper.guard.probation.needed == 2 * before
 
 
 def test_rule_1_numbers_grow_across_restarts_of_the_stamper(problem: Problem) -> None:

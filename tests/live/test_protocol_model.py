@@ -119,7 +119,7 @@ class Mirror:
             if not self._probing:
                 self.order("A", orders.WANTED, int(words[4]))
             self._probes(True)
-            world.run((world.stamper.probation.needed + 10) * self.period_ms)
+            world.run((world.stamper.guard.probation.needed + 10) * self.period_ms)
         elif label.endswith("arrives"):
             self.order(words[3], words[-2], int(words[6]))
         world.run(30 * self.period_ms)

@@ -129,7 +129,7 @@ def test_a_pin_that_is_taken_back_leaves_the_cell_where_it_is() -> None:
     world.run(6_000)
     assert world.status["proving"] is None
     assert world.stamper.placement == "LOC"
-    assert world.stamper.probation.wanted is None
+    assert world.stamper.guard.probation.wanted is None
     # And another begins anew.
     world.ask("pin", "SO")
     assert cycles_until(world, "SO", 60) >= world.problem.controller.probe_cycles

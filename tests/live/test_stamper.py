@@ -54,7 +54,7 @@ def test_both_copies_of_a_completion_are_one_cycle(
 def test_a_beat_says_how_long_ago_its_sender_has_heard_others(problem: Problem) -> None:
     world = World(problem)
     world.run(1_000)
-    presence = world.stamper.presence
+    presence = world.stamper.guard.presence
     assert not presence.missing("SO", world.network.now_ns)
     world.network.cut("R1", "E")
     world.run(500)

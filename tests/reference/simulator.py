@@ -1232,6 +1232,7 @@ class Simulation:
         self.proof.relapse()
         self.migration += 1
         self.moves = [*(move for move in self.moves if move[0] < first), (first, fallback)]
+        self.wishes = [*(wish for wish in self.wishes if wish[0] < first), (first, None)]
         self.open_window(first)
         if not self.over:
             self.decisions.append(Decision(len(self.windows), left, fallback, by_guard=True))

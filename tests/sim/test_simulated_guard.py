@@ -258,6 +258,9 @@ def test_it_does_not_move_to_where_it_is() -> None:
     # Once another placement has been ordered, OFF is somewhere else.
     found = play(problem, ("OFF", "OFF", "ALT"), down={"E": [(42, 60)], "X": [(100, 10_000)]})
     assert moves(found) == [(3, "ALT", "OFF")]
+    # Here OFF was silent before, and the guard had nowhere to go.
+    found = play(problem, ("OFF", "OFF", "ALT"), down={"E": [(42, 125)], "X": [(100, 10_000)]})
+    assert moves(found) == [(3, "ALT", "OFF")]
 
 
 def test_it_rests_after_its_own_move() -> None:

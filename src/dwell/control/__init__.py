@@ -3,13 +3,13 @@
 from dwell.control.controller import ClosedWindow, Controller, Proposal
 from dwell.control.course import Course
 from dwell.control.guard import (
+    CellGuard,
     Failures,
     FallbackRound,
     Guard,
     Presence,
     Probation,
     parts_of,
-    rest_cycles,
 )
 from dwell.control.plain_rule import plain_rule
 from dwell.control.windows import final_l95_ms
@@ -18,6 +18,7 @@ from dwell.model.shadow_plan import ShadowPlan, shadow_stamps
 from dwell.policies import MinimalPolicy
 
 __all__ = [
+    "CellGuard",
     "ClosedWindow",
     "Controller",
     "Course",
@@ -35,6 +36,5 @@ __all__ = [
     "final_l95_ms",
     "parts_of",
     "plain_rule",
-    "rest_cycles",
     "shadow_stamps",
 ]

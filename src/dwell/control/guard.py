@@ -4,9 +4,8 @@ Everything here is arithmetic on instants that the caller brings: there is no cl
 no message. Instants are whole nanoseconds of one clock, that of the node the guard is on, and never
 go back.
 
-Only the stamper of the live runtime runs `Guard`, `Presence.whole` and `Failures`. The simulator
-shares `FallbackRound`, `Probation`, `rest_cycles` and `parts_of`, has the rest of the same rules in
-`dwell.sim.simulated_guard` and the compiled event loop, and is tested against these classes.
+The same machine runs beside the stamper of a live cell and in the simulator: `CellGuard` is told
+what happens, and asked whether to move.
 """
 
 from __future__ import annotations
@@ -24,15 +23,12 @@ from dwell.model.problem import GUARD_CYCLES, PROBE_CYCLES
 MOST_DOUBLINGS = 5
 #: Windows' worth of completed cycles that make a cell healthy (see `Probation`).
 HEALTH_WINDOWS = 10
+#: Probes whose completion may still count, the newest of them.
+MOST_OPEN = 1_024
 
 
 #: Whether a candidate may be moved to.
 Whole: TypeAlias = Callable[[str], bool] | Mapping[str, bool]
-
-
-def rest_cycles(probe_cycles: int, rests: int) -> int:
-    """Return how many cycles the guard rests for, the so-manieth time before an order."""
-    return probe_cycles << min(rests - 1, MOST_DOUBLINGS) if rests else 0
 
 
 class _Silence:
@@ -129,18 +125,6 @@ class FallbackRound:
         fresh = (name for name in self.fallbacks if name not in self._failed)
         order = dict.fromkeys((*first, *fresh, *self._failed))
         return [name for name in order if name != placement and name not in self._tried]
-
-    def next(
-        self, placement: str, whole: Whole, heard: Whole, carrier: str | None = None
-    ) -> str | None:
-        """Return the first option that is whole, or else the first whose parts were heard."""
-        options = self.options(placement, carrier)
-        for asked in (whole, heard):
-            ask = asked.__getitem__ if isinstance(asked, Mapping) else asked
-            for name in options:
-                if ask(name):
-                    return name
-        return None
 
     def moved(self, left: str, to: str) -> None:
         """Note a move of the guard away from what has failed."""
@@ -265,22 +249,10 @@ class Guard:
         self._rest_last = -1
         self._spent_ns: int | None = None
 
-    @classmethod
-    def of(cls, problem: Problem, placement: str | None = None) -> Guard:
-        """Make the guard of a cell, on its initial placement or another one."""
-        settings = problem.controller
-        return cls(
-            settings.fallbacks,
-            guard_cycles=settings.guard_cycles,
-            period_ns=round(problem.pipeline.period_ms * 1e6),
-            probe_cycles=settings.probe_cycles,
-            placement=placement or problem.initial,
-        )
-
     def __repr__(self) -> str:
         how = ", resting" if self.resting else ", on a fallback" if self.on_fallback else ""
-        where = f"{self.placement!r}{how}"
-        return f"Guard({', '.join(self.fallbacks)}; at {where}, newest={self.newest})"
+        where = f"{', '.join(self.fallbacks)}; at {self.placement!r}{how}"
+        return f"{type(self).__name__}({where}, newest={self.newest})"
 
     @property
     def fallbacks(self) -> tuple[str, ...]:
@@ -307,6 +279,21 @@ class Guard:
         """Whether it rests, or will when a cycle has completed, so soon after its own move."""
         return self._rest > 0
 
+    @property
+    def waits_for(self) -> int:
+        """Cycle that it waits for, or will: none before it makes it fire."""
+        silence = self._silence
+        if silence.waiting:
+            return silence.waiting[0][0]
+        rests = self.carries or self._spent_ns is not None
+        return silence.released + 1 + (self._rest if rests else 0)
+
+    @property
+    def options(self) -> list[str]:
+        """Fallbacks that it may try, the next one first."""
+        recent = self.newest <= self._returned + self.probe_cycles
+        return self._round.options(self.placement, self._carrier if recent else None)
+
     def released(self, cycle: int, at_ns: int) -> None:
         """Note a cycle that has been stamped and released."""
         silence = self._silence
@@ -319,6 +306,13 @@ class Guard:
             self._rest_last = cycle
         else:
             silence.released = cycle
+
+    def passed(self, cycles: int) -> None:
+        """Note how many cycles have been released before one that has completed.
+
+        Of these nothing else has to be noted.
+        """
+        self._rest = max(self._rest - cycles, 0)
 
     def completed(self, cycle: int, at_ns: int) -> None:
         """Note that the completion of a cycle (by every sink) has been heard."""
@@ -334,7 +328,7 @@ class Guard:
         """
         if not any(name != self.placement for name in self.fallbacks):
             return None
-        if self._spent_ns is not None and not self.carries and self._round.options(self.placement):
+        if self._spent_ns is not None and not self.carries and self.options:
             return self._spent_ns
         return self._silence.due_ns
 
@@ -362,14 +356,16 @@ class Guard:
             self._round.over()
         elif self._spent_ns is not None and self._silence.over(now_ns):
             self._round.again()
-        recent = self.newest <= self._returned + self.probe_cycles
-        carrier = self._carrier if recent else None
-        found = self._round.next(self.placement, whole, whole if heard is None else heard, carrier)
-        if found is None and self._fails and self._round.begun:
+        options = self.options
+        for asked in (whole, whole if heard is None else heard):
+            ask = asked.__getitem__ if isinstance(asked, Mapping) else asked
+            for name in options:
+                if ask(name):
+                    return name
+        if self._fails and self._round.begun:
+            self._begin_rest()
             self._spent_ns = now_ns
-            self._rest, self._rest_last = rest_cycles(self.probe_cycles, self._rests), -1
-            self._silence.forget()
-        return found
+        return None
 
     @property
     def _fails(self) -> bool:
@@ -395,9 +391,15 @@ class Guard:
                 self._returned = self._silence.released
             self._rests = 0
             self._round.over()
-        self._rest, self._rest_last = rest_cycles(self.probe_cycles, self._rests), -1
+        self._begin_rest()
         self._spent_ns, self._since = None, self._silence.released
         self.placement, self.on_fallback = candidate, fallback
+
+    def _begin_rest(self) -> None:
+        """Wait for nothing that is out, and rest longer with each rest before an order."""
+        rests = self._rests
+        self._rest = self.probe_cycles << min(rests - 1, MOST_DOUBLINGS) if rests else 0
+        self._rest_last = -1
         self._silence.forget()
 
     def restart(self) -> None:
@@ -565,6 +567,7 @@ class Probation:
         "_first",
         "_health",
         "_on_fallback",
+        "_open",
         "_returned",
         "_silence",
         "health_cycles",
@@ -582,6 +585,8 @@ class Probation:
         self.health_cycles = health_cycles
         self.wanted: str | None = None
         self._silence = _Silence(patience_ns)
+        # Probes under this wish that have not completed, in their order.
+        self._open: dict[int, None] = {}
         self._count = self._first = self._health = 0
         self._on_fallback = self._returned = False
 
@@ -598,26 +603,37 @@ class Probation:
     def __repr__(self) -> str:
         return f"Probation({self._count} of {self.needed} through {self.wanted!r})"
 
-    def want(self, candidate: str | None) -> None:
-        """Set the placement that the fallback shall be left for; another wish begins anew."""
+    def want(self, candidate: str | None, first: int = 0) -> None:
+        """Set the placement that the fallback shall be left for; another wish begins anew.
+
+        Parameters
+        ----------
+        first : int
+            First cycle that is a probe under this wish.
+        """
         if candidate != self.wanted:
-            self.wanted, self._count = candidate, 0
-            self._first = self._silence.released + 1
+            self.wanted, self._count, self._first = candidate, 0, first
+            self._open.clear()
             self._silence.forget()
 
     def released(self, cycle: int, at_ns: int) -> None:
         """Note that a cycle has been sent as a probe through the wanted placement."""
         self._look(at_ns)
-        self._silence.release(cycle, at_ns)
+        if cycle >= max(self._first, self._silence.released + 1):
+            self._silence.release(cycle, at_ns)
+            self._open[cycle] = None
+            if len(self._open) > MOST_OPEN:
+                del self._open[next(iter(self._open))]
 
     def completed(self, cycle: int, at_ns: int) -> None:
         """Note that the completion of a probe through the wanted placement has been heard.
 
         One that comes after that of a later cycle counts, too. One that was sent under a wish
-        before does not. Doubles are the caller's to drop.
+        before, or that has been heard of already, does not.
         """
         self._look(at_ns, also_now=False)
-        if self.wanted is not None and self._first <= cycle <= self._silence.released:
+        if cycle in self._open:
+            del self._open[cycle]
             self._count += 1
             self._silence.complete(cycle)
 
@@ -656,3 +672,81 @@ class Probation:
         if stretches:
             self._returned = False
             self.needed = max(self.needed >> stretches, self.probe_cycles)
+
+
+class CellGuard(Guard):
+    """The guard of a cell: all that has to be noted of what happens in it.
+
+    Parameters
+    ----------
+    problem : Problem
+    placement : str, optional
+        Candidate that the first cycles are stamped with; by default the initial one.
+
+    Attributes
+    ----------
+    presence : Presence
+        To be told the signs of life.
+    failures : Failures
+        Cycles and shadows that nobody has heard complete.
+    probation : Probation
+        To be told who wants to leave the fallback, and what completes under orders.
+    """
+
+    __slots__ = ("failures", "presence", "probation")
+
+    def __init__(self, problem: Problem, placement: str | None = None) -> None:
+        settings = problem.controller
+        super().__init__(
+            settings.fallbacks,
+            guard_cycles=settings.guard_cycles,
+            period_ns=round(problem.pipeline.period_ms * 1e6),
+            probe_cycles=settings.probe_cycles,
+            placement=placement or problem.initial,
+        )
+        self.presence, self.failures = Presence.of(problem), Failures.of(problem)
+        self.probation = Probation.of(problem)
+
+    def sent(self, cycle: int, at_ns: int, candidate: str) -> None:
+        """Note that a cycle has been released through a candidate."""
+        self.released(cycle, at_ns)
+        self.failures.released(candidate, cycle, at_ns)
+
+    def shadow_sent(self, cycle: int, at_ns: int, candidate: str) -> None:
+        """Note that a cycle has also been released through another candidate."""
+        self.failures.released(candidate, cycle, at_ns)
+        if candidate == self.probation.wanted:
+            self.probation.released(cycle, at_ns)
+
+    def arrived(self, cycle: int, at_ns: int, candidate: str) -> None:
+        """Note that the completion of a cycle through a candidate has been heard."""
+        self.failures.completed(candidate, cycle)
+        # One that was sent a cycle early, before a move, says nothing of the placement that holds.
+        if candidate == self.placement or cycle <= self._since:
+            self.completed(cycle, at_ns)
+
+    def shadow_arrived(self, cycle: int, at_ns: int, candidate: str) -> None:
+        """Note that the completion of a shadow through a candidate has been heard."""
+        self.failures.completed(candidate, cycle)
+        if candidate == self.probation.wanted:
+            self.probation.completed(cycle, at_ns)
+
+    def look(self, now_ns: int) -> str | None:
+        """Return the fallback to try, if the cell has to move now; see `check`."""
+
+        def heard(name: str) -> bool:
+            return self.presence.whole(name, now_ns)
+
+        def whole(name: str) -> bool:
+            return heard(name) and not self.failures.failing(name, now_ns)
+
+        return self.check(now_ns, whole, heard)
+
+    def adopt(self, candidate: str, fallback: bool = False) -> None:
+        """Take note of a move (see `Guard.adopt`), and of what it says of the probation."""
+        left = self.on_fallback and not fallback
+        super().adopt(candidate, fallback)
+        if fallback:
+            self.probation.fell()
+        elif left:
+            self.probation.left()

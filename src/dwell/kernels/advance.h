@@ -89,7 +89,7 @@ template <class S>
       continue;
     }
     if (now > end_ns) break;
-    if (kind == kMigrate || (kind == kGuard && guard_fires(s, cell, now))) {
+    if (kind == kMigrate || (kind == kGuard && wakes_guard(s, cell, now))) {
       s.clock[0].step_key = event.key;
       s.clock[0].step_ns = now;
       return kStep;

@@ -28,7 +28,7 @@ enum Reason : i8 { kDwell, kHold, kMove, kCapped, kInfeasible };
 enum Tier : i8 { kRobot, kEdge, kCloud, kNoTier };
 
 // Kinds of events in the order in which equal times are handled. `kMigrate` and `kGuard` are steps
-// of the caller's: of a cold migration, and of the guard where it fires.
+// of the caller's: of a cold migration, and of the guard where it is woken.
 enum Kind : i8 {
   kCompletion,
   kArrival,

@@ -43,17 +43,14 @@ using Times = const i64*;
   field(i64, end_ns) /* of the last close that any cell can have */
 
 // A window closes no earlier than `due_ns` after the release of its last cycle, and `grace_ns` after
-// that of the one beyond it. `looks_ns` is when the guard looks next, -1 for never, and
-// `patience_ns` is g periods; `waited` is the first cycle that no completion has been heard of or
-// after, `moved` the first one of the newest placement that is waited for; once a completion has
-// been heard, no cycle before `rested` is.
+// that of the one beyond it. `wakes_ns` is when the guard is woken if no cycle from `waited` on has
+// been heard to complete, and `patience_ns` is g periods.
 #define DWELL_CELL(field)                                                                        \
   field(Times, release_ns) field(i64, due_ns) field(i64, grace_ns)                               \
   field(i64, n_cycles) field(i64, window) field(i64, window_first) field(i64, close_cycle)       \
   field(i64, close_pending) field(i64, window_cycles) field(i64, migrating)                      \
   field(i64, deadline_ns) field(f64, longest_ms) /* with which latencies beyond it count */       \
-  field(i64, looks_ns) field(i64, patience_ns) field(i64, waited) field(i64, moved)              \
-  field(i64, rested)                                                                             \
+  field(i64, wakes_ns) field(i64, patience_ns) field(i64, waited)                                \
   field(i64, period_ns) field(i64, released) /* cycles */                                        \
   field(i64, given_up_after) /* cycles released since, of a shadow under way */                  \
   field(i32, task_0) field(i32, n_tasks) field(i32, flow_0) field(i32, candidate_0)              \

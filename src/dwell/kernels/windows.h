@@ -1,4 +1,4 @@
-// Windows: what resources had done when each opened and closed; and when the guard looks.
+// Windows: what resources had done when each opened and closed; and when the guard is woken.
 #pragma once
 
 #include "changes.h"
@@ -72,31 +72,28 @@ bool announce_close(S& s, i64 cell) {
   return of.close_pending || of.migrating;
 }
 
-// Whether the guard fires; if not, it looks again when it would if nothing completed.
-//
-// Nothing has to be done at completions: the guard fires no earlier than g periods after the
-// release of the cycle that it has waited for, and what has completed by then can be seen then.
+// Whether the guard is woken now: no cycle from `waited` on has been heard to complete, or the one
+// after the newest that has is g periods old. If not, this is asked again when that cycle is.
 template <class S>
-bool guard_fires(S& s, i64 cell, i64 now) {
+bool wakes_guard(S& s, i64 cell, i64 now) {
   Cell& of = s.cell(cell);
-  // It has been told to look at another time instead.
-  if (of.looks_ns != now) return false;
-  of.looks_ns = -1;
-  i64 waited = of.waited;
+  // It wants to be woken at another time instead.
+  if (of.wakes_ns != now) return false;
+  of.wakes_ns = -1;
+  const i64 waited = of.waited;
   for (i64 cycle = waited; cycle < of.n_cycles && of.release_ns[cycle] < now; ++cycle) {
     const i64 row = s.output(cell, cycle);
     if (s.outcome[row] != kDone) continue;
     const i64 back_ns = s.back_ns[of.candidate_0 + s.stamps[row]];
     if (later(of.release_ns[cycle] + s.latency_ns[row], back_ns) <= now) {
-      waited = std::max(cycle + 1, of.rested);
+      of.waited = cycle + 1;
     }
   }
-  if (waited < of.moved && of.release_ns[of.moved] < now) waited = of.moved;
-  of.waited = waited;
-  if (waited >= of.n_cycles) return false;
-  const i64 due = later(of.release_ns[waited], of.patience_ns);
+  if (of.waited == waited) return true;
+  if (of.waited >= of.n_cycles) return false;
+  const i64 due = later(of.release_ns[of.waited], of.patience_ns);
   if (due <= now) return true;
-  of.looks_ns = due;
+  of.wakes_ns = due;
   s.post(due, make_key(kGuard, cell, 0, 0));
   return false;
 }

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from msgspec.structs import asdict
 
-from dwell.control import Failures, Guard, Presence, Probation, shadow_stamps
+from dwell.control import CellGuard, shadow_stamps
 from dwell.errors import LiveError
 from dwell.live.continuity import RESERVED, SetbackDetector
 from dwell.live.control_group import UNKNOWN
@@ -88,13 +88,9 @@ class Stamper:
         self.cycle = entry.reserved
         self._reserved = entry.reserved
         self.routes = Routes(problem)
-        self.guard = Guard.of(problem, entry.placement)
+        self.guard = CellGuard(problem, entry.placement)
         if entry.on_fallback:
             self.guard.adopt(entry.placement, fallback=True)
-        self.presence, self.failures = Presence.of(problem), Failures.of(problem)
-        self.probation = Probation.of(problem)
-        if entry.on_fallback:
-            self.probation.fell()
         self.pulse = Pulse(place, self._ready, self._holds, hears=[("*", "*")])
         self.timer = problem.live.release == "timer"
         self._next_ns = now_ns + place.period_ns
@@ -111,7 +107,6 @@ class Stamper:
         )
         self.intervals = Intervals(place.who, self._sinks)
         self._partial: dict[int, set[str]] = {}
-        self._probes: set[int] = set()
         self._fraction = 0.0
         self._forks: tuple[tuple[str, str], ...] = ()
         self._charge = ""
@@ -172,7 +167,7 @@ class Stamper:
         self._release(now_ns, now_ns)
 
     def _heard(self, beat: Beat, now_ns: int, direct: bool) -> None:
-        presence = self.presence
+        presence = self.guard.presence
         presence.heard(beat.node, now_ns)
         if direct:
             presence.heard(f"{beat.node}->{self.place.node}", now_ns)
@@ -192,12 +187,8 @@ class Stamper:
         if stamp.run != self.run:
             return
         if done.outcome == "shadow":
-            if done.sink not in self._sinks or stamp.shadow not in self._names:
-                return
-            self.failures.completed(stamp.shadow, stamp.cycle)
-            if stamp.shadow == self.probation.wanted and stamp.cycle in self._probes:
-                self._probes.discard(stamp.cycle)
-                self.probation.completed(stamp.cycle, now_ns)
+            if done.sink in self._sinks and stamp.shadow in self._names:
+                self.guard.shadow_arrived(stamp.cycle, now_ns, stamp.shadow)
             return
         # What the actuator refused has come as far as under any other placement.
         handed_over = done.outcome in HANDED_OVER and done.sink in self._sinks
@@ -216,11 +207,9 @@ class Stamper:
     def _complete(self, stamp: Stamp, now_ns: int) -> None:
         """All sinks have had a cycle's command."""
         if stamp.placement in self._names:
-            self.failures.completed(stamp.placement, stamp.cycle)
-        # One that was sent a cycle early, before a move, says nothing of the placement that holds.
+            self.guard.arrived(stamp.cycle, now_ns, stamp.placement)
         if stamp.placement == self.placement:
-            self.guard.completed(stamp.cycle, now_ns)
-            self.probation.healthy()
+            self.guard.probation.healthy()
 
     # ------------------------------------------------------------------------- orders
 
@@ -243,7 +232,8 @@ class Stamper:
         return self.cycle + (self._ahead is not None)
 
     def _answer(self, order: Order, refused: str, now_ns: int) -> Accepted:
-        probed = (self.probation.wanted if self.guard.on_fallback else None) or ""
+        probation = self.guard.probation
+        probed = (probation.wanted if self.guard.on_fallback else None) or ""
         return Accepted(
             order.number,
             order.controller,
@@ -253,12 +243,12 @@ class Stamper:
             self.placement,
             self._next,
             self.guard.on_fallback,
-            probed if self.probation.proven(probed, now_ns) else "",
+            probed if probation.proven(probed, now_ns) else "",
             self._newest,
             self.guard.resting,
             probed,
-            self.probation.done(now_ns) if probed else 0,
-            self.probation.needed,
+            probation.done(now_ns) if probed else 0,
+            probation.needed,
         )
 
     def _refusal(self, order: Order, now_ns: int) -> str:
@@ -281,12 +271,13 @@ class Stamper:
             return ""
         if order.number < self._newest:
             return f"stale order: {order.number}, after {self._newest}"
-        missing = self.presence.missing(order.placement, now_ns)
+        missing = self.guard.presence.missing(order.placement, now_ns)
         if missing:
             return f"not ready: {', '.join(sorted(missing))} not heard"
-        if self.guard.on_fallback and not self.probation.proven(order.placement, now_ns):
-            self.probation.want(order.placement)
-            done, needed = self.probation.done(now_ns), self.probation.needed
+        probation = self.guard.probation
+        if self.guard.on_fallback and not probation.proven(order.placement, now_ns):
+            probation.want(order.placement)
+            done, needed = probation.done(now_ns), probation.needed
             return f"not proven: {done} of {needed} cycles through {order.placement}"
         return ""
 
@@ -312,13 +303,13 @@ class Stamper:
         self._forks = order.forks
         if self.guard.on_fallback:
             known = order.want in self.place.problem.candidates
-            self.probation.want(order.want if known else None)
+            self.guard.probation.want(order.want if known else None)
 
     def _move(self, placement: str, *, by_guard: bool) -> None:
         """Change the placement: a new term, known to the book before any cycle has it."""
-        was_fallback = self.guard.on_fallback
         if by_guard:
             self._ahead = None
+            self._forks = ()
         self.moves.append((self._next, placement, "guard" if by_guard else "order"))
         del self.moves[:-1_000]
         self.term += 1
@@ -326,12 +317,6 @@ class Stamper:
         self._partial.clear()
         self._write(on_fallback=by_guard)
         self.guard.adopt(placement, fallback=by_guard)
-        if by_guard:
-            self._forks = ()
-            self.probation.fell()
-        elif was_fallback:
-            self.probation.left()
-        self._probes.clear()
 
     def _write(self, *, on_fallback: bool) -> None:
         self._book.write(
@@ -346,7 +331,7 @@ class Stamper:
             return min(self.pulse.wake(now_ns), now_ns + self.place.period_ns)
         if self._setback.back_ns(now_ns) > self.place.period_ns // 4:
             self._begin_anew(now_ns)
-        fallback = self.guard.check(now_ns, *self._guards_view(now_ns))
+        fallback = self.guard.look(now_ns)
         if fallback is not None:
             self._move(fallback, by_guard=True)
             self.pulse.send(now_ns)
@@ -364,21 +349,10 @@ class Stamper:
         again_ns = now_ns + self.place.period_ns // 4
         return due_ns if guard_ns is None else min(due_ns, max(guard_ns, again_ns))
 
-    def _guards_view(self, now_ns: int) -> tuple[Callable[[str], bool], Callable[[str], bool]]:
-        """Return whether a candidate is whole, and whether its parts were heard."""
-
-        def heard(name: str) -> bool:
-            return self.presence.whole(name, now_ns)
-
-        def whole(name: str) -> bool:
-            return heard(name) and not self.failures.failing(name, now_ns)
-
-        return whole, heard
-
     def _begin_anew(self, now_ns: int) -> None:
         """The clock has been set back: instants noted so far mean nothing any more."""
         self._next_ns, self._framed_ns = now_ns, now_ns - self.place.period_ns
-        for noted in (self.presence, self.failures, self.guard):
+        for noted in (self.guard.presence, self.guard.failures, self.guard):
             noted.restart()
 
     def _begin(self, now_ns: int) -> bool:
@@ -386,7 +360,8 @@ class Stamper:
         whole = [self.placement]
         if now_ns - self._since_ns > START_NS:
             whole += self.place.problem.controller.fallbacks
-        name = next((name for name in whole if self.presence.whole(name, now_ns)), None)
+        presence = self.guard.presence
+        name = next((name for name in whole if presence.whole(name, now_ns)), None)
         if name is None:
             return False
         if name != self.placement:
@@ -403,15 +378,9 @@ class Stamper:
         early, self._ahead = self._ahead, None
         stamp = early or self._stamp(self.cycle, released_ns)
         self.cycle += 1
-        self.guard.released(stamp.cycle, released_ns)
-        self.failures.released(stamp.placement, stamp.cycle, released_ns)
+        self.guard.sent(stamp.cycle, released_ns, stamp.placement)
         if stamp.shadow:
-            self.failures.released(stamp.shadow, stamp.cycle, released_ns)
-        if stamp.shadow and stamp.shadow == self.probation.wanted:
-            self.probation.released(stamp.cycle, released_ns)
-            self._probes.add(stamp.cycle)
-            if len(self._probes) > MAX_PARTIAL:
-                self._probes.discard(min(self._probes))
+            self.guard.shadow_sent(stamp.cycle, released_ns, stamp.shadow)
         self._send(stamp, here=True, elsewhere=early is None)
         # A beat wakes every process, and would take the source's turn.
         self.pulse.put_off(released_ns + self.place.period_ns // 2)
@@ -436,7 +405,7 @@ class Stamper:
                 place.transport.put(place.keys.inputs(task, node, kind), b"", header)
 
     def _stamp(self, cycle: int, released_ns: int) -> Stamp:
-        wanted = self.probation.wanted if self.guard.on_fallback else None
+        wanted = self.guard.probation.wanted if self.guard.on_fallback else None
         shadow = wanted or self._shadowed(cycle)
         if shadow == self.placement:
             shadow = ""

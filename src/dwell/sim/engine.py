@@ -5,7 +5,7 @@ from __future__ import annotations
 import bisect
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,8 +105,7 @@ def simulate_realisation(
     asked = problem, realisation, policy, estimator, jobs, guard, by_window
     # Until the first probe is sent a shadow changes nothing, so that the second one repeats what
     # the first has played. Shadows in every run that may want probes would cost all runs more.
-    played = _play(*asked) or _play(*asked, shadow=True)
-    assert played is not None
+    played = cast("PlayedRealisation", _play(*asked) or _play(*asked, shadow=True))
     meta = partial(
         _meta,
         problem,
@@ -265,7 +264,7 @@ class _Stamper:
             stop = min(stop, self.cycles)
             stamps[1, start:stop] = self.plan.stamps(start, stop, code)
         if self.watch is not None:
-            self.watch.probes.stamp(start, stop)
+            self.watch.stamp(start, stop)
 
     def _reach(self, boundary: int) -> int:
         """Cycles that may be released before the decision of the window closing at `boundary`."""
@@ -389,11 +388,10 @@ class _Stamper:
         now = int(tables.clock[0]["step_ns"])
         first = int(np.searchsorted(self.release_ns[: self.cycles], now))
         active = self.names[tables.stamps[0, first - 1]]
-        fallback = watch.fire(now, active)
+        fallback = watch.wake(now)
         if fallback is None:
             return
         cell = tables.cells[0]
-        watch.fell(now, first, active, fallback)
         if self.cold is not None:
             self.cold.stop()
         cell["migrating"] = cell["close_pending"] = 0

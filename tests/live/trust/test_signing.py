@@ -330,7 +330,7 @@ def test_a_relay_that_repeats_itself_does_not_hide_a_fault(world: World) -> None
             receive(sample, world.network.now_ns)
     # No cycle after the last one counts as done, and the sink's node is known to be silent.
     assert world.stamper.guard.newest <= before + 2
-    assert "control@R2" in world.stamper.presence.missing("SO", world.network.now_ns)
+    assert "control@R2" in world.stamper.guard.presence.missing("SO", world.network.now_ns)
 
 
 def test_orders_take_no_detour(world: World, seals: dict[str, Seals]) -> None:
