@@ -116,7 +116,7 @@ def started_again(change: Callable[[Stamper], None]) -> Patch:
 
 
 def begins_a_run(role: Stamper) -> None:
-    role.run += 1
+    role.course.run += 1
 
 
 def stamps_numbers_again(role: Stamper) -> None:
@@ -124,7 +124,7 @@ def stamps_numbers_again(role: Stamper) -> None:
 
 
 def goes_back_a_term(role: Stamper) -> None:
-    role.term -= 1
+    role.course.term -= 1
 
 
 def moves_within_a_term(patch: pytest.MonkeyPatch) -> None:
@@ -132,7 +132,7 @@ def moves_within_a_term(patch: pytest.MonkeyPatch) -> None:
 
     def moved(self: Stamper, placement: str, *, by_guard: bool) -> None:
         move(self, placement, by_guard=by_guard)
-        self.term -= by_guard
+        self.course.term -= by_guard
 
     patch.setattr(Stamper, "_move", moved)
 

@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import TypeAlias
 
+from dwell.control.course import Course
 from dwell.model import FrozenDict, Problem
 from dwell.model.bounds import require
 from dwell.model.instants import EVIDENCE_NS
@@ -201,10 +202,8 @@ class Guard:
 
     Attributes
     ----------
-    placement : str
-        Candidate that holds.
-    on_fallback : bool
-        Whether it is the guard's own move that holds.
+    course : Course
+        Where the cell is, and whose move that was.
     newest : int
         Highest cycle completed, -1 for none.
     """
@@ -219,8 +218,7 @@ class Guard:
         "_silence",
         "_since",
         "_spent_ns",
-        "on_fallback",
-        "placement",
+        "course",
         "probe_cycles",
     )
 
@@ -237,7 +235,7 @@ class Guard:
         PROBE_CYCLES.check("probe_cycles", probe_cycles)
         require(period_ns > 0, "period_ns", period_ns, "at least 1")
         self.probe_cycles = probe_cycles
-        self.placement, self.on_fallback = placement, False
+        self.course = Course(placement)
         self._silence = _Silence(guard_cycles * period_ns)
         self._round = FallbackRound(fallbacks)
         # Last cycle before the last move; and before an order left the fallback that carried.
@@ -253,6 +251,16 @@ class Guard:
         how = ", resting" if self.resting else ", on a fallback" if self.on_fallback else ""
         where = f"{', '.join(self.fallbacks)}; at {self.placement!r}{how}"
         return f"{type(self).__name__}({where}, newest={self.newest})"
+
+    @property
+    def placement(self) -> str:
+        """Candidate that holds."""
+        return self.course.placement
+
+    @property
+    def on_fallback(self) -> bool:
+        """Whether it is the guard's own move that holds."""
+        return self.course.by_guard
 
     @property
     def fallbacks(self) -> tuple[str, ...]:
@@ -385,15 +393,16 @@ class Guard:
             self._rests += not self._fails
             self._round.moved(self.placement, candidate)
             self._carrier = None
+            self.course.fall(candidate, self.placement)
         else:
             if self.on_fallback:
                 self._carrier = self.placement if self.carries else None
                 self._returned = self._silence.released
             self._rests = 0
             self._round.over()
+            self.course.move(candidate)
         self._begin_rest()
         self._spent_ns, self._since = None, self._silence.released
-        self.placement, self.on_fallback = candidate, fallback
 
     def _begin_rest(self) -> None:
         """Wait for nothing that is out, and rest longer with each rest before an order."""

@@ -83,14 +83,15 @@ class Stamper:
         entry = book.read()
         if entry is None or entry.placement not in problem.candidates:
             entry = StamperState(run, 0, 1, problem.initial, False)
-        self.run, self.term = entry.run, entry.term
-        self.placement = entry.placement
         self.cycle = entry.reserved
         self._reserved = entry.reserved
         self.routes = Routes(problem)
         self.guard = CellGuard(problem, entry.placement)
         if entry.on_fallback:
             self.guard.adopt(entry.placement, fallback=True)
+        #: Where the cell is.
+        self.course = self.guard.course
+        self.course.enter(entry.run, entry.term)
         self.pulse = Pulse(place, self._ready, self._holds, hears=[("*", "*")])
         self.timer = problem.live.release == "timer"
         self._next_ns = now_ns + place.period_ns
@@ -119,6 +120,21 @@ class Stamper:
         self.group_clock: Callable[[], int] = lambda: UNKNOWN
         self.skipped = 0
         self.moves: list[tuple[int, str, str]] = []
+
+    @property
+    def run(self) -> int:
+        """The run."""
+        return self.course.run
+
+    @property
+    def term(self) -> int:
+        """The term that holds."""
+        return self.course.term
+
+    @property
+    def placement(self) -> str:
+        """The candidate that holds."""
+        return self.course.placement
 
     # ------------------------------------------------------------------------ hearing
 
@@ -233,7 +249,7 @@ class Stamper:
 
     def _answer(self, order: Order, refused: str, now_ns: int) -> Accepted:
         probation = self.guard.probation
-        probed = (probation.wanted if self.guard.on_fallback else None) or ""
+        probed = (probation.wanted if self.course.by_guard else None) or ""
         return Accepted(
             order.number,
             order.controller,
@@ -242,7 +258,7 @@ class Stamper:
             self.term,
             self.placement,
             self._next,
-            self.guard.on_fallback,
+            self.course.by_guard,
             probed if probation.proven(probed, now_ns) else "",
             self._newest,
             self.guard.resting,
@@ -275,7 +291,7 @@ class Stamper:
         if missing:
             return f"not ready: {', '.join(sorted(missing))} not heard"
         probation = self.guard.probation
-        if self.guard.on_fallback and not probation.proven(order.placement, now_ns):
+        if self.course.by_guard and not probation.proven(order.placement, now_ns):
             probation.want(order.placement)
             done, needed = probation.done(now_ns), probation.needed
             return f"not proven: {done} of {needed} cycles through {order.placement}"
@@ -294,14 +310,14 @@ class Stamper:
         if order.number > self._newest:
             self._newest = order.number
             self._settle(order)
-        if order.placement and (order.placement != self.placement or self.guard.on_fallback):
+        if order.placement and (order.placement != self.placement or self.course.by_guard):
             self._move(order.placement, by_guard=False)
 
     def _settle(self, order: Order) -> None:
         """Take over what an order says beside the placement; an earlier one changes none of it."""
         self._fraction = order.shadow_fraction
         self._forks = order.forks
-        if self.guard.on_fallback:
+        if self.course.by_guard:
             known = order.want in self.place.problem.candidates
             self.guard.probation.want(order.want if known else None)
 
@@ -312,16 +328,15 @@ class Stamper:
             self._forks = ()
         self.moves.append((self._next, placement, "guard" if by_guard else "order"))
         del self.moves[:-1_000]
-        self.term += 1
-        self.placement = placement
         self._partial.clear()
-        self._write(on_fallback=by_guard)
         self.guard.adopt(placement, fallback=by_guard)
+        self.course.enter(self.run, self.term + 1)
+        self._write()
 
-    def _write(self, *, on_fallback: bool) -> None:
-        self._book.write(
-            StamperState(self.run, self._reserved, self.term, self.placement, on_fallback)
-        )
+    def _write(self) -> None:
+        course = self.course
+        holds = course.term, course.placement, course.by_guard
+        self._book.write(StamperState(course.run, self._reserved, *holds))
 
     # -------------------------------------------------------------------------- cycles
 
@@ -374,7 +389,7 @@ class Stamper:
         group_ns = self.group_clock()
         if self.cycle + 1 >= self._reserved:
             self._reserved = self.cycle + RESERVED
-            self._write(on_fallback=self.guard.on_fallback)
+            self._write()
         early, self._ahead = self._ahead, None
         stamp = early or self._stamp(self.cycle, released_ns)
         self.cycle += 1
@@ -405,7 +420,7 @@ class Stamper:
                 place.transport.put(place.keys.inputs(task, node, kind), b"", header)
 
     def _stamp(self, cycle: int, released_ns: int) -> Stamp:
-        wanted = self.guard.probation.wanted if self.guard.on_fallback else None
+        wanted = self.guard.probation.wanted if self.course.by_guard else None
         shadow = wanted or self._shadowed(cycle)
         if shadow == self.placement:
             shadow = ""
@@ -425,4 +440,4 @@ class Stamper:
         return True, ""
 
     def _holds(self) -> tuple[int, str]:
-        return self.term, self.placement
+        return self.course.term, self.course.placement
