@@ -75,9 +75,8 @@ candidates, nodes = _keys("candidates"), _keys("nodes")
 
 
 def scenarios(context: typer.Context) -> list[str]:
-    """Offer the scenarios of the cell file."""
-    named = _keys("scenarios")(context)
-    return list(dict.fromkeys(["baseline", *named])) if _cell(context) else []
+    """Offer the scenarios of the cell file, and the one that every cell has."""
+    return list(dict.fromkeys(["baseline", *_keys("scenarios")(context)]))
 
 
 def estimators() -> list[str]:
