@@ -12,7 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from dwell.live.messages import Beat, Heard
-from dwell.live.offsets import UNBOUNDED_NS, Offsets
+from dwell.live.offsets import MAX_DRIFT_PPB, UNBOUNDED_NS, Offsets
 
 US, MS, S = 1_000, 1_000_000, 1_000_000_000
 YEAR = 365 * 86_400 * S
@@ -173,18 +173,15 @@ def test_the_bound_is_close_to_half_the_best_round_trip(least_us: int, seed: int
     assert bound_ns <= round_trip_ns / 2 + 0.3 * MS
 
 
-def test_the_bound_of_a_silent_link_grows_with_what_is_known_of_the_drift() -> None:
+def test_the_bound_of_a_silent_link_grows_as_clocks_may_part() -> None:
     cell = world(jittery(100 * US, 0))
-    for _ in cell.play(0, 130 * S):
+    for _ in cell.play(0, 10 * S):
         pass
-    _, at_first_ns = cell.error_and_bound("E", 130 * S)
-    error_ns, later_ns = cell.error_and_bound("E", 190 * S)
-    assert error_ns <= later_ns
-    assert 0 < later_ns - at_first_ns <= 60 * S * 23e-6
-    # After more than two minutes nothing is known of the drift any more.
-    error_ns, later_ns = cell.error_and_bound("E", 330 * S)
-    assert error_ns <= later_ns
-    assert 40 * MS < later_ns < 41 * MS
+    _, at_first_ns = cell.error_and_bound("E", 10 * S)
+    for later_s in (60, 600):
+        error_ns, later_ns = cell.error_and_bound("E", (10 + later_s) * S)
+        assert error_ns <= later_ns
+        assert later_ns - at_first_ns == pytest.approx(later_s * S * MAX_DRIFT_PPB / 1e9, rel=1e-3)
 
 
 def test_drift_that_changes_slowly_stays_inside() -> None:
@@ -228,19 +225,6 @@ def test_processes_of_one_node_share_its_clock() -> None:
     assert together.error_and_bound("E", 200 * MS)[1] < alone.error_and_bound("E", 200 * MS)[1]
 
 
-def test_a_third_node_compares_where_the_direct_link_is_bad() -> None:
-    def bad_direct(random: Random, source: str, target: str, sent_ns: int) -> int | None:
-        return 30 * MS if {source, target} == {"R1", "E"} else 100 * US
-
-    cell = world(bad_direct)
-    for _ in cell.play(0, 2 * S):
-        pass
-    error_ns, bound_ns = cell.error_and_bound("E", 2 * S)
-    assert error_ns <= bound_ns + READING_NS
-    # Twice 100 us, and what two seconds of drift can do.
-    assert 200 * US <= bound_ns <= 250 * US
-
-
 def test_two_other_nodes_are_compared_through_what_their_beats_say_of_one_another() -> None:
     def far_from_me(random: Random, source: str, target: str, sent_ns: int) -> int | None:
         return 30 * MS if "E" in (source, target) else 100 * US
@@ -251,19 +235,6 @@ def test_two_other_nodes_are_compared_through_what_their_beats_say_of_one_anothe
     error_ns, bound_ns = cell.error_and_bound("R2", 2 * S)
     assert error_ns <= bound_ns + READING_NS
     assert bound_ns <= 150 * US
-
-
-def test_where_the_direct_link_carries_nothing_back_the_third_node_is_all_there_is() -> None:
-    # R1's beats come over the detour; nothing of E's reaches R1.
-    def one_way(random: Random, source: str, target: str, sent_ns: int) -> int | None:
-        detour = {("R1", "E"): 30 * MS, ("E", "R1"): None}
-        return detour.get((source, target), 100 * US)
-
-    cell = world(one_way)
-    for t_ns in cell.play(0, 2 * S):
-        if t_ns > S:
-            error_ns, bound_ns = cell.error_and_bound("E", t_ns)
-            assert error_ns <= bound_ns + READING_NS < 300 * US
 
 
 @pytest.mark.parametrize("jump_ns", [-8 * YEAR, -S, S, 8 * YEAR])
@@ -279,7 +250,7 @@ def test_a_clock_that_begins_anew_is_found_out(jump_ns: int, node: str) -> None:
             for other in ("E", "R2"):
                 error_ns, bound_ns = cell.error_and_bound(other, t_ns)
                 assert error_ns <= bound_ns + READING_NS < 5 * MS
-    assert cell.offsets.breaks >= 2
+    assert cell.offsets.breaks >= 1
 
 
 def test_copies_and_late_beats_change_nothing() -> None:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import random
-import sys
+import signal
 import threading
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import pytest
 
 from dwell.model import Decision, Placement, Problem, QoS
-from dwell.policies import DTP, MinimalPolicy, Policy, by_name, check_policy
+from dwell.policies import DTP, MinimalPolicy, Policy, by_name, check, check_policy
 from dwell.policies.registry import REGISTRY
 from tests.cells.paper import CANDIDATES, OBJECTIVE, place, problem
 
@@ -77,17 +78,23 @@ def test_a_policy_that_has_run_is_left_as_it_is() -> None:
     assert policy.incumbent == "SO"
 
 
-def test_the_tracer_is_given_back() -> None:
-    def tracer(frame: object, event: str, argument: object) -> None:
+def test_the_timer_is_given_back() -> None:
+    def handler(number: int, frame: object) -> None:
         return None
 
-    before = sys.gettrace()
-    sys.settrace(tracer)
+    before = signal.signal(signal.SIGVTALRM, handler)
     try:
-        check_policy(Sound(), problem())
-        assert sys.gettrace() is tracer
+        assert check_policy(Sound(), problem()) == ()
+        assert signal.getsignal(signal.SIGVTALRM) is handler
+        assert signal.getitimer(signal.ITIMER_VIRTUAL)[0] == 0
     finally:
-        sys.settrace(before)
+        signal.signal(signal.SIGVTALRM, before)
+
+
+def test_a_policy_is_checked_in_another_thread_too() -> None:
+    with ThreadPoolExecutor(1) as thread:
+        faults = thread.submit(broken, lambda decision: replace(decision, dwell=-1)).result()
+    assert "with dwell -1" in only(faults)
 
 
 # -------------------------------------------------------------------------------------- broken
@@ -311,7 +318,9 @@ def test_it_draws_without_a_seed(with_start: bool) -> None:
     assert "randomness needs a fixed seed" in only(check_policy(policy, problem()))
 
 
-def test_it_never_returns() -> None:
+def test_it_never_returns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(check, "LIMIT_S", 0.1)
+
     class Endless(Sound):
         def choose(self, observed: QoS, estimates: Estimates) -> str:
             while observed.l95_ms > 100:
@@ -319,7 +328,7 @@ def test_it_never_returns() -> None:
             return self.now
 
     fault = only(check_policy(Endless(), problem()))
-    assert "decide() did not return within 100000 lines" in fault
+    assert "decide() did not return within 0.1 s of CPU" in fault
     assert "latencies at their bound" in fault
 
 

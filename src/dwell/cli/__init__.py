@@ -23,11 +23,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     try:
         # Here, since the workers of a study import this module with the script that they are of.
-        from dwell.cli.completion import LINE, answer
+        from dwell.cli.commands import app
+        from dwell.cli.completion import LINE, learn_shells
 
         if LINE in os.environ:
-            return answer(os.environ[LINE])
-        from dwell.cli.commands import app
+            learn_shells()
 
         app(arguments, prog_name="dwell")
     except KeyboardInterrupt:

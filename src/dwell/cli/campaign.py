@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import dwell
+from dwell.cli.completion import several_policies, several_scenarios
 from dwell.cli.options import (
     CellArgument,
     Json,
@@ -35,7 +36,11 @@ def campaign(
     cell: CellArgument,
     scenarios: Annotated[
         str | None,
-        typer.Option(metavar="NAME,NAME", help="The paper's four if not given."),
+        typer.Option(
+            metavar="NAME,NAME",
+            help="The paper's four if not given.",
+            autocompletion=several_scenarios,
+        ),
     ] = None,
     policies: Annotated[
         str | None,
@@ -43,6 +48,7 @@ def campaign(
             metavar="NAME,NAME",
             help="Policies, candidates, or policies with an estimator, as cusum+corrected; all "
             "candidates, atp, dtp and cusum+corrected if not given.",
+            autocompletion=several_policies,
         ),
     ] = None,
     repetitions: Annotated[int, typer.Option(min=1, help="Of everything.")] = 5,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 import dwell
+from dwell.cli.completion import nodes
 from dwell.cli.options import CellArgument, Insecure, Json, Keys, Scenario, Traces
 from dwell.cli.output import aligned, print_json, warn
 from dwell.display import milliseconds
@@ -27,7 +28,8 @@ def check(
         str | None,
         typer.Option(
             help="Check instead that this computer can be that node of the live cell: import and "
-            "make its stages and actuators."
+            "make its stages and actuators.",
+            autocompletion=nodes,
         ),
     ] = None,
     scenario: Scenario = "baseline",

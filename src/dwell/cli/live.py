@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
+from dwell.cli.completion import candidates, nodes, processes, scenarios
 from dwell.cli.options import (
     CellArgument,
     CellOption,
@@ -20,6 +21,7 @@ from dwell.cli.options import (
     Insecure,
     Json,
     Keys,
+    Node,
     Policy,
     Seed,
     require_held,
@@ -45,6 +47,8 @@ Owner = Annotated[
     typer.Option(metavar="PID", hidden=True, help="Process that this one ends with."),
 ]
 
+NodeArgument = Annotated[str, typer.Argument(metavar="NODE", autocompletion=nodes)]
+
 Former = Annotated[list[str] | None, typer.Argument(hidden=True)]
 
 live = typer.Typer(
@@ -53,7 +57,7 @@ live = typer.Typer(
 
 
 def agent(
-    node: Annotated[str, typer.Option(help="Node of the cell that this computer is.")],
+    node: Node,
     cell: CellOption,
     state: Annotated[
         Path | None,
@@ -218,7 +222,7 @@ def _drawn(lines: list[str]) -> str:
 
 @live.command()
 def pin(
-    candidate: Annotated[str, typer.Argument(metavar="CANDIDATE")],
+    candidate: Annotated[str, typer.Argument(metavar="CANDIDATE", autocompletion=candidates)],
     cell: CellOption,
     keys: Keys = None,
     insecure: Insecure = False,
@@ -238,7 +242,7 @@ def unpin(
 
 @live.command()
 def drain(
-    node: Annotated[str, typer.Argument(metavar="NODE")],
+    node: NodeArgument,
     cell: CellOption,
     keys: Keys = None,
     insecure: Insecure = False,
@@ -250,7 +254,7 @@ def drain(
 
 @live.command()
 def undrain(
-    node: Annotated[str, typer.Argument(metavar="NODE")],
+    node: NodeArgument,
     cell: CellOption,
     keys: Keys = None,
     insecure: Insecure = False,
@@ -268,6 +272,7 @@ def run(
         typer.Option(
             metavar="NAME",
             help="One of the cell's scenarios; its first that disturbs something if not given.",
+            autocompletion=scenarios,
         ),
     ] = None,
     seconds: Annotated[
@@ -323,7 +328,8 @@ def up(
         list[str] | None,
         typer.Option(
             help="Node of the cell that this computer is; may repeat. If not given, those whose "
-            "address is this computer's."
+            "address is this computer's.",
+            autocompletion=nodes,
         ),
     ] = None,
     policy: Policy = None,
@@ -371,7 +377,12 @@ def down(cell: CellArgument, state: Root = None) -> None:
 @live.command()
 def log(
     process: Annotated[
-        str, typer.Argument(metavar="PROCESS", help="As agent@R1, controller@E, perception@E.")
+        str,
+        typer.Argument(
+            metavar="PROCESS",
+            help="As agent@R1, controller@E, perception@E.",
+            autocompletion=processes,
+        ),
     ],
     follow: Annotated[
         bool, typer.Option("--follow", "-f", help="Go on with what is added, until interrupted.")
@@ -393,7 +404,7 @@ def log(
 @live.command()
 def units(
     cell: CellArgument,
-    node: Annotated[str, typer.Option(help="Node of the cell that this computer is.")],
+    node: Node,
     out: Annotated[
         Path, typer.Option(metavar="FOLDER", help="Where the units go; made where it is missing.")
     ] = Path("units"),

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from dwell.cli.completion import estimators, nodes, policies, scenarios
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -51,11 +53,18 @@ def _require(bound: Bound, value: float | None) -> None:
 
 CellArgument = Annotated[Path, typer.Argument(metavar="CELL", help="Cell file (YAML).")]
 CellOption = Annotated[Path, typer.Option("--cell", metavar="FILE", help="Cell file (YAML).")]
+Node = Annotated[
+    str,
+    typer.Option(help="Node of the cell that this computer is.", autocompletion=nodes),
+]
 Traces = Annotated[
     Path | None,
     typer.Option(metavar="FOLDER", help="Where its trace files are; beside it if not given."),
 ]
-Scenario = Annotated[str, typer.Option(metavar="NAME", help="One of the cell's scenarios.")]
+Scenario = Annotated[
+    str,
+    typer.Option(metavar="NAME", help="One of the cell's scenarios.", autocompletion=scenarios),
+]
 Policy = Annotated[
     str | None,
     typer.Option(
@@ -63,6 +72,7 @@ Policy = Annotated[
         help="A policy, as dtp, or with its estimator, as cusum+corrected; a class of your own, as "
         "package.module:Class, beside the cell file or installed; or a candidate's name for the "
         "placement that never moves; what the cell says if not given.",
+        autocompletion=policies,
     ),
 ]
 Estimator = Annotated[
@@ -71,6 +81,7 @@ Estimator = Annotated[
         metavar="NAME",
         help="An estimator, or a class of your own, as package.module:Class; what the cell says if "
         "not given.",
+        autocompletion=estimators,
     ),
 ]
 Seed = Annotated[

@@ -9,23 +9,20 @@ from __future__ import annotations
 import copy
 import math
 import random
-import sys
+import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
 from types import FrameType
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, NoReturn
 
 from dwell.model.problem import Problem
-from dwell.model.qos import Decision, QoS, Reason
+from dwell.model.qos import REASONS, Decision, QoS
 from dwell.policies.protocol import MinimalPolicy
 
-if TYPE_CHECKING:
-    from _typeshed import TraceFunction
-
-#: Lines of Python that one decision may execute before it counts as never ending.
-MAX_LINES = 100_000
+#: CPU time that one call may take before it counts as never ending.
+LIMIT_S = 5.0
 
 SHORT, LONG = 24, 300
 WALK_SEED = 1
@@ -43,8 +40,12 @@ class Situation:
     moves: Mapping[int, str] = field(default_factory=dict)
 
 
+class _BrokenOffError(Exception):
+    """A fault has been noted after which a run cannot go on."""
+
+
 class _EndlessError(BaseException):
-    """Raised inside a decision that has executed too many lines; no `except Exception` stops it."""
+    """Raised inside a call that does not return; no `except Exception` stops it."""
 
 
 def check_policy(policy: MinimalPolicy, problem: Problem) -> tuple[str, ...]:
@@ -54,7 +55,7 @@ def check_policy(policy: MinimalPolicy, problem: Problem) -> tuple[str, ...]:
     over its caps, ties, an incumbent that is always the worst, hundreds of windows of a random
     walk, and a guard that moves the cell (where the policy has ``adopt``). In each of them it must
 
-    * raise nothing, and return within `MAX_LINES` lines of Python;
+    * raise nothing, and return within `LIMIT_S` of CPU time;
     * return a candidate's name, or a Decision whose name, placement, reason and flag agree;
     * leave alone what it was given;
     * decide the same again after ``start`` (a fresh copy, where it has none).
@@ -71,7 +72,8 @@ def check_policy(policy: MinimalPolicy, problem: Problem) -> tuple[str, ...]:
 
     Notes
     -----
-    Lines are counted by ``sys.settrace``; a debugger or a coverage tool is suspended meanwhile.
+    The limit is a timer of the main thread (``signal.ITIMER_VIRTUAL``). In other threads there is
+    none, and a policy that never returns keeps the caller waiting.
     """
     if not callable(getattr(policy, "decide", None)):
         return ("it has no method decide(*, observed, estimates)",)
@@ -82,6 +84,8 @@ def check_policy(policy: MinimalPolicy, problem: Problem) -> tuple[str, ...]:
     check = _Check(policy, problem)
     for situation in _situations(problem):
         check.play_twice(situation)
+        if "endless" in check.faults:
+            break
     return tuple(check.faults.values())
 
 
@@ -91,22 +95,30 @@ class _Check:
     def __init__(self, policy: MinimalPolicy, problem: Problem) -> None:
         self.policy = policy
         self.problem = problem
-        self.placements = {name: dict(moves) for name, moves in problem.candidates.items()}
+        self.placements = _placements(problem)
+        self.no_candidate = f"which is no candidate (candidates: {', '.join(self.placements)})"
         self.faults: dict[str, str] = {}
 
     def note(self, kind: str, sentence: str) -> None:
         """Keep the first sentence of each kind."""
         self.faults.setdefault(kind, sentence)
 
+    def stop(self, kind: str, sentence: str) -> NoReturn:
+        """Note a fault, and break the run off."""
+        self.note(kind, sentence)
+        raise _BrokenOffError
+
     def play_twice(self, situation: Situation) -> None:
         """Play a situation, restart, play it again, and compare."""
         policy = copy.deepcopy(self.policy)
         first = self.play(policy, situation)
+        if len(first) < len(situation.windows):
+            return
         if not hasattr(policy, "start"):
             policy = copy.deepcopy(self.policy)
         again = self.play(policy, situation)
         for window, (one, other) in enumerate(zip(first, again, strict=False)):
-            if one != other and len(first) == len(situation.windows):
+            if one != other:
                 self.note(
                     "restart",
                     f"the same windows gave other decisions after a restart, first in window "
@@ -115,182 +127,140 @@ class _Check:
                 )
                 return
 
-    def play(self, policy: MinimalPolicy, situation: Situation) -> list[object]:
+    def play(self, policy: Any, situation: Situation) -> list[str]:
         """Return the decisions of one run, as far as it got."""
-        decisions: list[object] = []
-        start = getattr(policy, "start", None)
-        if start is not None and not self.call("start", partial(start, self.problem), "a run"):
-            return decisions
-        incumbent = getattr(policy, "initial", None) or self.problem.initial
-        if incumbent not in self.placements:
-            self.note("initial", f"its initial is {incumbent!r}, {self.no_candidate()}")
-            return decisions
-        for index, window in enumerate(situation.windows):
-            where = f"window {index} of {situation.name!r}"
-            moved_to = situation.moves.get(index)
+        decisions: list[str] = []
+        with suppress(_BrokenOffError):
+            if start := getattr(policy, "start", None):
+                self.call("start", "a run", start, self.problem)
+            incumbent = getattr(policy, "initial", None) or self.problem.initial
+            if incumbent not in self.placements:
+                self.stop("initial", f"its initial is {incumbent!r}, {self.no_candidate}")
             adopt = getattr(policy, "adopt", None)
-            if moved_to is not None and adopt is not None:
-                incumbent = moved_to
-                if not self.call("adopt", partial(adopt, incumbent), where):
-                    return decisions
-            outcome = self.decide(policy, window, incumbent, where)
-            if outcome is None:
-                return decisions
-            name, decision = outcome
-            decisions.append(decision)
-            incumbent = name
+            for index, window in enumerate(situation.windows):
+                where = f"window {index} of {situation.name!r}"
+                if index in situation.moves and adopt is not None:
+                    incumbent = situation.moves[index]
+                    self.call("adopt", where, adopt, incumbent)
+                answer = self.decide(policy, window, incumbent, where)
+                incumbent = self.judge(answer, incumbent, where)
+                decisions.append(str(answer))
         return decisions
 
-    def decide(
-        self, policy: MinimalPolicy, window: Window, incumbent: str, where: str
-    ) -> tuple[str, object] | None:
-        """Return the name decided and what can be compared, or None where it cannot go on."""
+    def decide(self, policy: Any, window: Window, incumbent: str, where: str) -> object:
+        """Return the answer to a window."""
         observed, estimates = window[incumbent], dict(window)
         before = repr(estimates)
-        answers: list[object] = []
-
-        def act() -> None:
-            answers.append(policy.decide(observed=observed, estimates=estimates))
-
-        if not self.call("decide", act, where):
-            return None
+        answer = self.call("decide", where, policy.decide, observed=observed, estimates=estimates)
         if repr(estimates) != before:
-            self.note("mutates", f"it changed the metrics it was given, in {where}")
-            return None
-        if {name: dict(moves) for name, moves in self.problem.candidates.items()} != (
-            self.placements
-        ):
-            self.note("mutates", f"it changed the candidates of the problem, in {where}")
-            return None
-        return self.judge(answers[0], incumbent, where)
+            self.stop("mutates", f"it changed the metrics it was given, in {where}")
+        if _placements(self.problem) != self.placements:
+            self.stop("mutates", f"it changed the candidates of the problem, in {where}")
+        return answer
 
-    def judge(self, answer: object, incumbent: str, where: str) -> tuple[str, object] | None:
-        """Return the name decided and what can be compared, or None where there is no name."""
+    def judge(self, answer: object, incumbent: str, where: str) -> str:
+        """Return the name that was decided."""
         name = answer.name if isinstance(answer, Decision) else answer
         if not isinstance(name, str):
-            self.note(
+            self.stop(
                 "answer",
                 f"it returned {answer!r} in {where}; it must return a Decision, or the name of a "
                 "candidate",
             )
-            return None
         if name not in self.placements:
-            self.note("answer", f"it chose {name!r} in {where}, {self.no_candidate()}")
-            return None
-        if not isinstance(answer, Decision):
-            return name, name
-        said = f"it returned a Decision for {name} in {where}"
-        if not isinstance(answer.placement, Mapping) or (
-            dict(answer.placement) != self.placements[name]
-        ):
-            self.note(
-                "placement",
-                f"{said} with another placement than that candidate's: {answer.placement!r}",
-            )
-        moves = name != incumbent
-        if answer.migrated is not moves:
-            self.note(
-                "migrated",
-                f"{said} with migrated={answer.migrated!r}, when {incumbent} was the incumbent",
-            )
-        self.judge_reason(answer, moves, said)
-        self.judge_record(answer, said)
-        costs = tuple((candidate, repr(value)) for candidate, value in answer.costs.items())
-        record = (name, answer.migrated, answer.reason, answer.dwell, repr(answer.delta_j), costs)
-        return name, record
+            self.stop("answer", f"it chose {name!r} in {where}, {self.no_candidate}")
+        if isinstance(answer, Decision):
+            for kind, fault in _contradictions(answer, incumbent, self.placements):
+                self.note(kind, f"it returned a Decision for {name} in {where} {fault}")
+        return name
 
-    def judge_reason(self, decision: Decision, moves: bool, said: str) -> None:
-        """Compare the reason with what the decision does."""
-        reasons = get_args(Reason)
-        if decision.reason not in reasons:
-            known = ", ".join(reasons)
-            self.note(
-                "reason", f"{said} with reason {decision.reason!r}; it must be one of {known}"
-            )
-        elif (decision.reason in ("migrate", "capped")) > moves or moves > (
-            decision.reason in ("migrate", "capped", "infeasible", "guard")
-        ):
-            verb = "migrates" if moves else "stays"
-            self.note("reason", f"{said} that {verb}, with reason {decision.reason!r}")
-
-    def judge_record(self, decision: Decision, said: str) -> None:
-        """Check what is only recorded: dwell and costs."""
-        dwell = decision.dwell
-        if isinstance(dwell, bool) or not isinstance(dwell, int) or dwell < 0:
-            self.note("dwell", f"{said} with dwell {dwell!r}; it must be a whole number from 0")
-        for candidate, value in decision.costs.items():
-            if candidate not in self.placements or not math.isfinite(value):
-                self.note(
-                    "costs",
-                    f"{said} with the cost {value!r} for {candidate!r}; costs are finite and for "
-                    "candidates only",
-                )
-
-    def call(self, method: str, act: Callable[[], object], where: str) -> bool:
-        """Return whether a call came back; note it where it did not."""
+    def call(
+        self, name: str, where: str, method: Callable[..., object], *args: object, **named: object
+    ) -> object:
+        """Return what a method of the policy returns."""
         try:
-            with _bounded(MAX_LINES):
-                act()
+            with _limited(LIMIT_S):
+                return method(*args, **named)
         except _EndlessError:
-            self.note(
-                "endless", f"{method}() did not return within {MAX_LINES} lines of work in {where}"
-            )
-            return False
+            self.stop("endless", f"{name}() did not return within {LIMIT_S:g} s of CPU in {where}")
         except Exception as error:
-            self.note(f"raises {method}", f"{method}() raised {error!r} in {where}")
-            return False
-        return True
+            self.stop(f"raises {name}", f"{name}() raised {error!r} in {where}")
 
-    def no_candidate(self) -> str:
-        return f"which is no candidate (candidates: {', '.join(self.placements)})"
+
+def _placements(problem: Problem) -> dict[str, dict[str, str]]:
+    return {name: dict(moves) for name, moves in problem.candidates.items()}
+
+
+def _contradictions(
+    decision: Decision, incumbent: str, placements: Mapping[str, Mapping[str, str]]
+) -> Iterator[tuple[str, str]]:
+    """Yield the kind of each contradiction within a decision, and what is wrong."""
+    placement, reason, dwell = decision.placement, decision.reason, decision.dwell
+    if not isinstance(placement, Mapping) or dict(placement) != placements[decision.name]:
+        yield "placement", f"with another placement than that candidate's: {placement!r}"
+    moves = decision.name != incumbent
+    if decision.migrated is not moves:
+        yield (
+            "migrated",
+            f"with migrated={decision.migrated!r}, when {incumbent} was the incumbent",
+        )
+    fitting = ("migrate", "capped") if moves else ("dwell", "hold")
+    if reason not in REASONS:
+        yield "reason", f"with reason {reason!r}; it must be one of {', '.join(REASONS)}"
+    elif reason not in (*fitting, "infeasible", "guard"):
+        yield "reason", f"that {'migrates' if moves else 'stays'}, with reason {reason!r}"
+    if isinstance(dwell, bool) or not isinstance(dwell, int) or dwell < 0:
+        yield "dwell", f"with dwell {dwell!r}; it must be a whole number from 0"
+    for candidate, value in decision.costs.items():
+        if candidate not in placements or not math.isfinite(value):
+            yield (
+                "costs",
+                f"with the cost {value!r} for {candidate!r}; costs are finite and for candidates "
+                "only",
+            )
 
 
 @contextmanager
-def _bounded(lines: int) -> Iterator[None]:
-    """Raise _EndlessError inside the block once it has executed more than `lines` lines."""
-    executed = 0
+def _limited(seconds: float) -> Iterator[None]:
+    """Raise _EndlessError inside the block once it has taken so much CPU time."""
 
-    def trace(frame: FrameType, event: str, argument: Any) -> TraceFunction:
-        nonlocal executed
-        if event == "line":
-            executed += 1
-            if executed > lines:
-                raise _EndlessError
-        return trace
+    def stop(number: int, frame: FrameType | None) -> NoReturn:
+        raise _EndlessError
 
-    before = sys.gettrace()
-    sys.settrace(trace)
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGVTALRM, stop)
+    signal.setitimer(signal.ITIMER_VIRTUAL, seconds)
     try:
         yield
     finally:
-        sys.settrace(before)
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
+        signal.signal(signal.SIGVTALRM, before)
 
 
 def _situations(problem: Problem) -> Iterator[Situation]:
     """Yield the awkward windows for a problem's candidates and resources."""
     names = list(problem.candidates)
-    resources = list(problem.fabric.resources)
     deadline, bound = problem.pipeline.deadline_ms, problem.censor_ms
     caps = problem.objective.caps
 
     def qos(l95_ms: float, violation_rate: float, used: float) -> QoS:
-        return QoS(l95_ms, violation_rate, dict.fromkeys(resources, used))
+        return QoS(l95_ms, violation_rate, dict.fromkeys(problem.fabric.resources, used))
 
-    def alike(l95_ms: float, violation_rate: float, used: float) -> Window:
-        return dict.fromkeys(names, qos(l95_ms, violation_rate, used))
+    def alike(l95_ms: float, violation_rate: float, used: float) -> tuple[Window, ...]:
+        return (dict.fromkeys(names, qos(l95_ms, violation_rate, used)),) * SHORT
 
-    def best(winner: str) -> Window:
-        good, bad = qos(0.5 * deadline, 0.0, 0.2), qos(3 * deadline, 1.0, 0.9)
-        return {name: good if name == winner else bad for name in names}
-
+    good, bad = qos(0.5 * deadline, 0.0, 0.2), qos(3 * deadline, 1.0, 0.9)
+    best = [{name: good if name == winner else bad for name in names} for winner in names]
+    turns = tuple(best[k % len(names)] for k in range(SHORT))
     over_ms = 2 * caps.latency_ms if math.isfinite(caps.latency_ms) else bound
     over = 2 * caps.utilisation if math.isfinite(caps.utilisation) else 1.0
-    turns = tuple(best(names[k % len(names)]) for k in range(SHORT))
-    yield Situation("all metrics zero", (alike(0.0, 0.0, 0.0),) * SHORT)
-    yield Situation("every node saturated", (alike(0.8 * deadline, 0.0, 1.0),) * SHORT)
-    yield Situation("latencies at their bound", (alike(bound, 1.0, 0.5),) * SHORT)
-    yield Situation("every candidate over its caps", (alike(over_ms, 1.0, over),) * SHORT)
-    yield Situation("ties", (alike(0.8 * deadline, 0.02, 0.4),) * SHORT)
+    yield Situation("all metrics zero", alike(0.0, 0.0, 0.0))
+    yield Situation("every node saturated", alike(0.8 * deadline, 0.0, 1.0))
+    yield Situation("latencies at their bound", alike(bound, 1.0, 0.5))
+    yield Situation("every candidate over its caps", alike(over_ms, 1.0, over))
+    yield Situation("ties", alike(0.8 * deadline, 0.02, 0.4))
     yield Situation("another candidate is the best in every window", turns)
     yield Situation("estimates with large errors", tuple(map(_uncertain, turns)))
     yield Situation("a random walk", tuple(_walk(problem, LONG)))

@@ -5,7 +5,6 @@ Whatever is made for a trial is removed at once; nothing is changed that stays.
 
 from __future__ import annotations
 
-import gzip
 import math
 import os
 import shutil
@@ -92,7 +91,6 @@ def examine(problems: Sequence[Problem] = (), *, watch_s: float = 0.0) -> list[F
         _cores(problems),
         _stress_ng(),
         _pressure(),
-        _netem(),
         _fifo(),
         *([_standstill(problems, watch_s)] if watch_s > 0 else ()),
     ]
@@ -235,33 +233,6 @@ def _pressure() -> Finding:
         found = f"/proc/pressure/cpu: {error.strerror}"
         return Finding(name, False, found, "boot with psi=1", needed=False)
     return Finding(name, True, "/proc/pressure/cpu", needed=False)
-
-
-def _netem() -> Finding:
-    """Look it up without a trial: that would load the module, and leave it loaded."""
-    name = "tc netem"
-    if Path("/sys/module/sch_netem").exists() or "CONFIG_NET_SCH_NETEM=y" in _configuration():
-        return Finding(name, True, "in this kernel", needed=False)
-    if _module("sch_netem"):
-        return Finding(name, True, "a module of this kernel", needed=False)
-    found = "not in this kernel; links do without: delays and losses are Dwell's own"
-    return Finding(name, False, found, needed=False)
-
-
-def _configuration() -> str:
-    release = os.uname().release
-    with suppress(OSError):
-        return gzip.decompress(Path("/proc/config.gz").read_bytes()).decode()
-    with suppress(OSError):
-        return Path(f"/boot/config-{release}").read_text()
-    return ""
-
-
-def _module(name: str) -> bool:
-    folder = Path("/lib/modules", os.uname().release)
-    with suppress(OSError):
-        return f"/{name}.ko" in (folder / "modules.dep").read_text()
-    return False
 
 
 def _fifo() -> Finding:
