@@ -345,7 +345,7 @@ VALUES: list[tuple[tuple[str | int, ...], object, str, tuple[str, ...]]] = [
     (("controller", "fallbacks"), ["LOC", "HY"], "controller.fallbacks[1]", ("'HY'", "'HYB'?")),
     (("controller", "fallbacks"), "LOC", "controller.fallbacks", ("'LOC'", "a list")),
     (("controller", "estimator"), "oracle", "controller.estimator", ("'oracle'", "profile")),
-    (("controller", "estimator"), "shadows", "controller.estimator", ("'shadows'", "corrected")),
+    (("controller", "estimator"), "shadows", "controller.estimator", ("'shadows'", "'shadow'?")),
     (("controller", "escape"), "no", "controller.escape", ("'no'", "true or false")),
     (("controller", "shadow_fraction"), -1, "controller.shadow_fraction", ("-1", "from 0 to 1")),
     (("controller", "half_life_windows"), 0, "controller.half_life_windows", ("0", "above 0")),

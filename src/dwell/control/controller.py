@@ -92,8 +92,9 @@ class Proposal:
 class Controller:
     """Windows in, orders out: aggregation, estimator and policy in one object.
 
-    A window is decided on by `propose`, which changes nothing but what the estimator has learnt.
-    What becomes of the proposal is told once, when it is known:
+    A window is decided on by `propose`, which changes nothing but what the estimator has learnt
+    (and what an object of a user's does to itself, where no fallback of the guard's holds). What
+    becomes of the proposal is told once, when it is known:
 
     ==========  ======================================  ========================================
     told by     when                                    the policy is

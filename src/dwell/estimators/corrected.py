@@ -19,6 +19,7 @@ Age
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import ClassVar
 
 from dwell.estimators.learning import Learning
@@ -53,8 +54,8 @@ class Corrected(Learning):
     MEMORY: ClassVar[float] = 6.0
     UNSEEN: ClassVar[float] = 60.0
 
-    def _correct(self, changed: set[Part], measured: frozenset[Part]) -> None:
-        for place in {_place(part) for part in changed}:
+    def _correct(self, changed: Sequence[Part], measured: frozenset[Part]) -> None:
+        for place in dict.fromkeys(map(_place, changed)):
             here = [part for part in changed if _place(part) == place]
             surest = self._pools[max(here, key=lambda part: self._pools[part].measured)]
             for part, pool in self._pools.items():

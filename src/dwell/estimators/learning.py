@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import ClassVar, TypeAlias
 
 import numpy as np
@@ -80,12 +80,12 @@ class Learning(Online):
 
     def _take_in(self, demands: Mapping[Part, Floats], evidence: Evidence) -> None:
         self._window += 1
-        changed = set()
+        changed: list[Part] = []
         for part, values in demands.items():
             pool = self._pools[part]
             # To whole nanoseconds, as everything is measured: equal values must be ties.
             if pool.learn(np.round(values, 6), self._window, self.memory):
-                changed.add(part)
+                changed.append(part)
             self._has_grown |= not pool.is_declared
         for pool in self._pools.values():
             if pool.touched and self._window - pool.touched >= max(self.unseen, 1.0):
@@ -96,7 +96,7 @@ class Learning(Online):
             self._has_changed = True
             self._correct(changed, frozenset(demands))
 
-    def _correct(self, changed: set[Part], measured: frozenset[Part]) -> None:
+    def _correct(self, changed: Sequence[Part], measured: frozenset[Part]) -> None:
         """Correct what nobody measured by what has changed."""
 
     def _otherwise(self) -> dict[Part, Floats]:

@@ -512,7 +512,7 @@ def _played_as_declared(problem: Problem, seed: int) -> Declared:
     references: dict[Part, Reference] = {}
     l95_ms, violation_rate = {}, {}
     for index, (name, placement) in enumerate(problem.candidates.items()):
-        missing = set(parts_of(problem.pipeline, placement)) - set(references)
+        missing = [part for part in parts_of(problem.pipeline, placement) if part not in references]
         arrays = (logged if missing else plain).copy()
         arrays.replace(stamps=np.full_like(arrays.tables.stamps, index))
         play(arrays)

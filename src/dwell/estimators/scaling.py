@@ -27,7 +27,7 @@ What is bounded
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import ClassVar, TypeAlias
 
@@ -134,7 +134,7 @@ class Scaling(Learning):
             self._longest[site] = order_statistic(declared) if len(declared) else 0.0
         return np.where(np.isnan(alone_ms), self._longest[site], alone_ms)
 
-    def _correct(self, changed: set[Part], measured: frozenset[Part]) -> None:
+    def _correct(self, changed: Sequence[Part], measured: frozenset[Part]) -> None:
         sites = [part for part in changed if isinstance(part, Site)]
         # The surest one has the last word.
         for site in sorted(sites, key=lambda site: (self._pools[site].measured, site)):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dwell.errors import Fault, ProblemError
-from dwell.model.bounds import CYCLES, LENGTH_S, short
+from dwell.model.bounds import CYCLES, LENGTH_S, counted, short
 
 #: Later than every instant of people, longer than every latency; the sum with any of them fits 64
 #: bits.
@@ -31,7 +31,7 @@ def require_length(
         If they are too many, or last too long.
     """
     cycles = windows * window_cycles
-    product = f"{windows} windows of window_cycles = {window_cycles}"
+    product = f"{counted(windows, 'window')} of window_cycles = {window_cycles}"
     if not CYCLES.holds(cycles):
         message = f"{product} are {cycles} cycles; a run has at most {CYCLES.high}: ask for less"
         raise ProblemError([Fault(asked, message)])

@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 NAME = re.compile(r"\w[\w.+:-]*(?: [\w.+:-]+)*")
 NAME_SIGN = re.compile(r"[\w.+:\- ]")
 LONGEST_NAME = 64
+#: What a cell has at least one of.
+NEEDED = frozenset({"node", "task", "candidate"})
 # How far shares may sum up beyond 1 by rounding.
 SHARE_TOLERANCE = 1e-9
 
@@ -154,6 +156,9 @@ def find_unregistered(
 
 def _unknown(path: str, what: str, word: str, known: Iterable[str]) -> Iterator[Fault]:
     names = list(known)
+    if not names and what in NEEDED:
+        # That there is none is told once.
+        return
     if word not in names:
         # Decomposed, a name looks like the one that is declared.
         twin = unicodedata.normalize("NFC", word) in names and bad_name(word)
@@ -252,8 +257,8 @@ def _flows(parts: CellParts) -> Iterator[Fault]:
         yield from _unknown(f"{path}.to", "task", flow.target, parts.tasks)
         pair = (flow.source, flow.target)
         if pair in seen:
-            where = f"(first at {seen[pair]})"
-            yield Fault(path, f"flow {flow.source} -> {flow.target} is declared again {where}")
+            again = f"flow {flow.source} -> {flow.target} is declared again"
+            yield Fault(path, f"{again} (first at {seen[pair]}); keep one")
         seen.setdefault(pair, path)
     loop = _cycle(parts.tasks, [flow for _, flow in parts.flows])
     if loop:
@@ -446,10 +451,9 @@ def _registered(
     if not is_class_path(settings.policy):
         known = [*policies, *names]
         yield from _unknown("controller.policy", "policy", settings.policy, known)
-    if settings.estimator not in estimators and not is_class_path(settings.estimator):
-        bound = f"one of {', '.join(estimators)}"
-        message = f"{shown(settings.estimator)} is not allowed; it must be {bound}"
-        yield Fault("controller.estimator", message)
+    if not is_class_path(settings.estimator):
+        path = "controller.estimator"
+        yield from _unknown(path, "estimator", settings.estimator, estimators)
     if settings.estimator in shadowing:
         yield from _shadow_budget(settings, len(names))
 
