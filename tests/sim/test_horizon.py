@@ -84,7 +84,7 @@ def test_a_run_that_no_memory_holds_is_refused_before_it_is_drawn() -> None:
 
 
 def test_a_cell_of_which_no_window_fits_is_refused_when_it_is_made() -> None:
-    with pytest.raises(ProblemError, match=r"window_cycles: 1 windows of window_cycles = 10000 "):
+    with pytest.raises(ProblemError, match=r"window_cycles: 1 window of window_cycles = 10000 "):
         alone(1, node=E, period_ms=LONG_MS, window_cycles=10_000)
 
 
