@@ -190,9 +190,10 @@ def test_the_doctor_and_completion_work_without_any_extra(
     shutil.copy(ROOT / "examples" / "live" / "cell.yaml", tmp_path)
     looked = run(python, "-m", "dwell", "doctor", "cell.yaml", cwd=tmp_path)
     assert looked.returncode == 0, looked.stderr
-    line = "dwell live pin --cell cell.yaml H"
-    told = run(python, "-m", "dwell", cwd=tmp_path, DWELL_COMPLETE=line)
-    assert told.stdout == "HYB\n"
+    words = "dwell live pin --cell cell.yaml H"
+    asked = {"_DWELL_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": "5"}
+    told = run(python, "-m", "dwell", cwd=tmp_path, **asked)
+    assert told.stdout.strip() == "HYB"
 
 
 def test_a_stranger_s_way_from_the_wheel_to_a_report_of_his_own_policy(
