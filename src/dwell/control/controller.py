@@ -6,6 +6,7 @@ import copy
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from operator import add
 from typing import TypeAlias
 
@@ -190,7 +191,7 @@ class Controller:
         """The policy that decides: a copy of what was given."""
         return self._policy.given
 
-    @property
+    @cached_property
     def decision_columns(self) -> tuple[str, ...]:
         """Names of the columns of ``decisions``, but the last.
 

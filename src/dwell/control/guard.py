@@ -416,6 +416,11 @@ class Guard:
         self._silence.forget()
 
 
+def _patience_ns(problem: Problem) -> int:
+    """Longest wait of a cell for a cycle: g periods."""
+    return problem.controller.guard_cycles * round(problem.pipeline.period_ms * 1e6)
+
+
 def parts_of(problem: Problem, candidate: str) -> frozenset[str]:
     """Return the names of all that must be there for a candidate to be whole.
 
@@ -514,9 +519,8 @@ class Failures:
     @classmethod
     def of(cls, problem: Problem) -> Failures:
         """Make that of a cell: g + 1 in a row, each g periods old."""
-        settings = problem.controller
-        patience_ns = settings.guard_cycles * round(problem.pipeline.period_ms * 1e6)
-        return cls(problem.candidates, settings.failures_in_a_row, patience_ns)
+        in_a_row = problem.controller.failures_in_a_row
+        return cls(problem.candidates, in_a_row, _patience_ns(problem))
 
     def released(self, candidate: str, cycle: int, at_ns: int) -> None:
         """Note that a cycle, or its shadow, has been sent through a candidate."""
@@ -602,11 +606,10 @@ class Probation:
     @classmethod
     def of(cls, problem: Problem) -> Probation:
         """Make that of a cell: ten windows completed are a stretch of health."""
-        settings = problem.controller
         return cls(
-            settings.probe_cycles,
+            problem.controller.probe_cycles,
             health_cycles=HEALTH_WINDOWS * problem.window_cycles,
-            patience_ns=settings.guard_cycles * round(problem.pipeline.period_ms * 1e6),
+            patience_ns=_patience_ns(problem),
         )
 
     def __repr__(self) -> str:
