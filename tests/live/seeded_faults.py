@@ -42,7 +42,7 @@ from dwell.testbed.chaos.actuations import Seen
 from dwell.testbed.chaos.faults import Fault, PlannedFault, bound_of, faults_of, planned, struck
 from dwell.testbed.chaos.harness import RECENT_PERIODS, away_from_home
 from dwell.testbed.chaos.invariants import Judge
-from dwell.testbed.chaos.light_cell import CANDIDATES, document, exec_ms
+from dwell.testbed.chaos.light_cell import CANDIDATES, MIN_DWELL, document, exec_ms
 from dwell.testbed.chaos.stages import APPLY, FRAME_BYTES, HOLD, NODES, SAID, ZERO
 from dwell.testbed.chaos.strike import (
     RECOVERED_S,
@@ -163,7 +163,8 @@ class Touring:
         self.place = self.names.index(problem.initial)
 
     def adopt(self, name: str) -> None:
-        self.stayed = 0
+        # It goes on from there as soon as any policy may.
+        self.place, self.stayed = self.names.index(name), self.STAY - MIN_DWELL
 
     def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
         self.stayed += 1
