@@ -535,7 +535,7 @@ def play_stamped(
 ) -> Played:
     """Play a realisation with given stamps, without a controller."""
     problem, real = case.problem, case.real
-    arrays = lay_out([(problem, real)], log_jobs=True, shadows=shadows)
+    arrays = lay_out([(problem, real)], log_jobs=True, shadows=[shadows])
     codes: dict[str | None, int] = {name: i for i, name in enumerate(problem.candidates)}
     codes[None] = -1
     arrays.tables.stamps[0] = [codes[name] for name in stamps]

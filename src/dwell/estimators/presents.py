@@ -299,7 +299,7 @@ class Playing:
         if shadows is not None:
             sent = _with_own_demands(shadows.realisation)
             self._replaced.append((shadows.realisation, sent))
-        self._first = lay_out([(problem, self._real)], shadows=sent).copy()
+        self._first = lay_out([(problem, self._real)], shadows=[sent]).copy()
         tables = self._first.tables
         tables.clock[0]["pauses"] = 1
         self._declared_changes = tables.changes[tables.changes["at_ns"] < LAST_NS]
@@ -528,7 +528,7 @@ def _played_as_declared(problem: Problem, seed: int) -> Declared:
 def _with_shadows(problem: Problem, plain: Declared, shadow_fraction: float) -> Declared:
     """Play again with shadow jobs the candidates that are hindered by them."""
     shadows = SentShadows(problem, plain.realisation, shadow_fraction)
-    first = lay_out([(problem, plain.realisation)], shadows=shadows.realisation)
+    first = lay_out([(problem, plain.realisation)], shadows=[shadows.realisation])
     l95_ms, violation_rate = dict(plain.l95_ms), dict(plain.violation_rate)
     for index, name in enumerate(problem.candidates):
         if name in hindered(problem):

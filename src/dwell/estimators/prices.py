@@ -240,7 +240,8 @@ def price_of(
     problem: Problem, realisation: Realisation, name: str, shadows: SentShadows | None = None
 ) -> Price:
     """Price a candidate by its windows on one realisation."""
-    arrays = lay_out([(problem, realisation)], shadows=shadows.realisation if shadows else None)
+    sent = shadows.realisation if shadows else None
+    arrays = lay_out([(problem, realisation)], shadows=[sent])
     index = list(problem.candidates).index(name)
     arrays.replace(stamps=stamps_of(arrays, index, shadows))
     play(arrays)

@@ -163,7 +163,7 @@ def lay_out(
     shared: Collection[str] = (),
     log_jobs: bool = False,
     log_windows: bool = False,
-    shadows: Realisation | None = None,
+    shadows: Sequence[Realisation | None] = (),
 ) -> Arrays:
     """Build the tables of one or more cells.
 
@@ -176,8 +176,9 @@ def lay_out(
         Whether every job's instants are kept.
     log_windows : bool
         Whether those of a window are kept until it has closed.
-    shadows : Realisation, optional
-        Draws for the shadow jobs of a single cell (see `draw_shadows`); it gets a shadow then.
+    shadows : sequence of Realisation
+        By cell, draws for its shadow jobs (see `draw_shadows`): it gets a shadow then; None: it has
+        none.
     """
     return _Layout(cells, shared, log_jobs, log_windows, shadows).arrays()
 
@@ -191,11 +192,11 @@ class _Layout:
         shared: Collection[str],
         logs_all: bool,
         logs_windows: bool,
-        shadows: Realisation | None,
+        shadows: Sequence[Realisation | None],
     ) -> None:
         self.cells, self.shared = cells, frozenset(shared)
         self.logs_all, self.logs_windows = logs_all, logs_windows
-        self.shadows = shadows
+        self.shadows = shadows if any(one is not None for one in shadows) else ()
         self.reals = [real for _, real in cells]
         self.cycles = max(real.cycles for _, real in cells)
         self.max_tasks = max(len(problem.pipeline.tasks) for problem, _ in cells)
@@ -213,6 +214,7 @@ class _Layout:
         self.cell_servers: list[int] = []
         self.capacity: list[float] = []
         self.layers: list[dict[int, int]] = []
+        self.link_rows: list[dict[str, int]] = []
         self.segments: list[Rows] = []
         self.rates: list[Rows] = []
         self.n_segments = 0
@@ -226,9 +228,9 @@ class _Layout:
         for index, (problem, real) in enumerate(self.cells):
             self._add_nodes(index, problem, real)
             self._add_cell(index, problem, real)
-        if self.shadows is not None:
-            ((problem, _),) = self.cells
-            self._add_shadow(problem, self.shadows)
+        for index, shadow in enumerate(self.shadows):
+            if shadow is not None:
+                self._add_shadow(index, self.cells[index][0], shadow)
         self._check_keys()
         resources = tuple(tuple(problem.fabric.resources) for problem, _ in self.cells)
         return Arrays(self._tables(), resources, self.behind)
@@ -375,10 +377,10 @@ class _Layout:
         for name in names:
             outputs = [flow_row[flow.source, flow.target] for flow in pipeline.outputs(name)]
             self._add_task(pipeline, pipeline.tasks[name], outputs)
-        link_row = self._add_links(problem, real)
-        self._add_hops(problem, real, link_row)
+        self.link_rows.append(self._add_links(problem, real))
+        self._add_hops(problem, real, self.link_rows[index])
         self._add_candidates(index, index, problem, real, hop_0)
-        if self.shadows is not None:
+        if self.shadows:
             self._add_pairs(problem)
         self._add_changes(index, NodeChanges.of(real.node_changes))
 
@@ -407,24 +409,27 @@ class _Layout:
             for other in problem.candidates.values():
                 self.shadow_parts.append(shadow_parts(problem.pipeline, active, other))
 
-    def _add_shadow(self, problem: Problem, real: Realisation) -> None:
-        """Add the shadow of the only cell: workers and draws of its own, all else shared."""
-        parent = self.rows["cells"][0]
-        parent["shadow"] = 1
+    def _add_shadow(self, index: int, problem: Problem, real: Realisation) -> None:
+        """Add the shadow of a cell: workers and draws of its own, all else shared."""
+        cells = self.rows["cells"]
+        row, parent = len(cells), cells[index]
+        parent["shadow"] = row
         # Its windows never close.
         shadow = {"candidate_0": len(self.site_of), "close_cycle": real.cycles + 1}
-        self.rows["cells"].append(parent | shadow | {"shadow": -1, "parent": 0})
+        cells.append(parent | shadow | {"shadow": -1, "parent": index})
         self.reals.append(real)
         for node, kind in list(self.server_row):
             self._add_below(node, kind)
         hop_0 = len(self.rows["hops"])
-        self._add_hops(problem, real, {name: i for i, name in enumerate(problem.fabric.links)})
-        self._add_candidates(1, 0, problem, real, hop_0)
+        self._add_hops(problem, real, self.link_rows[index])
+        self._add_candidates(row, index, problem, real, hop_0)
 
     def _add_below(self, node: int, kind: str | None) -> None:
-        """Add what own jobs leave of a server."""
+        """Add what own jobs leave of a server, unless it is there."""
         row = self.server_row[node, kind]
         above = self.rows["servers"][row]
+        if above["below"] >= 0:
+            return
         turns = above["scheduler"] == Scheduler.TURNS
         above["below"] = len(self.rows["servers"])
         below = {"above": row, "below": -1, "quota": -1, "background": 0.0}
@@ -646,7 +651,7 @@ class _Layout:
             opened=np.zeros((cells, windows, 3, self.max_resources)),
             closed=np.zeros((cells, windows, 3, self.max_resources)),
             shares=np.zeros((cells, windows, 3, self.max_resources)),
-            shadow_bytes=np.zeros(cycles if self.shadows is not None else 0, np.int64),
+            shadow_bytes=np.zeros((len(self.shadows), cycles), np.int64),
             log_outcome=np.zeros(logged * self.max_tasks, np.int8),
             log_arrived=np.full((logged, self.max_flows), -1, np.int64),
         )

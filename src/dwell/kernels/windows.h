@@ -24,11 +24,13 @@ template <class S>
     if (!has_below(s, server)) continue;
     Server& below = s.servers[server.below];
     tick(s, below, now);
+    out[i] += below.busy_ns * below.pace + below.behind_ns;
+    if (of.shadow < 0) continue;
     f64 extra = s.own_ns[of.shadow * n_resources + i];
     for (i64 at = 0; at < below.n_run + below.n_wait; ++at) {
-      extra += progress(s, below, at).received_ns;
+      const Progress found = progress(s, below, at);
+      if (cell_of(found.key) == of.shadow) extra += found.received_ns;
     }
-    out[i] += below.busy_ns * below.pace + below.behind_ns;
     out[2 * n_resources + i] = extra;
   }
 }

@@ -169,7 +169,7 @@ def _play(
         # Probes may be of any cycle.
         shadows = draw_shadows(problem, realisation, plan.sent, others=guarded)
     arrays = lay_out(
-        [(problem, realisation)], log_jobs=jobs, log_windows=controller.learns, shadows=shadows
+        [(problem, realisation)], log_jobs=jobs, log_windows=controller.learns, shadows=[shadows]
     )
     stamper = _Stamper(problem, realisation, controller, arrays, plan, guarded=guarded)
     if not (guarded or by_window or any(stamper.host_down)):

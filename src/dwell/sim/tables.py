@@ -210,7 +210,7 @@ def _shadow_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray
         return {}
 
     def sent_bytes() -> Ints:
-        sent = played.by_window(played.arrays.tables.shadow_bytes)
+        sent = played.by_window(played.arrays.tables.shadow_bytes[0])
         # What 64 bits do not hold is as good as that.
         held = sent.sum(axis=1, dtype=np.float64) < HORIZON_NS
         return np.where(held, sent.sum(axis=1), HORIZON_NS)
