@@ -24,7 +24,7 @@ from dwell.estimators.pool import Reference
 from dwell.estimators.prices import SEED, Question, prices_of, unseen_error
 from dwell.estimators.sent_shadows import SentShadows, hindered, stamps_of
 from dwell.kernels.advance import logged_instants, play
-from dwell.kernels.arrays import Arrays, flow_rows, lay_out
+from dwell.kernels.arrays import Arrays, CellArrays, flow_rows, lay_out
 from dwell.kernels.codes import LAST_NS
 from dwell.kernels.random_draws import Drawing
 from dwell.kernels.realisation import NodeChange, NodeChanges, Realisation
@@ -553,7 +553,7 @@ def _shown(problem: Problem, arrays: Arrays) -> tuple[Floats, Floats]:
 def _evidence_of(problem: Problem, real: Realisation, arrays: Arrays, index: int) -> Evidence:
     """What all cycles show that have run under a candidate."""
     flows = flow_rows(problem.pipeline)
-    (instants,) = logged_instants(arrays, 0, real.cycles, flows)
+    (instants,) = logged_instants(CellArrays(arrays), 0, real.cycles, flows)
     return Evidence(
         close_ns=int(real.release_ns[-1]),
         release_ns=real.release_ns[:-1],

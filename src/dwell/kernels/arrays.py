@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,26 +34,49 @@ LINE = 64
 COUNTED = "quota_ns", "stressed_ns", "slack_ns", "least_ns", "drawn_ns"
 
 
+class CellPart(NamedTuple):
+    """Where a cell is in the kernel's tables.
+
+    Parameters
+    ----------
+    row, rows : int
+        Its row, and how many it has: two where a shadow is behind it.
+    cycles, windows, tasks, flows, resources, candidates : int
+        How many it has of them.
+    candidate_0, hop_0, site_0 : int
+        Rows of its first candidate, hop and site.
+    """
+
+    row: int
+    rows: int
+    cycles: int
+    windows: int
+    tasks: int
+    flows: int
+    resources: int
+    candidate_0: int
+    candidates: int
+    hop_0: int
+    site_0: int
+
+
 class Arrays:
-    """The kernel's tables, with the names of their rows.
+    """The kernel's tables, and where each cell is in them.
 
     Attributes
     ----------
     tables : Tables
         What the kernel works on; replaced as a whole when a part of it grows.
-    resources : tuple of tuple of str
-        By cell: its resources, in the order of the snapshots' columns.
+    parts : tuple of CellPart
+        By cell.
     address : int
         What the kernel is handed.
     """
 
     def __init__(
-        self,
-        tables: Tables,
-        resources: tuple[tuple[str, ...], ...],
-        behind: Sequence[Ints],
+        self, tables: Tables, parts: tuple[CellPart, ...], behind: Sequence[Ints]
     ) -> None:
-        self.resources = resources
+        self.parts = parts
         # Rows have addresses in these.
         self._behind = behind
         self._use(tables)
@@ -67,7 +90,7 @@ class Arrays:
 
     def copy(self) -> Arrays:
         """Return tables that share what is fixed with these, and have a state of their own."""
-        other = Arrays(self.tables, self.resources, self._behind)
+        other = Arrays(self.tables, self.parts, self._behind)
         other.restart(self)
         return other
 
@@ -157,6 +180,55 @@ class Arrays:
         self._use(t._replace(**{name: larger(table) for name, table in rings.items()}))
 
 
+#: Tables of which every cell has a row.
+BY_CELL = (
+    *("cells", "stamps", "latency_ns", "compute_ns", "network_ns", "outcome"),
+    *("opened", "closed", "seen", "shares"),
+)
+
+
+class CellArrays:
+    """A cell's part of the kernel's tables: it is row 0 of each, and its shadow row 1.
+
+    Parameters
+    ----------
+    whole : Arrays
+    index : int
+        Which of the cells.
+    """
+
+    def __init__(self, whole: Arrays, index: int = 0) -> None:
+        self.whole, self.part = whole, whole.parts[index]
+        self._of: Tables | None = None
+        self._tables = whole.tables
+
+    @property
+    def tables(self) -> Tables:
+        """The tables as if there were no other cell."""
+        whole, part = self.whole.tables, self.part
+        if whole is not self._of:
+            self._of = whole
+            own, cycles = slice(part.row, part.row + part.rows), slice(part.cycles)
+            candidates = slice(part.candidate_0, part.candidate_0 + part.candidates)
+            rows = {name: getattr(whole, name)[own] for name in BY_CELL}
+            for name in ("opened", "closed", "shares"):
+                rows[name] = rows[name][:, : part.windows, :, : part.resources]
+            if len(whole.shadow_bytes):
+                rows["shadow_bytes"] = whole.shadow_bytes[part.row, cycles]
+            self._tables = whole._replace(
+                **rows, site_of=whole.site_of[candidates, : part.tasks], back_ns=whole.back_ns[candidates]
+            )
+        return self._tables
+
+    def logs(self) -> tuple[Rows, NDArray[np.int8]]:
+        """Return every job's instants and outcome, shape (rows, cycles, tasks), where all are kept."""
+        whole, part = self.whole.tables, self.part
+        own = slice(part.row, part.row + part.rows), slice(part.cycles), slice(part.tasks)
+        clock = whole.clock[0]
+        shape = -1, int(clock["n_cycles"]), int(clock["n_tasks"])
+        return whole.log.reshape(shape)[own], whole.log_outcome.reshape(shape)[own]
+
+
 def lay_out(
     cells: Sequence[tuple[Problem, Realisation]],
     *,
@@ -197,7 +269,6 @@ class _Layout:
         self.cells, self.shared = cells, frozenset(shared)
         self.logs_all, self.logs_windows = logs_all, logs_windows
         self.shadows = shadows if any(one is not None for one in shadows) else ()
-        self.reals = [real for _, real in cells]
         self.cycles = max(real.cycles for _, real in cells)
         self.max_tasks = max(len(problem.pipeline.tasks) for problem, _ in cells)
         self.max_flows = max(len(problem.pipeline.flows) for problem, _ in cells)
@@ -214,6 +285,9 @@ class _Layout:
         self.cell_servers: list[int] = []
         self.capacity: list[float] = []
         self.layers: list[dict[int, int]] = []
+        #: By cell: its row in the kernel's tables, its first hop and site, and its links.
+        self.cell_rows: list[int] = []
+        self.firsts: list[tuple[int, int]] = []
         self.link_rows: list[dict[str, int]] = []
         self.segments: list[Rows] = []
         self.rates: list[Rows] = []
@@ -226,14 +300,36 @@ class _Layout:
 
     def arrays(self) -> Arrays:
         for index, (problem, real) in enumerate(self.cells):
+            self.cell_rows.append(len(self.rows["cells"]))
             self._add_nodes(index, problem, real)
             self._add_cell(index, problem, real)
-        for index, shadow in enumerate(self.shadows):
-            if shadow is not None:
-                self._add_shadow(index, self.cells[index][0], shadow)
+            if self.shadows and (shadow := self.shadows[index]) is not None:
+                self._add_shadow(index, problem, shadow)
         self._check_keys()
-        resources = tuple(tuple(problem.fabric.resources) for problem, _ in self.cells)
-        return Arrays(self._tables(), resources, self.behind)
+        return Arrays(self._tables(), self._parts(), self.behind)
+
+    def _parts(self) -> tuple[CellPart, ...]:
+        """Return where each cell is in the tables."""
+        ends = [*self.cell_rows[1:], len(self.rows["cells"])]
+        cells = self.rows["cells"]
+        return tuple(
+            CellPart(
+                row=row,
+                rows=end - row,
+                cycles=real.cycles,
+                windows=real.windows,
+                tasks=len(problem.pipeline.tasks),
+                flows=len(problem.pipeline.flows),
+                resources=len(problem.fabric.resources),
+                candidate_0=cells[row]["candidate_0"],
+                candidates=len(problem.candidates),
+                hop_0=hop_0,
+                site_0=site_0,
+            )
+            for (problem, real), row, end, (hop_0, site_0) in zip(
+                self.cells, self.cell_rows, ends, self.firsts, strict=True
+            )
+        )
 
     def _addresses(self, table: Ints) -> list[int]:
         """Return the address of every row of a realisation's table."""
@@ -338,6 +434,7 @@ class _Layout:
         pipeline, release_ns = problem.pipeline, real.release_ns
         resources = problem.fabric.resources.values()
         names, hop_0 = list(pipeline.tasks), len(self.rows["hops"])
+        self.firsts.append((hop_0, len(self.rows["sites"])))
         due_ns, grace_ns = close_after_ns(problem)
         self.end_ns = max(self.end_ns, int(release_ns[-1]) + grace_ns, int(release_ns[-2]) + due_ns)
         cell = {
@@ -379,17 +476,23 @@ class _Layout:
             self._add_task(pipeline, pipeline.tasks[name], outputs)
         self.link_rows.append(self._add_links(problem, real))
         self._add_hops(problem, real, self.link_rows[index])
-        self._add_candidates(index, index, problem, real, hop_0)
+        self._add_candidates(index, problem, real, hop_0)
         if self.shadows:
             self._add_pairs(problem)
         self._add_changes(index, NodeChanges.of(real.node_changes))
 
     def _add_candidates(
-        self, cell: int, index: int, problem: Problem, real: Realisation, hop_0: int
+        self,
+        index: int,
+        problem: Problem,
+        real: Realisation,
+        hop_0: int,
+        *,
+        of_shadow: bool = False,
     ) -> None:
         """Add where the tasks run and the flows cross under every candidate."""
         names = list(problem.pipeline.tasks)
-        site_row = self._add_sites(cell, index, problem, real, names)
+        site_row = self._add_sites(index, problem, real, names, of_shadow)
         hop_row = {hop: hop_0 + i for i, hop in enumerate(real.hops)}
         for placement in problem.candidates.values():
             on = [site_row[name, placement[name]] for name in names]
@@ -412,17 +515,17 @@ class _Layout:
     def _add_shadow(self, index: int, problem: Problem, real: Realisation) -> None:
         """Add the shadow of a cell: workers and draws of its own, all else shared."""
         cells = self.rows["cells"]
-        row, parent = len(cells), cells[index]
-        parent["shadow"] = row
+        row = self.cell_rows[index]
+        parent = cells[row]
+        parent["shadow"] = row + 1
         # Its windows never close.
         shadow = {"candidate_0": len(self.site_of), "close_cycle": real.cycles + 1}
-        cells.append(parent | shadow | {"shadow": -1, "parent": index})
-        self.reals.append(real)
+        cells.append(parent | shadow | {"shadow": -1, "parent": row})
         for node, kind in list(self.server_row):
             self._add_below(node, kind)
         hop_0 = len(self.rows["hops"])
         self._add_hops(problem, real, self.link_rows[index])
-        self._add_candidates(row, index, problem, real, hop_0)
+        self._add_candidates(index, problem, real, hop_0, of_shadow=True)
 
     def _add_below(self, node: int, kind: str | None) -> None:
         """Add what own jobs leave of a server, unless it is there."""
@@ -460,10 +563,11 @@ class _Layout:
         self.outputs += outputs
 
     def _add_sites(
-        self, cell: int, index: int, problem: Problem, real: Realisation, names: list[str]
+        self, index: int, problem: Problem, real: Realisation, names: list[str], of_shadow: bool
     ) -> dict[tuple[str, str], int]:
-        """Add the sites of a cell, or of its shadow, on the nodes of the cell `index`."""
+        """Add the sites of a cell, or of its shadow."""
         rows: dict[tuple[str, str], int] = {}
+        cell = self.cell_rows[index] + of_shadow
         columns = list(problem.fabric.resources)
         for (task_name, node_name), exec_ns in zip(
             real.sites, self._addresses(real.exec_ns), strict=True
@@ -473,7 +577,7 @@ class _Layout:
             node = self.node_row[index, node_name]
             server = self.server_row[node, execution.accelerator]
             on = self.rows["servers"][server]
-            if cell != index:
+            if of_shadow:
                 server = on["below"]
             fair, cores = on["scheduler"] in (Scheduler.FAIR, Scheduler.TURNS), on["cores"]
             threads = execution.threads if execution.accelerator is None else 1
@@ -549,7 +653,7 @@ class _Layout:
 
     def _check_keys(self) -> None:
         limits = (
-            ("cells", len(self.cells), codes.CELL_MASK),
+            ("cells", len(self.rows["cells"]), codes.CELL_MASK),
             ("tasks of a cell", self.max_tasks, codes.ITEM_MASK),
             ("flows of a cell", self.max_flows, codes.MOST_FLOWS),
             ("feasible (task, node) pairs", len(self.rows["sites"]), codes.ITEM_MASK),
@@ -651,7 +755,7 @@ class _Layout:
             opened=np.zeros((cells, windows, 3, self.max_resources)),
             closed=np.zeros((cells, windows, 3, self.max_resources)),
             shares=np.zeros((cells, windows, 3, self.max_resources)),
-            shadow_bytes=np.zeros((len(self.shadows), cycles), np.int64),
+            shadow_bytes=np.zeros((cells if self.shadows else 0, cycles), np.int64),
             log_outcome=np.zeros(logged * self.max_tasks, np.int8),
             log_arrived=np.full((logged, self.max_flows), -1, np.int64),
         )
@@ -684,8 +788,8 @@ class _Layout:
     def _announce_first(self, changes: Rows) -> None:
         """Put the first release of every cell, and the first change of a node, into the queue."""
         first = [
-            (int(self.reals[cell].release_ns[0]), make_key(EventKind.RELEASE, cell))
-            for cell in range(len(self.cells))
+            (int(real.release_ns[0]), make_key(EventKind.RELEASE, row))
+            for row, (_, real) in zip(self.cell_rows, self.cells, strict=True)
         ]
         if len(changes):
             first.append((int(changes[0]["at_ns"]), make_key(EventKind.CHANGE)))

@@ -12,7 +12,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from dwell.control import Controller, final_l95_ms
-from dwell.kernels.arrays import Arrays
+from dwell.kernels.arrays import CellArrays
 from dwell.kernels.realisation import Realisation
 from dwell.kernels.rows import Rows
 from dwell.model import REASONS, Problem
@@ -44,7 +44,7 @@ class PlayedRealisation:
     problem: Problem
     realisation: Realisation
     controller: Controller
-    arrays: Arrays
+    arrays: CellArrays
     metrics: list[tuple[float | None, ...]]
 
     @cached_property
@@ -210,7 +210,7 @@ def _shadow_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray
         return {}
 
     def sent_bytes() -> Ints:
-        sent = played.by_window(played.arrays.tables.shadow_bytes[0])
+        sent = played.by_window(played.arrays.tables.shadow_bytes)
         # What 64 bits do not hold is as good as that.
         held = sent.sum(axis=1, dtype=np.float64) < HORIZON_NS
         return np.where(held, sent.sum(axis=1), HORIZON_NS)
@@ -290,13 +290,12 @@ def _jobs(played: PlayedRealisation) -> pl.DataFrame:
     problem, tables = played.problem, played.arrays.tables
     tasks = tuple(problem.pipeline.tasks)
     nodes = tuple(problem.fabric.nodes)
-    cells, cycles = len(tables.cells), played.realisation.cycles
-    log = tables.log.reshape(cells, cycles, len(tasks))
-    outcome = tables.log_outcome.reshape(cells, cycles, len(tasks))
+    cells = len(tables.cells)
+    log, outcome = played.arrays.logs()
     # Sites of a shadow follow those of its cell in the same order.
     site_node = np.array([nodes.index(node) for _, node in played.realisation.sites] * cells)
-    site = tables.site_of[: len(problem.candidates)]
-    node = site_node[site[np.maximum(tables.stamps, 0).astype(np.int64)]]
+    site = tables.site_of - played.arrays.part.site_0
+    node = site_node[site[np.maximum(tables.stamps[:, : log.shape[1]], 0).astype(np.int64)]]
     cycle, cell, task = np.nonzero(log["ready_ns"].transpose(1, 0, 2) >= 0)
     picked = log[cell, cycle, task]
     started, ended = picked["start_ns"] >= 0, picked["end_ns"] >= 0

@@ -1,0 +1,166 @@
+"""A fleet in the simulator: cells that share nodes, played together, each with its controller."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from dwell.control import Controller
+from dwell.control.coordination import ByChance, Coordination, Uncoordinated
+from dwell.errors import SimulationError
+from dwell.kernels.random_draws import draw, stream
+from dwell.kernels.realisation import NodeChanges, Realisation
+from dwell.model import NodeDisturbance, Problem, Scenario
+from dwell.model.fleet import Fleet, FleetCell, Phases
+from dwell.record import Run
+from dwell.record.fleet_run import FleetRun
+from dwell.sim.engine import PlayedCell, meta_of, play_cells
+from dwell.sim.tables import make_tables
+
+
+def simulate_fleet(
+    fleet: Fleet,
+    *,
+    seed: int = 1,
+    windows: int = 100,
+    policy: str | None = None,
+    estimator: str | None = None,
+    coordination: str | None = None,
+    phases: Phases | None = None,
+    guard: bool = False,
+    jobs: bool = False,
+) -> FleetRun:
+    """Draw a realisation for every cell of a fleet, and play them together.
+
+    Parameters
+    ----------
+    seed : int
+        Seed of all random streams; the first cell of a file draws what it draws alone.
+    windows : int
+        Windows of every cell.
+    policy, estimator : str, optional
+        Of every cell; what the fleet's file says where None.
+    coordination, phases : optional
+        As in the fleet's file; what that says where None.
+    guard : bool
+        Whether the cells' guards act.
+    jobs : bool
+        Whether every job's instants are kept.
+
+    Raises
+    ------
+    ProblemError, PolicyError, TraceError, SimulationError
+        If something named is unknown, or a run cannot be drawn.
+    """
+    fleet = replace(
+        fleet,
+        **{
+            name: value
+            for name, value in (("coordination", coordination), ("phases", phases))
+            if value is not None
+        },
+    )
+    problems = dict(zip(fleet.cells, phased(fleet, seed), strict=True))
+    realisations = drawn(fleet, problems, seed, windows)
+
+    def made(cell: FleetCell) -> PlayedCell:
+        chosen = policy or cell.entry.policy or fleet.policy
+        named = estimator or cell.entry.estimator or fleet.estimator
+        controller = Controller(problems[cell], chosen, named)
+        guarded = guard and controller.guarded
+        asks = _coordination(fleet.coordination, cell, seed)
+        return PlayedCell(problems[cell], realisations[cell], controller, guarded, asks)
+
+    play = partial(play_cells, shared=fleet.shared, jobs=jobs)
+    # As in a cell alone, shadows are drawn for probes where the first are wanted.
+    played = play([*map(made, fleet.cells)]) or play([*map(made, fleet.cells)], shadow=True) or []
+    runs = {}
+    for cell, one in zip(fleet.cells, played, strict=True):
+        meta = partial(
+            meta_of,
+            one.problem,
+            one.controller,
+            scenario=cell.entry.scenario,
+            seed=seed,
+            windows=windows,
+            guard=guard,
+        )
+        runs[cell.name] = Run(meta, *make_tables(one, jobs=jobs))
+    return FleetRun(fleet, runs, seed=seed, guard=guard)
+
+
+def phased(fleet: Fleet, seed: int) -> Iterator[Problem]:
+    """Yield the problem of every cell, with its phase; one that says its own keeps it."""
+    cells = fleet.cells
+    for i, cell in enumerate(cells):
+        pipeline = cell.problem.pipeline
+        phase_ms = cell.entry.phase_ms
+        if phase_ms is None and not pipeline.phase_ms:
+            phase_ms = _phase_ms(fleet.phases, cell, i, len(cells), seed)
+        if phase_ms is None:
+            yield cell.problem
+        else:
+            yield replace(cell.problem, pipeline=replace(pipeline, phase_ms=phase_ms))
+
+
+def _phase_ms(phases: Phases, cell: FleetCell, place: int, count: int, seed: int) -> float:
+    period_ms = cell.problem.pipeline.period_ms
+    if isinstance(phases, tuple):
+        return phases[place]
+    if phases == "even":
+        return period_ms * place / count
+    if phases == "random":
+        name = f"{cell.problem.name}-{cell.copy}/fleet-phase"
+        return period_ms * float(np.random.Generator(np.random.SFC64(stream(seed, name))).random())
+    return 0.0
+
+
+def drawn(
+    fleet: Fleet, problems: Mapping[FleetCell, Problem], seed: int, windows: int
+) -> dict[FleetCell, Realisation]:
+    """Draw every cell; what befalls a shared node is drawn once, with the first cell."""
+    found: dict[FleetCell, Realisation] = {}
+    first, *_ = fleet.cells
+    for cell in fleet.cells:
+        problem, scenario = problems[cell], cell.entry.scenario
+        if cell is first:
+            problem = _with_all(problem, scenario, fleet)
+        real = draw(problem, scenario=scenario, seed=seed, windows=windows, streams=cell.streams)
+        found[cell] = real if cell is first else _meeting(real, found[first], fleet.shared)
+    return found
+
+
+def _with_all(problem: Problem, scenario: str, fleet: Fleet) -> Problem:
+    """Return the first cell with what the scenarios of all do to shared nodes; equal ones once."""
+    own: Scenario = problem.scenario(scenario)
+    others = [
+        one
+        for entry in fleet.entries
+        for one in entry.cell.scenario(entry.scenario)
+        if isinstance(one, NodeDisturbance) and one.node in fleet.shared
+    ]
+    added = tuple(one for one in dict.fromkeys(others) if one not in own)
+    if not added:
+        return problem
+    return replace(problem, scenarios={**problem.scenarios, scenario: (*own, *added)})
+
+
+def _meeting(real: Realisation, first: Realisation, shared: tuple[str, ...]) -> Realisation:
+    """Return a realisation whose shared nodes go through what those of the first cell do."""
+    mine = [one for one in NodeChanges.of(real.node_changes) if one.node not in shared]
+    theirs = [one for one in NodeChanges.of(first.node_changes) if one.node in shared]
+    changes = sorted([*mine, *theirs], key=lambda one: one.at_ns)
+    return replace(real, node_changes=changes)
+
+
+def _coordination(name: str, cell: FleetCell, seed: int) -> Coordination:
+    """Return what a cell asks before it moves."""
+    if name == "random":
+        streams = stream(seed, f"{cell.problem.name}-{cell.copy}/coordination")
+        return ByChance(np.random.Generator(np.random.SFC64(streams)))
+    if name == "none":
+        return Uncoordinated()
+    raise SimulationError(f"coordination {name!r} is not there; use none or random")

@@ -1,0 +1,121 @@
+"""Fleets: cells that share nodes, each decided on by its own controller."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import polars as pl
+import pytest
+from polars.testing import assert_frame_equal
+
+import dwell
+from dwell.model import Problem
+from dwell.model.fleet import Fleet, FleetEntry
+from dwell.sim.fleet import simulate_fleet
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+TABLES = ("cycles", "windows", "decisions")
+
+
+@pytest.fixture(scope="module")
+def canonical() -> Problem:
+    return dwell.load(EXAMPLES / "canonical.yaml")
+
+
+def hall(problem: Problem, count: int, scenario: str = "baseline", **more: object) -> Fleet:
+    entry = FleetEntry(problem, count, scenario)
+    settings = {"phases": "sync", "coordination": "none", **more}
+    return Fleet("hall", (entry,), ("E",), **settings)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("scenario", ["baseline", "robot-cpu-stress", "edge-cpu-stress"])
+@pytest.mark.parametrize(
+    ("policy", "guard"), [("dtp", False), ("cusum+corrected", False), ("dtp+shadow", True)]
+)
+def test_a_fleet_of_one_is_that_cell(
+    canonical: Problem, scenario: str, policy: str, guard: bool
+) -> None:
+    alone = dwell.simulate(
+        canonical, scenario=scenario, policy=policy, seed=3, windows=12, guard=guard, jobs=True
+    )
+    fleet = simulate_fleet(
+        hall(canonical, 1, scenario), policy=policy, seed=3, windows=12, guard=guard, jobs=True
+    )
+    (run,) = fleet.cells.values()
+    for table in (*TABLES, "jobs"):
+        assert_frame_equal(getattr(run, table), getattr(alone, table))
+    assert {**run.meta, "problem": None} == {**alone.meta, "problem": None}
+
+
+def test_cells_that_share_nothing_are_as_alone(canonical: Problem) -> None:
+    fleet = replace(hall(canonical, 3, "robot-cpu-stress"), shared=())
+    together = simulate_fleet(fleet, policy="cusum+corrected", seed=1, windows=8)
+    first = dwell.simulate(
+        canonical, scenario="robot-cpu-stress", policy="cusum+corrected", seed=1, windows=8
+    )
+    for table in TABLES:
+        assert_frame_equal(getattr(together.cells["canonical-01"], table), getattr(first, table))
+    latencies = [run.cycles["latency_ns"].to_list() for run in together.cells.values()]
+    assert latencies[0] != latencies[1] != latencies[2]
+
+
+def test_the_edge_is_one_for_all(canonical: Problem) -> None:
+    """As long as all of them are there."""
+    few, many = (
+        simulate_fleet(hall(canonical, count), policy="SO", estimator="profile", windows=6)
+        for count in (2, 10)
+    )
+    for run in (few, many):
+        shares = [one.windows["u_E"].to_list() for one in run.cells.values()]
+        assert all(share == pytest.approx(shares[0], abs=0.01) for share in shares)
+    mean = [float(run.windows["u_E"].mean()) for run in (few, many)]  # type: ignore[arg-type]
+    assert mean[1] > 2 * mean[0]
+    rates = [float(run.windows["violation_rate"].mean()) for run in (few, many)]  # type: ignore[arg-type]
+    assert rates[1] > rates[0]
+
+
+def test_tables_of_all_have_the_cells_name(canonical: Problem) -> None:
+    fleet = simulate_fleet(hall(canonical, 2), policy="LOC", windows=5)
+    assert fleet.windows.group_by("cell", maintain_order=True).len().rows() == [
+        ("canonical-01", 5),
+        ("canonical-02", 5),
+    ]
+    assert fleet.decisions.columns[0] == "cell"
+    assert fleet.windows.height == 10
+
+
+def test_phases_are_of_the_cells(canonical: Problem) -> None:
+    period_ms = canonical.pipeline.period_ms
+
+    def phases(how: object) -> list[float]:
+        fleet = simulate_fleet(hall(canonical, 4, phases=how), policy="LOC", windows=5)
+        first = [run.cycles["release_ns"][0] / 1e6 for run in fleet.cells.values()]
+        return [float(one) for one in first]
+
+    assert phases("sync") == [0.0] * 4
+    assert phases("even") == pytest.approx([period_ms * i / 4 for i in range(4)])
+    assert phases((0.0, 5.0, 10.0, 90.0)) == pytest.approx([0.0, 5.0, 10.0, 90.0])
+    drawn = phases("random")
+    assert len(set(drawn)) == 4
+    assert all(0 <= phase < period_ms for phase in drawn)
+    assert phases("random") == drawn
+
+
+def test_without_coordination_a_fleet_herds_and_chance_breaks_it(canonical: Problem) -> None:
+    """Robots that are stressed at once all leave at once, and come back at once."""
+
+    def moves(coordination: str) -> tuple[int, int]:
+        fleet = simulate_fleet(
+            hall(canonical, 12, "robot-cpu-stress", coordination=coordination),
+            policy="dtp",
+            estimator="shadow",
+            windows=30,
+        )
+        moved = fleet.decisions.filter(pl.col("migrated"))
+        return moved.height, int(moved.group_by("window").len()["len"].max() or 0)  # type: ignore[arg-type]
+
+    alone, by_chance = moves("none"), moves("random")
+    assert alone[1] == 12
+    assert by_chance[1] < 12
+    assert by_chance[0] < alone[0]
