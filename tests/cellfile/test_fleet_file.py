@@ -71,7 +71,7 @@ estimator: corected
         "'robot-cpu-stress'? (scenarios here: baseline, robot-cpu-stress, edge-cpu-stress, "
         "network-impairment, network-impairment-mild)",
         "fleet.yaml:5: cells[1].cell: nope.yaml: no such file; check the path",
-        "fleet.yaml:6: cells[2].cell: missing; add it",
+        "fleet.yaml:6: cells[2].cell: missing; add it: the cell file, relative to this file's folder",
         "fleet.yaml:7: cells[3].policy: unknown policy 'dpt'; did you mean 'dtp'? (policies here: "
         "dtp, atp, atp-thresholds, latency-first, work-function, cusum, LOC, PARTS, VISION, EDGE)",
         "fleet.yaml:7: cells[3].phase_ms: 50 is not allowed; it must be less than period_ms, 50",
@@ -111,7 +111,7 @@ phases: [1, 100]
         ("dwell-fleet: 1\ncells: []\n", "cells: the list is empty; name at least one cell"),
         (
             "dwell-fleet: 1\ncells: [{cell: EXAMPLES/canonical.yaml}]\nphases: [100]\n",
-            "phases[0]: 100 is not allowed; it must be at least 0 and less than period_ms, 100",
+            "phases[0]: 100 is not allowed; it must be at least 0 and less than period_ms, 33.3333",
         ),
         ("dwell: 1\n", "dwell: this is a cell; a fleet file begins with `dwell-fleet: 1`"),
     ],

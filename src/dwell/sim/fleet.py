@@ -63,16 +63,17 @@ def simulate_fleet(
             if value is not None
         },
     )
-    problems = dict(zip(fleet.cells, phased(fleet, seed), strict=True))
+    names = [cell.name for cell in fleet.cells]
+    problems = dict(zip(names, phased(fleet, seed), strict=True))
     realisations = drawn(fleet, problems, seed, windows)
 
     def made(cell: FleetCell) -> PlayedCell:
         chosen = policy or cell.entry.policy or fleet.policy
         named = estimator or cell.entry.estimator or fleet.estimator
-        controller = Controller(problems[cell], chosen, named)
+        controller = Controller(problems[cell.name], chosen, named)
         guarded = guard and controller.guarded
         asks = _coordination(fleet.coordination, cell, seed)
-        return PlayedCell(problems[cell], realisations[cell], controller, guarded, asks)
+        return PlayedCell(problems[cell.name], realisations[cell.name], controller, guarded, asks)
 
     play = partial(play_cells, shared=fleet.shared, jobs=jobs)
     # As in a cell alone, shadows are drawn for probes where the first are wanted.
@@ -119,17 +120,17 @@ def _phase_ms(phases: Phases, cell: FleetCell, place: int, count: int, seed: int
 
 
 def drawn(
-    fleet: Fleet, problems: Mapping[FleetCell, Problem], seed: int, windows: int
-) -> dict[FleetCell, Realisation]:
+    fleet: Fleet, problems: Mapping[str, Problem], seed: int, windows: int
+) -> dict[str, Realisation]:
     """Draw every cell; what befalls a shared node is drawn once, with the first cell."""
-    found: dict[FleetCell, Realisation] = {}
-    first, *_ = fleet.cells
-    for cell in fleet.cells:
-        problem, scenario = problems[cell], cell.entry.scenario
+    found: dict[str, Realisation] = {}
+    first, *others = fleet.cells
+    for cell in (first, *others):
+        problem, scenario = problems[cell.name], cell.entry.scenario
         if cell is first:
             problem = _with_all(problem, scenario, fleet)
         real = draw(problem, scenario=scenario, seed=seed, windows=windows, streams=cell.streams)
-        found[cell] = real if cell is first else _meeting(real, found[first], fleet.shared)
+        found[cell.name] = real if cell is first else _meeting(real, found[first.name], fleet.shared)
     return found
 
 

@@ -181,9 +181,10 @@ def _worst_static(
 ) -> float:
     """V_D of the worst cell where none moves: one call of the kernel."""
     cells = fleet.cells
-    problems = dict(zip(cells, phased(fleet, seed), strict=True))
+    names = [cell.name for cell in cells]
+    problems = dict(zip(names, phased(fleet, seed), strict=True))
     reals = drawn(fleet, problems, seed, windows)
-    arrays = lay_out([(problems[cell], reals[cell]) for cell in cells], shared=fleet.shared)
+    arrays = lay_out([(problems[name], reals[name]) for name in names], shared=fleet.shared)
     tables = arrays.tables
     for row, cell in enumerate(cells):
         names = list(cell.problem.candidates)
