@@ -6,8 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from dwell.cellfile.fleet_file import load_fleet
+import dwell
+from dwell import load_fleet
 from dwell.errors import ProblemError
+from dwell.study import load_study
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -71,11 +73,13 @@ estimator: corected
         "'robot-cpu-stress'? (scenarios here: baseline, robot-cpu-stress, edge-cpu-stress, "
         "network-impairment, network-impairment-mild)",
         "fleet.yaml:5: cells[1].cell: nope.yaml: no such file; check the path",
-        "fleet.yaml:6: cells[2].cell: missing; add it: the cell file, relative to this file's folder",
+        "fleet.yaml:6: cells[2].cell: missing; add it: the cell file, relative to this file's "
+        "folder",
+        "fleet.yaml:7: cells[3].weight: unknown key 'weight'; known: count, scenario, policy, "
+        "estimator, phase_ms, cell",
         "fleet.yaml:7: cells[3].policy: unknown policy 'dpt'; did you mean 'dtp'? (policies here: "
         "dtp, atp, atp-thresholds, latency-first, work-function, cusum, LOC, PARTS, VISION, EDGE)",
         "fleet.yaml:7: cells[3].phase_ms: 50 is not allowed; it must be less than period_ms, 50",
-        "fleet.yaml:7: cells[3].weight: unknown key 'weight'",
         "fleet.yaml:8: phases: 'evn' is not allowed; it must be one of sync, even, random, or a "
         "list of ms; did you mean 'even'?",
         "fleet.yaml:9: coordination: 'legder' is not allowed; it must be one of none, random, "
@@ -105,6 +109,46 @@ phases: [1, 100]
     ]
 
 
+def test_no_fault_hides_another(tmp_path: Path) -> None:
+    """A cell that is missing, or wrong in itself, leaves the others to be looked at."""
+    other = (EXAMPLES / "canonical.yaml").read_text()
+    for here, there in (
+        ("name: canonical", "name: other"),
+        ("cores: 8\n", "cores: 4\n"),
+        ("tier: edge", "tier: cloud"),
+    ):
+        other = other.replace(here, there)
+    (tmp_path / "other.yaml").write_text(other)
+    (tmp_path / "broken.yaml").write_text("dwell: 1\nnodes: 3\n")
+    told = faults_of(
+        tmp_path,
+        """dwell-fleet: 1
+shared: [E, edge]
+cells:
+  - {cell: EXAMPLES/canonical.yaml, count: 2}
+  - {cell: nope.yaml}
+  - {cell: broken.yaml, scenario: none}
+  - {cell: other.yaml, scenario: none}
+phases: [1, 2, 3]
+""",
+    )
+    assert [line.partition(": ")[2].partition(": ")[0] for line in told] == [
+        "shared[1]",
+        "shared[1]",
+        "cells[1].cell",
+        *["cells[2].cell"] * sum("broken.yaml" in line for line in told),
+        "cells[3].scenario",
+        "cells[3].cell",
+        "cells[3].cell",
+        "phases",
+    ]
+    assert told[-1].endswith("3 phases for 5 cells; give one for each, in the order of the file")
+    assert [line.split(" is ")[0].split()[-1] for line in told if "a shared" in line] == [
+        "E.tier",
+        "E.cores",
+    ]
+
+
 @pytest.mark.parametrize(
     ("text", "told"),
     [
@@ -114,6 +158,10 @@ phases: [1, 100]
             "phases[0]: 100 is not allowed; it must be at least 0 and less than period_ms, 33.3333",
         ),
         ("dwell: 1\n", "dwell: this is a cell; a fleet file begins with `dwell-fleet: 1`"),
+        (
+            "dwell-study: 1\n",
+            "dwell-study: this is a study; a fleet file begins with `dwell-fleet: 1`",
+        ),
     ],
 )
 def test_what_is_no_fleet(tmp_path: Path, text: str, told: str) -> None:
@@ -131,3 +179,12 @@ def test_two_cells_of_one_name_are_a_fault(tmp_path: Path) -> None:
     assert told == [
         "fleet.yaml:4: cells[1].cell: 'canonical' is the name of another cell, too; give it its own"
     ]
+
+
+def test_a_fleet_is_no_cell_and_no_study(tmp_path: Path) -> None:
+    file = tmp_path / "fleet.yaml"
+    file.write_text("dwell-fleet: 1\n")
+    with pytest.raises(ProblemError, match="1: dwell-fleet: this is a fleet, not a cell; run it"):
+        dwell.load(file)
+    with pytest.raises(ProblemError, match="1: dwell-fleet: this is a fleet; a study file begins"):
+        load_study(file)

@@ -547,7 +547,8 @@ def play_stamped(
         for _, missed, l95_ms, _ in arrays.tables.seen[0].tolist()
     ]
     tables, _ = make_tables(
-        sim_tables.PlayedRealisation(problem, real, controller, CellArrays(arrays), metrics), jobs=True
+        sim_tables.PlayedRealisation(problem, real, controller, CellArrays(arrays), metrics),
+        jobs=True,
     )
     flows = [(flow.source, flow.target) for flow in ordered_flows(problem.pipeline)]
     log = arrays.tables.log_arrived.reshape(2, real.cycles, len(flows)).tolist()

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
 
 import dwell
+from dwell import simulate_fleet
+from dwell.errors import DwellError
 from dwell.model import Problem
 from dwell.model.fleet import Fleet, FleetEntry
-from dwell.sim.fleet import simulate_fleet
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 TABLES = ("cycles", "windows", "decisions")
@@ -119,3 +121,19 @@ def test_without_coordination_a_fleet_herds_and_chance_breaks_it(canonical: Prob
     assert alone[1] == 12
     assert by_chance[1] < 12
     assert by_chance[0] < alone[0]
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"phases": "evn"}, "phases: 'evn' is not allowed.*did you mean 'even'?"),
+        ({"phases": [1.0, 2.0, 3.0]}, "phases: 3 phases for 2 cells; give one for each"),
+        ({"coordination": "legder"}, "coordination: 'legder' is not allowed.*none, random, ledger"),
+        ({"policy": "dpt"}, "unknown policy 'dpt'; did you mean 'dtp'?"),
+        ({"estimator": "corected"}, "unknown estimator 'corected'; did you mean 'corrected'?"),
+        ({"windows": 0}, "windows is 0"),
+    ],
+)
+def test_what_is_unknown_is_told(canonical: Problem, given: dict[str, Any], told: str) -> None:
+    with pytest.raises(DwellError, match=told):
+        simulate_fleet(hall(canonical, 2), **{"windows": 3, **given})

@@ -9,7 +9,6 @@ from typing import Any
 from dwell.cellfile.cell import load
 from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.forms import (
-    ChoiceForm,
     Entry,
     ListForm,
     NumberForm,
@@ -26,12 +25,11 @@ from dwell.errors import ProblemError
 from dwell.estimators.registry import names as estimator_names
 from dwell.model import Problem
 from dwell.model.bounds import NOT_EMPTY, Bound
-from dwell.model.fleet import COORDINATIONS, OBJECTIVES, PHASES, Fleet, FleetEntry
+from dwell.model.fleet import PHASE_WAYS, Fleet, FleetEntry, Kind, fleet_faults
 from dwell.model.semantics import bad_name, nearest, nearest_of
 from dwell.model.user_classes import is_class_path
 from dwell.policies.registry import names as policy_names
 
-VERSION = 1
 PHASE = NumberForm(Bound(0))
 
 
@@ -39,55 +37,32 @@ def _phases(value: Any) -> str | tuple[float, ...]:
     """Return a word, or the phases of a list."""
     if isinstance(value, list):
         return tuple(PHASE.number(phase) for phase in value)
-    if value not in PHASES:
-        hint = nearest(value, PHASES) if isinstance(value, str) else ""
-        remedy = f"; {hint}" if hint.startswith("did") else ""
-        ways = f"one of {', '.join(PHASES)}, or a list of ms{remedy}"
-        raise ValueError(not_allowed(value, ways))
-    return str(value)
+    if not isinstance(value, str):
+        raise ValueError(not_allowed(value, PHASE_WAYS))
+    return value
 
 
-NAME, GIVEN = TextForm(), TextForm(NOT_EMPTY)
-POLICY = optional("policy", GIVEN, "Policy of cells that name none.", "the cell's")
-ESTIMATOR = optional("estimator", GIVEN, "Estimator of cells that name none.", "the cell's")
+GIVEN = TextForm(NOT_EMPTY)
+CELL = required("cell", GIVEN, "The cell file, relative to this file's folder.")
+SETTINGS = shape_of(
+    Fleet,
+    {},
+    instead={"phases": WrittenForm("`sync`, `even`, `random`, list of ms", _phases)},
+)
 FLEET = FileKind.of(
     "fleet",
     "dwell-fleet",
-    VERSION,
-    "Fleet",
-    "Several cells that share nodes, each with a controller of its own.",
-    optional("name", NAME, "Name of the fleet.", "the file's"),
-    optional("shared", ListForm(GIVEN), "Nodes that are one computer for all cells.", "none"),
+    1,
+    SETTINGS.title,
+    SETTINGS.says,
+    optional("name", TextForm(), "Name of the fleet.", "the file's"),
     required(
         "cells",
-        ListForm(
-            shape_of(
-                FleetEntry,
-                {},
-                further=(
-                    required("cell", GIVEN, "The cell file, relative to this file's folder."),
-                ),
-            ),
-            keeps=True,
-        ),
+        ListForm(shape_of(FleetEntry, {}, further=(CELL,)), keeps=True),
         "Cells by kind.",
         [],
     ),
-    optional(
-        "phases",
-        WrittenForm("`sync`, `even`, `random`, list of ms", _phases),
-        "When each cell begins: all at once, evenly spread, drawn, or by a list.",
-        "random",
-    ),
-    optional(
-        "coordination",
-        ChoiceForm(COORDINATIONS),
-        "What a move is asked for: nothing, a chance, or the ledger.",
-        "ledger",
-    ),
-    optional("objective", ChoiceForm(OBJECTIVES), "What the ledger lowers.", "sum"),
-    POLICY,
-    ESTIMATOR,
+    *SETTINGS.keys,
 )
 
 
@@ -110,8 +85,6 @@ def load_fleet(path: str | PathLike[str]) -> Fleet:
     document = read_yaml(source, faults, FLEET.what, FLEET.begin)
     if faults.at(""):
         raise faults.error()
-    if isinstance(document, dict) and "dwell" in document and FLEET.key not in document:
-        faults.refuse("dwell", f"this is a cell; a fleet file begins with `{FLEET.begin}`")
     entry = read_structure(document, faults, FLEET)
     fleet = _Reading(entry, Path(source), faults).fleet()
     if fleet is None or faults:
@@ -128,36 +101,39 @@ class _Reading:
 
     def fleet(self) -> Fleet | None:
         """Return the fleet, or None beside at least one fault."""
-        entry = self.entry
+        entry, faults = self.entry, self.faults
         name = entry.name or self.path.stem
         if message := bad_name(name):
-            self.faults.add("name", message)
-        made = [self._entry(f"cells[{i}]", one) for i, one in enumerate(entry.cells)]
-        entries = tuple(one for one in made if one is not None)
+            faults.add("name", message)
+        read = [self._entry(f"cells[{i}]", one) for i, one in enumerate(entry.cells)]
         cells = [cell for cell in self.known.values() if cell is not None]
-        any(self._check_names("", entry, cell) for cell in cells)
-        if len(entries) < len(made):
+        for cell in cells:
+            self._check_names("", entry, cell)
+        given = {key: entry.values[key] for key in SETTINGS.names if key in entry.values}
+        given["shared"] = tuple(given.get("shared", ()))
+        if not faults.at("cells"):
+            phases = given.get("phases", "sync")
+            wrong = [faults.at(f"cells[{i}].count") for i in range(len(read))]
+            if not isinstance(phases, str) and (any(wrong) or None in entry.cells):
+                # How many phases there have to be is known where all counts are.
+                phases = "sync"
+            for fault in fleet_faults([kind for kind, _ in read], given["shared"], phases):
+                faults.add(fault.path, fault.message)
+        if faults:
             return None
-        given = {
-            key: getattr(entry, key)
-            for key in ("shared", "phases", "coordination", "objective", "policy", "estimator")
-            if getattr(entry, key) is not None
-        }
-        if "shared" in given:
-            given["shared"] = tuple(given["shared"])
-        return self.faults.attempt("", Fleet, name, entries, **given)
+        return Fleet(name, tuple(made for _, made in read if made is not None), **given)
 
-    def _entry(self, path: str, entry: Entry | None) -> FleetEntry | None:
-        """Return cells of one kind; None beside a fault."""
+    def _entry(self, path: str, entry: Entry | None) -> tuple[Kind, FleetEntry | None]:
+        """Return count and cell of an entry, and cells of one kind; None beside a fault."""
         if entry is None:
-            return None
+            return (1, None), None
         values = dict(entry.values)
-        file = values.pop("cell")
-        cell = self._cell(f"{path}.cell", file)
+        cell = self._cell(f"{path}.cell", values.pop("cell"))
+        kind = (values.get("count", 1), cell)
         if cell is None:
-            return None
+            return kind, None
         self._check_names(f"{path}.", entry, cell)
-        return self.faults.attempt(path, FleetEntry, cell, **values)
+        return kind, self.faults.attempt(path, FleetEntry, cell, **values)
 
     def _cell(self, path: str, file: str) -> Problem | None:
         """Return a cell; every file is read once."""
@@ -171,9 +147,8 @@ class _Reading:
                 self.faults.add(path, line)
         return self.known[file]
 
-    def _check_names(self, path: str, entry: Entry, cell: Problem) -> bool:
-        """Check that a policy and an estimator that are named are known; whether one is not."""
-        before = len(self.faults)
+    def _check_names(self, path: str, entry: Entry, cell: Problem) -> None:
+        """Check that a policy and an estimator that are named are known."""
         policy, estimator = entry.policy, entry.estimator
         if policy is not None:
             policy, named = cell.policy_and_estimator(policy)
@@ -186,4 +161,3 @@ class _Reading:
         if estimator is not None and estimator not in known and not is_class_path(estimator):
             hint = nearest(estimator, known)
             self.faults.add(f"{path}estimator", f"unknown estimator {estimator!r}; {hint}")
-        return len(self.faults) > before

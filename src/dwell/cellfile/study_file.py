@@ -95,8 +95,6 @@ def read_study(path: str | PathLike[str], *, references: Collection[str] = ()) -
     document = read_yaml(source, faults, STUDY.what, STUDY.begin)
     if faults.at(""):
         raise faults.error()
-    if isinstance(document, dict) and "dwell" in document and STUDY.key not in document:
-        faults.refuse("dwell", f"this is a cell; a study file begins with `{STUDY.begin}`")
     entry = read_structure(document, faults, STUDY)
     study = _Reading(entry, Path(source), faults, references).study()
     if study is None or faults:

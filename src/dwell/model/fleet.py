@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Literal, TypeAlias, get_args
+from typing import Literal, TypeAlias
 
 from dwell.errors import Fault, ProblemError
-from dwell.model.bounds import Bound
+from dwell.model.bounds import Bound, as_read, counted
 from dwell.model.declaration import declared, declared_fields, key
 from dwell.model.fabric import Node
 from dwell.model.problem import Problem
-from dwell.model.semantics import nearest_of
+from dwell.model.semantics import nearest, nearest_of
 
 Phases: TypeAlias = "Literal['sync', 'even', 'random'] | tuple[float, ...]"
 Coordination: TypeAlias = Literal["none", "random", "ledger"]
@@ -20,10 +20,12 @@ FleetObjective: TypeAlias = Literal["sum", "worst"]
 
 #: What the phases of a fleet may be, beside a list of them.
 PHASES = ("sync", "even", "random")
-COORDINATIONS: tuple[str, ...] = get_args(Coordination)
-OBJECTIVES: tuple[str, ...] = get_args(FleetObjective)
+PHASE_WAYS = f"one of {', '.join(PHASES)}, or a list of ms"
 MOST_CELLS = 1_000
 COUNT = Bound(1, MOST_CELLS, whole=True)
+
+#: Count and cell of an entry; None for a cell that could not be read.
+Kind: TypeAlias = "tuple[int, Problem | None]"
 
 
 @declared()
@@ -34,7 +36,9 @@ class FleetEntry:
     count: int = key("How many cells of it there are.", COUNT, default=1)
     scenario: str = key("What befalls them.", default="baseline")
     policy: str | None = key("Their policy.", default=None, usual="the fleet's, or the cell's")
-    estimator: str | None = key("Their estimator.", default=None, usual="the fleet's, or the cell's")
+    estimator: str | None = key(
+        "Their estimator.", default=None, usual="the fleet's, or the cell's"
+    )
     phase_ms: float | None = key(
         "Offset of their releases, below P.", Bound(0), default=None, usual="as `phases` says"
     )
@@ -80,43 +84,32 @@ class FleetCell:
         return "" if self.copy == 1 else f"{self.problem.name}-{self.copy}/"
 
 
-@dataclass(frozen=True, slots=True)
+@declared()
 class Fleet:
-    """Several cells that share nodes, each with a controller of its own.
-
-    Parameters
-    ----------
-    name : str
-    entries : tuple of FleetEntry
-        In the order of the file.
-    shared : tuple of str
-        Nodes that are one computer for all cells.
-    phases : {"sync", "even", "random"} or tuple of float
-        Offsets of releases: all at once, evenly spread, drawn, or so many ms, by cell.
-    coordination : {"none", "random", "ledger"}
-        What moves are asked for.
-    objective : {"sum", "worst"}
-        What the ledger lowers.
-    policy, estimator : str, optional
-        Of every cell whose entry names none.
-
-    Raises
-    ------
-    ProblemError
-        If shared nodes are none of a cell's, or differ, or there are other phases than cells.
-    """
+    """Several cells that share nodes, each with a controller of its own."""
 
     name: str
     entries: tuple[FleetEntry, ...]
-    shared: tuple[str, ...] = ()
-    phases: Phases = "random"
-    coordination: Coordination = "ledger"
-    objective: FleetObjective = "sum"
-    policy: str | None = None
-    estimator: str | None = None
+    shared: tuple[str, ...] = key("Nodes that are one computer for all cells.", default=())
+    phases: Phases = key(
+        "When each cell begins: all at once, evenly spread, drawn, or by a list.", default="random"
+    )
+    coordination: Coordination = key(
+        "What a move is asked for: nothing, a chance, or the ledger.", default="ledger"
+    )
+    objective: FleetObjective = key(
+        "What the ledger lowers: the sum over cells, or what the worst of them has.", default="sum"
+    )
+    policy: str | None = key("Policy of cells that name none.", default=None, usual="the cell's")
+    estimator: str | None = key(
+        "Estimator of cells that name none.", default=None, usual="the cell's"
+    )
 
     def __post_init__(self) -> None:
-        faults = [*self._faults()]
+        if not isinstance(self.phases, str):
+            object.__setattr__(self, "phases", tuple(self.phases))
+        kinds = [(entry.count, entry.cell) for entry in self.entries]
+        faults = [*fleet_faults(kinds, self.shared, self.phases)]
         if faults:
             raise ProblemError(faults)
 
@@ -157,50 +150,59 @@ class Fleet:
         }
         return tuple(name for name in self.shared if name not in used)
 
-    def _faults(self) -> Iterator[Fault]:
-        if not self.entries:
-            yield Fault("cells", "the list is empty; name at least one cell")
-            return
-        count = sum(entry.count for entry in self.entries)
-        if count > MOST_CELLS:
-            yield Fault("cells", f"{count} cells are more than {MOST_CELLS}; give fewer")
-        yield from self._apart()
-        first = self.entries[0].cell
-        for i, name in enumerate(self.shared):
-            if name in self.shared[:i]:
-                yield Fault(f"shared[{i}]", f"{name!r} is given twice; name each once")
-                continue
-            for place, entry in enumerate(self.entries):
-                nodes = entry.cell.fabric.nodes
-                if name not in nodes:
-                    hint = nearest_of(name, nodes, "nodes")
-                    yield Fault(f"shared[{i}]", f"{entry.cell.name} has no node {name!r}; {hint}")
-                elif name in first.fabric.nodes:
-                    here = f"cells[{place}].cell"
-                    yield from _differences(here, nodes[name], first.fabric.nodes[name], first.name)
-        if not isinstance(self.phases, str):
-            yield from self._phase_faults(self.phases)
 
-    def _apart(self) -> Iterator[Fault]:
-        """Yield a fault for every entry that has another's name, and is another cell."""
-        known: dict[str, Problem] = {}
-        for place, entry in enumerate(self.entries):
-            cell = known.setdefault(entry.cell.name, entry.cell)
-            if cell != entry.cell:
-                message = f"{entry.cell.name!r} is the name of another cell, too; give it its own"
-                yield Fault(f"cells[{place}].cell", message)
+def fleet_faults(kinds: Sequence[Kind], shared: Sequence[str], phases: Phases) -> Iterator[Fault]:
+    """Yield what is wrong with a fleet beyond its single entries."""
+    if not kinds:
+        yield Fault("cells", "the list is empty; name at least one cell")
+    count = sum(of for of, _ in kinds)
+    if count > MOST_CELLS:
+        yield Fault("cells", f"{count} cells are more than {MOST_CELLS}; give fewer")
+    known: dict[str, tuple[int, Problem]] = {}
+    for place, (_, cell) in enumerate(kinds):
+        if cell is not None and known.setdefault(cell.name, (place, cell))[1] != cell:
+            message = f"{cell.name!r} is the name of another cell, too; give it its own"
+            yield Fault(f"cells[{place}].cell", message)
+    for i, name in enumerate(shared):
+        if name in shared[:i]:
+            yield Fault(f"shared[{i}]", f"{name!r} is given twice; name each once")
+        else:
+            yield from _node_faults(f"shared[{i}]", name, [*known.values()])
+    if isinstance(phases, str):
+        if phases not in PHASES:
+            hint = nearest(phases, PHASES)
+            remedy = f"; {hint}" if hint.startswith("did") else ""
+            yield Fault(
+                "phases", f"{as_read(phases)} is not allowed; it must be {PHASE_WAYS}{remedy}"
+            )
+    elif kinds:
+        yield from _phase_faults(kinds, phases)
 
-    def _phase_faults(self, phases: tuple[float, ...]) -> Iterator[Fault]:
-        cells = self.cells
-        if len(phases) != len(cells):
-            has = f"{len(phases)} phases for {len(cells)} cells"
-            yield Fault("phases", f"{has}; give one for each, in the order of the file")
-            return
-        for i, (phase_ms, cell) in enumerate(zip(phases, cells, strict=True)):
-            period_ms = cell.problem.pipeline.period_ms
-            if not 0 <= phase_ms < period_ms:
-                bound = f"it must be at least 0 and less than period_ms, {period_ms:g}"
-                yield Fault(f"phases[{i}]", f"{phase_ms:g} is not allowed; {bound}")
+
+def _node_faults(path: str, name: str, cells: Sequence[tuple[int, Problem]]) -> Iterator[Fault]:
+    """Yield where a shared node is missing in a cell, or another one than in those before."""
+    first: Problem | None = None
+    for place, cell in cells:
+        nodes = cell.fabric.nodes
+        if name not in nodes:
+            hint = nearest_of(name, nodes, "nodes")
+            yield Fault(path, f"{cell.name} has no node {name!r}; {hint}")
+            continue
+        first = first or cell
+        of = first.fabric.nodes[name]
+        yield from _differences(f"cells[{place}].cell", nodes[name], of, first.name)
+
+
+def _phase_faults(kinds: Sequence[Kind], phases: Sequence[float]) -> Iterator[Fault]:
+    cells = [cell for count, cell in kinds for _ in range(count)]
+    if len(phases) != len(cells):
+        has = f"{counted(len(phases), 'phase')} for {counted(len(cells), 'cell')}"
+        yield Fault("phases", f"{has}; give one for each, in the order of the file")
+        return
+    for i, (phase_ms, cell) in enumerate(zip(phases, cells, strict=True)):
+        if cell is not None and not 0 <= phase_ms < cell.pipeline.period_ms:
+            bound = f"it must be at least 0 and less than period_ms, {cell.pipeline.period_ms:g}"
+            yield Fault(f"phases[{i}]", f"{phase_ms:g} is not allowed; {bound}")
 
 
 def _differences(path: str, node: Node, other: Node, of: str) -> Iterator[Fault]:

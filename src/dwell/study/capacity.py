@@ -155,9 +155,7 @@ def _found(
     return Capacity(robots, at_least, ends, limit, limit_on, fleet.phases, tuple(curve), reason)
 
 
-def _worst_of(
-    fleet: Fleet, policy: str | None, cycles: int
-) -> Callable[[Fleet, int], float]:
+def _worst_of(fleet: Fleet, policy: str | None, cycles: int) -> Callable[[Fleet, int], float]:
     """Return what plays a fleet of a size under a seed, and returns V_D of its worst cell."""
     problem = fleet.entries[0].cell
     size = problem.window_cycles
