@@ -37,6 +37,7 @@ from dwell.model import (
     Trace,
     TraceTable,
 )
+from dwell.model.fleet import Fleet, FleetEntry
 from dwell.policies import by_name as policy_by_name
 from dwell.record import Journal
 from dwell.study import (
@@ -158,6 +159,9 @@ def objects(
         Evidence(1, ints[:, 0], ints[:, 0], instants, ints[:, 0], instants),
         Trace(table, "rtt_ms"),
         Hindsight(),
+        dwell.simulate_fleet(
+            Fleet("pair", (FleetEntry(canonical, 2),)), windows=6, policy="LOC", coordination="none"
+        ),
         mean_interval([1.0, 2.0, 3.0]),
         *(run.arrays("cycles"), run.arrays("cycles").names("placement")),
         Journal(tmp_path_factory.mktemp("journal"), run="r", meta={}, columns={}),

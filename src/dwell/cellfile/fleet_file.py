@@ -121,7 +121,8 @@ class _Reading:
                 faults.add(fault.path, fault.message)
         if faults:
             return None
-        return Fleet(name, tuple(made for _, made in read if made is not None), **given)
+        entries = tuple(made for _, made in read if made is not None)
+        return Fleet(name, entries, file=str(self.path), **given)
 
     def _entry(self, path: str, entry: Entry | None) -> tuple[Kind, FleetEntry | None]:
         """Return count and cell of an entry, and cells of one kind; None beside a fault."""

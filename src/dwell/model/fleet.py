@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Literal, TypeAlias
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal, TypeAlias
 
 from dwell.errors import Fault, ProblemError
 from dwell.model.bounds import Bound, as_read, counted
@@ -104,6 +104,8 @@ class Fleet:
     estimator: str | None = key(
         "Estimator of cells that name none.", default=None, usual="the cell's"
     )
+    #: That it was read from; nothing where it was made otherwise.
+    file: str = field(default="", compare=False)
 
     def __post_init__(self) -> None:
         if not isinstance(self.phases, str):
@@ -128,6 +130,31 @@ class Fleet:
                 copy = copies[entry.cell.name]
                 cells.append(FleetCell(f"{entry.cell.name}-{copy:02}", copy, entry))
         return tuple(cells)
+
+    def changed(
+        self,
+        *,
+        policy: str | None = None,
+        estimator: str | None = None,
+        coordination: str | None = None,
+        phases: str | Sequence[float] | None = None,
+    ) -> Fleet:
+        """Return the fleet with other settings, those of entries included; None keeps them.
+
+        Raises
+        ------
+        ProblemError
+            If one is none of those that there are.
+        """
+        given = {
+            "policy": policy,
+            "estimator": estimator,
+            "coordination": coordination,
+            "phases": phases,
+        }
+        new: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+        own = {name: None for name in ("policy", "estimator") if name in new}
+        return replace(self, entries=tuple(replace(one, **own) for one in self.entries), **new)
 
     def with_count(self, count: int) -> Fleet:
         """Return the fleet with so many cells of the first entry.

@@ -18,6 +18,7 @@ from dwell.model.fleet import Fleet, FleetCell, Phases
 from dwell.record import Run
 from dwell.record.fleet_run import FleetRun
 from dwell.sim.engine import PlayedCell, meta_of, play_cells
+from dwell.sim.shared_load import shared_load
 from dwell.sim.tables import make_tables
 
 
@@ -55,21 +56,16 @@ def simulate_fleet(
     ProblemError, PolicyError, TraceError, SimulationError
         If something named is unknown, or a run cannot be drawn.
     """
-    fleet = replace(
-        fleet,
-        **{
-            name: value
-            for name, value in (("coordination", coordination), ("phases", phases))
-            if value is not None
-        },
+    fleet = fleet.changed(
+        policy=policy, estimator=estimator, coordination=coordination, phases=phases
     )
     names = [cell.name for cell in fleet.cells]
     problems = dict(zip(names, phased(fleet, seed), strict=True))
     realisations = drawn(fleet, problems, seed, windows)
 
     def made(cell: FleetCell) -> PlayedCell:
-        chosen = policy or cell.entry.policy or fleet.policy
-        named = estimator or cell.entry.estimator or fleet.estimator
+        chosen = cell.entry.policy or fleet.policy
+        named = cell.entry.estimator or fleet.estimator
         controller = Controller(problems[cell.name], chosen, named)
         guarded = guard and controller.guarded
         asks = _coordination(fleet.coordination, cell, seed)
@@ -90,7 +86,16 @@ def simulate_fleet(
             guard=guard,
         )
         runs[cell.name] = Run(meta, *make_tables(one, jobs=jobs))
-    return FleetRun(fleet, runs, seed=seed, guard=guard)
+    load = shared_load(dict(zip(runs, played, strict=True)), fleet.shared)
+    phases_ms = {name: problem.pipeline.phase_ms for name, problem in problems.items()}
+    return FleetRun(
+        fleet,
+        runs,
+        load,
+        seed=seed,
+        guard=guard,
+        phases_ms=phases_ms,
+    )
 
 
 def phased(fleet: Fleet, seed: int) -> Iterator[Problem]:
