@@ -154,9 +154,9 @@ class _Reading:
         if policy is not None:
             policy, named = cell.policy_and_estimator(policy)
             estimator = named or estimator
-            known = [*policy_names(), *cell.candidates]
-            if policy not in known and not is_class_path(policy):
-                hint = nearest_of(policy, known, "policies")
+            policies = [*policy_names(), *cell.candidates]
+            if policy not in policies and not is_class_path(policy):
+                hint = nearest_of(policy, policies, "policies")
                 self.faults.add(f"{path}policy", f"unknown policy {policy!r}; {hint}")
         known = estimator_names()
         if estimator is not None and estimator not in known and not is_class_path(estimator):

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from dwell.errors import Fault
     from dwell.report.page import Page
 
+BLOCKS = "▁▂▃▄▅▆▇█"
 #: Takes how many are done, and of how many.
 Progress = Callable[[int, int], None]
 
@@ -32,6 +33,11 @@ def aligned(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
         cells = [first[0].ljust(first[1]), *(text.rjust(width) for text, width in rest)]
         lines.append("  ".join(cells).rstrip())
     return "\n".join(lines)
+
+
+def block(share: float) -> str:
+    """Return a block that is so high, from 0 to 1, for a line of them."""
+    return BLOCKS[min(max(int(share * len(BLOCKS)), 0), len(BLOCKS) - 1)]
 
 
 def warn(file: Path, warnings: Iterable[Fault]) -> None:

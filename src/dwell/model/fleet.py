@@ -153,7 +153,7 @@ class Fleet:
             "phases": phases,
         }
         new: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-        own = {name: None for name in ("policy", "estimator") if name in new}
+        own: Any = {name: None for name in ("policy", "estimator") if name in new}
         return replace(self, entries=tuple(replace(one, **own) for one in self.entries), **new)
 
     def with_count(self, count: int) -> Fleet:

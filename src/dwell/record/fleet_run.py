@@ -88,7 +88,7 @@ class FleetRun:
     def _all(self, table: str) -> pl.DataFrame:
         import polars as pl
 
-        frames = [
+        frames: list[pl.DataFrame] = [
             getattr(run, table).select(pl.lit(name).alias("cell"), pl.all())
             for name, run in self.cells.items()
         ]

@@ -87,29 +87,33 @@ def simulate_fleet(
         )
         runs[cell.name] = Run(meta, *make_tables(one, jobs=jobs))
     load = shared_load(dict(zip(runs, played, strict=True)), fleet.shared)
-    phases_ms = {name: problem.pipeline.phase_ms for name, problem in problems.items()}
     return FleetRun(
         fleet,
         runs,
         load,
         seed=seed,
         guard=guard,
-        phases_ms=phases_ms,
+        phases_ms=phases_ms(fleet, seed),
     )
 
 
 def phased(fleet: Fleet, seed: int) -> Iterator[Problem]:
-    """Yield the problem of every cell, with its phase; one that says its own keeps it."""
+    """Yield the problem of every cell, with its phase."""
+    for cell, phase_ms in zip(fleet.cells, phases_ms(fleet, seed).values(), strict=True):
+        pipeline = replace(cell.problem.pipeline, phase_ms=phase_ms)
+        yield replace(cell.problem, pipeline=pipeline)
+
+
+def phases_ms(fleet: Fleet, seed: int) -> dict[str, float]:
+    """Return the phase of every cell; one that says its own keeps it."""
     cells = fleet.cells
+    found = {}
     for i, cell in enumerate(cells):
-        pipeline = cell.problem.pipeline
-        phase_ms = cell.entry.phase_ms
-        if phase_ms is None and not pipeline.phase_ms:
-            phase_ms = _phase_ms(fleet.phases, cell, i, len(cells), seed)
-        if phase_ms is None:
-            yield cell.problem
-        else:
-            yield replace(cell.problem, pipeline=replace(pipeline, phase_ms=phase_ms))
+        own = cell.entry.phase_ms
+        if own is None and not (own := cell.problem.pipeline.phase_ms):
+            own = _phase_ms(fleet.phases, cell, i, len(cells), seed)
+        found[cell.name] = own
+    return found
 
 
 def _phase_ms(phases: Phases, cell: FleetCell, place: int, count: int, seed: int) -> float:
