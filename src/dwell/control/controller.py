@@ -13,6 +13,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.control.coordination import Asked, Coordination, Verdict
 from dwell.control.course import Course
 from dwell.control.windows import missed_cycles, seen_l95_ms, utilisation
 from dwell.cost import excess
@@ -79,12 +80,18 @@ class Proposal:
         What was known of the candidates, for the row of ``decisions``.
     after : object
         What the policy is once this counts (`dwell.policies.protocol.Proposer.commit`).
+    verdict : Verdict, optional
+        What the fleet says of it.
+    wished : str
+        What the policy has decided for, where `decision` is the fleet's in its place.
     """
 
     seen: tuple[float, float, float]
     decision: Decision
     priced: tuple[object, ...]
     after: object
+    verdict: Verdict | None = None
+    wished: str = ""
 
     def __repr__(self) -> str:
         return f"<Proposal: {self.decision.reason}, {self.decision.name}>"
@@ -117,6 +124,8 @@ class Controller:
     estimator : Estimator, str, or None
         An object with `estimate`, an estimator's name, or None for the cell file's choice. The
         caller's object is copied, never changed.
+    coordination : Coordination, optional
+        What is asked before the cell moves, where it is one of a fleet.
 
     Raises
     ------
@@ -131,8 +140,9 @@ class Controller:
         problem: Problem,
         policy: MinimalPolicy | str | None = None,
         estimator: Estimator | str | None = None,
+        coordination: Coordination | None = None,
     ) -> None:
-        self.problem = problem
+        self.problem, self.coordination = problem, coordination
         if isinstance(policy, str):
             policy, estimator = _without_estimator(policy, estimator, problem)
         named = (policy or problem.controller.policy, estimator or problem.controller.estimator)
@@ -149,6 +159,8 @@ class Controller:
             start = getattr(self.estimator, "start", None)
             if start is not None:
                 start(problem)
+        if coordination is not None:
+            coordination.meet(self.estimator)
         self._support: Callable[[], Mapping[str, Support]] | None = getattr(
             self.estimator, "support", None
         )
@@ -159,6 +171,8 @@ class Controller:
         known = isinstance(initial, str) and initial in problem.candidates
         #: Where the cell is, as far as is known here.
         self.course = Course(str(initial) if known else problem.initial)
+        if coordination is not None:
+            coordination.place(self.course.placement)
         #: Number of the next window.
         self.window = 0
         #: Rows of ``decisions``: `decision_columns`, then why it was not carried out, or None.
@@ -191,6 +205,12 @@ class Controller:
         """The policy that decides: a copy of what was given."""
         return self._policy.given
 
+    @property
+    def features(self) -> tuple[Feature, ...]:
+        """What ``decisions`` has that not every run's has."""
+        supports: tuple[Feature, ...] = ("support",) if self.supports else ()
+        return supports if self.coordination is None else (*supports, "fleet")
+
     @cached_property
     def decision_columns(self) -> tuple[str, ...]:
         """Names of the columns of ``decisions``, but the last.
@@ -201,11 +221,11 @@ class Controller:
         estimator says it, how many samples stand behind the estimate and how old (windows) the
         newest is.
         """
-        features: tuple[Feature, ...] = ("support",) if self.supports else ()
         resources = self.problem.fabric.resources.values()
         return tuple(
             column.name
-            for one in those_with(features, DECISIONS)
+            for one in those_with(self.features, DECISIONS)
+            if one.name != "refused"
             for column in columns_of(one.name, resources, self._names)
         )
 
@@ -259,13 +279,16 @@ class Controller:
         ----------
         l95_ms, violation_rate, uncut_ms : float
             L95 as it could be known, V_D, and L95 as caps are compared with it.
-        shares : float64 array, shape (3, resources)
-            Busy, own and shadow share of every resource; NaN where they were not measured.
+        shares : float64 array, shape (3, resources) or (4, resources)
+            Busy, own and shadow share of every resource, and that of other cells of a fleet; NaN
+            where they were not measured.
         """
-        used, own, shadow = shares.tolist()
+        used, own, shadow, *others = shares.tolist()
         seen = dict(zip(self.resources, used, strict=True))
         # Neither the cell's jobs nor its shadow jobs are foreign.
         mine = dict(zip(self.resources, map(add, own, shadow), strict=True))
+        if others and self.coordination is not None and self.coordination.knows_others:
+            mine = {name: mine[name] + share for name, share in zip(mine, *others, strict=True)}
         if self._has_accelerators:
             seen, mine = _measured(seen), _measured(mine)
         return self.propose_by(QoS(l95_ms, violation_rate, FrozenDict(seen), uncut_ms), mine)
@@ -281,11 +304,35 @@ class Controller:
             # It knows no more of the incumbent than the window shows.
             estimates[incumbent] = observed
         decision, after = self._policy.propose(
-            observed=observed, estimates=estimates, tentative=course.by_guard
+            observed=observed,
+            estimates=estimates,
+            tentative=course.by_guard or self.coordination is not None,
         )
         decision = self._checked(decision)
         seen = observed.l95_ms, observed.violation_rate, measured
-        return Proposal(seen, decision, self._priced(decision, estimates), after)
+        proposal = Proposal(seen, decision, self._priced(decision, estimates), after)
+        if self.coordination is not None:
+            self._consider(proposal, estimates, self.coordination)
+        return proposal
+
+    def _consider(
+        self, proposal: Proposal, estimates: Mapping[str, QoS], coordination: Coordination
+    ) -> None:
+        """Have the fleet look at what the policy has decided."""
+        decision, incumbent = proposal.decision, self.course.placement
+        verdict = coordination.consider(decision, estimates, incumbent, self.estimator)
+        proposal.verdict, name = verdict, verdict.name
+        if name != decision.name:
+            migrated = name != incumbent
+            proposal.wished = decision.name
+            proposal.decision = replace(
+                decision,
+                placement=self.problem.candidates[name],
+                name=name,
+                migrated=migrated,
+                reason="migrate" if migrated else decision.reason,
+                dwell=0 if migrated else self.course.dwell,
+            )
 
     def learn(self, evidence: Callable[[], Evidence]) -> None:
         """Have the estimator learn from a window, if it learns, before it is decided on."""
@@ -320,7 +367,11 @@ class Controller:
     def commit(self, proposal: Proposal) -> None:
         """Take note that a proposal has been carried out."""
         decision = proposal.decision
-        self._policy.commit(proposal.after)
+        if not proposal.wished:
+            self._policy.commit(proposal.after)
+        elif decision.migrated or self.course.previous != self.course.placement:
+            # The fleet decides in its place, so that it has decided nothing.
+            self._policy.adopt(decision.name)
         self._record(proposal)
         if decision.migrated:
             self.course.move(decision.name, decision.dwell)
@@ -392,6 +443,8 @@ class Controller:
             self._policy.adopt(left)
         self._policy.adopt(name)
         self.course.fall(name, left)
+        if self.coordination is not None:
+            self.coordination.place(name)
         fixed = (self.window, left, name, name != left, "guard", 0, None)
         priced = [None] * (len(self.decision_columns) - len(fixed))
         self.decisions.append((*fixed, *priced, None))
@@ -411,6 +464,8 @@ class Controller:
         """
         self._find(name, self.course.placement)
         self.course.find(name, by_guard=fallback)
+        if self.coordination is not None:
+            self.coordination.place(name)
 
     def _find(self, name: str, believed: str) -> None:
         """Tell a policy that believes the cell elsewhere where it is."""
@@ -425,9 +480,14 @@ class Controller:
         name, migrated = decision.name, decision.migrated
         if why is not None and migrated:
             why, name, migrated = f"{name}: {why}", incumbent, False
+        asked: Asked | tuple[()] = ()
+        if proposal.verdict is not None:
+            asked = proposal.verdict.asked
+            if why is None and proposal.verdict.why is not None:
+                why = f"{proposal.wished}: {proposal.verdict.why}"
         fixed = (self.window, incumbent, name, migrated)
         rule = (decision.reason, decision.dwell, decision.delta_j)
-        self.decisions.append((*fixed, *rule, *proposal.priced, why))
+        self.decisions.append((*fixed, *rule, *proposal.priced, *asked, why))
         self.window += 1
 
     def _priced(self, decision: Decision, estimates: Mapping[str, QoS]) -> tuple[object, ...]:

@@ -2,35 +2,82 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 
-from dwell.control.controller import Proposal
+from dwell.estimators import Estimator
+from dwell.model import Decision, QoS
+
+#: Φ before and after what was looked at, and the round that it is of; what is not known is None.
+Asked: TypeAlias = tuple[float | None, float | None, int | None]
+NOT_ASKED: Asked = (None, None, None)
 
 
-class Coordination(Protocol):
-    """Says of a move that is proposed whether it may be made."""
+class Verdict(NamedTuple):
+    """What a fleet says of a decision.
 
-    def refusal(self, proposal: Proposal, incumbent: str) -> str:
-        """Return why a move may not be made; nothing where it may."""
-        ...
+    Parameters
+    ----------
+    name : str
+        Candidate of the cycles that follow.
+    why : str, optional
+        Why it is not the one that the policy has decided for.
+    asked : tuple
+        Φ before and after the move that was looked at, and the round.
+    """
+
+    name: str
+    why: str | None = None
+    asked: Asked = NOT_ASKED
 
 
-class Uncoordinated:
-    """Lets every move pass."""
+class Coordination(ABC):
+    """Says of a decision whether it may be carried out, or what is to be done in its place.
 
-    def refusal(self, proposal: Proposal, incumbent: str) -> str:
-        """Return nothing."""
-        return ""
+    Attributes
+    ----------
+    knows_others : bool
+        Whether what other cells of the fleet do is known, so that it is no foreign load.
+    """
+
+    knows_others: ClassVar[bool] = False
+
+    @abstractmethod
+    def consider(
+        self,
+        decision: Decision,
+        estimates: Mapping[str, QoS],
+        incumbent: str,
+        estimator: Estimator,
+    ) -> Verdict:
+        """Look at what a policy has decided at a close.
+
+        Parameters
+        ----------
+        estimates : mapping of str to QoS
+            Of every candidate.
+        incumbent : str
+            Where the cell is.
+        estimator : Estimator
+            Whose estimates they are.
+        """
+
+    def meet(self, estimator: Estimator) -> None:
+        """Have the cell's estimator take notice of the fleet, before the first window."""
+
+    def place(self, name: str) -> None:
+        """Take note of where the cell is, though nothing was asked: the guard, or a person."""
 
 
-class ByChance:
+class ByChance(Coordination):
     """Lets a move pass with a probability: the share of its J that the cell gains.
 
     Where all cells of a fleet see the same advantage at once, some go, and the others look again
     (Fischer and Vöcking, PODC 2005, DOI 10.1145/1073814.1073868). Controllers need not know of each
-    other for it.
+    other for it. The move of a policy without prices passes.
 
     Parameters
     ----------
@@ -44,11 +91,20 @@ class ByChance:
     def __repr__(self) -> str:
         return "<ByChance>"
 
-    def refusal(self, proposal: Proposal, incumbent: str) -> str:
-        """Return why not, in about that share of the cases; a policy without prices passes."""
-        costs, name = proposal.decision.costs, proposal.decision.name
-        if incumbent not in costs or name not in costs or not costs[incumbent] > 0:
-            return ""
+    def consider(
+        self,
+        decision: Decision,
+        estimates: Mapping[str, QoS],
+        incumbent: str,
+        estimator: Estimator,
+    ) -> Verdict:
+        """Refuse a move in some of the cases."""
+        costs = decision.costs
+        if not decision.migrated or incumbent not in costs or not costs[incumbent] > 0:
+            return Verdict(decision.name)
         # The price of the move is in what the other candidate costs.
-        chance = min(1.0, max(0.0, (costs[incumbent] - costs[name]) / costs[incumbent]))
-        return "" if self._rng.random() < chance else f"chance: {chance:.3g}"
+        gain = costs[incumbent] - costs[decision.name]
+        chance = min(1.0, max(0.0, gain / costs[incumbent]))
+        if self._rng.random() < chance:
+            return Verdict(decision.name)
+        return Verdict(incumbent, f"chance: {chance:.3g}")

@@ -28,6 +28,8 @@ BUDGET = 200_000
 #: What a core draws on the pool of a quota at a time (sched_cfs_bandwidth_slice_us), and the least
 #: run time of a turn (sched_base_slice of two CPUs; eight and more have twice as much), ms.
 DRAWN_MS, LEAST_MS = 5.0, 1.4
+#: Of what shares of a resource are told: busy, own, of shadows, of other cells that have it, too.
+PARTS = 4
 #: Tables of a state that is in one piece begin at multiples of so many bytes.
 LINE = 64
 #: What a quota counts in time of its core (`_counted_ns`).
@@ -693,6 +695,7 @@ class _Layout:
             "n_flows": self.max_flows,
             "n_layers": n_layers,
             "n_resources": self.max_resources,
+            "has_shared": len(self.cells) > 1 and bool(self.shared),
             "n_cycles": cycles,
             "n_windows": windows,
             "margin": margin,
@@ -752,9 +755,9 @@ class _Layout:
             compute_ns=np.zeros((cells, cycles), np.int64),
             network_ns=np.zeros((cells, cycles), np.int64),
             outcome=np.zeros((cells, cycles), np.int8),
-            opened=np.zeros((cells, windows, 3, self.max_resources)),
-            closed=np.zeros((cells, windows, 3, self.max_resources)),
-            shares=np.zeros((cells, windows, 3, self.max_resources)),
+            opened=np.zeros((cells, windows, PARTS, self.max_resources)),
+            closed=np.zeros((cells, windows, PARTS, self.max_resources)),
+            shares=np.zeros((cells, windows, PARTS, self.max_resources)),
             shadow_bytes=np.zeros((cells if self.shadows else 0, cycles), np.int64),
             log_outcome=np.zeros(logged * self.max_tasks, np.int8),
             log_arrived=np.full((logged, self.max_flows), -1, np.int64),

@@ -19,7 +19,6 @@ from dwell.control import (
     ShadowPlan,
     plain_rule,
 )
-from dwell.control.coordination import Coordination, Uncoordinated
 from dwell.errors import SimulationError
 from dwell.kernels.advance import logged_instants, play
 from dwell.kernels.arrays import CellArrays, flow_rows, lay_out
@@ -37,7 +36,6 @@ from dwell.sim.simulated_guard import SimulatedGuard
 from dwell.sim.tables import PlayedRealisation, make_tables
 from dwell.sim.versions import versions
 
-UNCOORDINATED = Uncoordinated()
 #: Columns of the kernel's table `seen`.
 SEEN = "first_cycle", "missed", "l95_ms", "uncut_ms"
 
@@ -176,15 +174,12 @@ class PlayedCell(NamedTuple):
         What decides has seen no window.
     guarded : bool
         Whether its guard acts.
-    coordination : Coordination
-        What it asks before it moves.
     """
 
     problem: Problem
     realisation: Realisation
     controller: Controller
     guarded: bool
-    coordination: Coordination = UNCOORDINATED
 
 
 def play_cells(
@@ -282,7 +277,7 @@ class _Stamper:
     """Carries closed windows to the controller, and its orders to the cycles they stamp."""
 
     def __init__(self, cell: PlayedCell, arrays: CellArrays, plan: ShadowPlan | None) -> None:
-        problem, realisation, controller, guarded, self.coordination = cell
+        problem, realisation, controller, guarded = cell
         self.controller, self.arrays = controller, arrays
         self.release_ns = realisation.release_ns
         self.cycles = realisation.cycles
@@ -395,12 +390,6 @@ class _Stamper:
         seen = l95_ms, missed / self.window_cycles, uncut_ms, self.shares[0, index]
         proposal = controller.propose_on(*seen)
         self.metrics.append(proposal.seen)
-        why = ""
-        if proposal.decision.migrated:
-            why = self.coordination.refusal(proposal, self.course.placement)
-        if why:
-            controller.reject(proposal, why)
-            return
         if watch is None or not self.course.by_guard:
             controller.commit(proposal)
             return

@@ -9,8 +9,9 @@ from functools import partial
 import numpy as np
 
 from dwell.control import Controller
-from dwell.control.coordination import ByChance, Coordination, Uncoordinated
-from dwell.errors import SimulationError
+from dwell.control.coordination import ByChance, Coordination
+from dwell.control.ledger import Ledger, Seat
+from dwell.estimators.fleet_prices import FleetCellSpec
 from dwell.kernels.random_draws import draw, stream
 from dwell.kernels.realisation import NodeChanges, Realisation
 from dwell.model import NodeDisturbance, Problem, Scenario
@@ -63,17 +64,17 @@ def simulate_fleet(
     problems = dict(zip(names, phased(fleet, seed), strict=True))
     realisations = drawn(fleet, problems, seed, windows)
 
-    def made(cell: FleetCell) -> PlayedCell:
-        chosen = cell.entry.policy or fleet.policy
-        named = cell.entry.estimator or fleet.estimator
-        controller = Controller(problems[cell.name], chosen, named)
-        guarded = guard and controller.guarded
-        asks = _coordination(fleet.coordination, cell, seed)
-        return PlayedCell(problems[cell.name], realisations[cell.name], controller, guarded, asks)
+    def cells() -> Iterator[PlayedCell]:
+        for cell, asks in zip(fleet.cells, _coordinations(fleet, problems, seed), strict=True):
+            chosen = cell.entry.policy or fleet.policy
+            named = cell.entry.estimator or fleet.estimator
+            problem, realisation = problems[cell.name], realisations[cell.name]
+            controller = Controller(problem, chosen, named, asks)
+            yield PlayedCell(problem, realisation, controller, guard and controller.guarded)
 
     play = partial(play_cells, shared=fleet.shared, jobs=jobs)
     # As in a cell alone, shadows are drawn for probes where the first are wanted.
-    played = play([*map(made, fleet.cells)]) or play([*map(made, fleet.cells)], shadow=True) or []
+    played = play([*cells()]) or play([*cells()], shadow=True) or []
     runs = {}
     for cell, one in zip(fleet.cells, played, strict=True):
         meta = partial(
@@ -160,17 +161,32 @@ def _with_all(problem: Problem, scenario: str, fleet: Fleet) -> Problem:
 
 def _meeting(real: Realisation, first: Realisation, shared: tuple[str, ...]) -> Realisation:
     """Return a realisation whose shared nodes go through what those of the first cell do."""
-    mine = [one for one in NodeChanges.of(real.node_changes) if one.node not in shared]
-    theirs = [one for one in NodeChanges.of(first.node_changes) if one.node in shared]
-    changes = sorted([*mine, *theirs], key=lambda one: one.at_ns)
-    return replace(real, node_changes=changes)
+    own, theirs = NodeChanges.of(real.node_changes), NodeChanges.of(first.node_changes)
+    nodes = tuple(dict.fromkeys((*own.nodes, *theirs.nodes)))
+    rows = []
+    for changes, is_first in ((own, False), (theirs, True)):
+        taken = [i for i, name in enumerate(changes.nodes) if (name in shared) == is_first]
+        table = changes.table[np.isin(changes.table[:, 1], taken)]
+        places = np.array([nodes.index(name) for name in changes.nodes], np.int64)
+        table[:, 1] = places[table[:, 1]]
+        rows.append(table)
+    merged = np.concatenate(rows)
+    order = np.argsort(merged[:, 0], kind="stable")
+    return replace(real, node_changes=NodeChanges(nodes, merged[order]))
 
 
-def _coordination(name: str, cell: FleetCell, seed: int) -> Coordination:
-    """Return what a cell asks before it moves."""
-    if name == "random":
-        streams = stream(seed, f"{cell.problem.name}-{cell.copy}/coordination")
-        return ByChance(np.random.Generator(np.random.SFC64(streams)))
-    if name == "none":
-        return Uncoordinated()
-    raise SimulationError(f"coordination {name!r} is not there; use none or random")
+def _coordinations(
+    fleet: Fleet, problems: Mapping[str, Problem], seed: int
+) -> Iterator[Coordination | None]:
+    """Yield what each cell asks before it moves; None where it asks nobody."""
+    if fleet.coordination == "ledger":
+        specs = [FleetCellSpec(cell.name, problems[cell.name], cell.streams) for cell in fleet.cells]
+        ledger = Ledger(specs, fleet.shared, fleet.objective)
+    for i, cell in enumerate(fleet.cells):
+        if fleet.coordination == "ledger":
+            yield Seat(ledger, i)
+        elif fleet.coordination == "random":
+            streams = stream(seed, f"{cell.problem.name}-{cell.copy}/coordination")
+            yield ByChance(np.random.Generator(np.random.SFC64(streams)))
+        else:
+            yield None

@@ -1,0 +1,287 @@
+"""Ledger: who of a fleet is where, and which move is good for all.
+
+Closes are looked at one after another. What cells know of themselves (their *presents*, see
+`dwell.estimators.presents`) and where they are is frozen from one close to the next; a cell that
+may move is asked for if something of it is new. A table of loads says which of its candidates are
+worth a look; then the fleet is played as it is and as it would be, on the same draws. The move is
+made if
+
+* Φ as played falls by more than the mover owes, Δ_min + α_S·S, and
+* no cell comes over a cap that it was under.
+
+A move counts from then on, before any window shows it. Under given presents Φ is a function of the
+placements alone, and every move lowers it by more than the least Δ_min: the number of moves is
+finite, whatever the table says, and at most (Φ at first − least Φ) / least Δ_min.
+
+What is lowered is the sum of the cells' costs; or the worst of them: costs are rounded up to
+multiples of the least Δ_min and sorted from the largest, the smaller list is the better one, and
+of equal lists that with the smaller sum.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import ClassVar
+
+import numpy as np
+
+from dwell.control.coordination import Coordination, Verdict
+from dwell.cost import excess, hamming
+from dwell.estimators import Estimator
+from dwell.estimators.fleet_prices import CellTerms, FleetCellSpec, FleetPrice, FleetPrices
+from dwell.estimators.load_table import LoadTable, load_table
+from dwell.estimators.online import Online
+from dwell.estimators.presents import Present
+from dwell.estimators.prices import prices_of
+from dwell.model import Caps, Decision, QoS
+from dwell.model.fleet import FleetObjective
+
+#: So many of a cell's candidates are played at a close, those that the table thinks best of.
+LOOKS = 2
+
+
+class Ledger:
+    """Knows where all cells of a fleet are, and lets them move where that is good for all.
+
+    Parameters
+    ----------
+    cells : sequence of FleetCellSpec
+    shared : sequence of str
+        Nodes that are one computer for all cells.
+    objective : {"sum", "worst"}
+    table : LoadTable, optional
+        What proposes; made of the cells where None.
+    prices : FleetPrices, optional
+        What plays.
+    progress : callable
+        Told how many of how many levels of the table have been played.
+    """
+
+    def __init__(
+        self,
+        cells: Sequence[FleetCellSpec],
+        shared: Sequence[str],
+        objective: FleetObjective = "sum",
+        *,
+        table: LoadTable | None = None,
+        prices: FleetPrices | None = None,
+        progress: Callable[[int, int], None] = lambda done, of: None,
+    ) -> None:
+        self.cells, self.shared, self.objective = tuple(cells), tuple(shared), objective
+        problems = [cell.problem for cell in cells]
+        self.table = load_table(cells, shared, progress) if table is None else table
+        self.prices = prices or FleetPrices(cells, shared)
+        self._loads = Loads(self.table)
+        self._terms = [CellTerms(problem, shared) for problem in problems]
+        self.placements = [problem.initial for problem in problems]
+        #: By cell and candidate, J alone, without switching and shared nodes.
+        self._alone = [
+            {name: terms.cost(price.qos) for name, price in prices_of(problem).items()}
+            for problem, terms in zip(problems, self._terms, strict=True)
+        ]
+        self._presents = [Present()] * len(self.cells)
+        self._revisions = [-1] * len(self.cells)
+        self._has_caps = any(problem.objective.caps != Caps() for problem in problems)
+        self._least = min(problem.controller.min_improvement for problem in problems)
+        #: Counts what is new: presents, and placements.
+        self._version = 0
+        self._looked = [-1] * len(self.cells)
+        self._refusals: list[dict[str, str]] = [{} for _ in self.cells]
+        #: Number of the round: of the closes since fleets were last played to compare them.
+        self.round = 0
+
+    def __repr__(self) -> str:
+        return f"<Ledger of {len(self.cells)} cells: round {self.round}>"
+
+    def place(self, index: int, name: str) -> None:
+        """Take note of where a cell is."""
+        if name != self.placements[index]:
+            self.placements[index] = name
+            self._version += 1
+
+    def note(self, index: int, estimates: Mapping[str, QoS], estimator: Estimator) -> None:
+        """Take note of what a cell knows of itself, where that is new."""
+        revision = estimator.revision if isinstance(estimator, Online) else 0
+        if revision == self._revisions[index]:
+            return
+        self._revisions[index] = revision
+        self._alone[index] = {name: self._terms[index].cost(qos) for name, qos in estimates.items()}
+        if isinstance(estimator, Online):
+            self._presents[index] = estimator.present
+        self._version += 1
+
+    def consider(self, index: int, decision: Decision) -> Verdict:
+        """Say where a cell is to be that its policy has decided on."""
+        here, wished = self.placements[index], decision.name
+        if self._looked[index] != self._version:
+            self._looked[index] = self._version
+            self._refusals[index] = {}
+        elif not decision.migrated or wished in self._refusals[index]:
+            return self._refused(index, wished)
+        if decision.costs:
+            if decision.reason == "dwell":
+                self._looked[index] = -1
+                return self._refused(index, wished)
+            names = self._promising(index)
+        else:
+            names = [wished] if decision.migrated else []
+        asked: tuple[float, float] | None = None
+        for name in names:
+            before, after = self._played(index, name)
+            asked = before.phi, after.phi
+            why = self._objection(index, name, before, after)
+            if why is None:
+                verdict = Verdict(name, None, (*asked, self.round))
+                self.round += 1
+                self.place(index, name)
+                return verdict
+            self._refusals[index][name] = why
+        verdict = self._refused(index, wished, asked)
+        self.round += asked is not None
+        return verdict
+
+    def _refused(
+        self, index: int, wished: str, asked: tuple[float, float] | None = None
+    ) -> Verdict:
+        here = self.placements[index]
+        why = None
+        if wished != here:
+            why = self._refusals[index].get(wished, "ledger: Φ would not fall")
+        return Verdict(here, why, (*(asked or (None, None)), self.round))
+
+    def _promising(self, index: int) -> list[str]:
+        """Candidates by which Φ would fall by more than is owed, as the table has it; best first."""
+        before = self._loads.costs(self.placements, self._alone)
+        found = []
+        for name in self.cells[index].problem.candidates:
+            if name != self.placements[index]:
+                after = self._loads.costs(self._with(index, name), self._alone)
+                if self._is_better(before, after, self.owed(index, name)):
+                    found.append((sum(after) - sum(before), name))
+        return [name for _, name in sorted(found)[:LOOKS]]
+
+    def _with(self, index: int, name: str) -> list[str]:
+        return [*self.placements[:index], name, *self.placements[index + 1 :]]
+
+    def owed(self, index: int, name: str) -> float:
+        """What Φ has to fall by at least for a cell to move: Δ_min + α_S·S."""
+        problem = self.cells[index].problem
+        here, there = problem.candidates[self.placements[index]], problem.candidates[name]
+        weight = problem.objective.weights.switching
+        return problem.controller.min_improvement + weight * hamming(there, here)
+
+    def _played(self, index: int, name: str) -> tuple[FleetPrice, FleetPrice]:
+        self.prices.begin(self._presents)
+        before = self.prices.price(tuple(self.placements))
+        return before, self.prices.price(tuple(self._with(index, name)))
+
+    def _objection(
+        self, index: int, name: str, before: FleetPrice, after: FleetPrice
+    ) -> str | None:
+        """Why a cell must not move, by what has been played."""
+        costs = [*before.costs, before.shared], [*after.costs, after.shared]
+        if not self._is_better(*costs, self.owed(index, name)):
+            rises = after.phi - before.phi
+            if rises > 0:
+                return f"ledger: Φ would rise by {rises:.3g}"
+            return f"ledger: Φ would fall by {-rises:.3g}, {self.owed(index, name):.3g} is owed"
+        if self._has_caps:
+            for cell, one, other in zip(self.cells, before.cells, after.cells, strict=True):
+                caps = cell.problem.objective
+                if one and other and excess(one.qos, caps) <= 0 < excess(other.qos, caps):
+                    return f"cap of {cell.name}"
+        return None
+
+    def _is_better(self, before: Sequence[float], after: Sequence[float], owed: float) -> bool:
+        if self.objective == "worst":
+            one, other = self._from_the_worst(before), self._from_the_worst(after)
+            if one != other:
+                return other < one
+        return sum(before) - sum(after) > owed
+
+    def _from_the_worst(self, costs: Sequence[float]) -> list[int]:
+        """Costs of cells in steps of the least Δ_min, the largest first."""
+        step = self._least or 1e-9
+        return sorted((math.ceil(cost / step) for cost in costs[: len(self.cells)]), reverse=True)
+
+
+class Seat(Coordination):
+    """A cell's place in a ledger."""
+
+    knows_others: ClassVar[bool] = True
+
+    def __init__(self, ledger: Ledger, index: int) -> None:
+        self._ledger, self._index = ledger, index
+
+    def __repr__(self) -> str:
+        return f"<Seat of {self._ledger.cells[self._index].name}>"
+
+    def meet(self, estimator: Estimator) -> None:
+        """Have the estimator take notice of the fleet."""
+        if isinstance(estimator, Online) and len(self._ledger.cells) > 1:
+            estimator.share(self._ledger.shared)
+
+    def place(self, name: str) -> None:
+        """Take note of where the cell is."""
+        self._ledger.place(self._index, name)
+
+    def consider(
+        self,
+        decision: Decision,
+        estimates: Mapping[str, QoS],
+        incumbent: str,
+        estimator: Estimator,
+    ) -> Verdict:
+        """Have the ledger look at what the policy has decided."""
+        self._ledger.place(self._index, incumbent)
+        self._ledger.note(self._index, estimates, estimator)
+        return self._ledger.consider(self._index, decision)
+
+
+class Loads:
+    """Costs of a fleet's cells at any placements, as a table of loads has them."""
+
+    def __init__(self, table: LoadTable) -> None:
+        self._kinds, self._work = table.kinds, table.work
+        self._more = {}
+        for (kind, name), column in table.columns.items():
+            objective = table.cells[kind].problem.objective
+            weights = objective.weights
+            j = weights.latency * column.l95_ms / objective.targets.latency_ms
+            j = j + weights.violations * column.violation_rate
+            self._more[kind, name] = column.level, j - j[0]
+        self._shared = [
+            CellTerms(cell.problem, table.shared).by_core() for cell in table.cells
+        ]
+
+    def costs(
+        self, placements: Sequence[str], alone: Sequence[Mapping[str, float]]
+    ) -> list[float]:
+        """J of every cell, without switching; then what shared nodes cost.
+
+        Parameters
+        ----------
+        alone : sequence of mapping of str to float
+            J of every candidate of each cell where no other is there.
+        """
+        cores: dict[str, float] = {}
+        for work, name in zip(self._work, placements, strict=True):
+            if name in work:
+                node, more = work[name]
+                cores[node] = cores.get(node, 0.0) + more
+        waits: dict[tuple[int, str], float] = {}
+        costs = []
+        for kind, work, name, mine in zip(self._kinds, self._work, placements, alone, strict=True):
+            cost = mine[name]
+            if name in work:
+                of = kind, name
+                if of not in waits:
+                    level, more_j = self._more[of]
+                    waits[of] = float(np.interp(cores[work[name][0]], level, more_j))
+                cost += waits[of]
+            costs.append(cost)
+        shared = sum(
+            factors.get(node, 0.0) * used for factors in self._shared for node, used in cores.items()
+        )
+        return [*costs, shared / len(costs)]
