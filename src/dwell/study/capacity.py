@@ -26,6 +26,7 @@ SEEDS = tuple(range(1, 11))
 MOST = 128
 #: Share of cycles that one cell alone may miss where an excess over it is of any use.
 USELESS = 0.5
+ROUNDING = 1e-12
 #: Sizes that are played together where no cell moves: they have draws in common.
 TOGETHER = 4
 #: Seeds that say where cycles wait.
@@ -296,15 +297,16 @@ class _Curve:
 
     @property
     def _useless(self) -> bool:
-        return self._alone > self.limit and self._alone >= USELESS
+        return self._alone > self.limit + ROUNDING and self._alone >= USELESS
 
     @property
     def bound(self) -> float:
-        return self.limit + (self._alone if self._on_excess else 0.0)
+        """V_D that is not to be passed, and what sums of floats are off by."""
+        return self.limit + (self._alone if self._on_excess else 0.0) + ROUNDING
 
     @property
     def _on_excess(self) -> bool:
-        return self._alone > self.limit and not self._useless
+        return self._alone > self.limit + ROUNDING and not self._useless
 
     def capacity(self, fleet: Fleet) -> Capacity:
         """Return what it comes to."""
