@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -17,7 +18,7 @@ from dwell.study.capacity import Capacity, Unit, capacity_of, what_ifs
 from tests.cells.fleets import fleet_of, one_job, within
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-FEW = {"seeds": (1, 2), "cycles": 100, "processes": 1}
+FEW: dict[str, Any] = {"seeds": (1, 2), "cycles": 100, "processes": 1}
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +65,7 @@ def test_where_one_alone_is_over_the_limit_the_excess_counts() -> None:
 
 
 @pytest.mark.parametrize("phases", ["sync", "even", "random"])
-def test_static_fleets_are_what_a_fleet_s_run_shows(quiet: Fleet, phases: str) -> None:
+def test_static_fleets_are_what_a_fleet_s_run_shows(quiet: Fleet, phases: Any) -> None:
     """V_D of the worst cell of every size, exactly."""
     seeds = (3, 4)
     found = capacity_of(
