@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dwell.estimators import Estimator
 from dwell.model import Decision, QoS
@@ -67,6 +68,10 @@ class Coordination(ABC):
 
     def meet(self, estimator: Estimator) -> None:
         """Have the cell's estimator take notice of the fleet, before the first window."""
+
+    def turns(self, release_ns: NDArray[np.int64]) -> NDArray[np.bool_] | None:
+        """Whether shadows may be sent to shared nodes with each cycle; None where all may."""
+        return None
 
     def place(self, name: str) -> None:
         """Take note of where the cell is, though nothing was asked: the guard, or a person."""

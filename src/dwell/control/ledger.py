@@ -22,9 +22,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import ClassVar
+from typing import ClassVar, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dwell.control.coordination import Coordination, Verdict
 from dwell.cost import excess, hamming
@@ -36,6 +37,8 @@ from dwell.estimators.presents import Present
 from dwell.estimators.prices import prices_of
 from dwell.model import Caps, Decision, QoS
 from dwell.model.fleet import FleetObjective
+
+Floats: TypeAlias = NDArray[np.float64]
 
 #: So many of a cell's candidates are played at a close, those that the table thinks best of.
 LOOKS = 2
@@ -84,6 +87,12 @@ class Ledger:
         self._revisions = [-1] * len(self.cells)
         self._has_caps = any(problem.objective.caps != Caps() for problem in problems)
         self._least = min(problem.controller.min_improvement for problem in problems)
+        names = sorted(cell.name for cell in cells)
+        #: Place of each cell where they take turns, and how long one is.
+        self.order = [names.index(cell.name) for cell in cells]
+        self.turn_ns = max(
+            round(problem.window_cycles * problem.pipeline.period_ms * 1e6) for problem in problems
+        )
         #: Counts what is new: presents, and placements.
         self._version = 0
         self._looked = [-1] * len(self.cells)
@@ -220,7 +229,12 @@ class Seat(Coordination):
     def meet(self, estimator: Estimator) -> None:
         """Have the estimator take notice of the fleet."""
         if isinstance(estimator, Online) and len(self._ledger.cells) > 1:
-            estimator.share(self._ledger.shared)
+            estimator.share(self._ledger.shared, len(self._ledger.cells))
+
+    def turns(self, release_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether it is the cell's turn at each cycle: one window after another, by name."""
+        ledger = self._ledger
+        return release_ns // ledger.turn_ns % len(ledger.cells) == ledger.order[self._index]
 
     def place(self, name: str) -> None:
         """Take note of where the cell is."""
@@ -244,16 +258,52 @@ class Loads:
 
     def __init__(self, table: LoadTable) -> None:
         self._kinds, self._work = table.kinds, table.work
-        self._more = {}
-        for (kind, name), column in table.columns.items():
-            objective = table.cells[kind].problem.objective
+        self._waits: dict[tuple[int, str], tuple[Floats, Floats]] = {}
+        for group, column in table.columns.items():
+            objective = table.cells[group[0]].problem.objective
             weights = objective.weights
             j = weights.latency * column.l95_ms / objective.targets.latency_ms
             j = j + weights.violations * column.violation_rate
-            self._more[kind, name] = column.level, j - j[0]
-        self._shared = [
-            CellTerms(cell.problem, table.shared).by_core() for cell in table.cells
-        ]
+            self._waits[group] = column.level, j - j[0]
+        of_core = [CellTerms(cell.problem, table.shared).by_core() for cell in table.cells]
+        #: What a busy core of each shared node costs the fleet.
+        self._of_core = {
+            node: sum(one.get(node, 0.0) for one in of_core) / len(of_core)
+            for node in table.shared
+        }
+
+    def __repr__(self) -> str:
+        return f"<Loads of {len(self._kinds)} cells on {', '.join(self.nodes) or 'nothing'}>"
+
+    @property
+    def nodes(self) -> list[str]:
+        """Shared nodes that any candidate asks most of."""
+        used = {node for work in self._work for node, _ in work.values()}
+        return [node for node in self._of_core if node in used]
+
+    def most(self, node: str) -> float:
+        """Cores that all cells together may ask of a node."""
+        return sum(
+            max((cores for where, cores in work.values() if where == node), default=0.0)
+            for work in self._work
+        )
+
+    def group(self, index: int, name: str) -> tuple[int, str]:
+        """Cells that wait alike: the kind of a cell, and a candidate."""
+        return self._kinds[index], name
+
+    def node(self, index: int, name: str) -> str | None:
+        """Shared node that a cell's candidate asks most of."""
+        return self._work[index].get(name, (None, 0.0))[0]
+
+    def work(self, index: int, name: str) -> float:
+        """How many cores of it."""
+        return self._work[index].get(name, (None, 0.0))[1]
+
+    def wait(self, index: int, name: str, cores: float) -> float:
+        """What J of a cell's candidate grows by at a load of its shared node."""
+        of = self._waits.get(self.group(index, name))
+        return 0.0 if of is None else float(np.interp(cores, *of))
 
     def costs(
         self, placements: Sequence[str], alone: Sequence[Mapping[str, float]]
@@ -265,23 +315,19 @@ class Loads:
         alone : sequence of mapping of str to float
             J of every candidate of each cell where no other is there.
         """
-        cores: dict[str, float] = {}
+        cores = dict.fromkeys(self._of_core, 0.0)
         for work, name in zip(self._work, placements, strict=True):
             if name in work:
                 node, more = work[name]
-                cores[node] = cores.get(node, 0.0) + more
+                cores[node] += more
         waits: dict[tuple[int, str], float] = {}
         costs = []
-        for kind, work, name, mine in zip(self._kinds, self._work, placements, alone, strict=True):
+        for i, (name, mine) in enumerate(zip(placements, alone, strict=True)):
             cost = mine[name]
-            if name in work:
-                of = kind, name
-                if of not in waits:
-                    level, more_j = self._more[of]
-                    waits[of] = float(np.interp(cores[work[name][0]], level, more_j))
-                cost += waits[of]
+            if name in self._work[i]:
+                group = self.group(i, name)
+                if group not in waits:
+                    waits[group] = self.wait(i, name, cores[self._work[i][name][0]])
+                cost += waits[group]
             costs.append(cost)
-        shared = sum(
-            factors.get(node, 0.0) * used for factors in self._shared for node, used in cores.items()
-        )
-        return [*costs, shared / len(costs)]
+        return [*costs, sum(self._of_core[node] * used for node, used in cores.items())]

@@ -50,11 +50,14 @@ class FleetCellSpec:
         With its phase.
     streams : str
         What the names of its random streams begin with.
+    scenario : str
+        What befalls it beside its present.
     """
 
     name: str
     problem: Problem
     streams: str = ""
+    scenario: str = "baseline"
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +123,13 @@ class FleetPrices:
         self.cells, self.shared = tuple(cells), tuple(shared)
         self._windows = [_windows_of(cell.problem, cells, cycles) for cell in self.cells]
         self._declared = [
-            draw(cell.problem, seed=SEED, windows=windows, streams=cell.streams)
+            draw(
+                cell.problem,
+                scenario=cell.scenario,
+                seed=SEED,
+                windows=windows,
+                streams=cell.streams,
+            )
             for cell, windows in zip(self.cells, self._windows, strict=True)
         ]
         self._index = [{name: i for i, name in enumerate(cell.problem.candidates)} for cell in cells]

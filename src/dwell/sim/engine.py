@@ -216,7 +216,7 @@ def play_cells(
         ],
     )
     stampers = [
-        _Stamper(cell, CellArrays(whole, i), plan)
+        _Stamper(cell, CellArrays(whole, i), plan, shared)
         for i, (cell, plan) in enumerate(zip(cells, plans, strict=True))
     ]
     first = stampers[0]
@@ -276,7 +276,13 @@ def _host_changes(problem: Problem, realisation: Realisation) -> NDArray[np.int6
 class _Stamper:
     """Carries closed windows to the controller, and its orders to the cycles they stamp."""
 
-    def __init__(self, cell: PlayedCell, arrays: CellArrays, plan: ShadowPlan | None) -> None:
+    def __init__(
+        self,
+        cell: PlayedCell,
+        arrays: CellArrays,
+        plan: ShadowPlan | None,
+        shared: Collection[str] = (),
+    ) -> None:
         problem, realisation, controller, guarded = cell
         self.controller, self.arrays = controller, arrays
         self.release_ns = realisation.release_ns
@@ -292,6 +298,12 @@ class _Stamper:
         self.host_at_ns, self.host_down = table[:, 0].tolist(), table[:, 3].tolist()
         self.cold = ColdMigration(problem, realisation) if settings.migration == "cold" else None
         self.plan = plan
+        #: Whether shadows may be sent to shared nodes with each cycle, and candidates that are there.
+        self.turns, self.there = None, np.zeros(0, np.int16)
+        if plan is not None and controller.coordination is not None and shared:
+            self.turns = controller.coordination.turns(realisation.release_ns[:-1])
+            here = [not set(shared).isdisjoint(one.values()) for one in problem.candidates.values()]
+            self.there = np.flatnonzero(here)
         #: Whether probes are wanted of a run that was laid out without a shadow.
         self.lacks_shadow = False
         self.course = controller.course
@@ -319,7 +331,10 @@ class _Stamper:
         stamps[0, start:stop] = code
         if self.plan is not None and start < self.cycles:
             stop = min(stop, self.cycles)
-            stamps[1, start:stop] = self.plan.stamps(start, stop, code)
+            shadows = self.plan.stamps(start, stop, code)
+            if self.turns is not None:
+                shadows[~self.turns[start:stop] & np.isin(shadows, self.there)] = -1
+            stamps[1, start:stop] = shadows
         if self.watch is not None:
             self.watch.stamp(start, stop)
 
