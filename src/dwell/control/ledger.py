@@ -21,7 +21,7 @@ of equal lists that with the smaller sum.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar, TypeAlias
 
 import numpy as np
@@ -30,13 +30,15 @@ from numpy.typing import NDArray
 from dwell.control.coordination import Coordination, Verdict
 from dwell.cost import excess, hamming
 from dwell.estimators import Estimator
-from dwell.estimators.fleet_prices import CellTerms, FleetCellSpec, FleetPrice, FleetPrices
+from dwell.estimators.fleet_prices import CellTerms, FleetPrice, FleetPrices, PricedCell
 from dwell.estimators.load_table import LoadTable, load_table
 from dwell.estimators.online import Online
 from dwell.estimators.presents import Present
 from dwell.estimators.prices import prices_of
 from dwell.model import Caps, Decision, QoS
 from dwell.model.fleet import FleetObjective
+
+__all__ = ["Ledger", "Loads", "PricedCell", "Seat"]
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -49,7 +51,7 @@ class Ledger:
 
     Parameters
     ----------
-    cells : sequence of FleetCellSpec
+    cells : sequence of PricedCell
     shared : sequence of str
         Nodes that are one computer for all cells.
     objective : {"sum", "worst"}
@@ -63,7 +65,7 @@ class Ledger:
 
     def __init__(
         self,
-        cells: Sequence[FleetCellSpec],
+        cells: Sequence[PricedCell],
         shared: Sequence[str],
         objective: FleetObjective = "sum",
         *,
@@ -122,7 +124,7 @@ class Ledger:
 
     def consider(self, index: int, decision: Decision) -> Verdict:
         """Say where a cell is to be that its policy has decided on."""
-        here, wished = self.placements[index], decision.name
+        wished = decision.name
         if self._looked[index] != self._version:
             self._looked[index] = self._version
             self._refusals[index] = {}
@@ -160,7 +162,7 @@ class Ledger:
         return Verdict(here, why, (*(asked or (None, None)), self.round))
 
     def _promising(self, index: int) -> list[str]:
-        """Candidates by which Φ would fall by more than is owed, as the table has it; best first."""
+        """Candidates by which the table's Φ falls by more than is owed; best first."""
         before = self._loads.costs(self.placements, self._alone)
         found = []
         for name in self.cells[index].problem.candidates:
@@ -234,7 +236,8 @@ class Seat(Coordination):
     def turns(self, release_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether it is the cell's turn at each cycle: one window after another, by name."""
         ledger = self._ledger
-        return release_ns // ledger.turn_ns % len(ledger.cells) == ledger.order[self._index]
+        turn = release_ns // ledger.turn_ns % len(ledger.cells)
+        return np.equal(turn, ledger.order[self._index])
 
     def place(self, name: str) -> None:
         """Take note of where the cell is."""
@@ -268,8 +271,7 @@ class Loads:
         of_core = [CellTerms(cell.problem, table.shared).by_core() for cell in table.cells]
         #: What a busy core of each shared node costs the fleet.
         self._of_core = {
-            node: sum(one.get(node, 0.0) for one in of_core) / len(of_core)
-            for node in table.shared
+            node: sum(one.get(node, 0.0) for one in of_core) / len(of_core) for node in table.shared
         }
 
     def __repr__(self) -> str:
@@ -305,9 +307,7 @@ class Loads:
         of = self._waits.get(self.group(index, name))
         return 0.0 if of is None else float(np.interp(cores, *of))
 
-    def costs(
-        self, placements: Sequence[str], alone: Sequence[Mapping[str, float]]
-    ) -> list[float]:
+    def costs(self, placements: Sequence[str], alone: Sequence[Mapping[str, float]]) -> list[float]:
         """J of every cell, without switching; then what shared nodes cost.
 
         Parameters

@@ -8,15 +8,14 @@ that has nothing on a shared node meets no other, so that it is played once.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.cost import excess, price, tier_nodes
+from dwell.cost import price, tier_nodes
 from dwell.estimators.presents import Present, realised
 from dwell.estimators.prices import SEED
 from dwell.kernels.advance import play
@@ -24,7 +23,6 @@ from dwell.kernels.arrays import Arrays, lay_out
 from dwell.kernels.codes import EventKind, cell_of, kind_of
 from dwell.kernels.random_draws import draw
 from dwell.model.frozen import FrozenDict
-from dwell.model.instants import NEVER_NS
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS
@@ -40,7 +38,7 @@ AS_DECLARED = Present()
 
 
 @dataclass(frozen=True, slots=True)
-class FleetCellSpec:
+class PricedCell:
     """A cell of a fleet, as it is priced.
 
     Parameters
@@ -110,7 +108,7 @@ class FleetPrices:
 
     Parameters
     ----------
-    cells : sequence of FleetCellSpec
+    cells : sequence of PricedCell
     shared : sequence of str
         Nodes that are one computer for all cells.
     cycles : int
@@ -118,7 +116,7 @@ class FleetPrices:
     """
 
     def __init__(
-        self, cells: Sequence[FleetCellSpec], shared: Sequence[str], cycles: int = CYCLES
+        self, cells: Sequence[PricedCell], shared: Sequence[str], cycles: int = CYCLES
     ) -> None:
         self.cells, self.shared = tuple(cells), tuple(shared)
         self._windows = [_windows_of(cell.problem, cells, cycles) for cell in self.cells]
@@ -132,7 +130,9 @@ class FleetPrices:
             )
             for cell, windows in zip(self.cells, self._windows, strict=True)
         ]
-        self._index = [{name: i for i, name in enumerate(cell.problem.candidates)} for cell in cells]
+        self._index = [
+            {name: i for i, name in enumerate(cell.problem.candidates)} for cell in cells
+        ]
         self._meets = [
             {name: self.meets(placed) for name, placed in cell.problem.candidates.items()}
             for cell in self.cells
@@ -152,7 +152,7 @@ class FleetPrices:
         return not set(self.shared).isdisjoint(placement.values())
 
     def begin(self, presents: Sequence[Present]) -> None:
-        """Begin with other presents, one of each cell; of a shared node the middle of them holds."""
+        """Begin with other presents, one a cell; of a shared node the middle of them holds."""
         agreed = self._agreed(presents)
         for i, (present, before) in enumerate(zip(agreed, self._presents, strict=True)):
             if present is not before:
@@ -178,7 +178,9 @@ class FleetPrices:
                         down.add(name)
             same = threads == present.threads and down == present.down
             agreed.append(
-                present if same else replace(present, threads=FrozenDict(threads), down=frozenset(down))
+                present
+                if same
+                else replace(present, threads=FrozenDict(threads), down=frozenset(down))
             )
         return agreed
 
@@ -190,9 +192,7 @@ class FleetPrices:
         return known
 
     def _price(self, placements: Placements) -> FleetPrice:
-        together = [
-            name is not None and self._meets[i][name] for i, name in enumerate(placements)
-        ]
+        together = [name is not None and self._meets[i][name] for i, name in enumerate(placements)]
         plays = [
             name is not None and (together[i] or name not in self._alone[i])
             for i, name in enumerate(placements)
@@ -248,11 +248,7 @@ class FleetPrices:
 
     def _shared_cost(self, cells: Sequence[CellPrice | None]) -> float:
         """What the utilisation of shared nodes costs: of each once, the mean over cells."""
-        met = [
-            (self._terms[i], cell)
-            for i, cell in enumerate(cells)
-            if cell is not None
-        ]
+        met = [(self._terms[i], cell) for i, cell in enumerate(cells) if cell is not None]
         return sum(terms.shared_cost(cell.qos) for terms, cell in met) / max(len(met), 1)
 
 
@@ -283,11 +279,9 @@ class CellTerms:
 
     def cost(self, qos: QoS) -> float:
         """J without switching and shared nodes."""
-        used = qos.utilisation
-        tiers = (
-            max((used[name] for name in names if name in used), default=0.0) for names in self._own
-        )
-        return float(price(qos.l95_ms, qos.violation_rate, *tiers, 0.0, self._objective))
+        robot, edge, cloud = (self._most(names, qos) for names in self._own)
+        rate, objective = qos.violation_rate, self._objective
+        return float(price(qos.l95_ms, rate, robot, edge, cloud, 0.0, objective))
 
     def by_core(self) -> dict[str, float]:
         """What a core that is busy of each shared node would cost the cell."""
@@ -295,14 +289,14 @@ class CellTerms:
 
     def shared_cost(self, qos: QoS) -> float:
         """What the utilisation of shared nodes would cost the cell."""
-        used = qos.utilisation
-        return sum(
-            factor * max((used[name] for name in names if name in used), default=0.0)
-            for factor, names in self._shared
-        )
+        return sum(factor * self._most(names, qos) for factor, names in self._shared)
+
+    def _most(self, names: Sequence[str], qos: QoS) -> float:
+        """Utilisation of the fullest of some resources that are known."""
+        return max((qos.utilisation.get(name, 0.0) for name in names), default=0.0)
 
 
-def _windows_of(problem: Problem, cells: Sequence[FleetCellSpec], cycles: int) -> int:
+def _windows_of(problem: Problem, cells: Sequence[PricedCell], cycles: int) -> int:
     """Windows that are played of a cell: all cells for about as long."""
     periods_ms = [cell.problem.pipeline.period_ms for cell in cells]
     span_ms = cycles / sum(1 / period_ms for period_ms in periods_ms)

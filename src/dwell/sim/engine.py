@@ -211,7 +211,9 @@ def play_cells(
         log_windows=any(cell.controller.learns for cell in cells),
         shadows=[
             # Probes may be of any cycle.
-            plan and draw_shadows(cell.problem, cell.realisation, plan.sent, others=cell.guarded)
+            draw_shadows(cell.problem, cell.realisation, plan.sent, others=cell.guarded)
+            if plan is not None
+            else None
             for cell, plan in zip(cells, plans, strict=True)
         ],
     )
@@ -298,12 +300,12 @@ class _Stamper:
         self.host_at_ns, self.host_down = table[:, 0].tolist(), table[:, 3].tolist()
         self.cold = ColdMigration(problem, realisation) if settings.migration == "cold" else None
         self.plan = plan
-        #: Whether shadows may be sent to shared nodes with each cycle, and candidates that are there.
-        self.turns, self.there = None, np.zeros(0, np.int16)
-        if plan is not None and controller.coordination is not None and shared:
+        #: Whether shadows may be sent to shared nodes with each cycle, and who is there.
+        self.turns: NDArray[np.bool_] | None = None
+        if plan is not None and controller.coordination is not None:
             self.turns = controller.coordination.turns(realisation.release_ns[:-1])
-            here = [not set(shared).isdisjoint(one.values()) for one in problem.candidates.values()]
-            self.there = np.flatnonzero(here)
+        placed = problem.candidates.values()
+        self.there = [i for i, one in enumerate(placed) if not set(shared).isdisjoint(one.values())]
         #: Whether probes are wanted of a run that was laid out without a shadow.
         self.lacks_shadow = False
         self.course = controller.course
@@ -530,6 +532,7 @@ def meta_of(
     windows: int,
     guard: bool,
 ) -> dict[str, Any]:
+    """Return what the record of a simulated run says of it."""
     return {
         "kind": "simulated",
         "cell": problem.name,

@@ -10,8 +10,7 @@ import numpy as np
 
 from dwell.control import Controller
 from dwell.control.coordination import ByChance, Coordination
-from dwell.control.ledger import Ledger, Seat
-from dwell.estimators.fleet_prices import FleetCellSpec
+from dwell.control.ledger import Ledger, PricedCell, Seat
 from dwell.kernels.random_draws import draw, stream
 from dwell.kernels.realisation import NodeChanges, Realisation
 from dwell.model import NodeDisturbance, Problem, Scenario
@@ -140,7 +139,9 @@ def drawn(
         if cell is first:
             problem = _with_all(problem, scenario, fleet)
         real = draw(problem, scenario=scenario, seed=seed, windows=windows, streams=cell.streams)
-        found[cell.name] = real if cell is first else _meeting(real, found[first.name], fleet.shared)
+        found[cell.name] = (
+            real if cell is first else _meeting(real, found[first.name], fleet.shared)
+        )
     return found
 
 
@@ -180,7 +181,7 @@ def _coordinations(
 ) -> Iterator[Coordination | None]:
     """Yield what each cell asks before it moves; None where it asks nobody."""
     if fleet.coordination == "ledger":
-        specs = [FleetCellSpec(cell.name, problems[cell.name], cell.streams) for cell in fleet.cells]
+        specs = [PricedCell(cell.name, problems[cell.name], cell.streams) for cell in fleet.cells]
         ledger = Ledger(specs, fleet.shared, fleet.objective)
     for i, cell in enumerate(fleet.cells):
         if fleet.coordination == "ledger":

@@ -7,7 +7,6 @@ from collections.abc import Collection, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.kernels.arrays import CellArrays
 from dwell.sim.tables import PlayedRealisation
 
 Floats = NDArray[np.float64]

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dwell.control.ledger import Loads
-from dwell.estimators.fleet_prices import CellTerms, FleetCellSpec, FleetPrice, FleetPrices
+from dwell.estimators.fleet_prices import CellTerms, FleetPrice, FleetPrices, PricedCell
 from dwell.estimators.load_table import load_table
 from dwell.estimators.prices import prices_of
 from dwell.model.fleet import Fleet
@@ -70,7 +70,7 @@ def plan_fleet(
         Told how many of how many levels of the table have been played.
     """
     cells = [
-        FleetCellSpec(cell.name, problem, cell.streams, cell.entry.scenario)
+        PricedCell(cell.name, problem, cell.streams, cell.entry.scenario)
         for cell, problem in zip(fleet.cells, phased(fleet, seed), strict=True)
     ]
     undisturbed = [replace(cell, scenario="baseline") for cell in cells]
@@ -155,14 +155,14 @@ def _by_program(
     groups = list(dict.fromkeys(loads.group(i, name) for i, name in taken if loads.work(i, name)))
     waits = [(group, one) for group in groups for one in held if one[0] == loads.node(*group)]
     count = len(taken) + len(held) + len(waits)
-    column = {one: place for place, one in enumerate([*taken, *held, *waits])}
+    column: dict[Any, int] = {one: place for place, one in enumerate([*taken, *held, *waits])}
     cost = np.zeros(count)
     cost[: len(taken)] = [alone[i][name] for i, name in taken]
     for group, one in waits:
         cost[column[group, one]] = loads.wait(*group, one[1])
     rows, low, high = [], [], []
 
-    def require(terms: Mapping[object, float], at_least: float, at_most: float) -> None:
+    def require(terms: Mapping[Any, float], at_least: float, at_most: float) -> None:
         row = np.zeros(count)
         for one, factor in terms.items():
             row[column[one]] += factor
@@ -178,11 +178,11 @@ def _by_program(
         work = {one: loads.work(*one) for one in taken if loads.node(*one) == node}
         require(work | {one: -one[1] for one in mine}, -np.inf, 0.0)
     for group in groups:
-        of = {one: -1.0 for one in taken if loads.group(*one) == group}
-        mine = [one for one in waits if one[0] == group]
-        require(of | dict.fromkeys(mine, 1.0), 0.0, 0.0)
-        for one in mine:
-            require({one: 1.0, one[1]: -float(len(of))}, -np.inf, 0.0)
+        of: dict[Any, float] = {one: -1.0 for one in taken if loads.group(*one) == group}
+        paid = [one for one in waits if one[0] == group]
+        require(of | dict.fromkeys(paid, 1.0), 0.0, 0.0)
+        for wait in paid:
+            require({wait: 1.0, wait[1]: -float(len(of))}, -np.inf, 0.0)
     whole = np.zeros(count)
     whole[: len(taken) + len(held)] = 1
     most = np.where(whole, 1.0, np.inf)
@@ -192,6 +192,4 @@ def _by_program(
         integrality=whole,
         bounds=Bounds(np.zeros(count), most),
     )
-    return [
-        max(costs, key=lambda name: found.x[column[i, name]]) for i, costs in enumerate(alone)
-    ]
+    return [max(costs, key=lambda name: found.x[column[i, name]]) for i, costs in enumerate(alone)]
