@@ -38,7 +38,7 @@ from dwell.estimators.prices import prices_of
 from dwell.model import Caps, Decision, QoS
 from dwell.model.fleet import FleetObjective
 
-__all__ = ["Ledger", "Loads", "PricedCell", "Seat"]
+__all__ = ["FleetLedger", "Loads", "PricedCell", "Seat"]
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -46,7 +46,7 @@ Floats: TypeAlias = NDArray[np.float64]
 LOOKS = 2
 
 
-class Ledger:
+class FleetLedger:
     """Knows where all cells of a fleet are, and lets them move where that is good for all.
 
     Parameters
@@ -103,7 +103,7 @@ class Ledger:
         self.round = 0
 
     def __repr__(self) -> str:
-        return f"<Ledger of {len(self.cells)} cells: round {self.round}>"
+        return f"<FleetLedger of {len(self.cells)} cells: round {self.round}>"
 
     def place(self, index: int, name: str) -> None:
         """Take note of where a cell is."""
@@ -222,7 +222,7 @@ class Seat(Coordination):
 
     knows_others: ClassVar[bool] = True
 
-    def __init__(self, ledger: Ledger, index: int) -> None:
+    def __init__(self, ledger: FleetLedger, index: int) -> None:
         self._ledger, self._index = ledger, index
 
     def __repr__(self) -> str:
@@ -268,44 +268,44 @@ class Loads:
             j = weights.latency * column.l95_ms / objective.targets.latency_ms
             j = j + weights.violations * column.violation_rate
             self._waits[group] = column.level, j - j[0]
-        of_core = [CellTerms(cell.problem, table.shared).by_core() for cell in table.cells]
-        #: What a busy core of each shared node costs the fleet.
-        self._of_core = {
-            node: sum(one.get(node, 0.0) for one in of_core) / len(of_core) for node in table.shared
+        terms = [CellTerms(cell.problem, table.shared).of_one() for cell in table.cells]
+        #: What a busy core, or place, of each shared resource costs the fleet.
+        self._of_one = {
+            name: sum(one.get(name, 0.0) for one in terms) / len(terms)
+            for name in dict.fromkeys(name for work in self._work for name, _ in work.values())
         }
 
     def __repr__(self) -> str:
-        return f"<Loads of {len(self._kinds)} cells on {', '.join(self.nodes) or 'nothing'}>"
+        return f"<Loads of {len(self._kinds)} cells on {', '.join(self.resources) or 'nothing'}>"
 
     @property
-    def nodes(self) -> list[str]:
-        """Shared nodes that any candidate asks most of."""
-        used = {node for work in self._work for node, _ in work.values()}
-        return [node for node in self._of_core if node in used]
+    def resources(self) -> tuple[str, ...]:
+        """Resources of shared nodes that any candidate fills most."""
+        return tuple(self._of_one)
 
-    def most(self, node: str) -> float:
-        """Cores that all cells together may ask of a node."""
+    def most(self, resource: str) -> float:
+        """Work that all cells together may have for a resource: cores, or places."""
         return sum(
-            max((cores for where, cores in work.values() if where == node), default=0.0)
-            for work in self._work
+            max((work for where, work in of.values() if where == resource), default=0.0)
+            for of in self._work
         )
 
     def group(self, index: int, name: str) -> tuple[int, str]:
         """Cells that wait alike: the kind of a cell, and a candidate."""
         return self._kinds[index], name
 
-    def node(self, index: int, name: str) -> str | None:
-        """Shared node that a cell's candidate asks most of."""
+    def resource(self, index: int, name: str) -> str | None:
+        """Shared resource that a cell's candidate fills most."""
         return self._work[index].get(name, (None, 0.0))[0]
 
     def work(self, index: int, name: str) -> float:
-        """How many cores of it."""
+        """How much of it."""
         return self._work[index].get(name, (None, 0.0))[1]
 
-    def wait(self, index: int, name: str, cores: float) -> float:
-        """What J of a cell's candidate grows by at a load of its shared node."""
+    def wait(self, index: int, name: str, load: float) -> float:
+        """What J of a cell's candidate grows by at a load of its shared resource."""
         of = self._waits.get(self.group(index, name))
-        return 0.0 if of is None else float(np.interp(cores, *of))
+        return 0.0 if of is None else float(np.interp(load, *of))
 
     def costs(self, placements: Sequence[str], alone: Sequence[Mapping[str, float]]) -> list[float]:
         """J of every cell, without switching; then what shared nodes cost.
@@ -315,11 +315,11 @@ class Loads:
         alone : sequence of mapping of str to float
             J of every candidate of each cell where no other is there.
         """
-        cores = dict.fromkeys(self._of_core, 0.0)
+        loads = dict.fromkeys(self._of_one, 0.0)
         for work, name in zip(self._work, placements, strict=True):
             if name in work:
-                node, more = work[name]
-                cores[node] += more
+                resource, more = work[name]
+                loads[resource] += more
         waits: dict[tuple[int, str], float] = {}
         costs = []
         for i, (name, mine) in enumerate(zip(placements, alone, strict=True)):
@@ -327,7 +327,7 @@ class Loads:
             if name in self._work[i]:
                 group = self.group(i, name)
                 if group not in waits:
-                    waits[group] = self.wait(i, name, cores[self._work[i][name][0]])
+                    waits[group] = self.wait(i, name, loads[self._work[i][name][0]])
                 cost += waits[group]
             costs.append(cost)
-        return [*costs, sum(self._of_core[node] * used for node, used in cores.items())]
+        return [*costs, sum(self._of_one[one] * load for one, load in loads.items())]

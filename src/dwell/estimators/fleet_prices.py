@@ -265,7 +265,7 @@ class CellTerms:
             "edge": weights.edge / targets.edge,
             "cloud": (weights.cloud or 0.0) / (targets.cloud or 1.0),
         }
-        self._capacity = {name: node.capacity for name, node in problem.fabric.nodes.items()}
+        self._capacity = {name: one.capacity for name, one in problem.fabric.resources.items()}
         node_of = {name: one.node for name, one in problem.fabric.resources.items()}
         self._own, self._shared = [], []
         for tier in ("robot", "edge", "cloud"):
@@ -283,9 +283,11 @@ class CellTerms:
         rate, objective = qos.violation_rate, self._objective
         return float(price(qos.l95_ms, rate, robot, edge, cloud, 0.0, objective))
 
-    def by_core(self) -> dict[str, float]:
-        """What a core that is busy of each shared node would cost the cell."""
-        return {names[0]: factor / self._capacity[names[0]] for factor, names in self._shared}
+    def of_one(self) -> dict[str, float]:
+        """What one busy core, or place, of each shared resource would cost the cell."""
+        return {
+            name: factor / self._capacity[name] for factor, names in self._shared for name in names
+        }
 
     def shared_cost(self, qos: QoS) -> float:
         """What the utilisation of shared nodes would cost the cell."""

@@ -30,12 +30,12 @@ KEPT = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadColumn:
-    """A candidate of a kind of cell, by the load of its shared node.
+    """A candidate of a kind of cell, by the load of the shared resource that it fills most.
 
     Parameters
     ----------
     level : float64 array, shape (levels,)
-        Cores of the node that all cells there ask for, ascending; the first is that of one cell.
+        Cores, or places, that all cells keep busy there, ascending; the first is that of one cell.
     l95_ms, violation_rate : float64 array, shape (levels,)
         Mean over the cells of the kind.
     l95_error_ms, violation_error : float64 array, shape (levels,)
@@ -66,8 +66,9 @@ class LoadTable:
     ----------
     kinds : tuple of int
         Kind of each cell: the first one that is as it is, but for its phase.
-    work : tuple of mapping of str to (node, cores)
-        By cell and candidate, the shared node that it asks most of, and how much.
+    work : tuple of mapping of str to (resource, work)
+        By cell and candidate, the resource of a shared node that it fills most: the CPU, or a kind
+        of accelerators; and how many cores, or places, it keeps busy.
     columns : mapping of (kind, candidate) to LoadColumn
     """
 
@@ -98,7 +99,7 @@ class LoadTable:
     def __repr__(self) -> str:
         return f"<LoadTable: {len(self.cells)} cells, {len(self.columns)} candidates of kinds>"
 
-    def _cores(self, index: int, name: str) -> float:
+    def _asked(self, index: int, name: str) -> float:
         return self.work[index][name][1]
 
     def _levels(self, plays: FleetPrices, kind: int, name: str) -> Iterator[tuple[float, ...]]:
@@ -109,9 +110,9 @@ class LoadTable:
         asked, level = self.work[kind][name][0], 0.0
         for i in mine + others:
             # The others ask for as much as they may.
-            placed = name if i in mine else max(self.work[i], key=partial(self._cores, i))
-            placements[i], (node, cores) = placed, self.work[i][placed]
-            level += cores if node == asked else 0.0
+            placed = name if i in mine else max(self.work[i], key=partial(self._asked, i))
+            placements[i], (resource, work) = placed, self.work[i][placed]
+            level += work if resource == asked else 0.0
             found = plays.price(tuple(placements)).cells
             seen = [cell.qos for j in mine if (cell := found[j]) is not None]
             l95_ms = np.array([qos.l95_ms for qos in seen])
@@ -149,15 +150,15 @@ def _kind(problem: Problem) -> object:
 
 
 def _work(problem: Problem, shared: Sequence[str]) -> Mapping[str, tuple[str, float]]:
-    """Of every candidate that uses shared nodes, the one that it asks most cores of."""
-    prices, nodes = prices_of(problem), problem.fabric.nodes
+    """Of every candidate that has work on shared nodes, the resource that it fills most."""
+    prices, resources = prices_of(problem), problem.fabric.resources
     found = {}
-    for name, placement in problem.candidates.items():
-        here = [node for node in shared if node in placement.values()]
+    for name in problem.candidates:
+        own = prices[name].own
+        here = [one for one, of in resources.items() if of.node in shared and own[one] > 0]
         if here:
-            cores = {node: prices[name].own[node] * nodes[node].capacity for node in here}
-            node = max(here, key=cores.__getitem__)
-            found[name] = node, cores[node]
+            most = max(here, key=own.__getitem__)
+            found[name] = most, own[most] * resources[most].capacity
     return found
 
 

@@ -1,9 +1,8 @@
 """Plan: where the cells of a fleet are best placed, by the table of loads, and played.
 
-Of the table's Φ the least is found exactly over one shared node, by dynamic programming: of every
-load that the node may have, cell after cell takes the candidates by which the sum of costs at that
-load is least and the work asked of the node no more than it (a knapsack). With more nodes than one
-it is a mixed-integer program over the levels of the table.
+Of the table's Φ the least is found over one shared resource by dynamic programming: of every load
+that it may have, cell after cell takes the candidates by which the sum of costs at that load is
+least and the work no more than it (a knapsack). With several it is a mixed-integer program.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from dwell.sim.fleet import phased
 
 Floats: TypeAlias = NDArray[np.float64]
 
-#: Levels of a shared node's load: of one node, of each of several.
+#: Levels of the load of a shared resource: of the only one, of each of several.
 LEVELS, LEVELS_OF_SEVERAL = 400, 40
 #: Cycles of a cell that a plan is played for.
 CYCLES = 3_000
@@ -98,10 +97,10 @@ def best_placements(loads: Loads, alone: Sequence[Mapping[str, float]]) -> list[
     alone : sequence of mapping of str to float
         J of every candidate of each cell where no other is there.
     """
-    nodes = loads.nodes
-    if len(nodes) > 1:
-        return _by_program(loads, alone, nodes)
-    levels = np.linspace(0.0, loads.most(nodes[0]), LEVELS + 1) if nodes else np.zeros(1)
+    if len(loads.resources) > 1:
+        return _by_program(loads, alone)
+    most = max(map(loads.most, loads.resources), default=0.0)
+    levels = np.linspace(0.0, most, LEVELS + 1) if most else np.zeros(1)
     found = (_at_level(loads, alone, levels, last) for last in range(len(levels)))
     return min(
         (one for one in found if one is not None), key=lambda one: sum(loads.costs(one, alone))
@@ -139,21 +138,22 @@ def _at_level(
     return names[::-1]
 
 
-def _by_program(
-    loads: Loads, alone: Sequence[Mapping[str, float]], nodes: Sequence[str]
-) -> list[str]:
-    """Return the best placements over several nodes; every load is rounded up to a level.
+def _by_program(loads: Loads, alone: Sequence[Mapping[str, float]]) -> list[str]:
+    """Return the best placements over several resources; every load is rounded up to a level.
 
-    Of every cell one candidate is taken, of every node one level. What candidates of one kind wait
-    at a level is paid for as often as they are taken while it is.
+    Of every cell one candidate is taken, of every resource one level. What candidates of one kind
+    wait at a level is paid for as often as they are taken while it is.
     """
     from scipy.optimize import Bounds, LinearConstraint, milp
 
     taken = [(i, name) for i, costs in enumerate(alone) for name in costs]
-    levels = {node: np.linspace(0.0, loads.most(node), LEVELS_OF_SEVERAL) for node in nodes}
-    held = [(node, level) for node in nodes for level in levels[node].tolist()]
+    held = [
+        (resource, level)
+        for resource in loads.resources
+        for level in np.linspace(0.0, loads.most(resource), LEVELS_OF_SEVERAL).tolist()
+    ]
     groups = list(dict.fromkeys(loads.group(i, name) for i, name in taken if loads.work(i, name)))
-    waits = [(group, one) for group in groups for one in held if one[0] == loads.node(*group)]
+    waits = [(group, one) for group in groups for one in held if one[0] == loads.resource(*group)]
     count = len(taken) + len(held) + len(waits)
     column: dict[Any, int] = {one: place for place, one in enumerate([*taken, *held, *waits])}
     cost = np.zeros(count)
@@ -172,10 +172,10 @@ def _by_program(
 
     for i, costs in enumerate(alone):
         require({(i, name): 1.0 for name in costs}, 1.0, 1.0)
-    for node in nodes:
-        mine = [one for one in held if one[0] == node]
+    for resource in loads.resources:
+        mine = [one for one in held if one[0] == resource]
         require(dict.fromkeys(mine, 1.0), 1.0, 1.0)
-        work = {one: loads.work(*one) for one in taken if loads.node(*one) == node}
+        work = {one: loads.work(*one) for one in taken if loads.resource(*one) == resource}
         require(work | {one: -one[1] for one in mine}, -np.inf, 0.0)
     for group in groups:
         of: dict[Any, float] = {one: -1.0 for one in taken if loads.group(*one) == group}
