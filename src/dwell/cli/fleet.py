@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,8 +11,17 @@ import typer
 
 import dwell
 from dwell.cli.completion import estimators, policies
-from dwell.cli.options import Json, Seed
-from dwell.cli.output import aligned, block, print_json, warn, working
+from dwell.cli.options import Json, Processes, Seed
+from dwell.cli.output import (
+    aligned,
+    block,
+    file_name,
+    print_json,
+    progress,
+    warn,
+    working,
+    write_report,
+)
 from dwell.cli.run import default_folder
 from dwell.display import milliseconds
 from dwell.errors import ExitCode, Fault
@@ -20,6 +30,8 @@ from dwell.model.bounds import counted
 if TYPE_CHECKING:
     from dwell.model.fleet import Fleet
     from dwell.record import FleetRun
+    from dwell.study.capacity import Capacity, WhatIf
+    from dwell.study.intervals import Interval
 
 #: Cells, and rounds, that the terminal shows, and columns that time has there.
 SHOWN, TIMES = 24, 40
@@ -127,6 +139,77 @@ def run(
         typer.echo(f"\nsaved to {folder}")
 
 
+@fleet.command()
+def capacity(
+    file: FleetArgument,
+    limit: Annotated[
+        float,
+        typer.Option(metavar="SHARE", help="V_D that the worst cell may have at most."),
+    ] = 0.05,
+    policy: Policy = None,
+    phases: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HOW",
+            help="When each cell begins: sync, even or random; what the file says if not given.",
+        ),
+    ] = None,
+    most: Annotated[
+        int, typer.Option(min=1, max=1000, metavar="N", help="Robots beyond are not asked for.")
+    ] = 128,
+    what_if: Annotated[
+        bool,
+        typer.Option(
+            "--what-if",
+            help="Also with a core more on a shared node, with phases evenly spread, and on every "
+            "other placement that uses a shared node.",
+        ),
+    ] = False,
+    processes: Processes = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Page to write; capacity/FLEET-POLICY-PHASES.html if not given."
+        ),
+    ] = None,
+    figures: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Also write the curve for a paper: PDF, SVG, CSV."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Find how many robots a fleet may have, so that no cell misses more than a limit.
+
+    The count of the first entry is varied, the others stay: 10 seeds of 2,000 cycles a cell each.
+    """
+    from dwell.report.capacity_page import capacity_page
+    from dwell.study.capacity import WhatIf, capacity_of, what_ifs
+
+    if not 0 < limit < 1:
+        raise typer.BadParameter(f"--limit: {limit:g} is not allowed; it must be between 0 and 1")
+    given = dwell.load_fleet(file)
+    warn(file, warnings_of(given))
+    asked = given.changed(policy=policy, phases=read_phases(phases))
+    settings: dict[str, Any] = {"limit": limit, "most": most, "processes": processes}
+    with progress(f"playing up to {most} robots") as shown:
+        found = capacity_of(asked, **settings, progress=shown)
+    changes = []
+    for change, changed in what_ifs(asked) if what_if else ():
+        with progress(f"what if: {change}") as shown:
+            changes.append(WhatIf(change, capacity_of(changed, **settings, progress=shown)))
+    page = out or Path("capacity", file_name(f"{asked.name}-{found.policy}-{found.phases}.html"))
+    with working("writing the report"):
+        write_report(capacity_page(asked.name, found, changes), page, figures=figures, static=False)
+    if as_json:
+        more = {"what_if": [one.as_json() for one in changes]} if what_if else {}
+        print_json({"fleet": asked.name, **found.as_json(), **more, "report": page})
+        return
+    typer.echo(_capacity_text(asked, found, changes))
+    typer.echo(f"\nreport: {page}")
+    if figures is not None:
+        typer.echo(f"figures: {figures}")
+
+
 def read_phases(text: str | None) -> str | tuple[float, ...] | None:
     """Return what an option says of phases: a word, or a number a cell."""
     if text is None:
@@ -182,9 +265,23 @@ def _summed_up(result: FleetRun) -> dict[str, Any]:
         for name, values in result.load.to_dict().items()
         if name.startswith("u_") and len(values)
     }
-    summary: dict[str, Any] = {"cells": cells, "load": load}
-    summary |= {"moves": moved.height, "guard_moves": by_guard, "rounds": _rounds(result)}
-    return summary
+    return {
+        "cells": cells,
+        "load": load,
+        "moves": moved.height,
+        "guard_moves": by_guard,
+        "refused": _refused(result),
+        "rounds": _rounds(result),
+    }
+
+
+def _refused(result: FleetRun) -> dict[str, int]:
+    """Return how many moves were refused, by who refused them: ``ledger``, ``cap``, ``chance``."""
+    if "refused" not in result.decisions.columns:
+        return {}
+    # ``SO: ledger: Φ would rise by 0.2``, ``SO: cap of canonical-07``
+    whys = result.decisions["refused"].drop_nulls().to_list()
+    return dict(Counter(why.partition(": ")[2].split()[0].rstrip(":") for why in whys))
 
 
 def _known(mean: float | None) -> float:
@@ -222,10 +319,15 @@ def _text(result: FleetRun, windows: int, summary: Mapping[str, Any]) -> str:
         *_cells(result, summary["cells"]),
         "",
         *_nodes(result, summary["load"]),
-        f"moves: {summary['moves']}, of guards {summary['guard_moves']}",
+        f"moves: {summary['moves']}, of guards {summary['guard_moves']}{_told(summary['refused'])}",
         *_round_lines(summary["rounds"]),
     ]
     return "\n".join(lines)
+
+
+def _told(refused: Mapping[str, int]) -> str:
+    listed = ", ".join(f"{count} by {who}" for who, count in refused.items())
+    return f"; refused: {listed}" if listed else ""
 
 
 def _cells(result: FleetRun, cells: Sequence[Mapping[str, Any]]) -> Iterator[str]:
@@ -295,3 +397,59 @@ def _round_lines(rounds: Sequence[Mapping[str, Any]]) -> Iterator[str]:
         yield f"round {one['round']}: {phi}; {moved}"
     if len(moving) > SHOWN:
         yield f"{len(moving) - SHOWN} more rounds moved cells"
+
+
+def _capacity_text(of: Fleet, found: Capacity, changes: Sequence[WhatIf]) -> str:
+    from dwell.report.capacity_page import written
+
+    limits = found.limits
+    excess = " beyond that of one cell" if found.limit_on == "excess" else ""
+    low, high = found.interval
+    facts = [
+        ("robots", f"{written(found)} [{low}, {high}]"),
+        ("limit", f"V_D of the worst cell{excess}: {found.limit * 100:g} %"),
+        ("played", f"{found.policy}, phases {found.phases}"),
+    ]
+    if limits is not None:
+        share = f"{limits.share:.0%} of what cycles that missed have waited"
+        facts.append(("what limits", f"{limits.kind} {limits.name}, {share}"))
+    if found.reason:
+        facts.append(("why none", found.reason))
+    width = max(len(name) for name, _ in facts)
+    scale = 2 * found.bound
+    rows = [
+        [
+            str(point.robots),
+            f"{point.violation_rate.value * 100:.2f}",
+            _ends(point.violation_rate),
+            _bar(point.violation_rate.value / scale),
+        ]
+        for point in found.curve
+    ]
+    lines = [
+        f"{of.name}: {', '.join(of.shared)} shared by {of.entries[0].cell.name}",
+        *(f"{name.ljust(width)}  {value}" for name, value in facts),
+        "",
+        aligned(
+            ["robots", "V_D (%)", "95 % interval", f"{'the limit'.rjust(TIMES // 2 + 4)}"], rows
+        ),
+    ]
+    if changes:
+        table = [
+            [one.change, written(one.capacity), "[{}, {}]".format(*one.capacity.interval)]
+            for one in changes
+        ]
+        lines += ["", aligned(["what if", "robots", "95 % interval"], table)]
+    return "\n".join(lines)
+
+
+def _ends(rate: Interval) -> str:
+    return f"[{rate.low * 100:.2f}, {rate.high * 100:.2f}]" if rate.known else "-"
+
+
+def _bar(share: float) -> str:
+    """Return a bar that reaches the limit in the middle, where a stroke stands."""
+    filled = min(round(share * TIMES), TIMES)
+    signs = ["█" if place < filled else " " for place in range(TIMES)]
+    middle = TIMES // 2
+    return "".join([*signs[:middle], "│", *signs[middle:]])

@@ -19,7 +19,8 @@ from dwell.record import Run
 from dwell.record.fleet_run import FleetRun
 from dwell.sim.engine import PlayedCell, meta_of, play_cells
 from dwell.sim.shared_load import shared_load
-from dwell.sim.tables import make_tables
+from dwell.sim.tables import PlayedRealisation, make_tables
+from dwell.sim.waiting import Waiting, waiting_of
 
 
 def simulate_fleet(
@@ -59,6 +60,29 @@ def simulate_fleet(
     fleet = fleet.changed(
         policy=policy, estimator=estimator, coordination=coordination, phases=phases
     )
+    played = play_fleet(fleet, seed=seed, windows=windows, guard=guard, jobs=jobs)
+    runs = {}
+    for cell in fleet.cells:
+        one = played[cell.name]
+        meta = partial(
+            meta_of,
+            one.problem,
+            one.controller,
+            scenario=cell.entry.scenario,
+            seed=seed,
+            windows=windows,
+            guard=guard,
+        )
+        runs[cell.name] = Run(meta, *make_tables(one, jobs=jobs))
+    load = shared_load(played, fleet.shared)
+    offsets = phases_ms(fleet, seed)
+    return FleetRun(fleet, runs, load, seed=seed, guard=guard, phases_ms=offsets)
+
+
+def play_fleet(
+    fleet: Fleet, *, seed: int, windows: int, guard: bool = False, jobs: bool = False
+) -> dict[str, PlayedRealisation]:
+    """Play the cells of a fleet as it is (see `simulate_fleet`), and return them by name."""
     names = [cell.name for cell in fleet.cells]
     problems = dict(zip(names, phased(fleet, seed), strict=True))
     realisations = drawn(fleet, problems, seed, windows)
@@ -74,27 +98,15 @@ def simulate_fleet(
     play = partial(play_cells, shared=fleet.shared, jobs=jobs)
     # As in a cell alone, shadows are drawn for probes where the first are wanted.
     played = play([*cells()]) or play([*cells()], shadow=True) or []
-    runs = {}
-    for cell, one in zip(fleet.cells, played, strict=True):
-        meta = partial(
-            meta_of,
-            one.problem,
-            one.controller,
-            scenario=cell.entry.scenario,
-            seed=seed,
-            windows=windows,
-            guard=guard,
-        )
-        runs[cell.name] = Run(meta, *make_tables(one, jobs=jobs))
-    load = shared_load(dict(zip(runs, played, strict=True)), fleet.shared)
-    return FleetRun(
-        fleet,
-        runs,
-        load,
-        seed=seed,
-        guard=guard,
-        phases_ms=phases_ms(fleet, seed),
-    )
+    return dict(zip(names, played, strict=True))
+
+
+def waiting_in_fleet(fleet: Fleet, *, seed: int, windows: int) -> Waiting:
+    """Return where the cycles of a fleet that missed have waited."""
+    whole = Waiting()
+    for one in play_fleet(fleet, seed=seed, windows=windows, jobs=True).values():
+        whole += waiting_of(one.problem, one.realisation, one.arrays)
+    return whole
 
 
 def phased(fleet: Fleet, seed: int) -> Iterator[Problem]:
@@ -134,15 +146,27 @@ def drawn(
     """Draw every cell; what befalls a shared node is drawn once, with the first cell."""
     found: dict[str, Realisation] = {}
     first, *others = fleet.cells
-    for cell in (first, *others):
-        problem, scenario = problems[cell.name], cell.entry.scenario
-        if cell is first:
-            problem = _with_all(problem, scenario, fleet)
-        real = draw(problem, scenario=scenario, seed=seed, windows=windows, streams=cell.streams)
-        found[cell.name] = (
-            real if cell is first else _meeting(real, found[first.name], fleet.shared)
-        )
+    found[first.name] = draw_cell(fleet, first, problems[first.name], seed, windows, is_first=True)
+    for cell in others:
+        real = draw_cell(fleet, cell, problems[cell.name], seed, windows)
+        found[cell.name] = _meeting(real, found[first.name], fleet.shared)
     return found
+
+
+def draw_cell(
+    fleet: Fleet,
+    cell: FleetCell,
+    problem: Problem,
+    seed: int,
+    windows: int,
+    *,
+    is_first: bool = False,
+) -> Realisation:
+    """Draw a cell; the first one of the fleet with what all scenarios do to shared nodes."""
+    scenario = cell.entry.scenario
+    if is_first:
+        problem = _with_all(problem, scenario, fleet)
+    return draw(problem, scenario=scenario, seed=seed, windows=windows, streams=cell.streams)
 
 
 def _with_all(problem: Problem, scenario: str, fleet: Fleet) -> Problem:

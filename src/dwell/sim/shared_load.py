@@ -58,13 +58,13 @@ def shared_load(
         busy = np.concatenate([known[name][1][:, 0, places[name]] for name in played])
         columns[f"u_{resource.name}"] = _share(edges_ns, at, busy, whole_ns)
         for name, (at, done) in known.items():
-            own = done[:, 1:, places[name]].sum(axis=1)
+            own = done[:, 1:3, places[name]].sum(axis=1)
             columns[f"own_{resource.name}_{name}"] = _share(edges_ns, at, own, whole_ns)
     return columns
 
 
 def _snapshots(of: PlayedRealisation) -> tuple[Floats, Floats]:
-    """Return instants, and the core-nanoseconds done by then, shape (instants, 3, resources)."""
+    """Return instants, and the core-nanoseconds done by then, shape (instants, 4, resources)."""
     count = len(of.first)
     at = np.concatenate([of.realisation.release_ns[of.first], of.close_ns]).astype(np.float64)
     tables = of.arrays.tables
