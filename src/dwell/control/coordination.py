@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import ClassVar, NamedTuple, TypeAlias
+from typing import ClassVar, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dwell.estimators import Estimator
 from dwell.model import Decision, QoS
@@ -34,7 +34,7 @@ class Verdict(NamedTuple):
     asked: Asked = NOT_ASKED
 
 
-class Coordination(ABC):
+class Coordination(Protocol):
     """Says of a decision whether it may be carried out, or what is to be done in its place.
 
     Attributes
@@ -45,7 +45,6 @@ class Coordination(ABC):
 
     knows_others: ClassVar[bool] = False
 
-    @abstractmethod
     def consider(
         self,
         decision: Decision,
@@ -64,12 +63,19 @@ class Coordination(ABC):
         estimator : Estimator
             Whose estimates they are.
         """
+        ...
 
     def meet(self, estimator: Estimator) -> None:
         """Have the cell's estimator take notice of the fleet, before the first window."""
+        return
+
+    def turns(self, release_ns: NDArray[np.int64]) -> NDArray[np.bool_] | None:
+        """Whether shadows may be sent to shared nodes with each cycle; None where all may."""
+        return None
 
     def place(self, name: str) -> None:
         """Take note of where the cell is, though nothing was asked: the guard, or a person."""
+        return
 
 
 class ByChance(Coordination):

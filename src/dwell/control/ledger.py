@@ -21,15 +21,16 @@ of equal lists that with the smaller sum.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import ClassVar
+from collections.abc import Callable, Mapping, Sequence
+from typing import ClassVar, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dwell.control.coordination import Coordination, Verdict
 from dwell.cost import excess, hamming
 from dwell.estimators import Estimator
-from dwell.estimators.fleet_prices import CellTerms, FleetCellSpec, FleetPrice, FleetPrices
+from dwell.estimators.fleet_prices import CellTerms, FleetPrice, FleetPrices, PricedCell
 from dwell.estimators.load_table import LoadTable, load_table
 from dwell.estimators.online import Online
 from dwell.estimators.presents import Present
@@ -37,16 +38,20 @@ from dwell.estimators.prices import prices_of
 from dwell.model import Caps, Decision, QoS
 from dwell.model.fleet import FleetObjective
 
+__all__ = ["FleetLedger", "Loads", "PricedCell", "Seat"]
+
+Floats: TypeAlias = NDArray[np.float64]
+
 #: So many of a cell's candidates are played at a close, those that the table thinks best of.
 LOOKS = 2
 
 
-class Ledger:
+class FleetLedger:
     """Knows where all cells of a fleet are, and lets them move where that is good for all.
 
     Parameters
     ----------
-    cells : sequence of FleetCellSpec
+    cells : sequence of PricedCell
     shared : sequence of str
         Nodes that are one computer for all cells.
     objective : {"sum", "worst"}
@@ -60,7 +65,7 @@ class Ledger:
 
     def __init__(
         self,
-        cells: Sequence[FleetCellSpec],
+        cells: Sequence[PricedCell],
         shared: Sequence[str],
         objective: FleetObjective = "sum",
         *,
@@ -84,6 +89,12 @@ class Ledger:
         self._revisions = [-1] * len(self.cells)
         self._has_caps = any(problem.objective.caps != Caps() for problem in problems)
         self._least = min(problem.controller.min_improvement for problem in problems)
+        names = sorted(cell.name for cell in cells)
+        #: Place of each cell where they take turns, and how long one is.
+        self.order = [names.index(cell.name) for cell in cells]
+        self.turn_ns = max(
+            round(problem.window_cycles * problem.pipeline.period_ms * 1e6) for problem in problems
+        )
         #: Counts what is new: presents, and placements.
         self._version = 0
         self._looked = [-1] * len(self.cells)
@@ -92,7 +103,7 @@ class Ledger:
         self.round = 0
 
     def __repr__(self) -> str:
-        return f"<Ledger of {len(self.cells)} cells: round {self.round}>"
+        return f"<FleetLedger of {len(self.cells)} cells: round {self.round}>"
 
     def place(self, index: int, name: str) -> None:
         """Take note of where a cell is."""
@@ -113,7 +124,7 @@ class Ledger:
 
     def consider(self, index: int, decision: Decision) -> Verdict:
         """Say where a cell is to be that its policy has decided on."""
-        here, wished = self.placements[index], decision.name
+        wished = decision.name
         if self._looked[index] != self._version:
             self._looked[index] = self._version
             self._refusals[index] = {}
@@ -151,7 +162,7 @@ class Ledger:
         return Verdict(here, why, (*(asked or (None, None)), self.round))
 
     def _promising(self, index: int) -> list[str]:
-        """Candidates by which Φ would fall by more than is owed, as the table has it; best first."""
+        """Candidates by which the table's Φ falls by more than is owed; best first."""
         before = self._loads.costs(self.placements, self._alone)
         found = []
         for name in self.cells[index].problem.candidates:
@@ -211,7 +222,7 @@ class Seat(Coordination):
 
     knows_others: ClassVar[bool] = True
 
-    def __init__(self, ledger: Ledger, index: int) -> None:
+    def __init__(self, ledger: FleetLedger, index: int) -> None:
         self._ledger, self._index = ledger, index
 
     def __repr__(self) -> str:
@@ -220,7 +231,13 @@ class Seat(Coordination):
     def meet(self, estimator: Estimator) -> None:
         """Have the estimator take notice of the fleet."""
         if isinstance(estimator, Online) and len(self._ledger.cells) > 1:
-            estimator.share(self._ledger.shared)
+            estimator.share(self._ledger.shared, len(self._ledger.cells))
+
+    def turns(self, release_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether it is the cell's turn at each cycle: one window after another, by name."""
+        ledger = self._ledger
+        turn = release_ns // ledger.turn_ns % len(ledger.cells)
+        return np.equal(turn, ledger.order[self._index])
 
     def place(self, name: str) -> None:
         """Take note of where the cell is."""
@@ -244,20 +261,53 @@ class Loads:
 
     def __init__(self, table: LoadTable) -> None:
         self._kinds, self._work = table.kinds, table.work
-        self._more = {}
-        for (kind, name), column in table.columns.items():
-            objective = table.cells[kind].problem.objective
+        self._waits: dict[tuple[int, str], tuple[Floats, Floats]] = {}
+        for group, column in table.columns.items():
+            objective = table.cells[group[0]].problem.objective
             weights = objective.weights
             j = weights.latency * column.l95_ms / objective.targets.latency_ms
             j = j + weights.violations * column.violation_rate
-            self._more[kind, name] = column.level, j - j[0]
-        self._shared = [
-            CellTerms(cell.problem, table.shared).by_core() for cell in table.cells
-        ]
+            self._waits[group] = column.level, j - j[0]
+        terms = [CellTerms(cell.problem, table.shared).of_one() for cell in table.cells]
+        #: What a busy core, or place, of each shared resource costs the fleet.
+        self._of_one = {
+            name: sum(one.get(name, 0.0) for one in terms) / len(terms)
+            for name in dict.fromkeys(name for work in self._work for name, _ in work.values())
+        }
 
-    def costs(
-        self, placements: Sequence[str], alone: Sequence[Mapping[str, float]]
-    ) -> list[float]:
+    def __repr__(self) -> str:
+        return f"<Loads of {len(self._kinds)} cells on {', '.join(self.resources) or 'nothing'}>"
+
+    @property
+    def resources(self) -> tuple[str, ...]:
+        """Resources of shared nodes that any candidate fills most."""
+        return tuple(self._of_one)
+
+    def most(self, resource: str) -> float:
+        """Work that all cells together may have for a resource: cores, or places."""
+        return sum(
+            max((work for where, work in of.values() if where == resource), default=0.0)
+            for of in self._work
+        )
+
+    def group(self, index: int, name: str) -> tuple[int, str]:
+        """Cells that wait alike: the kind of a cell, and a candidate."""
+        return self._kinds[index], name
+
+    def resource(self, index: int, name: str) -> str | None:
+        """Shared resource that a cell's candidate fills most."""
+        return self._work[index].get(name, (None, 0.0))[0]
+
+    def work(self, index: int, name: str) -> float:
+        """How much of it."""
+        return self._work[index].get(name, (None, 0.0))[1]
+
+    def wait(self, index: int, name: str, load: float) -> float:
+        """What J of a cell's candidate grows by at a load of its shared resource."""
+        of = self._waits.get(self.group(index, name))
+        return 0.0 if of is None else float(np.interp(load, *of))
+
+    def costs(self, placements: Sequence[str], alone: Sequence[Mapping[str, float]]) -> list[float]:
         """J of every cell, without switching; then what shared nodes cost.
 
         Parameters
@@ -265,23 +315,19 @@ class Loads:
         alone : sequence of mapping of str to float
             J of every candidate of each cell where no other is there.
         """
-        cores: dict[str, float] = {}
+        loads = dict.fromkeys(self._of_one, 0.0)
         for work, name in zip(self._work, placements, strict=True):
             if name in work:
-                node, more = work[name]
-                cores[node] = cores.get(node, 0.0) + more
+                resource, more = work[name]
+                loads[resource] += more
         waits: dict[tuple[int, str], float] = {}
         costs = []
-        for kind, work, name, mine in zip(self._kinds, self._work, placements, alone, strict=True):
+        for i, (name, mine) in enumerate(zip(placements, alone, strict=True)):
             cost = mine[name]
-            if name in work:
-                of = kind, name
-                if of not in waits:
-                    level, more_j = self._more[of]
-                    waits[of] = float(np.interp(cores[work[name][0]], level, more_j))
-                cost += waits[of]
+            if name in self._work[i]:
+                group = self.group(i, name)
+                if group not in waits:
+                    waits[group] = self.wait(i, name, loads[self._work[i][name][0]])
+                cost += waits[group]
             costs.append(cost)
-        shared = sum(
-            factors.get(node, 0.0) * used for factors in self._shared for node, used in cores.items()
-        )
-        return [*costs, shared / len(costs)]
+        return [*costs, sum(self._of_one[one] * load for one, load in loads.items())]

@@ -8,15 +8,14 @@ that has nothing on a shared node meets no other, so that it is played once.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.cost import excess, price, tier_nodes
+from dwell.cost import price, tier_nodes
 from dwell.estimators.presents import Present, realised
 from dwell.estimators.prices import SEED
 from dwell.kernels.advance import play
@@ -24,7 +23,6 @@ from dwell.kernels.arrays import Arrays, lay_out
 from dwell.kernels.codes import EventKind, cell_of, kind_of
 from dwell.kernels.random_draws import draw
 from dwell.model.frozen import FrozenDict
-from dwell.model.instants import NEVER_NS
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS
@@ -40,7 +38,7 @@ AS_DECLARED = Present()
 
 
 @dataclass(frozen=True, slots=True)
-class FleetCellSpec:
+class PricedCell:
     """A cell of a fleet, as it is priced.
 
     Parameters
@@ -50,11 +48,14 @@ class FleetCellSpec:
         With its phase.
     streams : str
         What the names of its random streams begin with.
+    scenario : str
+        What befalls it beside its present.
     """
 
     name: str
     problem: Problem
     streams: str = ""
+    scenario: str = "baseline"
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +108,7 @@ class FleetPrices:
 
     Parameters
     ----------
-    cells : sequence of FleetCellSpec
+    cells : sequence of PricedCell
     shared : sequence of str
         Nodes that are one computer for all cells.
     cycles : int
@@ -115,15 +116,23 @@ class FleetPrices:
     """
 
     def __init__(
-        self, cells: Sequence[FleetCellSpec], shared: Sequence[str], cycles: int = CYCLES
+        self, cells: Sequence[PricedCell], shared: Sequence[str], cycles: int = CYCLES
     ) -> None:
         self.cells, self.shared = tuple(cells), tuple(shared)
         self._windows = [_windows_of(cell.problem, cells, cycles) for cell in self.cells]
         self._declared = [
-            draw(cell.problem, seed=SEED, windows=windows, streams=cell.streams)
+            draw(
+                cell.problem,
+                scenario=cell.scenario,
+                seed=SEED,
+                windows=windows,
+                streams=cell.streams,
+            )
             for cell, windows in zip(self.cells, self._windows, strict=True)
         ]
-        self._index = [{name: i for i, name in enumerate(cell.problem.candidates)} for cell in cells]
+        self._index = [
+            {name: i for i, name in enumerate(cell.problem.candidates)} for cell in cells
+        ]
         self._meets = [
             {name: self.meets(placed) for name, placed in cell.problem.candidates.items()}
             for cell in self.cells
@@ -143,7 +152,7 @@ class FleetPrices:
         return not set(self.shared).isdisjoint(placement.values())
 
     def begin(self, presents: Sequence[Present]) -> None:
-        """Begin with other presents, one of each cell; of a shared node the middle of them holds."""
+        """Begin with other presents, one a cell; of a shared node the middle of them holds."""
         agreed = self._agreed(presents)
         for i, (present, before) in enumerate(zip(agreed, self._presents, strict=True)):
             if present is not before:
@@ -169,7 +178,9 @@ class FleetPrices:
                         down.add(name)
             same = threads == present.threads and down == present.down
             agreed.append(
-                present if same else replace(present, threads=FrozenDict(threads), down=frozenset(down))
+                present
+                if same
+                else replace(present, threads=FrozenDict(threads), down=frozenset(down))
             )
         return agreed
 
@@ -181,9 +192,7 @@ class FleetPrices:
         return known
 
     def _price(self, placements: Placements) -> FleetPrice:
-        together = [
-            name is not None and self._meets[i][name] for i, name in enumerate(placements)
-        ]
+        together = [name is not None and self._meets[i][name] for i, name in enumerate(placements)]
         plays = [
             name is not None and (together[i] or name not in self._alone[i])
             for i, name in enumerate(placements)
@@ -239,11 +248,7 @@ class FleetPrices:
 
     def _shared_cost(self, cells: Sequence[CellPrice | None]) -> float:
         """What the utilisation of shared nodes costs: of each once, the mean over cells."""
-        met = [
-            (self._terms[i], cell)
-            for i, cell in enumerate(cells)
-            if cell is not None
-        ]
+        met = [(self._terms[i], cell) for i, cell in enumerate(cells) if cell is not None]
         return sum(terms.shared_cost(cell.qos) for terms, cell in met) / max(len(met), 1)
 
 
@@ -260,7 +265,7 @@ class CellTerms:
             "edge": weights.edge / targets.edge,
             "cloud": (weights.cloud or 0.0) / (targets.cloud or 1.0),
         }
-        self._capacity = {name: node.capacity for name, node in problem.fabric.nodes.items()}
+        self._capacity = {name: one.capacity for name, one in problem.fabric.resources.items()}
         node_of = {name: one.node for name, one in problem.fabric.resources.items()}
         self._own, self._shared = [], []
         for tier in ("robot", "edge", "cloud"):
@@ -274,26 +279,26 @@ class CellTerms:
 
     def cost(self, qos: QoS) -> float:
         """J without switching and shared nodes."""
-        used = qos.utilisation
-        tiers = (
-            max((used[name] for name in names if name in used), default=0.0) for names in self._own
-        )
-        return float(price(qos.l95_ms, qos.violation_rate, *tiers, 0.0, self._objective))
+        robot, edge, cloud = (self._most(names, qos) for names in self._own)
+        rate, objective = qos.violation_rate, self._objective
+        return float(price(qos.l95_ms, rate, robot, edge, cloud, 0.0, objective))
 
-    def by_core(self) -> dict[str, float]:
-        """What a core that is busy of each shared node would cost the cell."""
-        return {names[0]: factor / self._capacity[names[0]] for factor, names in self._shared}
+    def of_one(self) -> dict[str, float]:
+        """What one busy core, or place, of each shared resource would cost the cell."""
+        return {
+            name: factor / self._capacity[name] for factor, names in self._shared for name in names
+        }
 
     def shared_cost(self, qos: QoS) -> float:
         """What the utilisation of shared nodes would cost the cell."""
-        used = qos.utilisation
-        return sum(
-            factor * max((used[name] for name in names if name in used), default=0.0)
-            for factor, names in self._shared
-        )
+        return sum(factor * self._most(names, qos) for factor, names in self._shared)
+
+    def _most(self, names: Sequence[str], qos: QoS) -> float:
+        """Utilisation of the fullest of some resources that are known."""
+        return max((qos.utilisation.get(name, 0.0) for name in names), default=0.0)
 
 
-def _windows_of(problem: Problem, cells: Sequence[FleetCellSpec], cycles: int) -> int:
+def _windows_of(problem: Problem, cells: Sequence[PricedCell], cycles: int) -> int:
     """Windows that are played of a cell: all cells for about as long."""
     periods_ms = [cell.problem.pipeline.period_ms for cell in cells]
     span_ms = cycles / sum(1 / period_ms for period_ms in periods_ms)

@@ -8,14 +8,15 @@ played (see `dwell.estimators.fleet_prices`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.estimators.fleet_prices import FleetCellSpec, FleetPrices
+from dwell.estimators.fleet_prices import FleetPrices, PricedCell
 from dwell.estimators.prices import prices_of
 from dwell.model.problem import Problem
 
@@ -29,18 +30,16 @@ KEPT = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadColumn:
-    """A candidate of a kind of cell, by the load of its shared node.
+    """A candidate of a kind of cell, by the load of the shared resource that it fills most.
 
     Parameters
     ----------
     level : float64 array, shape (levels,)
-        Cores of the node that all cells there ask for, ascending; the first is that of one cell.
+        Cores, or places, that all cells keep busy there, ascending; the first is that of one cell.
     l95_ms, violation_rate : float64 array, shape (levels,)
         Mean over the cells of the kind.
     l95_error_ms, violation_error : float64 array, shape (levels,)
         Their standard errors.
-    cells : int array, shape (levels,)
-        How many cells are there.
     """
 
     level: Floats
@@ -48,7 +47,6 @@ class LoadColumn:
     violation_rate: Floats
     l95_error_ms: Floats
     violation_error: Floats
-    cells: NDArray[np.int64]
 
     def __repr__(self) -> str:
         return f"<LoadColumn: {len(self.level)} levels up to {self.level[-1]:.3g} cores>"
@@ -59,7 +57,7 @@ class LoadTable:
 
     Parameters
     ----------
-    cells : sequence of FleetCellSpec
+    cells : sequence of PricedCell
     shared : sequence of str
     progress : callable
         Told how many of how many levels have been played.
@@ -68,14 +66,15 @@ class LoadTable:
     ----------
     kinds : tuple of int
         Kind of each cell: the first one that is as it is, but for its phase.
-    work : tuple of mapping of str to (node, cores)
-        By cell and candidate, the shared node that it asks most of, and how much.
+    work : tuple of mapping of str to (resource, work)
+        By cell and candidate, the resource of a shared node that it fills most: the CPU, or a kind
+        of accelerators; and how many cores, or places, it keeps busy.
     columns : mapping of (kind, candidate) to LoadColumn
     """
 
     def __init__(
         self,
-        cells: Sequence[FleetCellSpec],
+        cells: Sequence[PricedCell],
         shared: Sequence[str],
         *,
         cycles: int = CYCLES,
@@ -85,57 +84,47 @@ class LoadTable:
         self.kinds = kinds_of(cells)
         self.work = tuple(_work(cell.problem, shared) for cell in cells)
         plays = FleetPrices(cells, shared, cycles * len(cells))
-        asked = [
-            (kind, name)
-            for kind in dict.fromkeys(self.kinds)
-            for name in self.work[kind]
-        ]
+        asked = [(kind, name) for kind in dict.fromkeys(self.kinds) for name in self.work[kind]]
         self.columns: dict[tuple[int, str], LoadColumn] = {}
-        for place, (kind, name) in enumerate(asked):
-            self.columns[kind, name] = self._column(
-                plays,
-                kind,
-                name,
-                lambda done, of, place=place: progress(place * of + done, len(asked) * of),
-            )
+        done, levels = 0, len(asked) * sum(map(bool, self.work))
+        for group in asked:
+            rows = []
+            for row in self._levels(plays, *group):
+                rows.append(row)
+                done += 1
+                progress(done, levels)
+            level, l95_ms, rate, l95_error_ms, error = np.array(rows, float).T
+            self.columns[group] = LoadColumn(level, l95_ms, rate, l95_error_ms, error)
 
     def __repr__(self) -> str:
         return f"<LoadTable: {len(self.cells)} cells, {len(self.columns)} candidates of kinds>"
 
-    def _column(
-        self, plays: FleetPrices, kind: int, name: str, progress: Callable[[int, int], None]
-    ) -> LoadColumn:
+    def _asked(self, index: int, name: str) -> float:
+        return self.work[index][name][1]
+
+    def _levels(self, plays: FleetPrices, kind: int, name: str) -> Iterator[tuple[float, ...]]:
+        """Yield rows of a column, one cell more at each."""
         mine = [i for i, of in enumerate(self.kinds) if of == kind]
         others = [i for i, of in enumerate(self.kinds) if of != kind and self.work[i]]
-        order = mine + others
         placements: list[str | None] = [None] * len(self.cells)
-        node, cores = self.work[kind][name]
-        level, rows = 0.0, []
-        for count, i in enumerate(order, 1):
-            if self.kinds[i] == kind:
-                placements[i] = name
-                level += cores
-            else:
-                heaviest = max(self.work[i], key=lambda one: self.work[i][one][1])
-                placements[i], (where, more) = heaviest, self.work[i][heaviest]
-                level += more if where == node else 0.0
+        asked, level = self.work[kind][name][0], 0.0
+        for i in mine + others:
+            # The others ask for as much as they may.
+            placed = name if i in mine else max(self.work[i], key=partial(self._asked, i))
+            placements[i], (resource, work) = placed, self.work[i][placed]
+            level += work if resource == asked else 0.0
             found = plays.price(tuple(placements)).cells
-            seen = [cell for j in mine if (cell := found[j]) is not None]
-            l95, rates = (
-                np.array([getattr(one.qos, what) for one in seen])
-                for what in ("l95_ms", "violation_rate")
-            )
-            rows.append((level, l95.mean(), rates.mean(), _error(l95), _error(rates), count))
-            progress(count, len(order))
-        *columns, counts = (np.array(column) for column in zip(*rows, strict=True))
-        return LoadColumn(*columns, counts)
+            seen = [cell.qos for j in mine if (cell := found[j]) is not None]
+            l95_ms = np.array([qos.l95_ms for qos in seen])
+            rate = np.array([qos.violation_rate for qos in seen])
+            yield level, l95_ms.mean(), rate.mean(), _error(l95_ms), _error(rate)
 
 
-_known: dict[tuple[tuple[FleetCellSpec, ...], tuple[str, ...]], LoadTable] = {}
+_known: dict[tuple[tuple[PricedCell, ...], tuple[str, ...]], LoadTable] = {}
 
 
 def load_table(
-    cells: Sequence[FleetCellSpec],
+    cells: Sequence[PricedCell],
     shared: Sequence[str],
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> LoadTable:
@@ -148,12 +137,10 @@ def load_table(
     return _known[asked]
 
 
-def kinds_of(cells: Sequence[FleetCellSpec]) -> tuple[int, ...]:
+def kinds_of(cells: Sequence[PricedCell]) -> tuple[int, ...]:
     """Return of every cell the first one of its kind: equal but for phase and name."""
     firsts: dict[object, int] = {}
-    return tuple(
-        firsts.setdefault(_kind(cell.problem), i) for i, cell in enumerate(cells)
-    )
+    return tuple(firsts.setdefault(_kind(cell.problem), i) for i, cell in enumerate(cells))
 
 
 def _kind(problem: Problem) -> object:
@@ -163,15 +150,15 @@ def _kind(problem: Problem) -> object:
 
 
 def _work(problem: Problem, shared: Sequence[str]) -> Mapping[str, tuple[str, float]]:
-    """Of every candidate that uses shared nodes, the one that it asks most cores of."""
-    prices, nodes = prices_of(problem), problem.fabric.nodes
+    """Of every candidate that has work on shared nodes, the resource that it fills most."""
+    prices, resources = prices_of(problem), problem.fabric.resources
     found = {}
-    for name, placement in problem.candidates.items():
-        here = [node for node in shared if node in placement.values()]
+    for name in problem.candidates:
+        own = prices[name].own
+        here = [one for one, of in resources.items() if of.node in shared and own[one] > 0]
         if here:
-            cores = {node: prices[name].own[node] * nodes[node].capacity for node in here}
-            node = max(here, key=cores.__getitem__)
-            found[name] = node, cores[node]
+            most = max(here, key=own.__getitem__)
+            found[name] = most, own[most] * resources[most].capacity
     return found
 
 

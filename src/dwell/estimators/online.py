@@ -84,14 +84,21 @@ class Online(ABC):
         #: Whether the present is another one, or has newer values of the same.
         self._has_changed = self._has_grown = False
 
-    def share(self, nodes: Collection[str]) -> None:
+    def share(self, nodes: Collection[str], cells: int) -> None:
         """Take note of nodes whose other jobs are those of a fleet's cells, and accounted for.
 
         Jobs on them say nothing of foreign threads, nor of waits: they run beside jobs that are
-        not in the evidence. What others take of the node still does.
+        not in the evidence. What others take of the node still does. Cells take turns in sending
+        shadows there.
         """
         self._shared = frozenset(nodes)
         self._meter = Meter(self.problem, self._shared)
+        for name, sent in self._sent.items():
+            of = {
+                one: share / cells if one.partition(".")[0] in self._shared else share
+                for one, share in sent.items()
+            }
+            self._sent[name] = FrozenDict(of)
 
     def __getstate__(self) -> dict[str, object]:
         # A copy plays its present anew.

@@ -334,9 +334,10 @@ class Playing:
         for part, values in self.present.demands.items():
             rows = self._rows.get(part, ())
             if rows:
-                demands = _drawn(values, self._stretched.get(part, 1.0), places)
-                for row in rows if demands is not None else ():
-                    row[begin:] = demands
+                drawn = _drawn(values, self._stretched.get(part, 1.0), places)
+                if drawn is not None:
+                    for row in rows:
+                        row[begin:] = drawn
 
     def _fill_links(self, present: Present) -> None:
         """Set what links lose, and that measured delays are all that there is."""
@@ -495,21 +496,23 @@ def realised(problem: Problem, real: Realisation, present: Present) -> Realisati
     """Return draws of the undisturbed cell with what a present has in the place of some of them."""
     if not (present.demands or present.threads or present.down):
         return real
-    rows = [real.exec_ns.copy(), real.delay_ns.copy()]
-    extra_ns, places = real.extra_ns.copy(), np.arange(real.cycles)
+    exec_ns, delay_ns, extra_ns = real.exec_ns.copy(), real.delay_ns.copy(), real.extra_ns.copy()
+    places = np.arange(real.cycles)
     segments = LinkSegments.of(real.link_segments)
     state, rates = segments.table.copy(), segments.table_f.copy()
     lost: dict[str, list[float]] = {}
     for part, values in present.demands.items():
-        is_job = isinstance(part, Site)
-        known = real.sites if is_job else real.hops
-        row = known.index(part) if part in known else None
-        demands = _drawn(values, _stretched(problem, part) if is_job else 1.0, places)
-        if row is not None and demands is not None:
-            rows[0 if is_job else 1][row] = demands
-        if isinstance(part, Message):
+        known: tuple[tuple[str, ...], ...] = real.sites
+        times, stretched = exec_ns, 1.0
+        if isinstance(part, Site):
+            stretched = _stretched(problem, part)
+        else:
+            known, times = real.hops, delay_ns
             lost.setdefault(part.link, []).append(float(np.isinf(values).mean()))
-            extra_ns[[hop == row for hop, _ in real.layers]] = 0
+            extra_ns[[real.hops[hop] == part for hop, _ in real.layers]] = 0
+        demands = _drawn(values, stretched, places)
+        if part in known and demands is not None:
+            times[known.index(part)] = demands
     for name, shares in lost.items():
         share, mine = sum(shares) / len(shares), state[:, 1] == segments.links.index(name)
         if problem.fabric.links[name].retransmit_ms is None:
@@ -519,8 +522,8 @@ def realised(problem: Problem, real: Realisation, present: Present) -> Realisati
             state[mine, 2] = share >= 0.5
     return replace(
         real,
-        exec_ns=rows[0],
-        delay_ns=rows[1],
+        exec_ns=exec_ns,
+        delay_ns=delay_ns,
         extra_ns=extra_ns,
         node_changes=_changed(problem, real, present),
         link_segments=LinkSegments(segments.links, state, rates),

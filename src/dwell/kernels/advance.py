@@ -71,9 +71,10 @@ def logged_instants(
     Returns
     -------
     list of (ready_ns, end_ns, arrived_ns, start_ns, work_ns)
-        Of the cell, then of its shadow: when all inputs of a job were there, and when it had completed, int64 arrays of
-        shape (cycles, tasks), when messages arrived, (cycles, flows), when a job started, and the
-        core time that it has received, if it has completed, (cycles, tasks).
+        Of the cell, then of its shadow: when all inputs of a job were there, and when it had
+        completed, int64 arrays of shape (cycles, tasks), when messages arrived, (cycles, flows),
+        when a job started, and the core time that it has received, if it has completed,
+        (cycles, tasks).
     """
     part, tables, count = of.part, of.whole.tables, last - first
     jobs = count * (tables.jobs.size // tables.slots.size)

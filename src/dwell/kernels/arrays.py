@@ -75,9 +75,7 @@ class Arrays:
         What the kernel is handed.
     """
 
-    def __init__(
-        self, tables: Tables, parts: tuple[CellPart, ...], behind: Sequence[Ints]
-    ) -> None:
+    def __init__(self, tables: Tables, parts: tuple[CellPart, ...], behind: Sequence[Ints]) -> None:
         self.parts = parts
         # Rows have addresses in these.
         self._behind = behind
@@ -218,12 +216,14 @@ class CellArrays:
             if len(whole.shadow_bytes):
                 rows["shadow_bytes"] = whole.shadow_bytes[part.row, cycles]
             self._tables = whole._replace(
-                **rows, site_of=whole.site_of[candidates, : part.tasks], back_ns=whole.back_ns[candidates]
+                **rows,
+                site_of=whole.site_of[candidates, : part.tasks],
+                back_ns=whole.back_ns[candidates],
             )
         return self._tables
 
     def logs(self) -> tuple[Rows, NDArray[np.int8]]:
-        """Return every job's instants and outcome, shape (rows, cycles, tasks), where all are kept."""
+        """Every job's instants and outcome, shape (rows, cycles, tasks), where all are kept."""
         whole, part = self.whole.tables, self.part
         own = slice(part.row, part.row + part.rows), slice(part.cycles), slice(part.tasks)
         clock = whole.clock[0]

@@ -211,12 +211,14 @@ def play_cells(
         log_windows=any(cell.controller.learns for cell in cells),
         shadows=[
             # Probes may be of any cycle.
-            plan and draw_shadows(cell.problem, cell.realisation, plan.sent, others=cell.guarded)
+            draw_shadows(cell.problem, cell.realisation, plan.sent, others=cell.guarded)
+            if plan is not None
+            else None
             for cell, plan in zip(cells, plans, strict=True)
         ],
     )
     stampers = [
-        _Stamper(cell, CellArrays(whole, i), plan)
+        _Stamper(cell, CellArrays(whole, i), plan, shared)
         for i, (cell, plan) in enumerate(zip(cells, plans, strict=True))
     ]
     first = stampers[0]
@@ -276,7 +278,13 @@ def _host_changes(problem: Problem, realisation: Realisation) -> NDArray[np.int6
 class _Stamper:
     """Carries closed windows to the controller, and its orders to the cycles they stamp."""
 
-    def __init__(self, cell: PlayedCell, arrays: CellArrays, plan: ShadowPlan | None) -> None:
+    def __init__(
+        self,
+        cell: PlayedCell,
+        arrays: CellArrays,
+        plan: ShadowPlan | None,
+        shared: Collection[str] = (),
+    ) -> None:
         problem, realisation, controller, guarded = cell
         self.controller, self.arrays = controller, arrays
         self.release_ns = realisation.release_ns
@@ -292,6 +300,12 @@ class _Stamper:
         self.host_at_ns, self.host_down = table[:, 0].tolist(), table[:, 3].tolist()
         self.cold = ColdMigration(problem, realisation) if settings.migration == "cold" else None
         self.plan = plan
+        #: Whether shadows may be sent to shared nodes with each cycle, and who is there.
+        self.turns: NDArray[np.bool_] | None = None
+        if plan is not None and controller.coordination is not None:
+            self.turns = controller.coordination.turns(realisation.release_ns[:-1])
+        placed = problem.candidates.values()
+        self.there = [i for i, one in enumerate(placed) if not set(shared).isdisjoint(one.values())]
         #: Whether probes are wanted of a run that was laid out without a shadow.
         self.lacks_shadow = False
         self.course = controller.course
@@ -319,7 +333,10 @@ class _Stamper:
         stamps[0, start:stop] = code
         if self.plan is not None and start < self.cycles:
             stop = min(stop, self.cycles)
-            stamps[1, start:stop] = self.plan.stamps(start, stop, code)
+            shadows = self.plan.stamps(start, stop, code)
+            if self.turns is not None:
+                shadows[~self.turns[start:stop] & np.isin(shadows, self.there)] = -1
+            stamps[1, start:stop] = shadows
         if self.watch is not None:
             self.watch.stamp(start, stop)
 
@@ -515,6 +532,7 @@ def meta_of(
     windows: int,
     guard: bool,
 ) -> dict[str, Any]:
+    """Return what the record of a simulated run says of it."""
     return {
         "kind": "simulated",
         "cell": problem.name,

@@ -10,8 +10,7 @@ import numpy as np
 
 from dwell.control import Controller
 from dwell.control.coordination import ByChance, Coordination
-from dwell.control.ledger import Ledger, Seat
-from dwell.estimators.fleet_prices import FleetCellSpec
+from dwell.control.ledger import FleetLedger, PricedCell, Seat
 from dwell.kernels.random_draws import draw, stream
 from dwell.kernels.realisation import NodeChanges, Realisation
 from dwell.model import NodeDisturbance, Problem, Scenario
@@ -206,10 +205,8 @@ def _coordinations(
 ) -> Iterator[Coordination | None]:
     """Yield what each cell asks before it moves; None where it asks nobody."""
     if fleet.coordination == "ledger":
-        specs = [
-            FleetCellSpec(cell.name, problems[cell.name], cell.streams) for cell in fleet.cells
-        ]
-        ledger = Ledger(specs, fleet.shared, fleet.objective)
+        specs = [PricedCell(cell.name, problems[cell.name], cell.streams) for cell in fleet.cells]
+        ledger = FleetLedger(specs, fleet.shared, fleet.objective)
     for i, cell in enumerate(fleet.cells):
         if fleet.coordination == "ledger":
             yield Seat(ledger, i)
