@@ -140,11 +140,17 @@ class Rates:
 
 
 def by_rates(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Capacity]:
-    def found(*rates: float, most: int = 16) -> Capacity:
+    def found(*rates: float, most: int = 16, on_excess: bool = False) -> Capacity:
         monkeypatch.setattr(capacity, "FleetPlayer", lambda *_: Rates(*rates))
         fleet = fleet_of((one_job(), 1))
         return capacity_of(
-            fleet, policy="OFF", phases="even", most=most, seeds=(1, 2, 3), processes=1
+            fleet,
+            policy="OFF",
+            phases="even",
+            most=most,
+            seeds=(1, 2, 3),
+            on_excess=on_excess,
+            processes=1,
         )
 
     return found
@@ -157,6 +163,7 @@ def test_no_smaller_size_may_be_over_the_limit(monkeypatch: pytest.MonkeyPatch) 
     assert found(0.01, 0.02, 0.03, most=3).at_least
     assert found(0.06, 0.11, 0.12).limit_on == "excess"
     assert found(0.06, 0.11, 0.12).robots == 2
+    assert found(0.04, 0.09, 0.12, on_excess=True).robots == 2
     useless = found(0.6, 0.6)
     assert (useless.robots, useless.reason) == (0, "one cell alone misses 60% of its deadlines")
 
