@@ -44,6 +44,7 @@ def _phases(value: Any) -> str | tuple[float, ...]:
 
 GIVEN = TextForm(NOT_EMPTY)
 CELL = required("cell", GIVEN, "The cell file, relative to this file's folder.")
+ENTRY = shape_of(FleetEntry, {}, further=(CELL,))
 SETTINGS = shape_of(
     Fleet,
     {},
@@ -58,7 +59,7 @@ FLEET = FileKind.of(
     optional("name", TextForm(), "Name of the fleet.", "the file's"),
     required(
         "cells",
-        ListForm(shape_of(FleetEntry, {}, further=(CELL,)), keeps=True),
+        ListForm(ENTRY, keeps=True),
         "Cells by kind.",
         [],
     ),
