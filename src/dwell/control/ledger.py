@@ -96,9 +96,9 @@ class FleetLedger:
         self.turn_ns = max(
             round(problem.window_cycles * problem.pipeline.period_ms * 1e6) for problem in problems
         )
-        #: Counts what is new: presents, and placements.
-        self._version = 0
-        self._looked = [-1] * len(self.cells)
+        #: How often any cell has moved; and of each cell what it was when it was looked at.
+        self._moves = 0
+        self._looked = [(-1, -1)] * len(self.cells)
         self._refusals: list[dict[str, str]] = [{} for _ in self.cells]
         #: Number of the round: of the closes since fleets were last played to compare them.
         self.round = 0
@@ -111,7 +111,7 @@ class FleetLedger:
         if name != self.placements[index]:
             self.placements[index] = name
             self._at = self._loads.at(self.placements)
-            self._version += 1
+            self._moves += 1
 
     def note(self, index: int, estimates: Mapping[str, QoS], estimator: Estimator) -> None:
         """Take note of what a cell knows of itself, where that is new."""
@@ -122,19 +122,19 @@ class FleetLedger:
         self._alone[index] = {name: self._terms[index].cost(qos) for name, qos in estimates.items()}
         if isinstance(estimator, Online):
             self._presents[index] = estimator.present
-        self._version += 1
 
     def consider(self, index: int, decision: Decision) -> Verdict:
         """Say where a cell is to be that its policy has decided on."""
         wished = decision.name
-        if self._looked[index] != self._version:
-            self._looked[index] = self._version
+        state = self._moves, self._revisions[index]
+        if self._looked[index] != state:
+            self._looked[index] = state
             self._refusals[index] = {}
         elif not decision.migrated or wished in self._refusals[index]:
             return self._refused(index, wished)
         if decision.costs:
             if decision.reason == "dwell":
-                self._looked[index] = -1
+                self._looked[index] = -1, -1
                 return self._refused(index, wished)
             names = self._promising(index)
         else:
