@@ -61,6 +61,19 @@ class FleetLedger:
         What plays.
     progress : callable
         Told how many of how many levels of the table have been played.
+
+    Attributes
+    ----------
+    placements : list of str
+        Where every cell is.
+    presents : list of Present
+        What each cell knows of itself.
+    alone : list of mapping of str to float
+        By cell and candidate, J where no other cell is there, without switching and shared nodes.
+    loads : Loads
+        The table, added up.
+    round : int
+        Number of the round: of the closes since the fleet was last played.
     """
 
     def __init__(
@@ -77,16 +90,15 @@ class FleetLedger:
         problems = [cell.problem for cell in cells]
         self.table = load_table(cells, shared, progress) if table is None else table
         self.prices = prices or FleetPrices(cells, shared)
-        self._loads = Loads(self.table)
+        self.loads = Loads(self.table)
         self._terms = [CellTerms(problem, shared) for problem in problems]
         self.placements = [problem.initial for problem in problems]
-        self._at = self._loads.at(self.placements)
-        #: By cell and candidate, J alone, without switching and shared nodes.
-        self._alone = [
+        self._at = self.loads.at(self.placements)
+        self.alone = [
             {name: terms.cost(price.qos) for name, price in prices_of(problem).items()}
             for problem, terms in zip(problems, self._terms, strict=True)
         ]
-        self._presents = [Present()] * len(self.cells)
+        self.presents = [Present()] * len(self.cells)
         self._revisions = [-1] * len(self.cells)
         self._has_caps = any(problem.objective.caps != Caps() for problem in problems)
         self._least = min(problem.controller.min_improvement for problem in problems)
@@ -100,7 +112,6 @@ class FleetLedger:
         self._moves = 0
         self._looked = [(-1, -1)] * len(self.cells)
         self._refusals: list[dict[str, str]] = [{} for _ in self.cells]
-        #: Number of the round: of the closes since fleets were last played to compare them.
         self.round = 0
 
     def __repr__(self) -> str:
@@ -110,7 +121,7 @@ class FleetLedger:
         """Take note of where a cell is."""
         if name != self.placements[index]:
             self.placements[index] = name
-            self._at = self._loads.at(self.placements)
+            self._at = self.loads.at(self.placements)
             self._moves += 1
 
     def note(self, index: int, estimates: Mapping[str, QoS], estimator: Estimator) -> None:
@@ -119,9 +130,9 @@ class FleetLedger:
         if revision == self._revisions[index]:
             return
         self._revisions[index] = revision
-        self._alone[index] = {name: self._terms[index].cost(qos) for name, qos in estimates.items()}
+        self.alone[index] = {name: self._terms[index].cost(qos) for name, qos in estimates.items()}
         if isinstance(estimator, Online):
-            self._presents[index] = estimator.present
+            self.presents[index] = estimator.present
 
     def consider(self, index: int, decision: Decision) -> Verdict:
         """Say where a cell is to be that its policy has decided on."""
@@ -168,8 +179,8 @@ class FleetLedger:
         found = []
         for name in self.cells[index].problem.candidates:
             if name != self.placements[index]:
-                rise = self._loads.rise(self._at, index, self.placements[index], name)
-                rise += self._alone[index][name] - self._alone[index][self.placements[index]]
+                rise = self.loads.rise(self._at, index, self.placements[index], name)
+                rise += self.alone[index][name] - self.alone[index][self.placements[index]]
                 if -rise > self.owed(index, name) or self._helps_the_worst(index, name):
                     found.append((rise, name))
         return [name for _, name in sorted(found)[:LOOKS]]
@@ -178,8 +189,8 @@ class FleetLedger:
         """Whether the table thinks so."""
         if self.objective != "worst":
             return False
-        before = self._loads.costs(self.placements, self._alone)
-        after = self._loads.costs(self._with(index, name), self._alone)
+        before = self.loads.costs(self.placements, self.alone)
+        after = self.loads.costs(self._with(index, name), self.alone)
         return self._from_the_worst(after) < self._from_the_worst(before)
 
     def _with(self, index: int, name: str) -> list[str]:
@@ -193,7 +204,7 @@ class FleetLedger:
         return problem.controller.min_improvement + weight * hamming(there, here)
 
     def _played(self, index: int, name: str) -> tuple[FleetPrice, FleetPrice]:
-        self.prices.begin(self._presents)
+        self.prices.begin(self.presents)
         before = self.prices.price(tuple(self.placements))
         return before, self.prices.price(tuple(self._with(index, name)))
 
@@ -233,25 +244,25 @@ class Seat(Coordination):
     knows_others: ClassVar[bool] = True
 
     def __init__(self, ledger: FleetLedger, index: int) -> None:
-        self._ledger, self._index = ledger, index
+        self.ledger, self._index = ledger, index
 
     def __repr__(self) -> str:
-        return f"<Seat of {self._ledger.cells[self._index].name}>"
+        return f"<Seat of {self.ledger.cells[self._index].name}>"
 
     def meet(self, estimator: Estimator) -> None:
         """Have the estimator take notice of the fleet."""
-        if isinstance(estimator, Online) and len(self._ledger.cells) > 1:
-            estimator.share(self._ledger.shared, len(self._ledger.cells))
+        if isinstance(estimator, Online) and len(self.ledger.cells) > 1:
+            estimator.share(self.ledger.shared, len(self.ledger.cells))
 
     def turns(self, release_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether it is the cell's turn at each cycle: one window after another, by name."""
-        ledger = self._ledger
+        ledger = self.ledger
         turn = release_ns // ledger.turn_ns % len(ledger.cells)
         return np.equal(turn, ledger.order[self._index])
 
     def place(self, name: str) -> None:
         """Take note of where the cell is."""
-        self._ledger.place(self._index, name)
+        self.ledger.place(self._index, name)
 
     def consider(
         self,
@@ -261,9 +272,9 @@ class Seat(Coordination):
         estimator: Estimator,
     ) -> Verdict:
         """Have the ledger look at what the policy has decided."""
-        self._ledger.place(self._index, incumbent)
-        self._ledger.note(self._index, estimates, estimator)
-        return self._ledger.consider(self._index, decision)
+        self.ledger.place(self._index, incumbent)
+        self.ledger.note(self._index, estimates, estimator)
+        return self.ledger.consider(self._index, decision)
 
 
 class AtLoad(NamedTuple):
