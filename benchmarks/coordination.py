@@ -25,7 +25,7 @@ from dwell.control.coordination import Coordination, Verdict
 from dwell.control.ledger import FleetLedger, PricedCell, Seat
 from dwell.estimators import Estimator
 from dwell.estimators.load_table import load_table
-from dwell.model import Decision, NodeDisturbance, QoS
+from dwell.model import Decision, NodeDisturbance, Problem, QoS
 from dwell.model.fleet import Fleet, FleetEntry
 from dwell.record.fleet_run import FleetRun
 from dwell.sim import fleet as fleets
@@ -80,14 +80,14 @@ class Outcome(NamedTuple):
     away_from_best: float
 
 
-def fleet_of(cells: int, scenario: Sequence[NodeDisturbance], **entry: str) -> Fleet:
+def fleet_of(cells: int, scenario: Sequence[NodeDisturbance]) -> Fleet:
     """Canonical cells on one server, with as many cores a cell as twelve have on one of eight."""
     cell = dwell.load(CELL)
     nodes = dict(cell.fabric.nodes)
     nodes["E"] = replace(nodes["E"], cores=round(nodes["E"].cores * cells / CELLS_A_SERVER))
     fabric = replace(cell.fabric, nodes=nodes)
     cell = replace(cell, fabric=fabric, scenarios={"change": tuple(scenario)})
-    return Fleet("hall", (FleetEntry(cell, cells, "change", **entry),), ("E",), "random")
+    return Fleet("hall", (FleetEntry(cell, cells, "change"),), ("E",), "random")
 
 
 def common_change(cells: int) -> Fleet:
@@ -123,8 +123,10 @@ def play_rule(cells: int, rule: str, estimator: str, seed: int) -> Outcome:
     wishes: dict[int, dict[int, float]] = {}
     made = fleets.coordinations
 
-    def coordinations(*asked: object) -> Iterator[Coordination | None]:
-        for i, one in enumerate(made(*asked)):  # type: ignore[arg-type]
+    def coordinations(
+        fleet: Fleet, problems: Mapping[str, Problem], seed: int
+    ) -> Iterator[Coordination | None]:
+        for i, one in enumerate(made(fleet, problems, seed)):
             if isinstance(one, Seat) and not ledgers:
                 ledgers.append(one.ledger)
             yield MostGainFirst(wishes, i) if rule == "most-gain-first" else one
@@ -170,13 +172,13 @@ def rules(cells: int, seeds: Sequence[int], pool: ProcessPoolExecutor) -> Iterat
     for rule in RULES:
         for estimator in ESTIMATORS:
             found = list(pool.map(partial(play_rule, cells, rule, estimator), seeds))
-            cost = mean_interval([one.cost for one in found])
+            cost, most = mean_interval([one.cost for one in found]), max(one[4] for one in found)
             means = Outcome(*np.mean(found, axis=0))
             away = f"{means.away_from_best:+.3f}" if rule == "ledger" else "–"
             yield (
                 f"| {rule} | {estimator} | {cost.value:.3f} ({cost.low:.3f}, {cost.high:.3f}) | "
-                f"{cost.value / best[1]:.3f} | {100 * means.violation_rate:.1f} | {means.moves:.0f} "
-                f"| {means.crossings:.0f} | {max(one.most_crossings for one in found)} | {away} |\n"
+                f"{cost.value / best[1]:.3f} | {100 * means.violation_rate:.1f} | "
+                f"{means.moves:.0f} | {means.crossings:.0f} | {most} | {away} |\n"
             )
 
 
