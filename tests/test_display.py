@@ -42,7 +42,9 @@ from dwell.policies import by_name as policy_by_name
 from dwell.record import Journal
 from dwell.study import (
     Hindsight,
+    Limiting,
     StudyResult,
+    capacity_of,
     compare,
     load_study,
     mean_interval,
@@ -162,6 +164,15 @@ def objects(
         dwell.simulate_fleet(
             Fleet("pair", (FleetEntry(canonical, 2),)), windows=6, policy="LOC", coordination="none"
         ),
+        capacity_of(
+            Fleet("pair", (FleetEntry(canonical, 1),), ("E",)),
+            policy="SO",
+            most=2,
+            seeds=(1,),
+            cycles=100,
+            processes=1,
+        ),
+        Limiting("node", "E", 0.9),
         mean_interval([1.0, 2.0, 3.0]),
         *(run.arrays("cycles"), run.arrays("cycles").names("placement")),
         Journal(tmp_path_factory.mktemp("journal"), run="r", meta={}, columns={}),

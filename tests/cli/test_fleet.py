@@ -137,3 +137,75 @@ def test_the_example_is_a_fleet_that_can_be_played(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     told = json.loads((tmp_path / "hall" / "fleet.json").read_text())
     assert (told["file"], len(told["cells"])) == (str(example), 12)
+
+
+#: Few enough cycles for a test.
+FEW = ("--most", "6", "--processes", "1")
+
+
+@pytest.fixture
+def crowd(fleet: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a fleet of cells of which a few fill the edge."""
+    text = SMALL.replace("cores: 4", "cores: 1, scheduler: fifo").replace(
+        "E: {exec_ms: 2}", "E: {exec_ms: 6}"
+    )
+    fleet.with_name("small.yaml").write_text(text, encoding="utf-8")
+    monkeypatch.setattr("dwell.study.capacity.CYCLES", 100)
+    return fleet
+
+
+def test_a_capacity_as_json(crowd: Path) -> None:
+    """P = 20 ms, jobs of 6 ms one after another, 5 ms before: two are done by 17 ms, three by 23.
+
+    Of the late ones each first waits 3 ms for its stressed robot.
+    """
+    command = ("fleet", "capacity", crowd, "--policy", "OFF", "--phases", "sync", *FEW, "--json")
+    found = read_json(call(*command))
+    assert {name: found[name] for name in ("robots", "at_least", "interval", "limit")} == {
+        "robots": 2,
+        "at_least": False,
+        "interval": [2, 2],
+        "limit": 0.05,
+    }
+    assert (found["limit_on"], found["phases"], found["policy"]) == (
+        "violation_rate",
+        "sync",
+        "OFF",
+    )
+    assert found["limits"] == {"node": "E", "share": pytest.approx(12 / 15, abs=1e-3)}
+    assert [point["robots"] for point in found["curve"]] == [1, 2, 3]
+    assert set(found["curve"][0]) == {"robots", "violation_rate", "low", "high"}
+    assert "what_if" not in found
+    assert Path(found["report"]).is_file()
+
+
+def test_a_capacity_on_a_terminal_with_what_would_change_it(crowd: Path) -> None:
+    command = ("fleet", "capacity", crowd, "--policy", "OFF", "--phases", "sync", *FEW)
+    result = call(*command, "--what-if", "--figures", "figures")
+    assert (result.exit_code, result.stderr) == (0, "")
+    lines = result.stdout.splitlines()
+    assert lines[1].split() == ["robots", "2", "[2,", "2]"]
+    assert [
+        line.rsplit("  ", 1)[0].split() for line in lines if line.startswith("a core more")
+    ] == [["a", "core", "more", "on", "E", "4"]]
+    (even,) = [line.split() for line in lines if line.startswith("phases evenly spread")]
+    assert even[3:] == ["3", "[3,", "3]"]
+    assert "report: capacity/pair-OFF-sync.html" in result.stdout
+    assert {path.name for path in Path("figures").iterdir()} >= {"capacity.svg", "capacity.pdf"}
+    page = Path("capacity/pair-OFF-sync.html").read_text(encoding="utf-8")
+    assert "all cells begin their cycles at one instant" in page
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--policy", "LOC"), ("policy: LOC never uses a shared node (E)", "name another one")),
+        (("--policy", "OF"), ("unknown policy 'OF'", "OFF")),
+        (("--policy", "OFF", "--phases", "1,2"), ("phases: ",)),
+        (("--policy", "OFF", "--limit", "5"), ("--limit: 5 is not allowed", "between 0 and 1")),
+    ],
+)
+def test_a_capacity_that_cannot_be_answered_is_refused(
+    crowd: Path, options: tuple[str, ...], words: tuple[str, ...]
+) -> None:
+    assert_refused(call("fleet", "capacity", crowd, *FEW, *options), *words)

@@ -137,3 +137,14 @@ def test_without_coordination_a_fleet_herds_and_chance_breaks_it(canonical: Prob
 def test_what_is_unknown_is_told(canonical: Problem, given: dict[str, Any], told: str) -> None:
     with pytest.raises(DwellError, match=told):
         simulate_fleet(hall(canonical, 2), **{"windows": 3, **given})
+
+
+@pytest.mark.parametrize("coordination", ["none", "random", "ledger"])
+@pytest.mark.parametrize("policy", ["SO", "dtp"])
+def test_a_fleet_of_one_may_be_coordinated(
+    canonical: Problem, policy: str, coordination: str
+) -> None:
+    fleet = hall(canonical, 1, coordination=coordination)
+    run = simulate_fleet(fleet, policy=policy, estimator="profile", windows=7)
+    assert 6 <= run.decisions.height <= 7
+    assert ("round" in run.decisions.columns) == (coordination != "none")

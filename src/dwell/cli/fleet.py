@@ -194,6 +194,8 @@ def capacity(
     with progress(f"playing up to {most} robots") as shown:
         found = capacity_of(asked, **settings, progress=shown)
     changes = []
+    # Numbers of robots compare where the limit is on the same.
+    settings["on_excess"] = found.limit_on == "excess"
     for change, changed in what_ifs(asked) if what_if else ():
         with progress(f"what if: {change}") as shown:
             changes.append(WhatIf(change, capacity_of(changed, **settings, progress=shown)))

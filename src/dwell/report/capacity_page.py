@@ -56,7 +56,7 @@ def _assumed(found: Capacity) -> Definitions:
     entries = {
         "robots": "the largest number such that neither it nor a smaller one is over the limit; in "
         "brackets the same by the ends of the 95 % intervals over seeds",
-        "limit": f"{found.limit:.1%} of deadlines missed{excess}, by the cell that misses most; the "
+        "limit": f"{found.limit * 100:g} % of deadlines missed{excess}, by the cell that misses most; the "
         "mean over seeds",
         "phases": PHASES.get(str(found.phases), "as listed"),
         "what limits": "the node or link that cycles which missed have waited for most, and its "
@@ -85,7 +85,7 @@ def _figure(found: Capacity) -> Figure:
         for point in found.curve
     ]
     frame = pl.DataFrame(rows).with_columns(pl.col("low", "high").fill_nan(None))
-    limit = Limit(found.bound * 100, f"limit: {found.bound:.1%}")
+    limit = Limit(found.bound * 100, f"limit: {found.bound * 100:.3g} %")
     return Figure(
         slug="capacity",
         title="V_D of the worst cell by number of robots",
@@ -100,7 +100,7 @@ def _drawing(limit: Limit, sizes: int) -> Draw:
     def draw(width: float) -> Spec:
         axis = {"tickMinStep": 1, "tickCount": min(sizes, 12), "format": "d"}
         shared = {
-            "x": quantity("robots", "robots", scale={"nice": False}, axis=axis),
+            "x": quantity("robots", "robots", scale={"nice": False, "padding": 8}, axis=axis),
             "y": quantity("mean", RATE.heading, scale={"domainMin": 0}),
         }
         tip = [

@@ -95,7 +95,9 @@ def play_fleet(
             controller = Controller(problem, chosen, named, asks)
             yield PlayedCell(problem, realisation, controller, guard and controller.guarded)
 
-    play = partial(play_cells, shared=fleet.shared, jobs=jobs)
+    # The kernel knows the rules of policies, and nothing of a fleet's.
+    by_window = fleet.coordination != "none"
+    play = partial(play_cells, shared=fleet.shared, jobs=jobs, by_window=by_window)
     # As in a cell alone, shadows are drawn for probes where the first are wanted.
     played = play([*cells()]) or play([*cells()], shadow=True) or []
     return dict(zip(names, played, strict=True))

@@ -90,4 +90,5 @@ def _unhindered(
         for extra, (of, layer) in zip(real.extra_ns, real.layers, strict=True):
             if of == row:
                 taken += extra[cycles] * (segments[at, 3] >> layer & 1)
-    return taken.astype(np.int64)
+    whole: Ints = taken.astype(np.int64)
+    return whole

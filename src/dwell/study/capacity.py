@@ -26,6 +26,7 @@ SEEDS = tuple(range(1, 11))
 MOST = 128
 #: Share of cycles that one cell alone may miss where an excess over it is of any use.
 USELESS = 0.5
+ROUNDING = 1e-12
 #: Sizes that are played together where no cell moves: they have draws in common.
 TOGETHER = 4
 #: Seeds that say where cycles wait.
@@ -213,6 +214,7 @@ def capacity_of(
     limit: float = 0.05,
     policy: str | None = None,
     phases: str | None = None,
+    on_excess: bool = False,
     most: int = MOST,
     seeds: Sequence[int] = SEEDS,
     cycles: int = CYCLES,
@@ -230,6 +232,8 @@ def capacity_of(
         without any estimator.
     phases : {"sync", "even", "random"}, optional
         What the file says where None.
+    on_excess : bool
+        Whether the limit is on the excess over one cell, also where one alone is not over it.
     most : int
         Sizes beyond are not played.
     cycles : int
@@ -254,7 +258,7 @@ def capacity_of(
         for first in range(1, most + 1, together)
         for seed in seeds
     ]
-    curve = _Curve(limit, len(seeds))
+    curve = _Curve(limit, len(seeds), on_excess=on_excess)
 
     def take(unit: Unit, rates: list[float]) -> bool:
         enough = curve.take(unit, rates)
@@ -272,8 +276,8 @@ def capacity_of(
 class _Curve:
     """V_D by size, in order, as seeds of sizes come in."""
 
-    def __init__(self, limit: float, seeds: int) -> None:
-        self.limit, self.seeds = limit, seeds
+    def __init__(self, limit: float, seeds: int, *, on_excess: bool) -> None:
+        self.limit, self.seeds, self.asked = limit, seeds, on_excess
         self.points: list[CapacityPoint] = []
         self._rates: dict[int, dict[int, float]] = {}
         self._enough = False
@@ -296,15 +300,16 @@ class _Curve:
 
     @property
     def _useless(self) -> bool:
-        return self._alone > self.limit and self._alone >= USELESS
+        return self._alone > self.limit + ROUNDING and self._alone >= USELESS
 
     @property
     def bound(self) -> float:
-        return self.limit + (self._alone if self._on_excess else 0.0)
+        """V_D that is not to be passed, and what sums of floats are off by."""
+        return self.limit + (self._alone if self._on_excess else 0.0) + ROUNDING
 
     @property
     def _on_excess(self) -> bool:
-        return self._alone > self.limit and not self._useless
+        return (self.asked or self._alone > self.limit + ROUNDING) and not self._useless
 
     def capacity(self, fleet: Fleet) -> Capacity:
         """Return what it comes to."""
