@@ -7,13 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import dwell
 from dwell.control import Controller, Estimator
 from dwell.control.coordination import Coordination, Verdict
-from dwell.control.ledger import FleetLedger, PricedCell, Seat
+from dwell.control.ledger import FleetLedger, Loads, PricedCell, Seat
 from dwell.estimators.load_table import LoadColumn, LoadTable
 from dwell.estimators.presents import Present
 from dwell.model import Decision, FrozenDict, Problem, QoS
@@ -269,3 +270,21 @@ def test_reprs_are_short() -> None:
     ledger = FleetLedger(cells, ["E"], table=wrong_table(cells, 0))
     for one in (ledger, Seat(ledger, 0), ledger.prices, ledger.table):
         assert len(repr(one)) < 100
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 1000), data=st.data())
+def test_what_a_move_changes_is_the_difference_of_all_costs(seed: int, data: st.DataObject) -> None:
+    names = st.sampled_from(list(CANONICAL.candidates))
+    placements = data.draw(st.lists(names, min_size=4, max_size=4))
+    index, there = data.draw(st.integers(0, 3)), data.draw(names)
+    loads = Loads(wrong_table(cells_of(CANONICAL, 4), seed))
+    rng = np.random.default_rng(seed)
+    alone = [{name: float(rng.uniform(1, 5)) for name in CANONICAL.candidates} for _ in range(4)]
+    here = placements[index]
+    moved = [*placements[:index], there, *placements[index + 1 :]]
+    before, after = (sum(loads.costs(one, alone)) for one in (placements, moved))
+    rise = loads.rise(loads.at(placements), index, here, there)
+    rise += alone[index][there] - alone[index][here]
+    if here != there:
+        assert rise == pytest.approx(after - before)

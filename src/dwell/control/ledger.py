@@ -20,9 +20,11 @@ of equal lists that with the smaller sum.
 
 from __future__ import annotations
 
+import bisect
 import math
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from typing import ClassVar, TypeAlias
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,8 +41,6 @@ from dwell.model import Caps, Decision, QoS
 from dwell.model.fleet import FleetObjective
 
 __all__ = ["FleetLedger", "Loads", "PricedCell", "Seat"]
-
-Floats: TypeAlias = NDArray[np.float64]
 
 #: So many of a cell's candidates are played at a close, those that the table thinks best of.
 LOOKS = 2
@@ -61,6 +61,19 @@ class FleetLedger:
         What plays.
     progress : callable
         Told how many of how many levels of the table have been played.
+
+    Attributes
+    ----------
+    placements : list of str
+        Where every cell is.
+    presents : list of Present
+        What each cell knows of itself.
+    alone : list of mapping of str to float
+        By cell and candidate, J where no other cell is there, without switching and shared nodes.
+    loads : Loads
+        The table, added up.
+    round : int
+        Number of the round: of the closes since the fleet was last played.
     """
 
     def __init__(
@@ -77,15 +90,15 @@ class FleetLedger:
         problems = [cell.problem for cell in cells]
         self.table = load_table(cells, shared, progress) if table is None else table
         self.prices = prices or FleetPrices(cells, shared)
-        self._loads = Loads(self.table)
+        self.loads = Loads(self.table)
         self._terms = [CellTerms(problem, shared) for problem in problems]
         self.placements = [problem.initial for problem in problems]
-        #: By cell and candidate, J alone, without switching and shared nodes.
-        self._alone = [
+        self._at = self.loads.at(self.placements)
+        self.alone = [
             {name: terms.cost(price.qos) for name, price in prices_of(problem).items()}
             for problem, terms in zip(problems, self._terms, strict=True)
         ]
-        self._presents = [Present()] * len(self.cells)
+        self.presents = [Present()] * len(self.cells)
         self._revisions = [-1] * len(self.cells)
         self._has_caps = any(problem.objective.caps != Caps() for problem in problems)
         self._least = min(problem.controller.min_improvement for problem in problems)
@@ -95,11 +108,10 @@ class FleetLedger:
         self.turn_ns = max(
             round(problem.window_cycles * problem.pipeline.period_ms * 1e6) for problem in problems
         )
-        #: Counts what is new: presents, and placements.
-        self._version = 0
-        self._looked = [-1] * len(self.cells)
+        #: How often any cell has moved; and of each cell what it was when it was looked at.
+        self._moves = 0
+        self._looked = [(-1, -1)] * len(self.cells)
         self._refusals: list[dict[str, str]] = [{} for _ in self.cells]
-        #: Number of the round: of the closes since fleets were last played to compare them.
         self.round = 0
 
     def __repr__(self) -> str:
@@ -109,7 +121,8 @@ class FleetLedger:
         """Take note of where a cell is."""
         if name != self.placements[index]:
             self.placements[index] = name
-            self._version += 1
+            self._at = self.loads.at(self.placements)
+            self._moves += 1
 
     def note(self, index: int, estimates: Mapping[str, QoS], estimator: Estimator) -> None:
         """Take note of what a cell knows of itself, where that is new."""
@@ -117,22 +130,22 @@ class FleetLedger:
         if revision == self._revisions[index]:
             return
         self._revisions[index] = revision
-        self._alone[index] = {name: self._terms[index].cost(qos) for name, qos in estimates.items()}
+        self.alone[index] = {name: self._terms[index].cost(qos) for name, qos in estimates.items()}
         if isinstance(estimator, Online):
-            self._presents[index] = estimator.present
-        self._version += 1
+            self.presents[index] = estimator.present
 
     def consider(self, index: int, decision: Decision) -> Verdict:
         """Say where a cell is to be that its policy has decided on."""
         wished = decision.name
-        if self._looked[index] != self._version:
-            self._looked[index] = self._version
+        state = self._moves, self._revisions[index]
+        if self._looked[index] != state:
+            self._looked[index] = state
             self._refusals[index] = {}
         elif not decision.migrated or wished in self._refusals[index]:
             return self._refused(index, wished)
         if decision.costs:
             if decision.reason == "dwell":
-                self._looked[index] = -1
+                self._looked[index] = -1, -1
                 return self._refused(index, wished)
             names = self._promising(index)
         else:
@@ -163,14 +176,22 @@ class FleetLedger:
 
     def _promising(self, index: int) -> list[str]:
         """Candidates by which the table's Φ falls by more than is owed; best first."""
-        before = self._loads.costs(self.placements, self._alone)
         found = []
         for name in self.cells[index].problem.candidates:
             if name != self.placements[index]:
-                after = self._loads.costs(self._with(index, name), self._alone)
-                if self._is_better(before, after, self.owed(index, name)):
-                    found.append((sum(after) - sum(before), name))
+                rise = self.loads.rise(self._at, index, self.placements[index], name)
+                rise += self.alone[index][name] - self.alone[index][self.placements[index]]
+                if -rise > self.owed(index, name) or self._helps_the_worst(index, name):
+                    found.append((rise, name))
         return [name for _, name in sorted(found)[:LOOKS]]
+
+    def _helps_the_worst(self, index: int, name: str) -> bool:
+        """Whether the table thinks so."""
+        if self.objective != "worst":
+            return False
+        before = self.loads.costs(self.placements, self.alone)
+        after = self.loads.costs(self._with(index, name), self.alone)
+        return self._from_the_worst(after) < self._from_the_worst(before)
 
     def _with(self, index: int, name: str) -> list[str]:
         return [*self.placements[:index], name, *self.placements[index + 1 :]]
@@ -183,7 +204,7 @@ class FleetLedger:
         return problem.controller.min_improvement + weight * hamming(there, here)
 
     def _played(self, index: int, name: str) -> tuple[FleetPrice, FleetPrice]:
-        self.prices.begin(self._presents)
+        self.prices.begin(self.presents)
         before = self.prices.price(tuple(self.placements))
         return before, self.prices.price(tuple(self._with(index, name)))
 
@@ -223,25 +244,25 @@ class Seat(Coordination):
     knows_others: ClassVar[bool] = True
 
     def __init__(self, ledger: FleetLedger, index: int) -> None:
-        self._ledger, self._index = ledger, index
+        self.ledger, self._index = ledger, index
 
     def __repr__(self) -> str:
-        return f"<Seat of {self._ledger.cells[self._index].name}>"
+        return f"<Seat of {self.ledger.cells[self._index].name}>"
 
     def meet(self, estimator: Estimator) -> None:
         """Have the estimator take notice of the fleet."""
-        if isinstance(estimator, Online) and len(self._ledger.cells) > 1:
-            estimator.share(self._ledger.shared, len(self._ledger.cells))
+        if isinstance(estimator, Online) and len(self.ledger.cells) > 1:
+            estimator.share(self.ledger.shared, len(self.ledger.cells))
 
     def turns(self, release_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether it is the cell's turn at each cycle: one window after another, by name."""
-        ledger = self._ledger
+        ledger = self.ledger
         turn = release_ns // ledger.turn_ns % len(ledger.cells)
         return np.equal(turn, ledger.order[self._index])
 
     def place(self, name: str) -> None:
         """Take note of where the cell is."""
-        self._ledger.place(self._index, name)
+        self.ledger.place(self._index, name)
 
     def consider(
         self,
@@ -251,9 +272,24 @@ class Seat(Coordination):
         estimator: Estimator,
     ) -> Verdict:
         """Have the ledger look at what the policy has decided."""
-        self._ledger.place(self._index, incumbent)
-        self._ledger.note(self._index, estimates, estimator)
-        return self._ledger.consider(self._index, decision)
+        self.ledger.place(self._index, incumbent)
+        self.ledger.note(self._index, estimates, estimator)
+        return self.ledger.consider(self._index, decision)
+
+
+class AtLoad(NamedTuple):
+    """What placements come to on shared resources.
+
+    Parameters
+    ----------
+    loads : mapping of str to float
+        Cores, or places, that are kept busy, by resource.
+    waiting : mapping of (kind, candidate) to int
+        How many cells there are of each that has work there.
+    """
+
+    loads: Mapping[str, float]
+    waiting: Mapping[tuple[int, str], int]
 
 
 class Loads:
@@ -261,18 +297,24 @@ class Loads:
 
     def __init__(self, table: LoadTable) -> None:
         self._kinds, self._work = table.kinds, table.work
-        self._waits: dict[tuple[int, str], tuple[Floats, Floats]] = {}
+        #: Loads and what J is more there, by kind and candidate.
+        self._waits: dict[tuple[int, str], tuple[list[float], list[float]]] = {}
         for group, column in table.columns.items():
             objective = table.cells[group[0]].problem.objective
             weights = objective.weights
             j = weights.latency * column.l95_ms / objective.targets.latency_ms
             j = j + weights.violations * column.violation_rate
-            self._waits[group] = column.level, j - j[0]
+            self._waits[group] = column.level.tolist(), (j - j[0]).tolist()
         terms = [CellTerms(cell.problem, table.shared).of_one() for cell in table.cells]
         #: What a busy core, or place, of each shared resource costs the fleet.
         self._of_one = {
             name: sum(one.get(name, 0.0) for one in terms) / len(terms)
             for name in dict.fromkeys(name for work in self._work for name, _ in work.values())
+        }
+
+        self._filling = {
+            name: [group for group in self._waits if self.resource(*group) == name]
+            for name in self._of_one
         }
 
     def __repr__(self) -> str:
@@ -305,29 +347,62 @@ class Loads:
     def wait(self, index: int, name: str, load: float) -> float:
         """What J of a cell's candidate grows by at a load of its shared resource."""
         of = self._waits.get(self.group(index, name))
-        return 0.0 if of is None else float(np.interp(load, *of))
+        return 0.0 if of is None else _between(load, *of)
+
+    def at(self, placements: Sequence[str]) -> AtLoad:
+        """Add up what placements come to."""
+        loads, waiting = dict.fromkeys(self._of_one, 0.0), Counter[tuple[int, str]]()
+        for i, name in enumerate(placements):
+            if name in self._work[i]:
+                resource, work = self._work[i][name]
+                loads[resource] += work
+                waiting[self.group(i, name)] += 1
+        return AtLoad(loads, waiting)
+
+    def rise(self, at: AtLoad, index: int, here: str, there: str) -> float:
+        """What Φ rises by, but for J alone, where a cell goes from one candidate to another."""
+        loads = dict(at.loads)
+        for name, sign in ((here, -1.0), (there, 1.0)):
+            if name in self._work[index]:
+                resource, work = self._work[index][name]
+                loads[resource] += sign * work
+        of_here, of_there = self.group(index, here), self.group(index, there)
+        rise = 0.0
+        for resource, load in loads.items():
+            before = at.loads[resource]
+            rise += self._of_one[resource] * (load - before)
+            for group in self._filling[resource]:
+                count = at.waiting[group]
+                if group == of_here:
+                    rise -= _between(before, *self._waits[group])
+                    count -= 1
+                elif group == of_there:
+                    rise += _between(load, *self._waits[group])
+                if count and load != before:
+                    waits = self._waits[group]
+                    rise += count * (_between(load, *waits) - _between(before, *waits))
+        return rise
 
     def costs(self, placements: Sequence[str], alone: Sequence[Mapping[str, float]]) -> list[float]:
-        """J of every cell, without switching; then what shared nodes cost.
+        """J of every cell, without switching; then what shared resources cost.
 
         Parameters
         ----------
         alone : sequence of mapping of str to float
             J of every candidate of each cell where no other is there.
         """
-        loads = dict.fromkeys(self._of_one, 0.0)
-        for work, name in zip(self._work, placements, strict=True):
-            if name in work:
-                resource, more = work[name]
-                loads[resource] += more
-        waits: dict[tuple[int, str], float] = {}
-        costs = []
-        for i, (name, mine) in enumerate(zip(placements, alone, strict=True)):
-            cost = mine[name]
-            if name in self._work[i]:
-                group = self.group(i, name)
-                if group not in waits:
-                    waits[group] = self.wait(i, name, loads[self._work[i][name][0]])
-                cost += waits[group]
-            costs.append(cost)
+        loads = self.at(placements).loads
+        costs = [
+            mine[name] + self.wait(i, name, loads.get(self.resource(i, name) or "", 0.0))
+            for i, (name, mine) in enumerate(zip(placements, alone, strict=True))
+        ]
         return [*costs, sum(self._of_one[one] * load for one, load in loads.items())]
+
+
+def _between(x: float, xs: Sequence[float], ys: Sequence[float]) -> float:
+    """Interpolate; beyond an end it is as there."""
+    i = bisect.bisect_right(xs, x)
+    if i == 0 or i == len(xs):
+        return ys[max(i - 1, 0)]
+    x0, x1, y0, y1 = xs[i - 1], xs[i], ys[i - 1], ys[i]
+    return y0 + (y1 - y0) * (x - x0) / (x1 - x0)

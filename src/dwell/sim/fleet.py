@@ -88,7 +88,7 @@ def play_fleet(
     realisations = drawn(fleet, problems, seed, windows)
 
     def cells() -> Iterator[PlayedCell]:
-        for cell, asks in zip(fleet.cells, _coordinations(fleet, problems, seed), strict=True):
+        for cell, asks in zip(fleet.cells, coordinations(fleet, problems, seed), strict=True):
             chosen = cell.entry.policy or fleet.policy
             named = cell.entry.estimator or fleet.estimator
             problem, realisation = problems[cell.name], realisations[cell.name]
@@ -202,7 +202,7 @@ def _meeting(real: Realisation, first: Realisation, shared: tuple[str, ...]) -> 
     return replace(real, node_changes=NodeChanges(nodes, merged[order]))
 
 
-def _coordinations(
+def coordinations(
     fleet: Fleet, problems: Mapping[str, Problem], seed: int
 ) -> Iterator[Coordination | None]:
     """Yield what each cell asks before it moves; None where it asks nobody."""
