@@ -12,7 +12,7 @@ from pathlib import Path
 from dwell.cellfile import cell_form, fleet_file
 from dwell.cellfile.forms import FormKey, ListForm, MappingForm, Shape
 
-FILES = tuple(Path(__file__).parent / name for name in ("cells.md", "capacity.md"))
+FILES = tuple(Path(__file__).parent / name for name in ("cells.md", "fleets.md"))
 SHAPES = {
     "the file": cell_form.CELL.shape,
     "a trace": cell_form.TRACE,

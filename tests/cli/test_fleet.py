@@ -209,3 +209,17 @@ def test_a_capacity_that_cannot_be_answered_is_refused(
     crowd: Path, options: tuple[str, ...], words: tuple[str, ...]
 ) -> None:
     assert_refused(call("fleet", "capacity", crowd, *FEW, *options), *words)
+
+
+def test_a_plan_says_where_each_cell_is_best_placed(crowd: Path) -> None:
+    """One at a time fits the edge; stressed robots cannot hold a deadline."""
+    found = read_json(call("fleet", "plan", crowd, "--phases", "sync", "--json"))
+    assert [row["cell"] for row in found["cells"]] == ["small-01", "small-02"]
+    assert {row["placement"] for row in found["cells"]} == {"OFF"}
+    assert found["phi"] == pytest.approx(found["table_phi"], rel=0.2)
+    text = call("fleet", "plan", crowd, "--phases", "sync").stdout
+    assert text.startswith("pair: 2 on OFF; Φ a cell ")
+    assert [line.split()[:2] for line in text.splitlines()[3:]] == [
+        ["small-01", "OFF"],
+        ["small-02", "OFF"],
+    ]

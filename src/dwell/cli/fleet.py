@@ -140,6 +140,63 @@ def run(
 
 
 @fleet.command()
+def plan(
+    file: FleetArgument,
+    seed: Annotated[
+        int, typer.Option(min=0, metavar="S", help="Seed of the phases, where these are random.")
+    ] = 1,
+    phases: Phases = None,
+    as_json: Json = False,
+) -> None:
+    """Find where the cells of a fleet are best placed, and play them there.
+
+    The scenarios of the file go on all the time; what is best is told by the least sum of costs.
+    """
+    from dwell.study.fleet_plan import plan_fleet
+
+    given = dwell.load_fleet(file)
+    warn(file, warnings_of(given))
+    asked = given.changed(phases=read_phases(phases))
+    with progress("playing the table of loads") as shown:
+        found = plan_fleet(asked, seed=seed, progress=shown or (lambda done, of: None))
+    priced = zip(found.placements.items(), found.played.cells, strict=True)
+    cells = [(*one, price) for one, price in priced if price is not None]
+    if as_json:
+        rows = [
+            {
+                "cell": name,
+                "placement": placement,
+                "violation_rate": price.qos.violation_rate,
+                "l95_ms": price.qos.l95_ms,
+                "cost": price.cost,
+            }
+            for name, placement, price in cells
+        ]
+        told = {"phi": found.phi, "table_phi": found.table_phi}
+        print_json(
+            {"fleet": asked.name, "phases": asked.phases, "seed": seed, **told, "cells": rows}
+        )
+        return
+    head = ["cell", "placement", "V_D (%)", "L95 (ms)", "J without shared nodes"]
+    lines = [
+        [
+            name,
+            placement,
+            f"{price.qos.violation_rate * 100:.2f}",
+            milliseconds(price.qos.l95_ms, 2),
+            f"{price.cost:.3f}",
+        ]
+        for name, placement, price in cells
+    ]
+    counts = Counter(found.placements.values())
+    placed = ", ".join(f"{count} on {name}" for name, count in counts.most_common())
+    typer.echo(
+        f"{asked.name}: {placed}; Φ a cell {found.phi:.3f}, by the table {found.table_phi:.3f}\n"
+    )
+    typer.echo(aligned(head, lines))
+
+
+@fleet.command()
 def capacity(
     file: FleetArgument,
     limit: Annotated[

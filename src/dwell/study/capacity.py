@@ -155,7 +155,7 @@ class WhatIf:
         return {"change": self.change, **{name: known[name] for name in names}}
 
 
-class Unit(NamedTuple):
+class Sizes(NamedTuple):
     """Sizes that are played together, under one seed."""
 
     first: int
@@ -179,7 +179,7 @@ class FleetPlayer:
     windows: int
     placements: Mapping[str, str]
 
-    def __call__(self, unit: Unit) -> list[float]:
+    def __call__(self, unit: Sizes) -> list[float]:
         """Return V_D of the worst cell of every size."""
         fleets = [self.fleet.with_count(size) for size in range(unit.first, unit.last + 1)]
         if self.placements:
@@ -254,13 +254,13 @@ def capacity_of(
     player = FleetPlayer(fleet, _windows(fleet, cycles), _placements(fleet))
     together = TOGETHER if player.placements else 1
     units = [
-        Unit(first, min(first + together - 1, most), seed)
+        Sizes(first, min(first + together - 1, most), seed)
         for first in range(1, most + 1, together)
         for seed in seeds
     ]
     curve = _Curve(limit, len(seeds), on_excess=on_excess)
 
-    def take(unit: Unit, rates: list[float]) -> bool:
+    def take(unit: Sizes, rates: list[float]) -> bool:
         enough = curve.take(unit, rates)
         if progress is not None:
             progress(len(curve.points), most)
@@ -282,7 +282,7 @@ class _Curve:
         self._rates: dict[int, dict[int, float]] = {}
         self._enough = False
 
-    def take(self, unit: Unit, rates: Sequence[float]) -> bool:
+    def take(self, unit: Sizes, rates: Sequence[float]) -> bool:
         """Take the rates of a unit; whether no larger size can change the answer."""
         for size, rate in enumerate(rates, unit.first):
             self._rates.setdefault(size, {})[unit.seed] = rate
