@@ -380,8 +380,9 @@ def _require_capacity(fleet: Fleet) -> None:
         )
     elif not any(node in fleet.shared for one in used for node in one.values()):
         nodes = ", ".join(fleet.shared)
-        message = f"{policy_of(fleet, first)} never uses a shared node ({nodes}), so that there may be any number"
-        faults.append(Fault("policy", f"{message} of {first.cell.name}; name another one"))
+        message = f"{policy_of(fleet, first)} never uses a shared node ({nodes})"
+        any_number = f"so that there may be any number of {first.cell.name}"
+        faults.append(Fault("policy", f"{message}, {any_number}; name another one"))
     if faults:
         raise ProblemError(faults)
 
