@@ -209,3 +209,15 @@ def test_a_capacity_that_cannot_be_answered_is_refused(
     crowd: Path, options: tuple[str, ...], words: tuple[str, ...]
 ) -> None:
     assert_refused(call("fleet", "capacity", crowd, *FEW, *options), *words)
+
+
+def test_the_plan_of_a_fleet(crowd: Path) -> None:
+    result = call("fleet", "plan", crowd, "--phases", "sync")
+    assert (result.exit_code, result.stderr) == (0, "")
+    head, best, phi, *_ = result.stdout.splitlines()
+    assert "phases: sync; seed 1" in head
+    assert best.startswith("best: ")
+    assert phi.startswith("Φ/n ")
+    told = json.loads(call("fleet", "plan", crowd, "--phases", "sync", "--json").stdout)
+    assert {"fleet", "seed", "phases", "phi", "table_phi", "cells"} == set(told)
+    assert set(told["cells"][0]) == {"cell", "placement", "violation_rate", "l95_ms"}

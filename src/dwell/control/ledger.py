@@ -59,7 +59,7 @@ class FleetLedger:
         What proposes; made of the cells where None.
     prices : FleetPrices, optional
         What plays.
-    progress : callable
+    progress : callable, optional
         Told how many of how many levels of the table have been played.
 
     Attributes
@@ -84,7 +84,7 @@ class FleetLedger:
         *,
         table: LoadTable | None = None,
         prices: FleetPrices | None = None,
-        progress: Callable[[int, int], None] = lambda done, of: None,
+        progress: Callable[[int, int], None] | None = None,
     ) -> None:
         self.cells, self.shared, self.objective = tuple(cells), tuple(shared), objective
         problems = [cell.problem for cell in cells]

@@ -19,6 +19,7 @@ from dwell.estimators.fleet_prices import CellTerms, FleetPrice, FleetPrices, Pr
 from dwell.estimators.load_table import load_table
 from dwell.estimators.prices import prices_of
 from dwell.model.fleet import Fleet
+from dwell.model.qos import QoS
 from dwell.sim.fleet import phased
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -55,9 +56,31 @@ class FleetPlan:
         """Φ a cell, as played."""
         return self.played.phi / len(self.placements)
 
+    @property
+    def cells(self) -> dict[str, QoS]:
+        """What each cell comes to."""
+        priced = zip(self.placements, self.played.cells, strict=True)
+        return {name: cell.qos for name, cell in priced if cell is not None}
+
+    def as_json(self) -> dict[str, object]:
+        """Return it as plain values."""
+        return {
+            "phi": self.phi,
+            "table_phi": self.table_phi,
+            "cells": [
+                {
+                    "cell": name,
+                    "placement": self.placements[name],
+                    "violation_rate": qos.violation_rate,
+                    "l95_ms": qos.l95_ms,
+                }
+                for name, qos in self.cells.items()
+            ],
+        }
+
 
 def plan_fleet(
-    fleet: Fleet, *, seed: int = 1, progress: Callable[[int, int], None] = lambda done, of: None
+    fleet: Fleet, *, seed: int = 1, progress: Callable[[int, int], None] | None = None
 ) -> FleetPlan:
     """Find where the cells of a fleet are best placed while their scenarios go on.
 
@@ -65,7 +88,7 @@ def plan_fleet(
     ----------
     seed : int
         Of the phases, where these are random.
-    progress : callable
+    progress : callable, optional
         Told how many of how many levels of the table have been played.
     """
     cells = [
