@@ -216,4 +216,6 @@ def test_a_fleet_of_one_may_be_coordinated(
     fleet = hall(canonical, 1, coordination=coordination)
     run = simulate_fleet(fleet, policy=policy, estimator="profile", windows=7)
     assert 6 <= run.decisions.height <= 7
-    assert ("round" in run.decisions.columns) == (coordination != "none")
+    rounds = run.decisions["round"]
+    assert (rounds.null_count() == 0) == (coordination == "ledger")
+    assert {"phi_before", "phi_after"} <= set(run.decisions.columns)
