@@ -21,14 +21,14 @@ import polars as pl
 
 import dwell
 from benchmarks.canonical import CELL
-from dwell.control.coordination import Coordination, Verdict
+from dwell.control.coordination import Coordination, Verdict, Wish
 from dwell.control.ledger import FleetLedger, PricedCell, Seat
-from dwell.estimators import Estimator
 from dwell.estimators.load_table import load_table
-from dwell.model import Decision, NodeDisturbance, Problem, QoS
+from dwell.model import NodeDisturbance, Problem
 from dwell.model.fleet import Fleet, FleetEntry
 from dwell.record.fleet_run import FleetRun
 from dwell.sim import fleet as fleets
+from dwell.sim.engine import Progress
 from dwell.sim.fleet import phased, simulate_fleet
 from dwell.study.fleet_plan import best_placements
 from dwell.study.intervals import mean_interval
@@ -50,14 +50,9 @@ class MostGainFirst(Coordination):
     def __init__(self, wishes: dict[int, dict[int, float]], index: int) -> None:
         self._wishes, self._index, self._window = wishes, index, 0
 
-    def consider(
-        self,
-        decision: Decision,
-        estimates: Mapping[str, QoS],
-        incumbent: str,
-        estimator: Estimator,
-    ) -> Verdict:
+    def consider(self, wish: Wish) -> Verdict:
         """Let the move pass if nobody has gained more at the window before."""
+        decision, incumbent = wish.decision, wish.incumbent
         window, self._window = self._window, self._window + 1
         if not decision.migrated:
             return Verdict(incumbent)
@@ -124,9 +119,9 @@ def play_rule(cells: int, rule: str, estimator: str, seed: int) -> Outcome:
     made = fleets.coordinations
 
     def coordinations(
-        fleet: Fleet, problems: Mapping[str, Problem], seed: int
+        fleet: Fleet, problems: Mapping[str, Problem], seed: int, progress: Progress | None = None
     ) -> Iterator[Coordination | None]:
-        for i, one in enumerate(made(fleet, problems, seed)):
+        for i, one in enumerate(made(fleet, problems, seed, progress)):
             if isinstance(one, Seat) and not ledgers:
                 ledgers.append(one.ledger)
             yield MostGainFirst(wishes, i) if rule == "most-gain-first" else one

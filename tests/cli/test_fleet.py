@@ -213,15 +213,13 @@ def test_a_capacity_that_cannot_be_answered_is_refused(
     assert_refused(call("fleet", "capacity", crowd, *FEW, *options), *words)
 
 
-def test_a_plan_says_where_each_cell_is_best_placed(crowd: Path) -> None:
-    """One at a time fits the edge; stressed robots cannot hold a deadline."""
-    found = read_json(call("fleet", "plan", crowd, "--phases", "sync", "--json"))
-    assert [row["cell"] for row in found["cells"]] == ["small-01", "small-02"]
-    assert {row["placement"] for row in found["cells"]} == {"OFF"}
-    assert found["phi"] == pytest.approx(found["table_phi"], rel=0.2)
-    text = call("fleet", "plan", crowd, "--phases", "sync").stdout
-    assert text.startswith("pair: 2 on OFF; Φ a cell ")
-    assert [line.split()[:2] for line in text.splitlines()[3:]] == [
-        ["small-01", "OFF"],
-        ["small-02", "OFF"],
-    ]
+def test_the_plan_of_a_fleet(crowd: Path) -> None:
+    result = call("fleet", "plan", crowd, "--phases", "sync")
+    assert (result.exit_code, result.stderr) == (0, "")
+    head, best, phi, *_ = result.stdout.splitlines()
+    assert "phases: sync; seed 1" in head
+    assert best.startswith("best: ")
+    assert phi.startswith("Φ/n ")
+    told = json.loads(call("fleet", "plan", crowd, "--phases", "sync", "--json").stdout)
+    assert {"fleet", "seed", "phases", "phi", "table_phi", "cells"} == set(told)
+    assert set(told["cells"][0]) == {"cell", "placement", "violation_rate", "l95_ms"}

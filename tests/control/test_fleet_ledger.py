@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import dwell
-from dwell.control import Controller, Estimator
-from dwell.control.coordination import Coordination, Verdict
+from dwell.control import Controller
+from dwell.control.coordination import Coordination, Verdict, Wish
 from dwell.control.ledger import FleetLedger, Loads, PricedCell, Seat
 from dwell.estimators.load_table import LoadColumn, LoadTable
 from dwell.estimators.presents import Present
@@ -68,7 +68,7 @@ def settle(ledger: FleetLedger, rounds: int = 50) -> list[tuple[int, str, Verdic
             here = ledger.placements[i]
             costs = dict.fromkeys(cell.problem.candidates, 0.0)
             owed = {name: ledger.owed(i, name) for name in costs}
-            verdict = ledger.consider(i, priced(cell.problem, here, here, costs))
+            verdict = ledger.consider(i, priced(cell.problem, here, here, costs), by_price=True)
             if verdict.name != here:
                 assert ledger.placements[i] == verdict.name
                 first, last, _ = verdict.asked
@@ -157,7 +157,7 @@ def test_no_cell_is_moved_over_a_cap_of_another_one() -> None:
     for first in (cells[0], replace(cells[0], problem=tight)):
         ledger = FleetLedger([first, *cells[1:]], ["E"], table=plain.table)
         ledger.place(0, "HYB")
-        answers.append(ledger.consider(1, wished))
+        answers.append(ledger.consider(1, wished, by_price=True))
     assert answers[0].name != "LOC"
     assert (answers[1].name, answers[1].why) == ("LOC", "cap of cell-01")
 
@@ -166,12 +166,12 @@ def test_a_cell_that_somebody_else_has_moved_is_load_from_then_on() -> None:
     problem = stressed(with_cores(CANONICAL, 2))
     cells = cells_of(problem, 3)
     ledger, costs = FleetLedger(cells, ["E"]), dict.fromkeys(problem.candidates, 0.0)
-    assert ledger.consider(0, priced(problem, "LOC", "LOC", costs)).name != "LOC"
+    assert ledger.consider(0, priced(problem, "LOC", "LOC", costs), by_price=True).name != "LOC"
     crowded = FleetLedger(cells, ["E"])
     Seat(crowded, 1).place("SO")
     Seat(crowded, 2).place("SO")
     assert crowded.placements == ["LOC", "SO", "SO"]
-    assert crowded.consider(0, priced(problem, "LOC", "LOC", costs)).name == "LOC"
+    assert crowded.consider(0, priced(problem, "LOC", "LOC", costs), by_price=True).name == "LOC"
 
 
 def test_nothing_is_played_twice_while_nothing_is_new() -> None:
@@ -190,12 +190,12 @@ def test_a_policy_without_prices_is_let_through_or_refused() -> None:
     def wishes(name: str) -> Decision:
         return Decision(problem.candidates[name], name, True, "migrate")
 
-    assert ledger.consider(0, wishes("SO")).name == "SO"
-    assert ledger.consider(1, wishes("SO")).name in ("SO", "LOC")
-    verdict = ledger.consider(2, wishes("SO"))
+    assert ledger.consider(0, wishes("SO"), by_price=False).name == "SO"
+    assert ledger.consider(1, wishes("SO"), by_price=False).name in ("SO", "LOC")
+    verdict = ledger.consider(2, wishes("SO"), by_price=False)
     assert verdict.name == "LOC"
     assert str(verdict.why).startswith("ledger: Φ would rise by ")
-    assert ledger.consider(2, wishes("SO")).why == verdict.why
+    assert ledger.consider(2, wishes("SO"), by_price=False).why == verdict.why
 
 
 class Says(Coordination):
@@ -204,13 +204,7 @@ class Says(Coordination):
     def __init__(self, *names: str) -> None:
         self.names = list(names)
 
-    def consider(
-        self,
-        decision: Decision,
-        estimates: Mapping[str, QoS],
-        incumbent: str,
-        estimator: Estimator,
-    ) -> Verdict:
+    def consider(self, wish: Wish) -> Verdict:
         return Verdict(self.names.pop(0), "because", (2.0, 1.0, 7))
 
 

@@ -12,9 +12,11 @@ from polars.testing import assert_frame_equal
 
 import dwell
 from dwell import simulate_fleet
+from dwell.cost import hamming
 from dwell.errors import DwellError
-from dwell.model import Problem
+from dwell.model import NodeDisturbance, Problem
 from dwell.model.fleet import Fleet, FleetEntry
+from dwell.record import FleetRun
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 TABLES = ("cycles", "windows", "decisions")
@@ -123,6 +125,73 @@ def test_without_coordination_a_fleet_herds_and_chance_breaks_it(canonical: Prob
     assert by_chance[0] < alone[0]
 
 
+def crowded(problem: Problem, *more: NodeDisturbance) -> Problem:
+    """Return a cell with stressed robots and an edge of four cores that nobody else uses."""
+    nodes = dict(problem.fabric.nodes)
+    nodes["E"] = replace(nodes["E"], cores=4, bursts=None)
+    stress = NodeDisturbance(node="R1", stress_threads=4)
+    fabric = replace(problem.fabric, nodes=nodes)
+    return replace(problem, fabric=fabric, scenarios={"change": (stress, *more)})
+
+
+def on_edge(run: FleetRun) -> list[int]:
+    """How many cells are on the edge at each window."""
+    placed = run.windows.group_by("window").agg((pl.col("placement") != "LOC").sum())
+    return [int(count) for _, count in placed.sort("window").rows()]
+
+
+def test_under_a_ledger_each_move_is_worth_what_it_costs_and_none_goes_back(
+    canonical: Problem,
+) -> None:
+    problem = crowded(canonical)
+    fleet = hall(problem, 6, "change", phases="even", coordination="ledger")
+    run = simulate_fleet(fleet, policy="dtp", estimator="corrected", windows=20)
+    moved = run.decisions.filter("migrated")
+    objective, least = problem.objective, problem.controller.min_improvement
+    for row in moved.to_dicts():
+        here, there = (problem.candidates[row[name]] for name in ("incumbent", "placement"))
+        owed = least + objective.weights.switching * hamming(there, here)
+        assert row["phi_before"] - row["phi_after"] > owed
+    assert moved["round"].n_unique() == moved.height
+    # The last windows of cells that have moved are not whole.
+    counts = on_edge(run)[:-2]
+    assert 3 < counts[-1] < 6
+    assert counts == sorted(counts)
+    refused = run.decisions.filter(pl.col("refused").is_not_null())
+    assert not refused["migrated"].any()
+    assert refused["refused"].str.contains("ledger: Φ would|cap of canonical-0").all()
+
+
+def test_when_the_edge_is_back_nobody_tramples_it(canonical: Problem) -> None:
+    problem = crowded(canonical, NodeDisturbance(node="E", at_s=60.0, for_s=8.0, down=True))
+    # No guard moves a cell onto the edge because its robot is slow.
+    problem = replace(problem, controller=replace(problem.controller, fallbacks=("LOC",)))
+    fleet = hall(problem, 6, "change", phases="even", coordination="ledger")
+    run = simulate_fleet(fleet, policy="dtp", estimator="corrected", windows=36, guard=True)
+    counts = on_edge(run)
+    assert counts[16] > counts[19] == 0
+    assert counts[20:] == sorted(counts[20:])
+    assert counts[28] >= counts[16]
+    by_guard = run.decisions.filter((pl.col("reason") == "guard") & pl.col("migrated"))
+    assert by_guard["window"].max() == 18
+    late = pl.concat([one.cycles for one in run.cells.values()])
+    seconds = (pl.col("release_ns") / 10_000_000_000).floor()
+    missed = dict(late.group_by(seconds).agg(pl.col("missed").mean()).rows())
+    assert all(missed[at] <= missed[6] + 0.01 for at in range(7, 11))
+
+
+def test_cells_take_turns_in_sending_shadows_to_the_edge(canonical: Problem) -> None:
+    fleet = hall(crowded(canonical), 4, "change", phases="even", coordination="ledger")
+    run = simulate_fleet(fleet, policy="LOC", estimator="shadow", windows=12)
+    alone = simulate_fleet(
+        hall(crowded(canonical), 1, "change"), policy="LOC", windows=12, estimator="shadow"
+    )
+    sent = run.windows.group_by("window").agg(pl.col("shadow_cycles").sum())["shadow_cycles"].max()
+    most = alone.windows["shadow_cycles"].max()
+    assert 0 < int(str(sent)) <= int(str(most)) + 2
+    assert all(one.windows["shadow_cycles"].sum() > 0 for one in run.cells.values())
+
+
 @pytest.mark.parametrize(
     ("given", "told"),
     [
@@ -147,4 +216,6 @@ def test_a_fleet_of_one_may_be_coordinated(
     fleet = hall(canonical, 1, coordination=coordination)
     run = simulate_fleet(fleet, policy=policy, estimator="profile", windows=7)
     assert 6 <= run.decisions.height <= 7
-    assert ("round" in run.decisions.columns) == (coordination != "none")
+    rounds = run.decisions["round"]
+    assert (rounds.null_count() == 0) == (coordination == "ledger")
+    assert {"phi_before", "phi_after"} <= set(run.decisions.columns)

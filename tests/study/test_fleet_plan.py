@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from dwell.control.ledger import Loads, PricedCell
 from dwell.estimators.load_table import LoadColumn, LoadTable
 from dwell.model import Placement
 from dwell.model.fleet import Fleet, FleetEntry
+from dwell.sim.fleet import simulate_fleet
 from dwell.study import fleet_plan
 from dwell.study.fleet_plan import best_placements, plan_fleet
 
@@ -86,3 +88,11 @@ def test_a_plan_is_near_what_it_comes_to_where_cells_meet() -> None:
     assert "LOC" in taken
     assert len(taken) > 1
     assert plan.phi == pytest.approx(plan.table_phi, rel=0.1)
+    entries = tuple(
+        replace(fleet.entries[0], count=count, policy=name)
+        for name, count in Counter(plan.placements.values()).items()
+    )
+    best = simulate_fleet(replace(fleet, entries=entries), coordination="none", windows=40)
+    assert plan.regret(best) == pytest.approx(0.0, abs=0.2)
+    alone = simulate_fleet(fleet, policy="LOC", windows=40)
+    assert plan.regret(alone) > 0.5

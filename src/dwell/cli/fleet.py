@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from dwell.model.fleet import Fleet
     from dwell.record import FleetRun
     from dwell.study.capacity import Capacity, WhatIf
+    from dwell.study.fleet_plan import FleetPlan
     from dwell.study.intervals import Interval
 
 #: Cells, and rounds, that the terminal shows, and columns that time has there.
@@ -118,9 +119,9 @@ def run(
     require_free_or_same(folder, describe_fleet(played, phases=offsets, **settings))
     cells = counted(len(played.cells), "cell")
     try:
-        with working(f"simulating {cells}, {counted(windows, 'window')} of each"):
+        with progress(f"simulating {cells}, {counted(windows, 'window')} of each") as shown:
             result = dwell.simulate_fleet(
-                played, seed=seed, windows=windows, guard=guard, jobs=jobs
+                played, seed=seed, windows=windows, guard=guard, jobs=jobs, progress=shown
             )
         with working(f"writing {cells}"):
             result.save(folder)
@@ -141,60 +142,23 @@ def run(
 
 
 @fleet.command()
-def plan(
-    file: FleetArgument,
-    seed: Annotated[
-        int, typer.Option(min=0, metavar="S", help="Seed of the phases, where these are random.")
-    ] = 1,
-    phases: Phases = None,
-    as_json: Json = False,
-) -> None:
-    """Find where the cells of a fleet are best placed, and play them there.
+def plan(file: FleetArgument, seed: Seed = 1, phases: Phases = None, as_json: Json = False) -> None:
+    """Find where the cells are best placed while their scenarios go on, all at once.
 
-    The scenarios of the file go on all the time; what is best is told by the least sum of costs.
+    Φ of the table of loads is least there; what the placements come to is played.
     """
     from dwell.study.fleet_plan import plan_fleet
 
     given = dwell.load_fleet(file)
     warn(file, warnings_of(given))
-    asked = given.changed(phases=read_phases(phases))
-    with progress("playing the table of loads") as shown:
-        found = plan_fleet(asked, seed=seed, progress=shown or (lambda done, of: None))
-    priced = zip(found.placements.items(), found.played.cells, strict=True)
-    cells = [(*one, price) for one, price in priced if price is not None]
+    planned = given.changed(phases=read_phases(phases))
+    with progress(f"playing loads of {counted(len(planned.cells), 'cell')}") as shown:
+        found = plan_fleet(planned, seed=seed, progress=shown)
     if as_json:
-        rows = [
-            {
-                "cell": name,
-                "placement": placement,
-                "violation_rate": price.qos.violation_rate,
-                "l95_ms": price.qos.l95_ms,
-                "cost": price.cost,
-            }
-            for name, placement, price in cells
-        ]
-        told = {"phi": found.phi, "table_phi": found.table_phi}
-        print_json(
-            {"fleet": asked.name, "phases": asked.phases, "seed": seed, **told, "cells": rows}
-        )
+        head = {"fleet": planned.name, "seed": seed, "phases": planned.phases}
+        print_json(head | found.as_json())
         return
-    head = ["cell", "placement", "V_D (%)", "L95 (ms)", "J without shared nodes"]
-    lines = [
-        [
-            name,
-            placement,
-            f"{price.qos.violation_rate * 100:.2f}",
-            milliseconds(price.qos.l95_ms, 2),
-            f"{price.cost:.3f}",
-        ]
-        for name, placement, price in cells
-    ]
-    counts = Counter(found.placements.values())
-    placed = ", ".join(f"{count} on {name}" for name, count in counts.most_common())
-    typer.echo(
-        f"{asked.name}: {placed}; Φ a cell {found.phi:.3f}, by the table {found.table_phi:.3f}\n"
-    )
-    typer.echo(aligned(head, lines))
+    typer.echo(_plan_text(planned, found, seed))
 
 
 @fleet.command()
@@ -273,6 +237,33 @@ def capacity(
     typer.echo(f"\nreport: {page}")
     if figures is not None:
         typer.echo(f"figures: {figures}")
+
+
+def _plan_text(of: Fleet, found: FleetPlan, seed: int) -> str:
+    phases = of.phases if isinstance(of.phases, str) else "listed"
+    counts = Counter(found.placements.values())
+    placed = ", ".join(f"{count} on {name}" for name, count in counts.most_common())
+    rows = [
+        [
+            name,
+            found.placements[name],
+            f"{qos.violation_rate * 100:.2f}",
+            milliseconds(qos.l95_ms, 2),
+        ]
+        for name, qos in sorted(
+            found.cells.items(), key=lambda one: one[1].violation_rate, reverse=True
+        )
+    ]
+    lines = [
+        f"{of.name}: {counted(len(found.placements), 'cell')}; phases: {phases}; seed {seed}",
+        f"best: {placed}",
+        f"Φ/n   {found.phi:.3f} as played, {found.table_phi:.3f} by the table of loads",
+        "",
+        aligned(["cell, the worst first", "placement", "V_D (%)", "L95 (ms)"], rows[:SHOWN]),
+    ]
+    if len(rows) > SHOWN:
+        lines.append(f"{len(rows) - SHOWN} more, with fewer misses, are in --json")
+    return "\n".join(lines)
 
 
 def read_phases(text: str | None) -> str | tuple[float, ...] | None:

@@ -13,7 +13,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.control.coordination import Asked, Coordination, Verdict
+from dwell.control.coordination import Asked, Coordination, Verdict, Wish
 from dwell.control.course import Course
 from dwell.control.windows import missed_cycles, seen_l95_ms, utilisation
 from dwell.cost import excess
@@ -320,7 +320,9 @@ class Controller:
     ) -> None:
         """Have the fleet look at what the policy has decided."""
         decision, incumbent = proposal.decision, self.course.placement
-        verdict = coordination.consider(decision, estimates, incumbent, self.estimator)
+        by_price = self._policy.by_price
+        wish = Wish(decision, estimates, incumbent, self.estimator, by_price)
+        verdict = coordination.consider(wish)
         proposal.verdict, name = verdict, verdict.name
         if name != decision.name:
             migrated = name != incumbent

@@ -34,6 +34,30 @@ class Verdict(NamedTuple):
     asked: Asked = NOT_ASKED
 
 
+class Wish(NamedTuple):
+    """What a policy has decided at a close.
+
+    Parameters
+    ----------
+    decision : Decision
+    estimates : mapping of str to QoS
+        Of every candidate.
+    incumbent : str
+        Where the cell is.
+    estimator : Estimator
+        Whose estimates they are.
+    by_price : bool
+        Whether the policy would move to any candidate that is cheap enough, so that another one
+        may be taken in the place of its own.
+    """
+
+    decision: Decision
+    estimates: Mapping[str, QoS]
+    incumbent: str
+    estimator: Estimator
+    by_price: bool
+
+
 class Coordination(Protocol):
     """Says of a decision whether it may be carried out, or what is to be done in its place.
 
@@ -45,24 +69,8 @@ class Coordination(Protocol):
 
     knows_others: ClassVar[bool] = False
 
-    def consider(
-        self,
-        decision: Decision,
-        estimates: Mapping[str, QoS],
-        incumbent: str,
-        estimator: Estimator,
-    ) -> Verdict:
-        """Look at what a policy has decided at a close.
-
-        Parameters
-        ----------
-        estimates : mapping of str to QoS
-            Of every candidate.
-        incumbent : str
-            Where the cell is.
-        estimator : Estimator
-            Whose estimates they are.
-        """
+    def consider(self, wish: Wish) -> Verdict:
+        """Look at what a policy has decided at a close."""
         ...
 
     def meet(self, estimator: Estimator) -> None:
@@ -97,14 +105,9 @@ class ByChance(Coordination):
     def __repr__(self) -> str:
         return "<ByChance>"
 
-    def consider(
-        self,
-        decision: Decision,
-        estimates: Mapping[str, QoS],
-        incumbent: str,
-        estimator: Estimator,
-    ) -> Verdict:
+    def consider(self, wish: Wish) -> Verdict:
         """Refuse a move in some of the cases."""
+        decision, incumbent = wish.decision, wish.incumbent
         costs = decision.costs
         if not decision.migrated or incumbent not in costs or not costs[incumbent] > 0:
             return Verdict(decision.name)

@@ -29,7 +29,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.control.coordination import Coordination, Verdict
+from dwell.control.coordination import Coordination, Verdict, Wish
 from dwell.cost import excess, hamming
 from dwell.estimators import Estimator
 from dwell.estimators.fleet_prices import CellTerms, FleetPrice, FleetPrices, PricedCell
@@ -59,7 +59,7 @@ class FleetLedger:
         What proposes; made of the cells where None.
     prices : FleetPrices, optional
         What plays.
-    progress : callable
+    progress : callable, optional
         Told how many of how many levels of the table have been played.
 
     Attributes
@@ -84,7 +84,7 @@ class FleetLedger:
         *,
         table: LoadTable | None = None,
         prices: FleetPrices | None = None,
-        progress: Callable[[int, int], None] = lambda done, of: None,
+        progress: Callable[[int, int], None] | None = None,
     ) -> None:
         self.cells, self.shared, self.objective = tuple(cells), tuple(shared), objective
         problems = [cell.problem for cell in cells]
@@ -134,8 +134,8 @@ class FleetLedger:
         if isinstance(estimator, Online):
             self.presents[index] = estimator.present
 
-    def consider(self, index: int, decision: Decision) -> Verdict:
-        """Say where a cell is to be that its policy has decided on."""
+    def consider(self, index: int, decision: Decision, *, by_price: bool) -> Verdict:
+        """Say where a cell is to be that its policy has decided on (see `Wish`)."""
         wished = decision.name
         state = self._moves, self._revisions[index]
         if self._looked[index] != state:
@@ -143,13 +143,14 @@ class FleetLedger:
             self._refusals[index] = {}
         elif not decision.migrated or wished in self._refusals[index]:
             return self._refused(index, wished)
-        if decision.costs:
-            if decision.reason == "dwell":
-                self._looked[index] = -1, -1
-                return self._refused(index, wished)
+        if not by_price:
+            names = [wished] if decision.migrated else []
+        elif decision.costs and decision.reason != "dwell":
             names = self._promising(index)
         else:
-            names = [wished] if decision.migrated else []
+            # It may be looked at again as soon as it is free to move.
+            self._looked[index] = -1, -1
+            return self._refused(index, wished)
         asked: tuple[float, float] | None = None
         for name in names:
             before, after = self._played(index, name)
@@ -264,17 +265,11 @@ class Seat(Coordination):
         """Take note of where the cell is."""
         self.ledger.place(self._index, name)
 
-    def consider(
-        self,
-        decision: Decision,
-        estimates: Mapping[str, QoS],
-        incumbent: str,
-        estimator: Estimator,
-    ) -> Verdict:
+    def consider(self, wish: Wish) -> Verdict:
         """Have the ledger look at what the policy has decided."""
-        self.ledger.place(self._index, incumbent)
-        self.ledger.note(self._index, estimates, estimator)
-        return self.ledger.consider(self._index, decision)
+        self.ledger.place(self._index, wish.incumbent)
+        self.ledger.note(self._index, wish.estimates, wish.estimator)
+        return self.ledger.consider(self._index, wish.decision, by_price=wish.by_price)
 
 
 class AtLoad(NamedTuple):

@@ -59,7 +59,7 @@ class LoadTable:
     ----------
     cells : sequence of PricedCell
     shared : sequence of str
-    progress : callable
+    progress : callable, optional
         Told how many of how many levels have been played.
 
     Attributes
@@ -78,7 +78,7 @@ class LoadTable:
         shared: Sequence[str],
         *,
         cycles: int = CYCLES,
-        progress: Callable[[int, int], None] = lambda done, of: None,
+        progress: Callable[[int, int], None] | None = None,
     ) -> None:
         self.cells, self.shared = tuple(cells), tuple(shared)
         self.kinds = kinds_of(cells)
@@ -92,7 +92,8 @@ class LoadTable:
             for row in self._levels(plays, *group):
                 rows.append(row)
                 done += 1
-                progress(done, levels)
+                if progress is not None:
+                    progress(done, levels)
             level, l95_ms, rate, l95_error_ms, error = np.array(rows, float).T
             self.columns[group] = LoadColumn(level, l95_ms, rate, l95_error_ms, error)
 
@@ -126,7 +127,7 @@ _known: dict[tuple[tuple[PricedCell, ...], tuple[str, ...]], LoadTable] = {}
 def load_table(
     cells: Sequence[PricedCell],
     shared: Sequence[str],
-    progress: Callable[[int, int], None] = lambda done, of: None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> LoadTable:
     """Return the table of a fleet; what was asked before is not played again."""
     asked = tuple(cells), tuple(shared)

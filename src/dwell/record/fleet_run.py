@@ -75,8 +75,16 @@ class FleetRun:
 
     @property
     def decisions(self) -> pl.DataFrame:
-        """Decisions of all cells, with a column `cell`; what a cell does not have is null."""
-        return self._all("decisions")
+        """Decisions of all cells, with a column `cell`; what a cell does not have is null.
+
+        Φ and rounds are there also where nobody was asked.
+        """
+        import polars as pl
+
+        found = self._all("decisions")
+        asked = {"phi_before": pl.Float64, "phi_after": pl.Float64, "round": pl.Int64}
+        missing = [(name, kind) for name, kind in asked.items() if name not in found.columns]
+        return found.with_columns(pl.lit(None, kind).alias(name) for name, kind in missing)
 
     @cached_property
     def load(self) -> pl.DataFrame:

@@ -57,7 +57,7 @@ def _assumed(found: Capacity) -> Definitions:
         "robots": "the largest number such that neither it nor a smaller one is over the limit; in "
         "brackets the same by the ends of the 95 % intervals over seeds",
         "limit": f"{found.limit * 100:g} % of deadlines missed{excess}, by the cell that misses "
-        "most, in the mean over seeds",
+        "most; the mean over seeds",
         "phases": PHASES.get(str(found.phases), "as listed"),
         "what limits": "the node or link that cycles which missed have waited for most, and its "
         "share of all that they waited, one robot beyond the limit",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bisect
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,8 @@ from dwell.sim.simulated_guard import SimulatedGuard
 from dwell.sim.tables import PlayedRealisation, make_tables
 from dwell.sim.versions import versions
 
+#: Told how much of how much is done.
+Progress: TypeAlias = Callable[[int, int], None]
 #: Columns of the kernel's table `seen`.
 SEEN = "first_cycle", "missed", "l95_ms", "uncut_ms"
 
@@ -189,6 +191,7 @@ def play_cells(
     jobs: bool = False,
     by_window: bool = False,
     shadow: bool = False,
+    progress: Progress | None = None,
 ) -> list[PlayedRealisation] | None:
     """Play cells together; None where probes are wanted of a cell without a shadow.
 
@@ -202,6 +205,8 @@ def play_cells(
         See `simulate_realisation`.
     shadow : bool
         Whether guarded cells have a shadow, too, whose estimators want none.
+    progress : callable, optional
+        Told how many of how many windows have closed.
     """
     plans = [_shadow_plan(cell, shadow and cell.guarded) for cell in cells]
     whole = lay_out(
@@ -225,6 +230,7 @@ def play_cells(
     if len(cells) == 1 and not (cells[0].guarded or by_window or any(first.host_down)):
         first.leave_to_kernel()
     by_row = {stamper.arrays.part.row: stamper for stamper in stampers}
+    closed, total = 0, sum(cell.realisation.windows for cell in cells)
     while (status := play(whole)) != Status.FINISHED:
         clock = whole.tables.clock[0]
         if status == Status.STEP:
@@ -233,6 +239,9 @@ def play_cells(
         else:
             stamper = by_row[int(clock["closed_cell"])]
             stamper.close_window()
+            closed += 1
+            if progress is not None:
+                progress(closed, total)
         if stamper.lacks_shadow:
             return None
     return [

@@ -17,7 +17,7 @@ from dwell.model import NodeDisturbance, Problem, Scenario
 from dwell.model.fleet import Fleet, FleetCell, Phases
 from dwell.record import Run
 from dwell.record.fleet_run import FleetRun
-from dwell.sim.engine import PlayedCell, meta_of, play_cells
+from dwell.sim.engine import PlayedCell, Progress, meta_of, play_cells
 from dwell.sim.shared_load import shared_load
 from dwell.sim.tables import PlayedRealisation, make_tables
 from dwell.sim.waiting import Waiting, waiting_of
@@ -34,6 +34,7 @@ def simulate_fleet(
     phases: Phases | None = None,
     guard: bool = False,
     jobs: bool = False,
+    progress: Progress | None = None,
 ) -> FleetRun:
     """Draw a realisation for every cell of a fleet, and play them together.
 
@@ -51,6 +52,8 @@ def simulate_fleet(
         Whether the cells' guards act.
     jobs : bool
         Whether every job's instants are kept.
+    progress : callable, optional
+        Told how much of how much is done: levels of the ledger's table of loads, then windows.
 
     Raises
     ------
@@ -60,7 +63,9 @@ def simulate_fleet(
     fleet = fleet.changed(
         policy=policy, estimator=estimator, coordination=coordination, phases=phases
     )
-    played = play_fleet(fleet, seed=seed, windows=windows, guard=guard, jobs=jobs)
+    played = play_fleet(
+        fleet, seed=seed, windows=windows, guard=guard, jobs=jobs, progress=progress
+    )
     runs = {}
     for cell in fleet.cells:
         one = played[cell.name]
@@ -80,15 +85,23 @@ def simulate_fleet(
 
 
 def play_fleet(
-    fleet: Fleet, *, seed: int, windows: int, guard: bool = False, jobs: bool = False
+    fleet: Fleet,
+    *,
+    seed: int,
+    windows: int,
+    guard: bool = False,
+    jobs: bool = False,
+    progress: Progress | None = None,
 ) -> dict[str, PlayedRealisation]:
     """Play the cells of a fleet as it is (see `simulate_fleet`), and return them by name."""
     names = [cell.name for cell in fleet.cells]
     problems = dict(zip(names, phased(fleet, seed), strict=True))
     realisations = drawn(fleet, problems, seed, windows)
 
+    asked = partial(coordinations, fleet, problems, seed, progress)
+
     def cells() -> Iterator[PlayedCell]:
-        for cell, asks in zip(fleet.cells, coordinations(fleet, problems, seed), strict=True):
+        for cell, asks in zip(fleet.cells, asked(), strict=True):
             chosen = cell.entry.policy or fleet.policy
             named = cell.entry.estimator or fleet.estimator
             problem, realisation = problems[cell.name], realisations[cell.name]
@@ -97,7 +110,9 @@ def play_fleet(
 
     # The kernel knows the rules of policies, and nothing of a fleet's.
     by_window = fleet.coordination != "none"
-    play = partial(play_cells, shared=fleet.shared, jobs=jobs, by_window=by_window)
+    play = partial(
+        play_cells, shared=fleet.shared, jobs=jobs, by_window=by_window, progress=progress
+    )
     # As in a cell alone, shadows are drawn for probes where the first are wanted.
     played = play([*cells()]) or play([*cells()], shadow=True) or []
     return dict(zip(names, played, strict=True))
@@ -203,12 +218,15 @@ def _meeting(real: Realisation, first: Realisation, shared: tuple[str, ...]) -> 
 
 
 def coordinations(
-    fleet: Fleet, problems: Mapping[str, Problem], seed: int
+    fleet: Fleet,
+    problems: Mapping[str, Problem],
+    seed: int,
+    progress: Progress | None = None,
 ) -> Iterator[Coordination | None]:
     """Yield what each cell asks before it moves; None where it asks nobody."""
     if fleet.coordination == "ledger":
         specs = [PricedCell(cell.name, problems[cell.name], cell.streams) for cell in fleet.cells]
-        ledger = FleetLedger(specs, fleet.shared, fleet.objective)
+        ledger = FleetLedger(specs, fleet.shared, fleet.objective, progress=progress)
     for i, cell in enumerate(fleet.cells):
         if fleet.coordination == "ledger":
             yield Seat(ledger, i)

@@ -19,6 +19,8 @@ from dwell.estimators.fleet_prices import CellTerms, FleetPrice, FleetPrices, Pr
 from dwell.estimators.load_table import load_table
 from dwell.estimators.prices import prices_of
 from dwell.model.fleet import Fleet
+from dwell.model.qos import QoS
+from dwell.record import FleetRun
 from dwell.sim.fleet import phased
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -55,9 +57,56 @@ class FleetPlan:
         """Φ a cell, as played."""
         return self.played.phi / len(self.placements)
 
+    @property
+    def cells(self) -> dict[str, QoS]:
+        """What each cell comes to."""
+        priced = zip(self.placements, self.played.cells, strict=True)
+        return {name: cell.qos for name, cell in priced if cell is not None}
+
+    def regret(self, run: FleetRun) -> float:
+        """How far Φ of a run, by what its windows show, is above that of the plan: a share of it.
+
+        Windows of the warm-up do not count.
+        """
+        return phi_of(run) / self.phi - 1.0
+
+    def as_json(self) -> dict[str, object]:
+        """Return it as plain values."""
+        return {
+            "phi": self.phi,
+            "table_phi": self.table_phi,
+            "cells": [
+                {
+                    "cell": name,
+                    "placement": self.placements[name],
+                    "violation_rate": qos.violation_rate,
+                    "l95_ms": qos.l95_ms,
+                }
+                for name, qos in self.cells.items()
+            ],
+        }
+
+
+def phi_of(run: FleetRun) -> float:
+    """Φ a cell of a run, by the means of what its windows showed after the warm-up."""
+    own, shared = 0.0, 0.0
+    for name, one in run.cells.items():
+        cell = next(cell for cell in run.fleet.cells if cell.name == name)
+        terms, windows = CellTerms(cell.problem, run.fleet.shared), one.arrays("windows")
+        counts = ~windows["warmup"]
+
+        def mean(column: str, windows: Any = windows, counts: Any = counts) -> float:
+            return float(np.nanmean(windows[column][counts]))
+
+        used = {name: mean(f"u_{name}") for name in terms.resources}
+        qos = QoS(mean("seen_l95_ms"), mean("seen_violation_rate"), used)
+        own, shared = own + terms.cost(qos), shared + terms.shared_cost(qos)
+    count = len(run.cells)
+    return (own + shared / count) / count
+
 
 def plan_fleet(
-    fleet: Fleet, *, seed: int = 1, progress: Callable[[int, int], None] = lambda done, of: None
+    fleet: Fleet, *, seed: int = 1, progress: Callable[[int, int], None] | None = None
 ) -> FleetPlan:
     """Find where the cells of a fleet are best placed while their scenarios go on.
 
@@ -65,7 +114,7 @@ def plan_fleet(
     ----------
     seed : int
         Of the phases, where these are random.
-    progress : callable
+    progress : callable, optional
         Told how many of how many levels of the table have been played.
     """
     cells = [
