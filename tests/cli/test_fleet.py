@@ -176,7 +176,9 @@ def test_a_capacity_as_json(crowd: Path) -> None:
     assert [point["robots"] for point in found["curve"]] == [1, 2, 3]
     assert set(found["curve"][0]) == {"robots", "violation_rate", "low", "high"}
     assert "what_if" not in found
-    assert Path(found["report"]).is_file()
+    assert found["report"] is None
+    assert read_json(call(*command, "--out", "page.html"))["report"] == "page.html"
+    assert Path("page.html").is_file()
 
 
 def test_a_capacity_on_a_terminal_with_what_would_change_it(crowd: Path) -> None:

@@ -14,7 +14,7 @@ from dwell.errors import ProblemError
 from dwell.model import evolve
 from dwell.model.fleet import Fleet, FleetEntry
 from dwell.study import capacity
-from dwell.study.capacity import Capacity, Unit, capacity_of, what_ifs
+from dwell.study.capacity import Capacity, Sizes, capacity_of, what_ifs
 from tests.cells.fleets import fleet_of, one_job, within
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -131,7 +131,7 @@ class Rates:
     def __init__(self, *rates: float) -> None:
         self.rates, self.placements = rates, {"one": "OFF"}
 
-    def __call__(self, unit: Unit) -> list[float]:
+    def __call__(self, unit: Sizes) -> list[float]:
         sizes = range(unit.first, unit.last + 1)
         return [self.rates[min(size, len(self.rates)) - 1] for size in sizes]
 

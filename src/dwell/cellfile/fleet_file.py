@@ -9,13 +9,16 @@ from typing import Any
 from dwell.cellfile.cell import load
 from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.forms import (
+    FAULTY,
+    Definitions,
     Entry,
+    Form,
+    JsonSchema,
     ListForm,
     NumberForm,
     TextForm,
-    WrittenForm,
-    not_allowed,
     optional,
+    refused,
     required,
     shape_of,
 )
@@ -25,29 +28,39 @@ from dwell.errors import ProblemError
 from dwell.estimators.registry import names as estimator_names
 from dwell.model import Problem
 from dwell.model.bounds import NOT_EMPTY, Bound
-from dwell.model.fleet import PHASE_WAYS, Fleet, FleetEntry, Kind, fleet_faults
+from dwell.model.fleet import PHASE_WAYS, PHASES, Fleet, FleetEntry, Kind, fleet_faults
 from dwell.model.semantics import bad_name, nearest, nearest_of
 from dwell.model.user_classes import is_class_path
 from dwell.policies.registry import names as policy_names
 
-PHASE = NumberForm(Bound(0))
 
+class PhasesForm(Form):
+    """A word, or a list of phases."""
 
-def _phases(value: Any) -> str | tuple[float, ...]:
-    """Return a word, or the phases of a list."""
-    if isinstance(value, list):
-        return tuple(PHASE.number(phase) for phase in value)
-    if not isinstance(value, str):
-        raise ValueError(not_allowed(value, PHASE_WAYS))
-    return value
+    @property
+    def words(self) -> str:
+        """What it may be, as a table of the docs has it."""
+        return "`sync`, `even`, `random`, list of ms"
+
+    def read(self, value: Any, path: str, faults: Faults) -> Any:
+        """Return the word, or the phases of a list."""
+        if isinstance(value, list):
+            found = ListForm(NumberForm(Bound(0))).read(value, path, faults)
+            return found if found is FAULTY else tuple(found)
+        return value if isinstance(value, str) else refused(value, PHASE_WAYS, path, faults)
+
+    def schema(self, definitions: Definitions) -> JsonSchema:
+        """Return both."""
+        return {"anyOf": [{"enum": list(PHASES)}, {"type": "array", "items": {"type": "number"}}]}
 
 
 GIVEN = TextForm(NOT_EMPTY)
 CELL = required("cell", GIVEN, "The cell file, relative to this file's folder.")
+ENTRY = shape_of(FleetEntry, {}, further=(CELL,))
 SETTINGS = shape_of(
     Fleet,
     {},
-    instead={"phases": WrittenForm("`sync`, `even`, `random`, list of ms", _phases)},
+    instead={"phases": PhasesForm()},
 )
 FLEET = FileKind.of(
     "fleet",
@@ -58,7 +71,7 @@ FLEET = FileKind.of(
     optional("name", TextForm(), "Name of the fleet.", "the file's"),
     required(
         "cells",
-        ListForm(shape_of(FleetEntry, {}, further=(CELL,)), keeps=True),
+        ListForm(ENTRY, keeps=True),
         "Cells by kind.",
         [],
     ),

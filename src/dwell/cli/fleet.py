@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -115,7 +116,7 @@ def run(
     folder = out or default_folder(played.name, *named, played.coordination, how, str(seed))
     settings = {"seed": seed, "guard": guard, "windows": windows, "versions": None}
     offsets = phases_ms(played, seed)
-    require_free_or_same(folder, describe_fleet(played, phases_ms=offsets, **settings))
+    require_free_or_same(folder, describe_fleet(played, phases=offsets, **settings))
     cells = counted(len(played.cells), "cell")
     try:
         with progress(f"simulating {cells}, {counted(windows, 'window')} of each") as shown:
@@ -190,7 +191,8 @@ def capacity(
     out: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Page to write; capacity/FLEET-POLICY-PHASES.html if not given."
+            metavar="FILE",
+            help="Page to write; capacity/FLEET-POLICY-PHASES.html if not given, none with --json.",
         ),
     ] = None,
     figures: Annotated[
@@ -220,9 +222,13 @@ def capacity(
     for change, changed in what_ifs(asked) if what_if else ():
         with progress(f"what if: {change}") as shown:
             changes.append(WhatIf(change, capacity_of(changed, **settings, progress=shown)))
-    page = out or Path("capacity", file_name(f"{asked.name}-{found.policy}-{found.phases}.html"))
-    with working("writing the report"):
-        write_report(capacity_page(asked.name, found, changes), page, figures=figures, static=False)
+    page = out
+    if page is None and not as_json:
+        page = Path("capacity", file_name(f"{asked.name}-{found.policy}-{found.phases}.html"))
+    if page is not None or figures is not None:
+        shown_page = capacity_page(asked.name, found, changes)
+        with working("writing the report"):
+            write_report(shown_page, page, figures=figures, static=False)
     if as_json:
         more = {"what_if": [one.as_json() for one in changes]} if what_if else {}
         print_json({"fleet": asked.name, **found.as_json(), **more, "report": page})
@@ -317,6 +323,7 @@ def _summed_up(result: FleetRun) -> dict[str, Any]:
     }
     return {
         "cells": cells,
+        "cost": _known(means["cost"].mean()),
         "load": load,
         "moves": moved.height,
         "guard_moves": by_guard,
@@ -334,9 +341,9 @@ def _refused(result: FleetRun) -> dict[str, int]:
     return dict(Counter(why.partition(": ")[2].split()[0].rstrip(":") for why in whys))
 
 
-def _known(mean: float | None) -> float:
+def _known(mean: object) -> float:
     """Return a mean; NaN where the controller saw no window."""
-    return float("nan") if mean is None else mean
+    return mean if isinstance(mean, float) else math.nan
 
 
 def _rounds(result: FleetRun) -> list[dict[str, Any]]:
@@ -369,6 +376,7 @@ def _text(result: FleetRun, windows: int, summary: Mapping[str, Any]) -> str:
         *_cells(result, summary["cells"]),
         "",
         *_nodes(result, summary["load"]),
+        f"mean J: {summary['cost']:.3f}",
         f"moves: {summary['moves']}, of guards {summary['guard_moves']}{_told(summary['refused'])}",
         *_round_lines(summary["rounds"]),
     ]
@@ -405,7 +413,7 @@ def _cells(result: FleetRun, cells: Sequence[Mapping[str, Any]]) -> Iterator[str
     yield aligned(head, rows)
     if len(cells) > SHOWN:
         yield f"{len(cells) - SHOWN} more, with fewer misses, are in the folder"
-    yield f"where: {legend}; warm-up included there, and left out elsewhere"
+    yield f"where: {legend}; V_D, L95 and J leave the warm-up out"
 
 
 def _letters(names: Iterable[str]) -> dict[str, str]:

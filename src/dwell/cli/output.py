@@ -85,11 +85,13 @@ def write_file(path: Path, text: str) -> None:
     write_whole(path, text, durable=False)
 
 
-def write_report(page: Page, path: Path, *, figures: Path | None, static: bool) -> None:
+def write_report(page: Page, path: Path | None, *, figures: Path | None, static: bool) -> None:
     """Write a page, and its figures and tables as files where a folder is named for them.
 
     Parameters
     ----------
+    path : Path, optional
+        Of the page; none is written where None.
     figures : Path, optional
         Made where there is none; files of the same names are replaced.
     static : bool
@@ -98,7 +100,8 @@ def write_report(page: Page, path: Path, *, figures: Path | None, static: bool) 
     from dwell.report.figure_files import figure_files
     from dwell.report.page import page_html
 
-    write_file(path, page_html(page, static=static))
+    if path is not None:
+        write_file(path, page_html(page, static=static))
     if figures is not None:
         figures.mkdir(parents=True, exist_ok=True)
         for name, data in figure_files(page):

@@ -145,14 +145,20 @@ class FleetRun:
             self.fleet,
             seed=self.seed,
             guard=self.guard,
-            phases_ms=self.phases_ms,
+            phases=self.phases_ms,
             windows=meta["windows"],
             versions=meta["versions"],
         )
 
 
 def describe_fleet(fleet: Fleet, **settings: Any) -> dict[str, Any]:
-    """Return what ``fleet.json`` says of a fleet that was played with some settings."""
+    """Return what ``fleet.json`` says of a fleet that was played with some settings.
+
+    Parameters
+    ----------
+    **settings : JSON-able
+        Seed, guard, windows, versions, and the phases as drawn, ms by cell.
+    """
     document = fleet_document(fleet)
     digest = hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
     return {
@@ -161,7 +167,6 @@ def describe_fleet(fleet: Fleet, **settings: Any) -> dict[str, Any]:
         "file": fleet.file or None,
         "hash": digest,
         "coordination": fleet.coordination,
-        "phases": fleet.phases,
         **settings,
         "cells": [cell.name for cell in fleet.cells],
         "fleet": document,
@@ -233,7 +238,8 @@ def open_fleet(path: str | os.PathLike[str]) -> FleetRun:
     try:
         names = [str(name) for name in described["cells"]]
         fleet = _fleet_of(described["fleet"], str(described.get("file") or ""))
-        settings = {key: described[key] for key in ("seed", "guard", "phases_ms")}
+        seed, guard = int(described["seed"]), bool(described["guard"])
+        phases_ms = {name: float(described["phases"][name]) for name in names}
     except (KeyError, TypeError, ValueError) as error:
         why = "; ".join(str(error).splitlines()) if isinstance(error, ProblemError) else repr(error)
         raise RunError(f"{file}: cannot be read ({why})") from None
@@ -248,7 +254,8 @@ def open_fleet(path: str | os.PathLike[str]) -> FleetRun:
         whole = f"{folder}: {len(runs)} of {len(names)} runs are whole"
         remedy = "remove what is damaged, and the same command makes the others again"
         raise RunError("\n".join([f"{whole}; {remedy}", *faults[:LISTED], *more]))
-    return FleetRun(fleet, runs, read_table(folder / LOAD), **settings)
+    load = read_table(folder / LOAD)
+    return FleetRun(fleet, runs, load, seed=seed, guard=guard, phases_ms=phases_ms)
 
 
 def _read(file: Path) -> dict[str, Any]:

@@ -155,7 +155,7 @@ class WhatIf:
         return {"change": self.change, **{name: known[name] for name in names}}
 
 
-class Unit(NamedTuple):
+class Sizes(NamedTuple):
     """Sizes that are played together, under one seed."""
 
     first: int
@@ -179,7 +179,7 @@ class FleetPlayer:
     windows: int
     placements: Mapping[str, str]
 
-    def __call__(self, unit: Unit) -> list[float]:
+    def __call__(self, unit: Sizes) -> list[float]:
         """Return V_D of the worst cell of every size."""
         fleets = [self.fleet.with_count(size) for size in range(unit.first, unit.last + 1)]
         if self.placements:
@@ -254,13 +254,13 @@ def capacity_of(
     player = FleetPlayer(fleet, _windows(fleet, cycles), _placements(fleet))
     together = TOGETHER if player.placements else 1
     units = [
-        Unit(first, min(first + together - 1, most), seed)
+        Sizes(first, min(first + together - 1, most), seed)
         for first in range(1, most + 1, together)
         for seed in seeds
     ]
     curve = _Curve(limit, len(seeds), on_excess=on_excess)
 
-    def take(unit: Unit, rates: list[float]) -> bool:
+    def take(unit: Sizes, rates: list[float]) -> bool:
         enough = curve.take(unit, rates)
         if progress is not None:
             progress(len(curve.points), most)
@@ -282,7 +282,7 @@ class _Curve:
         self._rates: dict[int, dict[int, float]] = {}
         self._enough = False
 
-    def take(self, unit: Unit, rates: Sequence[float]) -> bool:
+    def take(self, unit: Sizes, rates: Sequence[float]) -> bool:
         """Take the rates of a unit; whether no larger size can change the answer."""
         for size, rate in enumerate(rates, unit.first):
             self._rates.setdefault(size, {})[unit.seed] = rate
@@ -291,7 +291,8 @@ class _Curve:
         ):
             rates = [of[seed] for seed in sorted(of)]
             self.points.append(CapacityPoint(len(self.points) + 1, mean_interval(rates)))
-            self._enough = _low(self.points[-1]) > self.bound or self._useless
+            is_over = self._is_over(self.points[-1], lambda rate: rate.low)
+            self._enough = is_over or self._useless
         return self._enough
 
     @property
@@ -313,13 +314,13 @@ class _Curve:
 
     def capacity(self, fleet: Fleet) -> Capacity:
         """Return what it comes to."""
-        robots = self._largest(lambda point: point.violation_rate.value)
+        robots = self._largest(lambda rate: rate.value)
         names = dict.fromkeys(policy_of(fleet, entry) for entry in fleet.entries)
         alone = f"one cell alone misses {self._alone:.0%} of its deadlines"
         return Capacity(
             robots=robots,
             at_least=robots == len(self.points),
-            interval=(self._largest(_high), self._largest(_low)),
+            interval=(self._largest(lambda rate: rate.high), self._largest(lambda rate: rate.low)),
             limit=self.limit,
             limit_on="excess" if self._on_excess else "violation_rate",
             phases=fleet.phases,
@@ -328,21 +329,15 @@ class _Curve:
             reason=alone if self._useless else "",
         )
 
-    def _largest(self, of: Callable[[CapacityPoint], float]) -> int:
+    def _largest(self, end: Callable[[Interval], float]) -> int:
         """Return the largest size such that none up to it is over the bound."""
-        return next(
-            (i for i, point in enumerate(self.points) if of(point) > self.bound), len(self.points)
-        )
+        over = (i for i, point in enumerate(self.points) if self._is_over(point, end))
+        return next(over, len(self.points))
 
-
-def _low(point: CapacityPoint) -> float:
-    rate = point.violation_rate
-    return rate.low if rate.known else rate.value
-
-
-def _high(point: CapacityPoint) -> float:
-    rate = point.violation_rate
-    return rate.high if rate.known else rate.value
+    def _is_over(self, point: CapacityPoint, end: Callable[[Interval], float]) -> bool:
+        rate = point.violation_rate
+        # One seed gives no interval.
+        return (end(rate) if rate.known else rate.value) > self.bound
 
 
 def policy_of(fleet: Fleet, entry: FleetEntry) -> str:
@@ -359,13 +354,16 @@ def _placements(fleet: Fleet) -> dict[str, str]:
     """Return the candidate of every cell by the name of its file; nothing where some may move."""
     known: dict[str, str] = {}
     for entry in fleet.entries:
-        policy = policy_of(fleet, entry)
-        if (
-            known.setdefault(entry.cell.name, policy) != policy
-            or policy not in entry.cell.candidates
-        ):
+        placed = _placed(fleet, entry)
+        if placed is None or known.setdefault(entry.cell.name, placed) != placed:
             return {}
     return known
+
+
+def _placed(fleet: Fleet, entry: FleetEntry) -> str | None:
+    """Return the candidate at which the cells of an entry stay, whatever estimator is named."""
+    name, _ = entry.cell.policy_and_estimator(policy_of(fleet, entry))
+    return name if name in entry.cell.candidates else None
 
 
 def _require_capacity(fleet: Fleet) -> None:
@@ -374,17 +372,17 @@ def _require_capacity(fleet: Fleet) -> None:
     if not isinstance(fleet.phases, str):
         faults.append(Fault("phases", f"a list is of one size; give one of {', '.join(PHASES)}"))
     first = fleet.entries[0]
-    policy = policy_of(fleet, first)
-    candidates = first.cell.candidates
-    used = {policy: candidates[policy]} if policy in candidates else candidates
+    placed, candidates = _placed(fleet, first), first.cell.candidates
+    used = candidates.values() if placed is None else [candidates[placed]]
     if not fleet.shared:
         faults.append(
             Fault("shared", "no node is shared, so that there may be any number of cells")
         )
-    elif not any(node in fleet.shared for one in used.values() for node in one.values()):
+    elif not any(node in fleet.shared for one in used for node in one.values()):
         nodes = ", ".join(fleet.shared)
-        message = f"{policy} never uses a shared node ({nodes}), so that there may be any number"
-        faults.append(Fault("policy", f"{message} of {first.cell.name}; name another one"))
+        message = f"{policy_of(fleet, first)} never uses a shared node ({nodes})"
+        any_number = f"so that there may be any number of {first.cell.name}"
+        faults.append(Fault("policy", f"{message}, {any_number}; name another one"))
     if faults:
         raise ProblemError(faults)
 
@@ -405,12 +403,8 @@ def what_ifs(fleet: Fleet, policy: str | None = None) -> Iterator[tuple[str, Fle
         yield f"a core more on {node}", replace(fleet, entries=tuple(entries))
     if fleet.phases != "even":
         yield "phases evenly spread", fleet.changed(phases="even")
-    first = fleet.entries[0]
+    first, policy = fleet.entries[0], policy_of(fleet, fleet.entries[0])
     for name, placement in first.cell.candidates.items():
-        everywhere = all(name in one.cell.candidates for one in fleet.entries)
-        if (
-            everywhere
-            and name != policy_of(fleet, first)
-            and {*placement.values()} & {*fleet.shared}
-        ):
-            yield f"{name} instead of {policy_of(fleet, first)}", fleet.changed(policy=name)
+        is_everywhere = all(name in one.cell.candidates for one in fleet.entries)
+        if is_everywhere and name != policy and {*placement.values()} & {*fleet.shared}:
+            yield f"{name} instead of {policy}", fleet.changed(policy=name)
