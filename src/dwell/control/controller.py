@@ -18,8 +18,10 @@ from dwell.control.course import Course
 from dwell.control.windows import missed_cycles, seen_l95_ms, utilisation
 from dwell.cost import excess
 from dwell.errors import Fault, MetricError, PolicyError, ProblemError
-from dwell.estimators import Estimator, Evidence, Learner, Support
+from dwell.estimators import Estimator, Evidence
 from dwell.estimators import by_name as estimator_by_name
+from dwell.estimators.protocol import CellEstimator
+from dwell.estimators.user_estimator import as_started
 from dwell.model import Caps, Decision, FrozenDict, Objective, Problem, QoS
 from dwell.model.problem import SHADOW_FRACTION
 from dwell.model.qos import NO_ERROR
@@ -153,20 +155,13 @@ class Controller:
         self._policy = _prepared_policy(policy, problem)
         if estimator is None or isinstance(estimator, str):
             name = estimator or problem.controller.estimator
-            self.estimator = estimator_by_name(name, problem)
+            self._estimator = as_started(estimator_by_name(name, problem), problem)
         else:
-            self.estimator = copy.deepcopy(estimator)
-            start = getattr(self.estimator, "start", None)
-            if start is not None:
-                start(problem)
+            self._estimator = as_started(copy.deepcopy(estimator), problem, again=True)
         if coordination is not None:
-            coordination.meet(self.estimator)
-        self._support: Callable[[], Mapping[str, Support]] | None = getattr(
-            self.estimator, "support", None
-        )
-        self._learner = self.estimator if isinstance(self.estimator, Learner) else None
+            coordination.meet(self._estimator)
         #: Share of the cycles that the estimator wants sent through each alternative.
-        self.shadow_fraction = _shadow_fraction(self.estimator, problem)
+        self.shadow_fraction = _shadow_fraction(self._estimator, problem)
         initial = self._policy.initial
         known = isinstance(initial, str) and initial in problem.candidates
         #: Where the cell is, as far as is known here.
@@ -206,6 +201,11 @@ class Controller:
         return self._policy.given
 
     @property
+    def estimator(self) -> object:
+        """The estimator that is asked: a copy of what was given."""
+        return self._estimator.given
+
+    @property
     def features(self) -> tuple[Feature, ...]:
         """What ``decisions`` has that not every run's has."""
         supports: tuple[Feature, ...] = ("support",) if self.supports else ()
@@ -243,7 +243,7 @@ class Controller:
     @property
     def learns(self) -> bool:
         """Whether windows have to bring their evidence."""
-        return self._learner is not None
+        return self._estimator.learns
 
     @property
     def guarded(self) -> bool:
@@ -299,8 +299,8 @@ class Controller:
         incumbent = course.placement
         # With the switching term of the decision that led to it.
         measured = self._pricing.cost(observed, incumbent, course.previous)
-        estimates = dict(self.estimator.estimate(observed=observed, incumbent=incumbent, own=own))
-        if self._learner is None:
+        estimates = dict(self._estimator.estimate(observed=observed, incumbent=incumbent, own=own))
+        if not self._estimator.learns:
             # It knows no more of the incumbent than the window shows.
             estimates[incumbent] = observed
         decision, after = self._policy.propose(
@@ -321,7 +321,7 @@ class Controller:
         """Have the fleet look at what the policy has decided."""
         decision, incumbent = proposal.decision, self.course.placement
         by_price = self._policy.by_price
-        wish = Wish(decision, estimates, incumbent, self.estimator, by_price)
+        wish = Wish(decision, estimates, incumbent, self._estimator, by_price)
         verdict = coordination.consider(wish)
         proposal.verdict, name = verdict, verdict.name
         if name != decision.name:
@@ -338,8 +338,8 @@ class Controller:
 
     def learn(self, evidence: Callable[[], Evidence]) -> None:
         """Have the estimator learn from a window, if it learns, before it is decided on."""
-        if self._learner is not None:
-            self._learner.learn(evidence())
+        if self._estimator.learns:
+            self._estimator.look(evidence())
 
     def utilisation(self, window: ClosedWindow) -> Floats:
         """Busy, own and shadow share of every resource, shape (3, resources)."""
@@ -519,12 +519,12 @@ class Controller:
     @property
     def supports(self) -> bool:
         """Whether the estimator says how much stands behind its estimates."""
-        return self._support is not None
+        return self._estimator.supports
 
     def _supported(self) -> list[float]:
-        if self._support is None:
+        if not self._estimator.supports:
             return []
-        support = self._support()
+        support = self._estimator.support()
         behind = [support[name] for name in self._names if name in support]
         if len(behind) < len(self._names):
             who, known = type(self.estimator).__name__, ", ".join(support) or "nothing"
@@ -589,7 +589,7 @@ def _prepared_policy(policy: MinimalPolicy | str | None, problem: Problem) -> Pr
     return prepared
 
 
-def _shadow_fraction(estimator: Estimator, problem: Problem) -> float:
+def _shadow_fraction(estimator: CellEstimator, problem: Problem) -> float:
     """Share of the cycles that an estimator wants sent through each alternative.
 
     Raises
@@ -597,8 +597,8 @@ def _shadow_fraction(estimator: Estimator, problem: Problem) -> float:
     ProblemError
         If it is no share, or all alternatives together would get more than all cycles.
     """
-    fraction = getattr(estimator, "shadow_fraction", 0.0)
-    who = f"shadow_fraction of {type(estimator).__name__}"
+    fraction = estimator.shadow_fraction
+    who = f"shadow_fraction of {type(estimator.given).__name__}"
     SHADOW_FRACTION.check(who, fraction)
     message = too_many_shadows(fraction, len(problem.candidates))
     if message:

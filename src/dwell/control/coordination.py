@@ -8,7 +8,7 @@ from typing import ClassVar, NamedTuple, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.estimators import Estimator
+from dwell.estimators.protocol import CellEstimator
 from dwell.model import Decision, QoS
 
 #: Φ before and after what was looked at, and the round that it is of; what is not known is None.
@@ -44,7 +44,7 @@ class Wish(NamedTuple):
         Of every candidate.
     incumbent : str
         Where the cell is.
-    estimator : Estimator
+    estimator : CellEstimator
         Whose estimates they are.
     by_price : bool
         Whether the policy would move to any candidate that is cheap enough, so that another one
@@ -54,7 +54,7 @@ class Wish(NamedTuple):
     decision: Decision
     estimates: Mapping[str, QoS]
     incumbent: str
-    estimator: Estimator
+    estimator: CellEstimator
     by_price: bool
 
 
@@ -73,7 +73,7 @@ class Coordination(Protocol):
         """Look at what a policy has decided at a close."""
         ...
 
-    def meet(self, estimator: Estimator) -> None:
+    def meet(self, estimator: CellEstimator) -> None:
         """Have the cell's estimator take notice of the fleet, before the first window."""
         return
 

@@ -31,12 +31,11 @@ from numpy.typing import NDArray
 
 from dwell.control.coordination import Coordination, Verdict, Wish
 from dwell.cost import excess, hamming
-from dwell.estimators import Estimator
 from dwell.estimators.fleet_prices import CellTerms, FleetPrice, FleetPrices, PricedCell
 from dwell.estimators.load_table import LoadTable, load_table
-from dwell.estimators.online import Online
 from dwell.estimators.presents import Present
 from dwell.estimators.prices import prices_of
+from dwell.estimators.protocol import CellEstimator
 from dwell.model import Caps, Decision, QoS
 from dwell.model.fleet import FleetObjective
 
@@ -124,14 +123,14 @@ class FleetLedger:
             self._at = self.loads.at(self.placements)
             self._moves += 1
 
-    def note(self, index: int, estimates: Mapping[str, QoS], estimator: Estimator) -> None:
+    def note(self, index: int, estimates: Mapping[str, QoS], estimator: CellEstimator) -> None:
         """Take note of what a cell knows of itself, where that is new."""
-        revision = estimator.revision if isinstance(estimator, Online) else 0
+        revision = estimator.revision
         if revision == self._revisions[index]:
             return
         self._revisions[index] = revision
         self.alone[index] = {name: self._terms[index].cost(qos) for name, qos in estimates.items()}
-        if isinstance(estimator, Online):
+        if estimator.present is not None:
             self.presents[index] = estimator.present
 
     def consider(self, index: int, decision: Decision, *, by_price: bool) -> Verdict:
@@ -250,9 +249,9 @@ class Seat(Coordination):
     def __repr__(self) -> str:
         return f"<Seat of {self.ledger.cells[self._index].name}>"
 
-    def meet(self, estimator: Estimator) -> None:
+    def meet(self, estimator: CellEstimator) -> None:
         """Have the estimator take notice of the fleet."""
-        if isinstance(estimator, Online) and len(self.ledger.cells) > 1:
+        if len(self.ledger.cells) > 1:
             estimator.share(self.ledger.shared, len(self.ledger.cells))
 
     def turns(self, release_ns: NDArray[np.int64]) -> NDArray[np.bool_]:

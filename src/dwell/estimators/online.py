@@ -10,7 +10,7 @@ more is known of it, and more of those on which a move may depend, until their p
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import partial
 from typing import TypeAlias
@@ -25,6 +25,7 @@ from dwell.estimators.measured import Message, Meter, Part, groups, parts_of
 from dwell.estimators.presents import PlayedPrice, Playing, Present
 from dwell.estimators.prices import SEED, Price
 from dwell.estimators.profile import Foreign, Profile, mean_ms
+from dwell.estimators.protocol import CellEstimator
 from dwell.estimators.spans import patience_ns
 from dwell.model.frozen import FrozenDict
 from dwell.model.problem import Problem
@@ -44,7 +45,7 @@ def _says_nothing() -> None:
     """Stand for jobs that say nothing of foreign threads."""
 
 
-class Online(ABC):
+class Online(CellEstimator):
     """Base of the estimators that watch windows.
 
     Attributes
@@ -55,7 +56,7 @@ class Online(ABC):
         Seed of what is played.
     """
 
-    shadow_fraction = 0.0
+    learns = True
     seed = SEED
 
     def start(self, problem: Problem) -> None:
@@ -120,6 +121,10 @@ class Online(ABC):
         """Take in a window: what it showed of each part, once it is known of its nodes."""
         self._take_in_pending()
         self._evidence = self._pending = evidence
+
+    def look(self, evidence: Evidence) -> None:
+        """Learn from a window."""
+        self.learn(evidence)
 
     def _take_in_pending(self) -> None:
         """Take in the demands of the last window, if they have not been; its nodes come first."""

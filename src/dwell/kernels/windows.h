@@ -5,8 +5,8 @@
 
 namespace dwell {
 
-// Of what the core-nanoseconds of a resource are told: busy, the cell's own, its shadow's, and those
-// of other cells that have it, too, with their shadows.
+// Of what the core-nanoseconds of a resource are told: busy, the cell's own, its shadow's, and
+// those of other cells that have it, too, with their shadows.
 constexpr i64 kParts = 4;
 
 // Core-nanoseconds of a server that all cells and their shadows have had up to now.
