@@ -23,6 +23,7 @@ BENCHMARKS = {
     "pricing": ("pricing", "measure"),
     "clairvoyant": ("clairvoyant", "measure"),
     "fleet": ("fleet", "measure"),
+    "ledger": ("fleet_ledger", "measure"),
     "study": ("study", "measure"),
     "memory": ("memory", "measure"),
     "draw": ("drawing", "measure"),

@@ -1,4 +1,4 @@
-"""The tables of cells.md, from the forms of the file: `python docs/cell_tables.py` writes them.
+"""The tables of keys, from the forms of the files: `python docs/cell_tables.py` writes them.
 
 A table stands between ``<!-- keys of NAME -->`` and the next empty line.
 """
@@ -9,10 +9,10 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from dwell.cellfile import cell_form
+from dwell.cellfile import cell_form, fleet_file
 from dwell.cellfile.forms import FormKey, ListForm, MappingForm, Shape
 
-FILE = Path(__file__).parent / "cells.md"
+FILES = tuple(Path(__file__).parent / name for name in ("cells.md", "fleets.md"))
 SHAPES = {
     "the file": cell_form.CELL.shape,
     "a trace": cell_form.TRACE,
@@ -32,6 +32,8 @@ SHAPES = {
     "its target": cell_form.TARGET,
     "live": cell_form.LIVE,
     "a host": cell_form.HOST,
+    "a fleet": fleet_file.FLEET.shape,
+    "an entry": fleet_file.ENTRY,
 }
 PLACE = re.compile(r"<!-- keys of ([^\n]*) -->\n(?:\|[^\n]*\n)*")
 
@@ -68,4 +70,5 @@ def _usual(key: FormKey) -> str:
 
 
 if __name__ == "__main__":
-    FILE.write_text(with_tables(FILE.read_text(encoding="utf-8")), encoding="utf-8")
+    for page in FILES:
+        page.write_text(with_tables(page.read_text(encoding="utf-8")), encoding="utf-8")

@@ -37,11 +37,14 @@ from dwell.model import (
     Trace,
     TraceTable,
 )
+from dwell.model.fleet import Fleet, FleetEntry
 from dwell.policies import by_name as policy_by_name
 from dwell.record import Journal
 from dwell.study import (
     Hindsight,
+    Limiting,
     StudyResult,
+    capacity_of,
     compare,
     load_study,
     mean_interval,
@@ -158,6 +161,18 @@ def objects(
         Evidence(1, ints[:, 0], ints[:, 0], instants, ints[:, 0], instants),
         Trace(table, "rtt_ms"),
         Hindsight(),
+        dwell.simulate_fleet(
+            Fleet("pair", (FleetEntry(canonical, 2),)), windows=6, policy="LOC", coordination="none"
+        ),
+        capacity_of(
+            Fleet("pair", (FleetEntry(canonical, 1),), ("E",)),
+            policy="SO",
+            most=2,
+            seeds=(1,),
+            cycles=100,
+            processes=1,
+        ),
+        Limiting("node", "E", 0.9),
         mean_interval([1.0, 2.0, 3.0]),
         *(run.arrays("cycles"), run.arrays("cycles").names("placement")),
         Journal(tmp_path_factory.mktemp("journal"), run="r", meta={}, columns={}),

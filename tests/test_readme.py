@@ -1,4 +1,4 @@
-"""The README: its commands run, one after another, and print what it says that they print."""
+"""The README, and the planner's page: their commands run, and print what they say."""
 
 from __future__ import annotations
 
@@ -51,6 +51,16 @@ def without_numbers(printed: str) -> str:
 def test_commands_print_what_the_readme_says(
     commands: list[tuple[str, str]], tmp_path: Path
 ) -> None:
+    check(commands, tmp_path)
+
+
+@pytest.mark.exhaustive
+def test_commands_print_what_the_page_on_capacity_says(tmp_path: Path) -> None:
+    page = ROOT / "docs" / "capacity.md"
+    check(transcript(page.read_text(encoding="utf-8")), tmp_path)
+
+
+def check(commands: list[tuple[str, str]], tmp_path: Path) -> None:
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     for words, printed in commands:

@@ -9,9 +9,11 @@ from dwell.display import Answers, Displayed
 
 if TYPE_CHECKING:
     from dwell.cellfile import load
+    from dwell.cellfile.fleet_file import load_fleet
     from dwell.errors import DwellError
     from dwell.record import Run, open_run
     from dwell.sim import Realisation, draw, simulate, simulate_realisation
+    from dwell.sim.fleet import simulate_fleet
     from dwell.version import __version__ as __version__
 
 __all__ = [
@@ -20,19 +22,23 @@ __all__ = [
     "Run",
     "draw",
     "load",
+    "load_fleet",
     "open_run",
     "simulate",
+    "simulate_fleet",
     "simulate_realisation",
 ]
 
 _HOME = {
     "DwellError": "dwell.errors",
     "load": "dwell.cellfile",
+    "load_fleet": "dwell.cellfile.fleet_file",
     "Run": "dwell.record",
     "open_run": "dwell.record",
     "Realisation": "dwell.sim",
     "draw": "dwell.sim",
     "simulate": "dwell.sim",
+    "simulate_fleet": "dwell.sim.fleet",
     "simulate_realisation": "dwell.sim",
     "__version__": "dwell.version",
 }

@@ -8,7 +8,7 @@ from pathlib import Path
 import jsonschema
 import pytest
 
-from docs.cell_tables import FILE, with_tables
+from docs.cell_tables import FILES, with_tables
 from dwell.cellfile import cell_form, schema
 from dwell.cellfile.forms import Shape
 from dwell.estimators.registry import REGISTRY as ESTIMATORS
@@ -18,13 +18,14 @@ from dwell.policies.registry import REGISTRY as POLICIES
 SHAPES = [one for one in vars(cell_form).values() if isinstance(one, Shape)]
 
 
-def test_the_tables_of_the_docs_are_those_of_the_form() -> None:
-    text = FILE.read_text(encoding="utf-8")
+@pytest.mark.parametrize("page", FILES, ids=lambda page: page.name)
+def test_the_tables_of_the_docs_are_those_of_the_form(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
     assert with_tables(text) == text
 
 
 def test_every_shape_of_the_file_has_a_table() -> None:
-    text = FILE.read_text(encoding="utf-8")
+    text = FILES[0].read_text(encoding="utf-8")
     for shape in SHAPES:
         for key in shape.keys:
             assert f"`{key.named}`" in text or f"{{{key.named}" in text or f", {key.named}" in text

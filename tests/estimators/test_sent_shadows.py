@@ -116,7 +116,7 @@ def test_cycles_of_hindered_candidates_alone_are_sent_through_others() -> None:
     problem = fork(kilobytes=100, rate_mbps=100.0)
     real = draw(problem, scenario="baseline", seed=1, windows=4)
     shadows = SentShadows(problem, real, FRACTION)
-    arrays = lay_out([(problem, real)], shadows=shadows.realisation)
+    arrays = lay_out([(problem, real)], shadows=[shadows.realisation])
     for index, sent in enumerate([shadow_stamps(0, 200, 0, 2, FRACTION), np.full(200, -1)]):
         stamps = stamps_of(arrays, index, shadows)
         np.testing.assert_array_equal(stamps, [np.full(200, index), sent])

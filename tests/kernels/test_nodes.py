@@ -11,7 +11,7 @@ import pytest
 
 import dwell
 from dwell.kernels.advance import logged_instants, play
-from dwell.kernels.arrays import lay_out
+from dwell.kernels.arrays import CellArrays, lay_out
 from dwell.kernels.codes import Status
 from dwell.kernels.realisation import NodeChange
 from dwell.model import (
@@ -326,5 +326,5 @@ def test_core_time_is_more_than_work_where_foreign_threads_interfere(
     real = make_realisation(problem, windows=1, node_changes=changes)
     arrays = lay_out([(problem, real)], log_jobs=True)
     assert play(arrays) == Status.FINISHED
-    ((*_, start_ns, work_ns),) = logged_instants(arrays, 0, 1, np.empty(0, np.int64))
+    ((*_, start_ns, work_ns),) = logged_instants(CellArrays(arrays), 0, 1, np.empty(0, np.int64))
     assert (start_ns.tolist(), work_ns.tolist()) == ([[0]], [[round(core_ms * MS)]])

@@ -281,12 +281,12 @@ def test_episodes_take_their_share_of_the_time() -> None:
 @pytest.mark.parametrize("name", ["bursts", "mixture", "step"])
 def test_a_drawn_scenario_without_episodes_is_the_same_realisation(name: str) -> None:
     problem = dynamic_problem()
-    asked = {"seed": 3, "windows": 120}
-    episodes = draw(problem, scenario=name, **asked)
-    plain = drawn_scenario(problem, scenario=name, **asked)
+    seed, windows = 3, 120
+    episodes = draw(problem, scenario=name, seed=seed, windows=windows)
+    plain = drawn_scenario(problem, scenario=name, seed=seed, windows=windows)
     assert all(item.episodes is None for item in plain)
     told = replace(problem, scenarios={**problem.scenarios, "plain": plain})
-    again = draw(told, scenario="plain", **asked)
+    again = draw(told, scenario="plain", seed=seed, windows=windows)
     # Delays are drawn by the disturbance's number, which is another one; not when they are on.
     assert (again.node_changes.table == episodes.node_changes.table).all()  # type: ignore[attr-defined]
     down = [[part.at_ns for part in one.link_segments] for one in (episodes, again)]

@@ -23,7 +23,7 @@ from dwell.control import guard as control_guard
 from dwell.estimators import Evidence, Instants
 from dwell.kernels import arrays as sim_arrays
 from dwell.kernels.advance import play as advance_to_end
-from dwell.kernels.arrays import lay_out, ordered_flows
+from dwell.kernels.arrays import CellArrays, lay_out, ordered_flows
 from dwell.kernels.codes import Status
 from dwell.kernels.random_draws import draw_shadows
 from dwell.kernels.realisation import LinkSegment, NodeChange, Realisation
@@ -535,7 +535,7 @@ def play_stamped(
 ) -> Played:
     """Play a realisation with given stamps, without a controller."""
     problem, real = case.problem, case.real
-    arrays = lay_out([(problem, real)], log_jobs=True, shadows=shadows)
+    arrays = lay_out([(problem, real)], log_jobs=True, shadows=[shadows])
     codes: dict[str | None, int] = {name: i for i, name in enumerate(problem.candidates)}
     codes[None] = -1
     arrays.tables.stamps[0] = [codes[name] for name in stamps]
@@ -547,7 +547,8 @@ def play_stamped(
         for _, missed, l95_ms, _ in arrays.tables.seen[0].tolist()
     ]
     tables, _ = make_tables(
-        sim_tables.PlayedRealisation(problem, real, controller, arrays, metrics), jobs=True
+        sim_tables.PlayedRealisation(problem, real, controller, CellArrays(arrays), metrics),
+        jobs=True,
     )
     flows = [(flow.source, flow.target) for flow in ordered_flows(problem.pipeline)]
     log = arrays.tables.log_arrived.reshape(2, real.cycles, len(flows)).tolist()

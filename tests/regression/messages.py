@@ -100,6 +100,8 @@ def _python(cases: list[str]) -> Iterator[str]:
 
 def _read(name: str, text: str) -> object:
     _write(name, text)
+    if name == "fleet.yaml":
+        return dwell.load_fleet(name)
     return load_study(name) if name.startswith("studies/") else dwell.load(name)
 
 

@@ -110,7 +110,7 @@ def test_own_work_of_a_cell_is_its_own() -> None:
         cells.append((one, dwell.draw(one, seed=5, windows=10)))
     arrays = lay_out(cells, shared={"E"})
     play(arrays)
-    e = arrays.resources[0].index("E")
+    e = list(cells[0][0].fabric.resources).index("E")
     busy, own = arrays.tables.closed[:, -1, 0, e], arrays.tables.closed[:, -1, 1, e]
     assert busy[0] == busy[1]
     assert own.sum() == pytest.approx(busy[0], rel=1e-12)

@@ -454,7 +454,7 @@ def test_shadows_that_never_end_take_bounded_room() -> None:
         window_cycles=10,
     )
     real = make_realisation(problem, windows=100)
-    arrays = lay_out([(problem, real)], shadows=real)
+    arrays = lay_out([(problem, real)], shadows=[real])
     arrays.tables.stamps[1] = 1
     assert advance_to_end(arrays) == Status.FINISHED
     assert arrays.tables.clock["n_slots"].tolist() == [128]

@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from dwell.cellfile.traces import Tables
 
 
+#: By the key of its version: another kind of file, and the command that takes it.
+OTHERS = {"dwell-study": ("study", "dwell study"), "dwell-fleet": ("fleet", "dwell fleet run")}
+
+
 def load(path: str | PathLike[str], *, traces: str | PathLike[str] | None = None) -> Problem:
     """Read a cell file.
 
@@ -76,9 +80,9 @@ def read_document(source: str) -> tuple[object, Faults]:
     document = read_yaml(source, faults)
     if faults.at(""):
         raise faults.error()  # the file as such; there is nothing to read on
-    if isinstance(document, dict) and "dwell-study" in document and "dwell" not in document:
-        faults.add("dwell-study", "this is a study, not a cell; run it by `dwell study FILE`")
-        raise faults.error()
+    for key, (what, command) in OTHERS.items():
+        if isinstance(document, dict) and key in document and "dwell" not in document:
+            faults.refuse(key, f"this is a {what}, not a cell; run it by `{command} FILE`")
     return document, faults
 
 

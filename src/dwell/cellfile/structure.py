@@ -15,6 +15,8 @@ from dwell.model.bounds import as_read, shown
 from dwell.model.dotted_paths import Step, dotted
 
 MAX_DEPTH = 40
+#: What is read, by the key of its version.
+KINDS = {"dwell": "cell", "dwell-study": "study", "dwell-fleet": "fleet"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +81,9 @@ def read_structure(document: object, faults: Faults, kind: FileKind) -> Entry:
         faults.refuse(
             "", f"a {kind.what} file is a mapping that begins with `{begin}`; this is {has}"
         )
+    for key, what in KINDS.items():
+        if key in document and kind.key not in document:
+            faults.refuse(key, f"this is a {what}; a {kind.what} file begins with `{kind.begin}`")
     values = _plain_mapping(document, (), faults)
     _check_version(values, faults, kind)
     # What it requires has a stand-in, so that it never is at fault itself.

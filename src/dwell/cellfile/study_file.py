@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike, fspath
 from pathlib import Path
@@ -17,12 +17,13 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.overrides import OpenCell, Override, check_apart, open_cell
-from dwell.cellfile.study_paths import SETTINGS
+from dwell.cellfile.study_paths import SETTINGS, with_settings
 from dwell.errors import ProblemError
 from dwell.estimators.registry import names as estimator_names
 from dwell.model import Problem
 from dwell.model.bounds import as_read
 from dwell.model.dotted_paths import Step, steps_of
+from dwell.model.fleet import Fleet
 from dwell.model.semantics import bad_name, nearest, nearest_of
 from dwell.model.user_classes import is_class_path
 from dwell.policies.registry import names as policy_names
@@ -50,10 +51,11 @@ class DeclaredPolicy:
 
 @dataclass(frozen=True, slots=True)
 class DeclaredPoint:
-    """A point of a study's grid: the values by their paths, and the cell with them."""
+    """A point of a study's grid: the values by their paths, and the cell, or fleet, with them."""
 
     values: Mapping[str, Value]
     problem: Problem
+    fleet: Fleet | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +89,7 @@ def read_study(path: str | PathLike[str], *, references: Collection[str] = ()) -
         at ``cell``.
     """
     from dwell.cellfile.structure import read_structure
-    from dwell.cellfile.study_form import STUDY
+    from dwell.cellfile.study_form import FLEET_STUDY, STUDY
     from dwell.cellfile.yaml_text import read_yaml
 
     source = fspath(path)
@@ -95,10 +97,10 @@ def read_study(path: str | PathLike[str], *, references: Collection[str] = ()) -
     document = read_yaml(source, faults, STUDY.what, STUDY.begin)
     if faults.at(""):
         raise faults.error()
-    if isinstance(document, dict) and "dwell" in document and STUDY.key not in document:
-        faults.refuse("dwell", f"this is a cell; a study file begins with `{STUDY.begin}`")
-    entry = read_structure(document, faults, STUDY)
-    study = _Reading(entry, Path(source), faults, references).study()
+    of_fleet = isinstance(document, dict) and "fleet" in document
+    entry = read_structure(document, faults, FLEET_STUDY if of_fleet else STUDY)
+    reading = _FleetReading if of_fleet else _Reading
+    study = reading(entry, Path(source), faults, references).study()
     if study is None or faults:
         raise faults.error()
     return study
@@ -389,6 +391,118 @@ class _Reading:
                 overrides.append(Override(place, ("controller", "estimator"), policy.estimator))
             if overrides:
                 cell.attempt(overrides, self.faults, path)
+
+
+#: Of the parameters of a study of a fleet: what a value makes of it.
+FLEET_PARAMETERS: Mapping[str, Callable[[Fleet, Any], Fleet]] = {
+    "fleet.count": lambda fleet, value: fleet.with_count(value),
+    "fleet.phases": lambda fleet, value: fleet.changed(phases=value),
+    "fleet.coordination": lambda fleet, value: fleet.changed(coordination=value),
+}
+
+
+class _FleetReading(_Reading):
+    """One study of a fleet on its way from its entry to what it declares."""
+
+    __slots__ = ()
+
+    def study(self) -> DeclaredStudy | None:
+        """Return the study, or None beside at least one fault."""
+        entry = self.entry
+        name = entry.name or self.path.stem
+        self._check_name("name", name)
+        grid = self._grid()
+        axes = self._axes(grid)
+        labels = self._labels()
+        policies = self._policies()
+        fleet = self._fleet()
+        if fleet is None:
+            return None
+        first = fleet.entries[0]
+        scenarios = tuple(entry.scenarios or (first.scenario,))
+        for i, scenario in enumerate(scenarios):
+            if scenario not in first.cell.scenarios:
+                hint = nearest(scenario, first.cell.scenarios)
+                message = f"{first.cell.name} has no scenario {scenario!r}; {hint}"
+                self.faults.add(f"scenarios[{i}]", message)
+        fleets = self._fleets(fleet, grid, axes)
+        policies = [self._with_estimator(policy, first.cell) for policy in policies]
+        for cell in {one.cell.name: one.cell for one in fleet.entries}.values():
+            for policy in policies:
+                self._check_names(policy, cell)
+        self._check_policy_settings(policies, fleet)
+        windows = WINDOWS if entry.windows is None else entry.windows
+        warmup = max(one.cell.warmup_windows for one in fleet.entries)
+        if windows <= warmup:
+            bound = f"more than the {warmup} windows of warm-up"
+            self.faults.add("windows", f"{windows} is not allowed; it must be {bound}")
+        return DeclaredStudy(
+            name=name,
+            points=tuple(DeclaredPoint(values, first.cell, one) for values, one in fleets),
+            labels=labels,
+            scenarios=scenarios,
+            policies=tuple(policies),
+            seeds=SEEDS if entry.seeds is None else entry.seeds,
+            windows=windows,
+            references=False,
+        )
+
+    def _fleet(self) -> Fleet | None:
+        """Read the fleet as it is in its file."""
+        from dwell.cellfile.fleet_file import load_fleet
+
+        if not self.entry.fleet:
+            if not self.faults.at("fleet"):
+                self.faults.add("fleet", "the text is empty; name the fleet's file")
+            return None
+        try:
+            return load_fleet(self.path.parent / self.entry.fleet)
+        except ProblemError as error:
+            for line in str(error).splitlines():
+                self.faults.add("fleet", line)
+            return None
+
+    def _fleets(
+        self, fleet: Fleet, grid: Mapping[str, list[Any]], axes: Sequence[tuple[str, ...]]
+    ) -> list[tuple[dict[str, Value], Fleet]]:
+        """Return every combination of the values of axes, and the fleet with them."""
+        for path, values in grid.items():
+            place = f"parameters.{path}"
+            if path not in FLEET_PARAMETERS:
+                hint = nearest(path, FLEET_PARAMETERS)
+                self.faults.add(place, f"unknown parameter of a fleet {path!r}; {hint}")
+                continue
+            for i, value in enumerate(values):
+                self._changed(fleet, {path: value}, f"{place}[{i}]")
+        if self.faults.touches("parameters"):
+            return []
+        shown = {path: _shown(values) for path, values in grid.items()}
+        points = []
+        for picked in itertools.product(*(range(len(grid[first])) for first, *_ in axes)):
+            at = [(path, i) for axis, i in zip(axes, picked, strict=True) for path in axis]
+            given = {path: grid[path][i] for path, i in at}
+            changed = self._changed(fleet, given, "parameters")
+            if changed is not None:
+                points.append(({path: shown[path][i] for path, i in at}, changed))
+        return points
+
+    def _changed(self, fleet: Fleet, values: Mapping[str, Any], place: str) -> Fleet | None:
+        """Return the fleet with some values, or None beside a fault at a place."""
+        try:
+            for path, value in values.items():
+                fleet = FLEET_PARAMETERS[path](fleet, value)
+        except ProblemError as error:
+            for fault in error.faults:
+                self.faults.add(place, fault.message)
+            return None
+        return fleet
+
+    def _check_policy_settings(self, policies: Sequence[DeclaredPolicy], fleet: Fleet) -> None:
+        """Check that the settings of policies are right in every cell."""
+        for policy in policies:
+            for entry in fleet.entries if policy.settings else ():
+                place = f"policies.{policy.name}"
+                self.faults.attempt(place, with_settings, entry.cell, policy.settings)
 
 
 def _is_estimator(name: str) -> bool:

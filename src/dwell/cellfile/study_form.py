@@ -145,3 +145,22 @@ STUDY = FileKind.of(
         "the paths",
     ),
 )
+FLEET_STUDY = FileKind.of(
+    "study",
+    "dwell-study",
+    VERSION,
+    "FleetStudy",
+    "Policies, parameters and seeds, of which every combination is played by the cells of a fleet.",
+    required("fleet", NAME, "The fleet file, relative to this file's folder.", ""),
+    *(
+        key
+        for key in STUDY.shape.keys
+        if key.name not in ("version", "cell", "traces", "scenarios", "references")
+    ),
+    optional(
+        "scenarios",
+        ListForm(NO_TEXT),
+        "Scenarios of the first entry's cells; the others keep theirs.",
+        "what the fleet says",
+    ),
+)

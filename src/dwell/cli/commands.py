@@ -12,6 +12,7 @@ from dwell import __version__
 from dwell.cli.check import check
 from dwell.cli.completion import completion
 from dwell.cli.demo import demo
+from dwell.cli.fleet import fleet
 from dwell.cli.keys import keys
 from dwell.cli.live import agent, controller, live
 from dwell.cli.new import new
@@ -106,6 +107,7 @@ for command in (
     *(agent, controller),
 ):
     app.command()(command)
+app.add_typer(fleet, name="fleet")
 app.add_typer(profile, name="profile")
 app.add_typer(live, name="live")
 app.add_typer(keys, name="keys")

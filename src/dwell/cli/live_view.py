@@ -18,6 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from dwell.cli.live import proof
+from dwell.cli.output import block
 from dwell.model import Problem
 from dwell.report.palette import Palette
 from dwell.report.phases import Disturbed
@@ -25,7 +26,6 @@ from dwell.report.phases import Disturbed
 MOST_COLUMNS = 100
 LABEL, VALUE = 10, 10
 BAR = 12
-BLOCKS = "▁▂▃▄▅▆▇█"
 #: Sparklines reach so many times the deadline, and so much violation rate and error (mm).
 DEADLINES, MOST_RATE, MOST_MM = 2.0, 1.0, 20.0
 #: An answer of the controller that is older is told.
@@ -348,8 +348,7 @@ def _sparkline(values: Sequence[float], columns: int, most: float, limit: float)
         if math.isnan(value):
             text.append(" ")
             continue
-        step = min(max(int(value / most * len(BLOCKS)), 0), len(BLOCKS) - 1)
-        text.append(BLOCKS[step], style=MISSED if value > limit else "default")
+        text.append(block(value / most), style=MISSED if value > limit else "default")
     text.append(" " * (columns - len(text)))
     return text
 

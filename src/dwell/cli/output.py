@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from dwell.errors import Fault
     from dwell.report.page import Page
 
+BLOCKS = "▁▂▃▄▅▆▇█"
 #: Takes how many are done, and of how many.
 Progress = Callable[[int, int], None]
 
@@ -32,6 +33,11 @@ def aligned(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
         cells = [first[0].ljust(first[1]), *(text.rjust(width) for text, width in rest)]
         lines.append("  ".join(cells).rstrip())
     return "\n".join(lines)
+
+
+def block(share: float) -> str:
+    """Return a block that is so high, from 0 to 1, for a line of them."""
+    return BLOCKS[min(max(int(share * len(BLOCKS)), 0), len(BLOCKS) - 1)]
 
 
 def warn(file: Path, warnings: Iterable[Fault]) -> None:
@@ -79,11 +85,13 @@ def write_file(path: Path, text: str) -> None:
     write_whole(path, text, durable=False)
 
 
-def write_report(page: Page, path: Path, *, figures: Path | None, static: bool) -> None:
+def write_report(page: Page, path: Path | None, *, figures: Path | None, static: bool) -> None:
     """Write a page, and its figures and tables as files where a folder is named for them.
 
     Parameters
     ----------
+    path : Path, optional
+        Of the page; none is written where None.
     figures : Path, optional
         Made where there is none; files of the same names are replaced.
     static : bool
@@ -92,7 +100,8 @@ def write_report(page: Page, path: Path, *, figures: Path | None, static: bool) 
     from dwell.report.figure_files import figure_files
     from dwell.report.page import page_html
 
-    write_file(path, page_html(page, static=static))
+    if path is not None:
+        write_file(path, page_html(page, static=static))
     if figures is not None:
         figures.mkdir(parents=True, exist_ok=True)
         for name, data in figure_files(page):

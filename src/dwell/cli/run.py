@@ -90,7 +90,7 @@ def run(
     from dwell.study.summary import summarise
 
     policy = policy or problem.controller.policy
-    folder = out or _default_folder(problem.name, scenario, policy, str(seed), *(settings or ()))
+    folder = out or default_folder(problem.name, scenario, policy, str(seed), *(settings or ()))
     require_free(folder)
     arguments: dict[str, Any] = {
         "scenario": scenario,
@@ -126,7 +126,7 @@ def run(
         typer.echo(f"\nsaved to {folder}")
 
 
-def _default_folder(*parts: str) -> Path:
+def default_folder(*parts: str) -> Path:
     """Return where a run is saved: its parts are told by their digest where they are long."""
     name = file_name("-".join(parts), more="+=")
     if len(name.encode()) > LONGEST_NAME:

@@ -13,12 +13,15 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.control.coordination import Asked, Coordination, Verdict, Wish
 from dwell.control.course import Course
 from dwell.control.windows import missed_cycles, seen_l95_ms, utilisation
 from dwell.cost import excess
 from dwell.errors import Fault, MetricError, PolicyError, ProblemError
-from dwell.estimators import Estimator, Evidence, Learner, Support
+from dwell.estimators import Estimator, Evidence
 from dwell.estimators import by_name as estimator_by_name
+from dwell.estimators.protocol import CellEstimator
+from dwell.estimators.user_estimator import as_started
 from dwell.model import Caps, Decision, FrozenDict, Objective, Problem, QoS
 from dwell.model.problem import SHADOW_FRACTION
 from dwell.model.qos import NO_ERROR
@@ -79,12 +82,18 @@ class Proposal:
         What was known of the candidates, for the row of ``decisions``.
     after : object
         What the policy is once this counts (`dwell.policies.protocol.Proposer.commit`).
+    verdict : Verdict, optional
+        What the fleet says of it.
+    wished : str
+        What the policy has decided for, where `decision` is the fleet's in its place.
     """
 
     seen: tuple[float, float, float]
     decision: Decision
     priced: tuple[object, ...]
     after: object
+    verdict: Verdict | None = None
+    wished: str = ""
 
     def __repr__(self) -> str:
         return f"<Proposal: {self.decision.reason}, {self.decision.name}>"
@@ -117,6 +126,8 @@ class Controller:
     estimator : Estimator, str, or None
         An object with `estimate`, an estimator's name, or None for the cell file's choice. The
         caller's object is copied, never changed.
+    coordination : Coordination, optional
+        What is asked before the cell moves, where it is one of a fleet.
 
     Raises
     ------
@@ -131,8 +142,9 @@ class Controller:
         problem: Problem,
         policy: MinimalPolicy | str | None = None,
         estimator: Estimator | str | None = None,
+        coordination: Coordination | None = None,
     ) -> None:
-        self.problem = problem
+        self.problem, self.coordination = problem, coordination
         if isinstance(policy, str):
             policy, estimator = _without_estimator(policy, estimator, problem)
         named = (policy or problem.controller.policy, estimator or problem.controller.estimator)
@@ -143,22 +155,19 @@ class Controller:
         self._policy = _prepared_policy(policy, problem)
         if estimator is None or isinstance(estimator, str):
             name = estimator or problem.controller.estimator
-            self.estimator = estimator_by_name(name, problem)
+            self._estimator = as_started(estimator_by_name(name, problem), problem)
         else:
-            self.estimator = copy.deepcopy(estimator)
-            start = getattr(self.estimator, "start", None)
-            if start is not None:
-                start(problem)
-        self._support: Callable[[], Mapping[str, Support]] | None = getattr(
-            self.estimator, "support", None
-        )
-        self._learner = self.estimator if isinstance(self.estimator, Learner) else None
+            self._estimator = as_started(copy.deepcopy(estimator), problem, again=True)
+        if coordination is not None:
+            coordination.meet(self._estimator)
         #: Share of the cycles that the estimator wants sent through each alternative.
-        self.shadow_fraction = _shadow_fraction(self.estimator, problem)
+        self.shadow_fraction = _shadow_fraction(self._estimator, problem)
         initial = self._policy.initial
         known = isinstance(initial, str) and initial in problem.candidates
         #: Where the cell is, as far as is known here.
         self.course = Course(str(initial) if known else problem.initial)
+        if coordination is not None:
+            coordination.place(self.course.placement)
         #: Number of the next window.
         self.window = 0
         #: Rows of ``decisions``: `decision_columns`, then why it was not carried out, or None.
@@ -191,6 +200,17 @@ class Controller:
         """The policy that decides: a copy of what was given."""
         return self._policy.given
 
+    @property
+    def estimator(self) -> object:
+        """The estimator that is asked: a copy of what was given."""
+        return self._estimator.given
+
+    @property
+    def features(self) -> tuple[Feature, ...]:
+        """What ``decisions`` has that not every run's has."""
+        supports: tuple[Feature, ...] = ("support",) if self.supports else ()
+        return supports if self.coordination is None else (*supports, "fleet")
+
     @cached_property
     def decision_columns(self) -> tuple[str, ...]:
         """Names of the columns of ``decisions``, but the last.
@@ -201,11 +221,11 @@ class Controller:
         estimator says it, how many samples stand behind the estimate and how old (windows) the
         newest is.
         """
-        features: tuple[Feature, ...] = ("support",) if self.supports else ()
         resources = self.problem.fabric.resources.values()
         return tuple(
             column.name
-            for one in those_with(features, DECISIONS)
+            for one in those_with(self.features, DECISIONS)
+            if one.name != "refused"
             for column in columns_of(one.name, resources, self._names)
         )
 
@@ -223,7 +243,7 @@ class Controller:
     @property
     def learns(self) -> bool:
         """Whether windows have to bring their evidence."""
-        return self._learner is not None
+        return self._estimator.learns
 
     @property
     def guarded(self) -> bool:
@@ -259,13 +279,16 @@ class Controller:
         ----------
         l95_ms, violation_rate, uncut_ms : float
             L95 as it could be known, V_D, and L95 as caps are compared with it.
-        shares : float64 array, shape (3, resources)
-            Busy, own and shadow share of every resource; NaN where they were not measured.
+        shares : float64 array, shape (3, resources) or (4, resources)
+            Busy, own and shadow share of every resource, and that of other cells of a fleet; NaN
+            where they were not measured.
         """
-        used, own, shadow = shares.tolist()
+        used, own, shadow, *others = shares.tolist()
         seen = dict(zip(self.resources, used, strict=True))
         # Neither the cell's jobs nor its shadow jobs are foreign.
         mine = dict(zip(self.resources, map(add, own, shadow), strict=True))
+        if others and self.coordination is not None and self.coordination.knows_others:
+            mine = {name: mine[name] + share for name, share in zip(mine, *others, strict=True)}
         if self._has_accelerators:
             seen, mine = _measured(seen), _measured(mine)
         return self.propose_by(QoS(l95_ms, violation_rate, FrozenDict(seen), uncut_ms), mine)
@@ -276,21 +299,47 @@ class Controller:
         incumbent = course.placement
         # With the switching term of the decision that led to it.
         measured = self._pricing.cost(observed, incumbent, course.previous)
-        estimates = dict(self.estimator.estimate(observed=observed, incumbent=incumbent, own=own))
-        if self._learner is None:
+        estimates = dict(self._estimator.estimate(observed=observed, incumbent=incumbent, own=own))
+        if not self._estimator.learns:
             # It knows no more of the incumbent than the window shows.
             estimates[incumbent] = observed
         decision, after = self._policy.propose(
-            observed=observed, estimates=estimates, tentative=course.by_guard
+            observed=observed,
+            estimates=estimates,
+            tentative=course.by_guard or self.coordination is not None,
         )
         decision = self._checked(decision)
         seen = observed.l95_ms, observed.violation_rate, measured
-        return Proposal(seen, decision, self._priced(decision, estimates), after)
+        proposal = Proposal(seen, decision, self._priced(decision, estimates), after)
+        if self.coordination is not None:
+            self._consider(proposal, estimates, self.coordination)
+        return proposal
+
+    def _consider(
+        self, proposal: Proposal, estimates: Mapping[str, QoS], coordination: Coordination
+    ) -> None:
+        """Have the fleet look at what the policy has decided."""
+        decision, incumbent = proposal.decision, self.course.placement
+        by_price = self._policy.by_price
+        wish = Wish(decision, estimates, incumbent, self._estimator, by_price)
+        verdict = coordination.consider(wish)
+        proposal.verdict, name = verdict, verdict.name
+        if name != decision.name:
+            migrated = name != incumbent
+            proposal.wished = decision.name
+            proposal.decision = replace(
+                decision,
+                placement=self.problem.candidates[name],
+                name=name,
+                migrated=migrated,
+                reason="migrate" if migrated else decision.reason,
+                dwell=0 if migrated else self.course.dwell,
+            )
 
     def learn(self, evidence: Callable[[], Evidence]) -> None:
         """Have the estimator learn from a window, if it learns, before it is decided on."""
-        if self._learner is not None:
-            self._learner.learn(evidence())
+        if self._estimator.learns:
+            self._estimator.look(evidence())
 
     def utilisation(self, window: ClosedWindow) -> Floats:
         """Busy, own and shadow share of every resource, shape (3, resources)."""
@@ -320,7 +369,11 @@ class Controller:
     def commit(self, proposal: Proposal) -> None:
         """Take note that a proposal has been carried out."""
         decision = proposal.decision
-        self._policy.commit(proposal.after)
+        if not proposal.wished:
+            self._policy.commit(proposal.after)
+        elif decision.migrated or self.course.previous != self.course.placement:
+            # The fleet decides in its place, so that it has decided nothing.
+            self._policy.adopt(decision.name)
         self._record(proposal)
         if decision.migrated:
             self.course.move(decision.name, decision.dwell)
@@ -392,6 +445,8 @@ class Controller:
             self._policy.adopt(left)
         self._policy.adopt(name)
         self.course.fall(name, left)
+        if self.coordination is not None:
+            self.coordination.place(name)
         fixed = (self.window, left, name, name != left, "guard", 0, None)
         priced = [None] * (len(self.decision_columns) - len(fixed))
         self.decisions.append((*fixed, *priced, None))
@@ -411,6 +466,8 @@ class Controller:
         """
         self._find(name, self.course.placement)
         self.course.find(name, by_guard=fallback)
+        if self.coordination is not None:
+            self.coordination.place(name)
 
     def _find(self, name: str, believed: str) -> None:
         """Tell a policy that believes the cell elsewhere where it is."""
@@ -425,9 +482,14 @@ class Controller:
         name, migrated = decision.name, decision.migrated
         if why is not None and migrated:
             why, name, migrated = f"{name}: {why}", incumbent, False
+        asked: Asked | tuple[()] = ()
+        if proposal.verdict is not None:
+            asked = proposal.verdict.asked
+            if why is None and proposal.verdict.why is not None:
+                why = f"{proposal.wished}: {proposal.verdict.why}"
         fixed = (self.window, incumbent, name, migrated)
         rule = (decision.reason, decision.dwell, decision.delta_j)
-        self.decisions.append((*fixed, *rule, *proposal.priced, why))
+        self.decisions.append((*fixed, *rule, *proposal.priced, *asked, why))
         self.window += 1
 
     def _priced(self, decision: Decision, estimates: Mapping[str, QoS]) -> tuple[object, ...]:
@@ -457,12 +519,12 @@ class Controller:
     @property
     def supports(self) -> bool:
         """Whether the estimator says how much stands behind its estimates."""
-        return self._support is not None
+        return self._estimator.supports
 
     def _supported(self) -> list[float]:
-        if self._support is None:
+        if not self._estimator.supports:
             return []
-        support = self._support()
+        support = self._estimator.support()
         behind = [support[name] for name in self._names if name in support]
         if len(behind) < len(self._names):
             who, known = type(self.estimator).__name__, ", ".join(support) or "nothing"
@@ -527,7 +589,7 @@ def _prepared_policy(policy: MinimalPolicy | str | None, problem: Problem) -> Pr
     return prepared
 
 
-def _shadow_fraction(estimator: Estimator, problem: Problem) -> float:
+def _shadow_fraction(estimator: CellEstimator, problem: Problem) -> float:
     """Share of the cycles that an estimator wants sent through each alternative.
 
     Raises
@@ -535,8 +597,8 @@ def _shadow_fraction(estimator: Estimator, problem: Problem) -> float:
     ProblemError
         If it is no share, or all alternatives together would get more than all cycles.
     """
-    fraction = getattr(estimator, "shadow_fraction", 0.0)
-    who = f"shadow_fraction of {type(estimator).__name__}"
+    fraction = estimator.shadow_fraction
+    who = f"shadow_fraction of {type(estimator.given).__name__}"
     SHADOW_FRACTION.check(who, fraction)
     message = too_many_shadows(fraction, len(problem.candidates))
     if message:

@@ -42,6 +42,7 @@ class Learning(Online):
         If `half_life_windows` is out of its range.
     """
 
+    supports = True
     #: Half-lives after which a measured value gives way to newer ones, and after which a part that
     #: was not measured any more is as declared again.
     MEMORY: ClassVar[float]

@@ -63,10 +63,17 @@ def parts_of(pipeline: Pipeline, placement: Placement) -> Iterator[Part]:
 
 
 class Meter:
-    """Takes windows apart into what they show of the parts that jobs and messages went through."""
+    """Takes windows apart into what they show of the parts that jobs and messages went through.
 
-    def __init__(self, problem: Problem) -> None:
+    Parameters
+    ----------
+    shared : collection of str
+        Nodes on which jobs run beside others that are not in the evidence, and wait for them.
+    """
+
+    def __init__(self, problem: Problem, shared: Collection[str] = ()) -> None:
         self._problem, self._pipeline = problem, problem.pipeline
+        self._shared = shared
         self._patience_ns = patience_ns(problem)
         names = list(problem.pipeline.tasks)
         self._sources = np.array([names.index(f.source) for f in problem.pipeline.flows], np.int64)
@@ -207,7 +214,7 @@ class Meter:
         for column, (name, task) in enumerate(self._pipeline.tasks.items()):
             node, execution = nodes[placement[name]], task.on[placement[name]]
             is_even = node.scheduler == "fair" and node.quota is None
-            if is_even and execution.accelerator is None:
+            if is_even and execution.accelerator is None and node.name not in self._shared:
                 sharing.setdefault(node.name, []).append((column, cores_of(node, execution)))
         return sharing
 

@@ -10,8 +10,8 @@ more is known of it, and more of those on which a move may depend, until their p
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from abc import abstractmethod
+from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import partial
 from typing import TypeAlias
 
@@ -20,11 +20,12 @@ from numpy.typing import NDArray
 
 from dwell.cost import cost, cost_error, hamming
 from dwell.estimators.evidence import Evidence
-from dwell.estimators.foreign_threads import ForeignThreads, Stretches
+from dwell.estimators.foreign_threads import ForeignThreads, Level, Stretches
 from dwell.estimators.measured import Message, Meter, Part, groups, parts_of
 from dwell.estimators.presents import PlayedPrice, Playing, Present
 from dwell.estimators.prices import SEED, Price
 from dwell.estimators.profile import Foreign, Profile, mean_ms
+from dwell.estimators.protocol import CellEstimator
 from dwell.estimators.spans import patience_ns
 from dwell.model.frozen import FrozenDict
 from dwell.model.problem import Problem
@@ -40,7 +41,11 @@ ROUNDS, STEPS = 2, 2
 BAND = 2.0
 
 
-class Online(ABC):
+def _says_nothing() -> None:
+    """Stand for jobs that say nothing of foreign threads."""
+
+
+class Online(CellEstimator):
     """Base of the estimators that watch windows.
 
     Attributes
@@ -51,7 +56,7 @@ class Online(ABC):
         Seed of what is played.
     """
 
-    shadow_fraction = 0.0
+    learns = True
     seed = SEED
 
     def start(self, problem: Problem) -> None:
@@ -67,6 +72,11 @@ class Online(ABC):
         }
         self._foreign = {name: ForeignThreads(node) for name, node in problem.fabric.nodes.items()}
         self._down: frozenset[str] = frozenset()
+        self._shared: frozenset[str] = frozenset()
+        #: Counts presents: changes, and every time that what is known of one has doubled.
+        self.revision = 0
+        self._grown = self._until = 1
+        self._plays = False
         self._patience_ns = patience_ns(problem)
         self._sent = {name: self._sent_under(name) for name in problem.candidates}
         #: The window that has been learnt from and not been priced, and not been taken in.
@@ -74,6 +84,22 @@ class Online(ABC):
         self._pending: Evidence | None = None
         #: Whether the present is another one, or has newer values of the same.
         self._has_changed = self._has_grown = False
+
+    def share(self, nodes: Collection[str], cells: int) -> None:
+        """Take note of nodes whose other jobs are those of a fleet's cells, and accounted for.
+
+        Jobs on them say nothing of foreign threads, nor of waits: they run beside jobs that are
+        not in the evidence. What others take of the node still does. Cells take turns in sending
+        shadows there.
+        """
+        self._shared = frozenset(nodes)
+        self._meter = Meter(self.problem, self._shared)
+        for name, sent in self._sent.items():
+            of = {
+                one: share / cells if one.partition(".")[0] in self._shared else share
+                for one, share in sent.items()
+            }
+            self._sent[name] = FrozenDict(of)
 
     def __getstate__(self) -> dict[str, object]:
         # A copy plays its present anew.
@@ -95,6 +121,10 @@ class Online(ABC):
         """Take in a window: what it showed of each part, once it is known of its nodes."""
         self._take_in_pending()
         self._evidence = self._pending = evidence
+
+    def look(self, evidence: Evidence) -> None:
+        """Learn from a window."""
+        self.learn(evidence)
 
     def _take_in_pending(self) -> None:
         """Take in the demands of the last window, if they have not been; its nodes come first."""
@@ -130,6 +160,9 @@ class Online(ABC):
             self._look_at_nodes(evidence, foreign, own, incumbent)
             self._take_in_pending()
         names = self._names
+        if self._plays and not names:
+            self.revision += 1
+        self._plays = bool(names)
         if names and (evidence is not None or self._has_changed):
             self._play(names)
         estimates = self._priced(names, foreign)
@@ -204,10 +237,14 @@ class Online(ABC):
         price = self._playing.prices[incumbent]
         for name, foreign in self._foreign.items():
             usual, deviation = price.foreign[name], price.foreign_deviation[name]
-            level = partial(self._stretches.level, evidence, name)
-            changed = foreign.see(
-                seen.shares[name], usual, deviation, level, is_full=name in seen.full
-            )
+            is_full = name in seen.full
+            if name in self._shared:
+                if is_full:
+                    continue
+                level: Callable[[], Level | None] = _says_nothing
+            else:
+                level = partial(self._stretches.level, evidence, name)
+            changed = foreign.see(seen.shares[name], usual, deviation, level, is_full=is_full)
             if changed:
                 self._has_changed = True
                 self._regimes += 1
@@ -263,12 +300,22 @@ class Online(ABC):
     def _play(self, names: list[str]) -> None:
         """Play the candidates that are not as declared, anew where the present has changed."""
         present = self.present
+        self._count_presents()
         if self._has_changed:
             self._playing.begin(present)
             self._playing.go_on(present, names, FIRST_STEPS)
         elif self._has_grown:
             self._playing.go_on(present, names, has_grown=True)
         self._has_changed = self._has_grown = False
+
+    def _count_presents(self) -> None:
+        """Count this present as a new one, if it is one."""
+        self._grown += 1
+        if self._has_changed:
+            self._grown = self._until = 1
+        if self._has_changed or self._grown >= self._until:
+            self.revision += 1
+            self._until *= 2
 
     def _sent_under(self, name: str) -> Mapping[str, float]:
         """Share of each resource that shadow jobs take while the cell is on a candidate."""

@@ -24,11 +24,11 @@ from dwell.estimators.pool import Reference
 from dwell.estimators.prices import SEED, Question, prices_of, unseen_error
 from dwell.estimators.sent_shadows import SentShadows, hindered, stamps_of
 from dwell.kernels.advance import logged_instants, play
-from dwell.kernels.arrays import Arrays, flow_rows, lay_out
+from dwell.kernels.arrays import Arrays, CellArrays, flow_rows, lay_out
 from dwell.kernels.codes import LAST_NS
 from dwell.kernels.random_draws import Drawing
-from dwell.kernels.realisation import NodeChange, NodeChanges, Realisation
-from dwell.kernels.rows import Rows
+from dwell.kernels.realisation import LinkSegments, NodeChange, NodeChanges, Realisation
+from dwell.kernels.rows import Rows, row_types
 from dwell.model.fabric import Node
 from dwell.model.frozen import FrozenDict
 from dwell.model.problem import Problem
@@ -299,7 +299,7 @@ class Playing:
         if shadows is not None:
             sent = _with_own_demands(shadows.realisation)
             self._replaced.append((shadows.realisation, sent))
-        self._first = lay_out([(problem, self._real)], shadows=sent).copy()
+        self._first = lay_out([(problem, self._real)], shadows=[sent]).copy()
         tables = self._first.tables
         tables.clock[0]["pauses"] = 1
         self._declared_changes = tables.changes[tables.changes["at_ns"] < LAST_NS]
@@ -333,12 +333,11 @@ class Playing:
         places = np.arange(begin, self._real.cycles) + self._offset
         for part, values in self.present.demands.items():
             rows = self._rows.get(part, ())
-            known = values[np.isfinite(values)]
-            if rows and len(known):
-                drawn = known * 1e6 / self._stretched.get(part, 1.0)
-                demands = np.rint(drawn).astype(np.int64)[places % len(known)]
-                for row in rows:
-                    row[begin:] = demands
+            if rows:
+                drawn = _drawn(values, self._stretched.get(part, 1.0), places)
+                if drawn is not None:
+                    for row in rows:
+                        row[begin:] = drawn
 
     def _fill_links(self, present: Present) -> None:
         """Set what links lose, and that measured delays are all that there is."""
@@ -373,38 +372,40 @@ class Playing:
         for number in others:
             name = names[number]
             mine = rows[rows["node"] == number]
-            pieces.append(self._with_threads(mine, present.threads.get(name, 0.0)))
+            threads = present.threads.get(name, 0.0)
+            pieces.append(with_threads(mine, threads, self._real.release_ns))
             if name in present.down:
                 pieces[-1]["is_down"] = 1
         changes = np.concatenate(pieces)
         return np.ascontiguousarray(changes[np.argsort(changes["at_ns"], kind="stable")])
 
-    def _with_threads(self, rows: Rows, threads: float) -> Rows:
-        """Return a node's changes with more threads, or fewer, a fraction as a share of periods."""
+
+def with_threads(rows: Rows, threads: float, release_ns: Ints) -> Rows:
+    """Return a node's changes with more threads, or fewer, a fraction as a share of periods."""
+    at_ns, stress = rows["at_ns"], rows["stress"]
+    if threads < 0.0:
+        spans = np.diff(np.append(at_ns, max(int(release_ns[-1]), int(at_ns[-1]))))
+        usual = float((stress * spans).sum()) / max(float(spans.sum()), 1.0)
+        rows, threads = rows[:1].copy(), max(usual + threads, 0.0)
         at_ns, stress = rows["at_ns"], rows["stress"]
-        if threads < 0.0:
-            spans = np.diff(np.append(at_ns, max(int(self._real.release_ns[-1]), int(at_ns[-1]))))
-            usual = float((stress * spans).sum()) / max(float(spans.sum()), 1.0)
-            rows, threads = rows[:1].copy(), max(usual + threads, 0.0)
-            at_ns, stress = rows["at_ns"], rows["stress"]
-        whole = math.floor(min(threads, MOST_THREADS))
-        rest = min(threads, MOST_THREADS) - whole
-        if rest > 1 - FRACTION:
-            whole, rest = whole + 1, 0.0
-        if rest < FRACTION:
-            changed = rows.copy()
-            changed["stress"] += whole
-            return changed
-        release_ns = self._real.release_ns[:-1]
-        all_ns = np.unique(np.concatenate((at_ns, release_ns[release_ns > at_ns[0]])))
-        cycle = np.searchsorted(release_ns, all_ns, side="right")
-        more = np.floor((cycle + 1) * rest) - np.floor(cycle * rest)
-        changed = np.zeros(len(all_ns), rows.dtype)
-        changed["at_ns"], changed["node"] = all_ns, rows["node"][0]
-        last = np.searchsorted(at_ns, all_ns, side="right") - 1
-        changed["stress"] = stress[last] + whole + more.astype(np.int64)
-        changed["is_down"] = rows["is_down"][last]
+    whole = math.floor(min(threads, MOST_THREADS))
+    rest = min(threads, MOST_THREADS) - whole
+    if rest > 1 - FRACTION:
+        whole, rest = whole + 1, 0.0
+    if rest < FRACTION:
+        changed = rows.copy()
+        changed["stress"] += whole
         return changed
+    release_ns = release_ns[:-1]
+    all_ns = np.unique(np.concatenate((at_ns, release_ns[release_ns > at_ns[0]])))
+    cycle = np.searchsorted(release_ns, all_ns, side="right")
+    more = np.floor((cycle + 1) * rest) - np.floor(cycle * rest)
+    changed = np.zeros(len(all_ns), rows.dtype)
+    changed["at_ns"], changed["node"] = all_ns, rows["node"][0]
+    last = np.searchsorted(at_ns, all_ns, side="right") - 1
+    changed["stress"] = stress[last] + whole + more.astype(np.int64)
+    changed["is_down"] = rows["is_down"][last]
+    return changed
 
 
 def _estimated(
@@ -464,6 +465,15 @@ def _with_own_demands(real: Realisation) -> Realisation:
     return replace(real, exec_ns=real.exec_ns.copy(), delay_ns=real.delay_ns.copy())
 
 
+def _drawn(values: Floats, stretched: float, places: Ints) -> Ints | None:
+    """Demands of cycles as a realisation has them, nanoseconds, from those that a present has."""
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return None
+    demands: Ints = np.rint(known * 1e6 / stretched).astype(np.int64)[places % len(known)]
+    return demands
+
+
 def _most_threads(node: Node) -> int:
     return MOST_THREADS + (node.bursts.threads if node.bursts is not None else 0)
 
@@ -480,6 +490,64 @@ def _with_short_windows(problem: Problem) -> Problem:
     if problem.window_cycles <= LONGEST_WINDOW:
         return problem
     return replace(problem, window_cycles=LONGEST_WINDOW)
+
+
+def realised(problem: Problem, real: Realisation, present: Present) -> Realisation:
+    """Return draws of the undisturbed cell with what a present has in the place of some of them."""
+    if not (present.demands or present.threads or present.down):
+        return real
+    exec_ns, delay_ns, extra_ns = real.exec_ns.copy(), real.delay_ns.copy(), real.extra_ns.copy()
+    places = np.arange(real.cycles)
+    segments = LinkSegments.of(real.link_segments)
+    state, rates = segments.table.copy(), segments.table_f.copy()
+    lost: dict[str, list[float]] = {}
+    for part, values in present.demands.items():
+        known: tuple[tuple[str, ...], ...] = real.sites
+        times, stretched = exec_ns, 1.0
+        if isinstance(part, Site):
+            stretched = _stretched(problem, part)
+        else:
+            known, times = real.hops, delay_ns
+            lost.setdefault(part.link, []).append(float(np.isinf(values).mean()))
+            extra_ns[[real.hops[hop] == part for hop, _ in real.layers]] = 0
+        demands = _drawn(values, stretched, places)
+        if part in known and demands is not None:
+            times[known.index(part)] = demands
+    for name, shares in lost.items():
+        share, mine = sum(shares) / len(shares), state[:, 1] == segments.links.index(name)
+        if problem.fabric.links[name].retransmit_ms is None:
+            rates[mine, 1] = share
+        else:
+            rates[mine, 1] = 0.0
+            state[mine, 2] = share >= 0.5
+    return replace(
+        real,
+        exec_ns=exec_ns,
+        delay_ns=delay_ns,
+        extra_ns=extra_ns,
+        node_changes=_changed(problem, real, present),
+        link_segments=LinkSegments(segments.links, state, rates),
+    )
+
+
+def _changed(problem: Problem, real: Realisation, present: Present) -> NodeChanges:
+    """Return the changes of nodes with the foreign threads and the outages of a present."""
+    names = tuple(problem.fabric.nodes)
+    begins = [NodeChange(0, name, 0, False) for name in names]
+    changes = NodeChanges.of([*begins, *real.node_changes])
+    kind = row_types()["changes"]
+    rows = np.ascontiguousarray(changes.table).view(kind).reshape(len(changes))
+    pieces = []
+    for number, name in enumerate(changes.nodes):
+        mine = with_threads(
+            rows[rows["node"] == number], present.threads.get(name, 0.0), real.release_ns
+        )
+        if name in present.down:
+            mine["is_down"] = 1
+        pieces.append(mine)
+    every = np.concatenate(pieces)
+    every = every[np.argsort(every["at_ns"], kind="stable")]
+    return NodeChanges(changes.nodes, every.view(np.int64).reshape(len(every), 4))
 
 
 def declared_of(problem: Problem, seed: int = SEED, shadow_fraction: float = 0.0) -> Declared:
@@ -528,7 +596,7 @@ def _played_as_declared(problem: Problem, seed: int) -> Declared:
 def _with_shadows(problem: Problem, plain: Declared, shadow_fraction: float) -> Declared:
     """Play again with shadow jobs the candidates that are hindered by them."""
     shadows = SentShadows(problem, plain.realisation, shadow_fraction)
-    first = lay_out([(problem, plain.realisation)], shadows=shadows.realisation)
+    first = lay_out([(problem, plain.realisation)], shadows=[shadows.realisation])
     l95_ms, violation_rate = dict(plain.l95_ms), dict(plain.violation_rate)
     for index, name in enumerate(problem.candidates):
         if name in hindered(problem):
@@ -553,7 +621,7 @@ def _shown(problem: Problem, arrays: Arrays) -> tuple[Floats, Floats]:
 def _evidence_of(problem: Problem, real: Realisation, arrays: Arrays, index: int) -> Evidence:
     """What all cycles show that have run under a candidate."""
     flows = flow_rows(problem.pipeline)
-    (instants,) = logged_instants(arrays, 0, real.cycles, flows)
+    (instants,) = logged_instants(CellArrays(arrays), 0, real.cycles, flows)
     return Evidence(
         close_ns=int(real.release_ns[-1]),
         release_ns=real.release_ns[:-1],

@@ -32,6 +32,7 @@ from dwell.model.instants import NEVER_NS, longest_run
 from dwell.model.pipeline import Pipeline
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
+from dwell.model.qos import QoS
 from dwell.model.scenario import Scenario
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -89,6 +90,13 @@ class Price:
     foreign: Mapping[str, float]
     foreign_deviation: Mapping[str, float]
     cycles: int
+
+    @property
+    def qos(self) -> QoS:
+        """The same as a QoS, with what others take as declared."""
+        used = {name: min(share + self.foreign[name], 1.0) for name, share in self.own.items()}
+        error = self.l95_error_ms, self.violation_error
+        return QoS(self.l95_ms, self.violation_rate, used, self.uncut_l95_ms, error)
 
     @property
     def is_good_enough(self) -> bool:
@@ -240,7 +248,8 @@ def price_of(
     problem: Problem, realisation: Realisation, name: str, shadows: SentShadows | None = None
 ) -> Price:
     """Price a candidate by its windows on one realisation."""
-    arrays = lay_out([(problem, realisation)], shadows=shadows.realisation if shadows else None)
+    sent = shadows.realisation if shadows else None
+    arrays = lay_out([(problem, realisation)], shadows=[sent])
     index = list(problem.candidates).index(name)
     arrays.replace(stamps=stamps_of(arrays, index, shadows))
     play(arrays)
@@ -266,7 +275,7 @@ def price_of(
     open_windows = is_young.reshape(len(seen), -1).any(axis=1)
     if not open_windows.all():
         uncut_ms = uncut_ms[~open_windows]
-    busy, own, shadow = np.moveaxis(tables.shares[0, first:], 1, 0)
+    busy, own, shadow, _ = np.moveaxis(tables.shares[0, first:], 1, 0)
     foreign = np.maximum(busy - own - shadow, 0.0)
     by_resource = partial(_by_resource, problem)
     return Price(

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from dwell.cost import SATURATED
 from dwell.errors import MetricError
 from dwell.estimators.prices import SEED, Price, prices_of
+from dwell.estimators.protocol import CellEstimator
 from dwell.model.bounds import require
 from dwell.model.frozen import FrozenDict
 from dwell.model.pipeline import Execution, Pipeline, Task
@@ -53,7 +54,7 @@ class Foreign(NamedTuple):
     full: Mapping[str, Mapping[str, float]]
 
 
-class Profile:
+class Profile(CellEstimator):
     """Estimates QoS as that of every candidate alone, undisturbed, played once in the kernel.
 
     Parameters

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import NamedTuple, Protocol, runtime_checkable
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Mapping
+from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
 from dwell.estimators.evidence import Evidence
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS
+
+if TYPE_CHECKING:
+    from dwell.estimators.presents import Present
 
 
 class Support(NamedTuple):
@@ -81,3 +85,54 @@ class Learner(Protocol):
     ) -> Mapping[str, QoS]:
         """As `Estimator.estimate`."""
         ...
+
+
+class CellEstimator(ABC):
+    """An estimator as the controller works with it: all that others need not have has a default.
+
+    Attributes
+    ----------
+    learns, supports : bool
+        Whether it is shown what happened to jobs, and says what stands behind its estimates.
+    shadow_fraction : float
+        Share of the cycles that it wants sent through each alternative.
+    revision : int
+        Counts what is new of `present`.
+    """
+
+    learns: bool = False
+    supports: bool = False
+    shadow_fraction: float = 0.0
+    revision: int = 0
+
+    @property
+    def given(self) -> object:
+        """The object that was given as the estimator."""
+        return self
+
+    @property
+    def present(self) -> Present | None:
+        """What it knows to be otherwise than declared; None where it says nothing of it."""
+        return None
+
+    @abstractmethod
+    def start(self, problem: Problem) -> None:
+        """Forget every window."""
+
+    def look(self, evidence: Evidence) -> None:
+        """Take in what happened to the jobs of a window, where it learns."""
+        return
+
+    @abstractmethod
+    def estimate(
+        self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
+    ) -> Mapping[str, QoS]:
+        """As `Estimator.estimate`."""
+
+    def support(self) -> Mapping[str, Support]:
+        """Say what stands behind the estimates, where it supports them."""
+        return {}
+
+    def share(self, nodes: Collection[str], cells: int) -> None:
+        """Take note of nodes whose other jobs are those of a fleet's cells, and accounted for."""
+        return

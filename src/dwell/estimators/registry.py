@@ -111,9 +111,6 @@ def by_name(name: str, problem: Problem) -> Estimator:
     """
     if is_class_path(name):
         own = make_user_class(name, problem, "estimate", "estimator", ProblemError)
-        start = getattr(own, "start", None)
-        if start is not None:
-            start(problem)
         return cast("Estimator", own)
     path = REGISTRY[name].path if name in REGISTRY else None
     kind = class_named(name, path, GROUP, "estimator", ProblemError)

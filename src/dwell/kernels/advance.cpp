@@ -39,10 +39,10 @@ DWELL_EXPORT void dwell_post_event(const Tables* tables, i64 at_ns, i64 key) noe
 // Copies what the logs have of `n` cycles, cell after cell, and in it one table after another: when
 // jobs became ready, when they completed, when they started and the core time that they took, (n,
 // tasks), and when the messages of `n_flows` flows arrived, (n, n_flows); -1 for never.
-DWELL_EXPORT void dwell_logged_instants(const Tables* tables, i64 first, i64 n, const i64* flows,
-                                        i64 n_flows, i64* out) noexcept {
+DWELL_EXPORT void dwell_logged_instants(const Tables* tables, i64 cell_0, i64 n_cells, i64 first,
+                                        i64 n, const i64* flows, i64 n_flows, i64* out) noexcept {
   const Simulation<false, false> s(*tables);
-  for (i64 cell = 0; cell < s.cells.size; ++cell) {
+  for (i64 cell = cell_0; cell < cell_0 + n_cells; ++cell) {
     const i64 jobs = n * s.n_tasks;
     i64 *ready_ns = out, *end_ns = ready_ns + jobs, *start_ns = end_ns + jobs;
     i64 *work_ns = start_ns + jobs, *arrived_ns = work_ns + jobs;

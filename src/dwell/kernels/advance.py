@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from dwell.kernels.arrays import Arrays
-from dwell.kernels.codes import Status
+from dwell.kernels.arrays import Arrays, CellArrays
+from dwell.kernels.codes import EventKind, Status, make_key
 from dwell.kernels.library import library
 from dwell.kernels.rows import Ints
 
@@ -23,7 +23,7 @@ def _functions() -> tuple[Any, Any, Any, Any]:
     loaded = library()
     advance, post, send = loaded.dwell_advance, loaded.dwell_post_event, loaded.dwell_send_state
     logged = loaded.dwell_logged_instants
-    logged.argtypes, logged.restype = (TABLES, I64, I64, TABLES, I64, TABLES), None
+    logged.argtypes, logged.restype = (TABLES, *(I64,) * 4, TABLES, I64, TABLES), None
     advance.argtypes, advance.restype = (TABLES,), ctypes.c_int32
     post.argtypes, post.restype = (TABLES, I64, I64), None
     send.argtypes, send.restype = (TABLES, I64, I64, I64, I64, ctypes.POINTER(I64)), None
@@ -51,15 +51,15 @@ def play(arrays: Arrays) -> Status:
             return STATUSES[status]
 
 
-def post_event(arrays: Arrays, at_ns: int, key: int) -> None:
-    """Add an event of the caller's; there is always room for a few (see `play`)."""
-    _functions()[1](arrays.address, at_ns, key)
+def post_event(of: CellArrays, at_ns: int, kind: EventKind, cycle: int = 0, item: int = 0) -> None:
+    """Add an event of a cell; there is always room for a few (see `play`)."""
+    _functions()[1](of.whole.address, at_ns, make_key(kind, of.part.row, cycle, item))
 
 
 def logged_instants(
-    arrays: Arrays, first: int, last: int, flows: Ints
+    of: CellArrays, first: int, last: int, flows: Ints
 ) -> list[tuple[Ints, Ints, Ints, Ints, Ints]]:
-    """Return what the logs still have of cycles, nanoseconds; -1 for never.
+    """Return what the logs still have of a cell's cycles, nanoseconds; -1 for never.
 
     Parameters
     ----------
@@ -71,28 +71,34 @@ def logged_instants(
     Returns
     -------
     list of (ready_ns, end_ns, arrived_ns, start_ns, work_ns)
-        By cell: when all inputs of a job were there, and when it had completed, int64 arrays of
-        shape (cycles, tasks), when messages arrived, (cycles, flows), when a job started, and the
-        core time that it has received, if it has completed, (cycles, tasks).
+        Of the cell, then of its shadow: when all inputs of a job were there, and when it had
+        completed, int64 arrays of shape (cycles, tasks), when messages arrived, (cycles, flows),
+        when a job started, and the core time that it has received, if it has completed,
+        (cycles, tasks).
     """
-    tables, count = arrays.tables, last - first
+    part, tables, count = of.part, of.whole.tables, last - first
     jobs = count * (tables.jobs.size // tables.slots.size)
-    found = np.empty((len(tables.cells), 4 * jobs + count * len(flows)), np.int64)
+    found = np.empty((part.rows, 4 * jobs + count * len(flows)), np.int64)
     _functions()[3](
-        *(arrays.address, first, count),
+        *(of.whole.address, part.row, part.rows, first, count),
         *(flows.ctypes.data, len(flows), found.ctypes.data),
     )
-    by_cell = []
-    for of in found:
-        ready, end, start, work = of[: 4 * jobs].reshape(4, count, -1)
-        by_cell.append((ready, end, of[4 * jobs :].reshape(count, len(flows)), start, work))
-    return by_cell
+    by_row = []
+    for row in found:
+        ready, end, start, work = row[: 4 * jobs].reshape(4, count, -1)[..., : part.tasks]
+        by_row.append((ready, end, row[4 * jobs :].reshape(count, len(flows)), start, work))
+    return by_row
 
 
 def send_state(
-    arrays: Arrays, hop: int, cycle: int, attempt: int, now_ns: int
+    of: CellArrays, hop: int, cycle: int, attempt: int, now_ns: int
 ) -> tuple[int, bool, int]:
     """Send the state of a task that moves; it is carried reliably, whatever the link does.
+
+    Parameters
+    ----------
+    hop : int
+        Which of the realisation's.
 
     Returns
     -------
@@ -104,5 +110,5 @@ def send_state(
         Number of the next attempt; waiting for the end of an outage is none.
     """
     sent = (I64 * 3)()
-    _functions()[2](arrays.address, hop, cycle, attempt, now_ns, sent)
+    _functions()[2](of.whole.address, of.part.hop_0 + hop, cycle, attempt, now_ns, sent)
     return sent[0], bool(sent[1]), sent[2]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,32 +28,55 @@ BUDGET = 200_000
 #: What a core draws on the pool of a quota at a time (sched_cfs_bandwidth_slice_us), and the least
 #: run time of a turn (sched_base_slice of two CPUs; eight and more have twice as much), ms.
 DRAWN_MS, LEAST_MS = 5.0, 1.4
+#: Of what shares of a resource are told: busy, own, of shadows, of other cells that have it, too.
+PARTS = 4
 #: Tables of a state that is in one piece begin at multiples of so many bytes.
 LINE = 64
 #: What a quota counts in time of its core (`_counted_ns`).
 COUNTED = "quota_ns", "stressed_ns", "slack_ns", "least_ns", "drawn_ns"
 
 
+class CellPart(NamedTuple):
+    """Where a cell is in the kernel's tables.
+
+    Parameters
+    ----------
+    row, rows : int
+        Its row, and how many it has: two where a shadow is behind it.
+    cycles, windows, tasks, flows, resources, candidates : int
+        How many it has of them.
+    candidate_0, hop_0, site_0 : int
+        Rows of its first candidate, hop and site.
+    """
+
+    row: int
+    rows: int
+    cycles: int
+    windows: int
+    tasks: int
+    flows: int
+    resources: int
+    candidate_0: int
+    candidates: int
+    hop_0: int
+    site_0: int
+
+
 class Arrays:
-    """The kernel's tables, with the names of their rows.
+    """The kernel's tables, and where each cell is in them.
 
     Attributes
     ----------
     tables : Tables
         What the kernel works on; replaced as a whole when a part of it grows.
-    resources : tuple of tuple of str
-        By cell: its resources, in the order of the snapshots' columns.
+    parts : tuple of CellPart
+        By cell.
     address : int
         What the kernel is handed.
     """
 
-    def __init__(
-        self,
-        tables: Tables,
-        resources: tuple[tuple[str, ...], ...],
-        behind: Sequence[Ints],
-    ) -> None:
-        self.resources = resources
+    def __init__(self, tables: Tables, parts: tuple[CellPart, ...], behind: Sequence[Ints]) -> None:
+        self.parts = parts
         # Rows have addresses in these.
         self._behind = behind
         self._use(tables)
@@ -67,7 +90,7 @@ class Arrays:
 
     def copy(self) -> Arrays:
         """Return tables that share what is fixed with these, and have a state of their own."""
-        other = Arrays(self.tables, self.resources, self._behind)
+        other = Arrays(self.tables, self.parts, self._behind)
         other.restart(self)
         return other
 
@@ -157,13 +180,64 @@ class Arrays:
         self._use(t._replace(**{name: larger(table) for name, table in rings.items()}))
 
 
+#: Tables of which every cell has a row.
+BY_CELL = (
+    *("cells", "stamps", "latency_ns", "compute_ns", "network_ns", "outcome"),
+    *("opened", "closed", "seen", "shares"),
+)
+
+
+class CellArrays:
+    """A cell's part of the kernel's tables: it is row 0 of each, and its shadow row 1.
+
+    Parameters
+    ----------
+    whole : Arrays
+    index : int
+        Which of the cells.
+    """
+
+    def __init__(self, whole: Arrays, index: int = 0) -> None:
+        self.whole, self.part = whole, whole.parts[index]
+        self._of: Tables | None = None
+        self._tables = whole.tables
+
+    @property
+    def tables(self) -> Tables:
+        """The tables as if there were no other cell."""
+        whole, part = self.whole.tables, self.part
+        if whole is not self._of:
+            self._of = whole
+            own, cycles = slice(part.row, part.row + part.rows), slice(part.cycles)
+            candidates = slice(part.candidate_0, part.candidate_0 + part.candidates)
+            rows = {name: getattr(whole, name)[own] for name in BY_CELL}
+            for name in ("opened", "closed", "shares"):
+                rows[name] = rows[name][:, : part.windows, :, : part.resources]
+            if len(whole.shadow_bytes):
+                rows["shadow_bytes"] = whole.shadow_bytes[part.row, cycles]
+            self._tables = whole._replace(
+                **rows,
+                site_of=whole.site_of[candidates, : part.tasks],
+                back_ns=whole.back_ns[candidates],
+            )
+        return self._tables
+
+    def logs(self) -> tuple[Rows, NDArray[np.int8]]:
+        """Every job's instants and outcome, shape (rows, cycles, tasks), where all are kept."""
+        whole, part = self.whole.tables, self.part
+        own = slice(part.row, part.row + part.rows), slice(part.cycles), slice(part.tasks)
+        clock = whole.clock[0]
+        shape = -1, int(clock["n_cycles"]), int(clock["n_tasks"])
+        return whole.log.reshape(shape)[own], whole.log_outcome.reshape(shape)[own]
+
+
 def lay_out(
     cells: Sequence[tuple[Problem, Realisation]],
     *,
     shared: Collection[str] = (),
     log_jobs: bool = False,
     log_windows: bool = False,
-    shadows: Realisation | None = None,
+    shadows: Sequence[Realisation | None] = (),
 ) -> Arrays:
     """Build the tables of one or more cells.
 
@@ -176,8 +250,9 @@ def lay_out(
         Whether every job's instants are kept.
     log_windows : bool
         Whether those of a window are kept until it has closed.
-    shadows : Realisation, optional
-        Draws for the shadow jobs of a single cell (see `draw_shadows`); it gets a shadow then.
+    shadows : sequence of Realisation
+        By cell, draws for its shadow jobs (see `draw_shadows`): it gets a shadow then; None: it has
+        none.
     """
     return _Layout(cells, shared, log_jobs, log_windows, shadows).arrays()
 
@@ -191,12 +266,11 @@ class _Layout:
         shared: Collection[str],
         logs_all: bool,
         logs_windows: bool,
-        shadows: Realisation | None,
+        shadows: Sequence[Realisation | None],
     ) -> None:
         self.cells, self.shared = cells, frozenset(shared)
         self.logs_all, self.logs_windows = logs_all, logs_windows
-        self.shadows = shadows
-        self.reals = [real for _, real in cells]
+        self.shadows = shadows if any(one is not None for one in shadows) else ()
         self.cycles = max(real.cycles for _, real in cells)
         self.max_tasks = max(len(problem.pipeline.tasks) for problem, _ in cells)
         self.max_flows = max(len(problem.pipeline.flows) for problem, _ in cells)
@@ -213,6 +287,10 @@ class _Layout:
         self.cell_servers: list[int] = []
         self.capacity: list[float] = []
         self.layers: list[dict[int, int]] = []
+        #: By cell: its row in the kernel's tables, its first hop and site, and its links.
+        self.cell_rows: list[int] = []
+        self.firsts: list[tuple[int, int]] = []
+        self.link_rows: list[dict[str, int]] = []
         self.segments: list[Rows] = []
         self.rates: list[Rows] = []
         self.n_segments = 0
@@ -224,14 +302,36 @@ class _Layout:
 
     def arrays(self) -> Arrays:
         for index, (problem, real) in enumerate(self.cells):
+            self.cell_rows.append(len(self.rows["cells"]))
             self._add_nodes(index, problem, real)
             self._add_cell(index, problem, real)
-        if self.shadows is not None:
-            ((problem, _),) = self.cells
-            self._add_shadow(problem, self.shadows)
+            if self.shadows and (shadow := self.shadows[index]) is not None:
+                self._add_shadow(index, problem, shadow)
         self._check_keys()
-        resources = tuple(tuple(problem.fabric.resources) for problem, _ in self.cells)
-        return Arrays(self._tables(), resources, self.behind)
+        return Arrays(self._tables(), self._parts(), self.behind)
+
+    def _parts(self) -> tuple[CellPart, ...]:
+        """Return where each cell is in the tables."""
+        ends = [*self.cell_rows[1:], len(self.rows["cells"])]
+        cells = self.rows["cells"]
+        return tuple(
+            CellPart(
+                row=row,
+                rows=end - row,
+                cycles=real.cycles,
+                windows=real.windows,
+                tasks=len(problem.pipeline.tasks),
+                flows=len(problem.pipeline.flows),
+                resources=len(problem.fabric.resources),
+                candidate_0=cells[row]["candidate_0"],
+                candidates=len(problem.candidates),
+                hop_0=hop_0,
+                site_0=site_0,
+            )
+            for (problem, real), row, end, (hop_0, site_0) in zip(
+                self.cells, self.cell_rows, ends, self.firsts, strict=True
+            )
+        )
 
     def _addresses(self, table: Ints) -> list[int]:
         """Return the address of every row of a realisation's table."""
@@ -336,6 +436,7 @@ class _Layout:
         pipeline, release_ns = problem.pipeline, real.release_ns
         resources = problem.fabric.resources.values()
         names, hop_0 = list(pipeline.tasks), len(self.rows["hops"])
+        self.firsts.append((hop_0, len(self.rows["sites"])))
         due_ns, grace_ns = close_after_ns(problem)
         self.end_ns = max(self.end_ns, int(release_ns[-1]) + grace_ns, int(release_ns[-2]) + due_ns)
         cell = {
@@ -375,19 +476,25 @@ class _Layout:
         for name in names:
             outputs = [flow_row[flow.source, flow.target] for flow in pipeline.outputs(name)]
             self._add_task(pipeline, pipeline.tasks[name], outputs)
-        link_row = self._add_links(problem, real)
-        self._add_hops(problem, real, link_row)
-        self._add_candidates(index, index, problem, real, hop_0)
-        if self.shadows is not None:
+        self.link_rows.append(self._add_links(problem, real))
+        self._add_hops(problem, real, self.link_rows[index])
+        self._add_candidates(index, problem, real, hop_0)
+        if self.shadows:
             self._add_pairs(problem)
         self._add_changes(index, NodeChanges.of(real.node_changes))
 
     def _add_candidates(
-        self, cell: int, index: int, problem: Problem, real: Realisation, hop_0: int
+        self,
+        index: int,
+        problem: Problem,
+        real: Realisation,
+        hop_0: int,
+        *,
+        of_shadow: bool = False,
     ) -> None:
         """Add where the tasks run and the flows cross under every candidate."""
         names = list(problem.pipeline.tasks)
-        site_row = self._add_sites(cell, index, problem, real, names)
+        site_row = self._add_sites(index, problem, real, names, of_shadow)
         hop_row = {hop: hop_0 + i for i, hop in enumerate(real.hops)}
         for placement in problem.candidates.values():
             on = [site_row[name, placement[name]] for name in names]
@@ -407,24 +514,27 @@ class _Layout:
             for other in problem.candidates.values():
                 self.shadow_parts.append(shadow_parts(problem.pipeline, active, other))
 
-    def _add_shadow(self, problem: Problem, real: Realisation) -> None:
-        """Add the shadow of the only cell: workers and draws of its own, all else shared."""
-        parent = self.rows["cells"][0]
-        parent["shadow"] = 1
+    def _add_shadow(self, index: int, problem: Problem, real: Realisation) -> None:
+        """Add the shadow of a cell: workers and draws of its own, all else shared."""
+        cells = self.rows["cells"]
+        row = self.cell_rows[index]
+        parent = cells[row]
+        parent["shadow"] = row + 1
         # Its windows never close.
         shadow = {"candidate_0": len(self.site_of), "close_cycle": real.cycles + 1}
-        self.rows["cells"].append(parent | shadow | {"shadow": -1, "parent": 0})
-        self.reals.append(real)
+        cells.append(parent | shadow | {"shadow": -1, "parent": row})
         for node, kind in list(self.server_row):
             self._add_below(node, kind)
         hop_0 = len(self.rows["hops"])
-        self._add_hops(problem, real, {name: i for i, name in enumerate(problem.fabric.links)})
-        self._add_candidates(1, 0, problem, real, hop_0)
+        self._add_hops(problem, real, self.link_rows[index])
+        self._add_candidates(index, problem, real, hop_0, of_shadow=True)
 
     def _add_below(self, node: int, kind: str | None) -> None:
-        """Add what own jobs leave of a server."""
+        """Add what own jobs leave of a server, unless it is there."""
         row = self.server_row[node, kind]
         above = self.rows["servers"][row]
+        if above["below"] >= 0:
+            return
         turns = above["scheduler"] == Scheduler.TURNS
         above["below"] = len(self.rows["servers"])
         below = {"above": row, "below": -1, "quota": -1, "background": 0.0}
@@ -455,10 +565,11 @@ class _Layout:
         self.outputs += outputs
 
     def _add_sites(
-        self, cell: int, index: int, problem: Problem, real: Realisation, names: list[str]
+        self, index: int, problem: Problem, real: Realisation, names: list[str], of_shadow: bool
     ) -> dict[tuple[str, str], int]:
-        """Add the sites of a cell, or of its shadow, on the nodes of the cell `index`."""
+        """Add the sites of a cell, or of its shadow."""
         rows: dict[tuple[str, str], int] = {}
+        cell = self.cell_rows[index] + of_shadow
         columns = list(problem.fabric.resources)
         for (task_name, node_name), exec_ns in zip(
             real.sites, self._addresses(real.exec_ns), strict=True
@@ -468,7 +579,7 @@ class _Layout:
             node = self.node_row[index, node_name]
             server = self.server_row[node, execution.accelerator]
             on = self.rows["servers"][server]
-            if cell != index:
+            if of_shadow:
                 server = on["below"]
             fair, cores = on["scheduler"] in (Scheduler.FAIR, Scheduler.TURNS), on["cores"]
             threads = execution.threads if execution.accelerator is None else 1
@@ -544,7 +655,7 @@ class _Layout:
 
     def _check_keys(self) -> None:
         limits = (
-            ("cells", len(self.cells), codes.CELL_MASK),
+            ("cells", len(self.rows["cells"]), codes.CELL_MASK),
             ("tasks of a cell", self.max_tasks, codes.ITEM_MASK),
             ("flows of a cell", self.max_flows, codes.MOST_FLOWS),
             ("feasible (task, node) pairs", len(self.rows["sites"]), codes.ITEM_MASK),
@@ -584,6 +695,7 @@ class _Layout:
             "n_flows": self.max_flows,
             "n_layers": n_layers,
             "n_resources": self.max_resources,
+            "has_shared": len(self.cells) > 1 and bool(self.shared),
             "n_cycles": cycles,
             "n_windows": windows,
             "margin": margin,
@@ -643,10 +755,10 @@ class _Layout:
             compute_ns=np.zeros((cells, cycles), np.int64),
             network_ns=np.zeros((cells, cycles), np.int64),
             outcome=np.zeros((cells, cycles), np.int8),
-            opened=np.zeros((cells, windows, 3, self.max_resources)),
-            closed=np.zeros((cells, windows, 3, self.max_resources)),
-            shares=np.zeros((cells, windows, 3, self.max_resources)),
-            shadow_bytes=np.zeros(cycles if self.shadows is not None else 0, np.int64),
+            opened=np.zeros((cells, windows, PARTS, self.max_resources)),
+            closed=np.zeros((cells, windows, PARTS, self.max_resources)),
+            shares=np.zeros((cells, windows, PARTS, self.max_resources)),
+            shadow_bytes=np.zeros((cells if self.shadows else 0, cycles), np.int64),
             log_outcome=np.zeros(logged * self.max_tasks, np.int8),
             log_arrived=np.full((logged, self.max_flows), -1, np.int64),
         )
@@ -679,8 +791,8 @@ class _Layout:
     def _announce_first(self, changes: Rows) -> None:
         """Put the first release of every cell, and the first change of a node, into the queue."""
         first = [
-            (int(self.reals[cell].release_ns[0]), make_key(EventKind.RELEASE, cell))
-            for cell in range(len(self.cells))
+            (int(real.release_ns[0]), make_key(EventKind.RELEASE, row))
+            for row, (_, real) in zip(self.cell_rows, self.cells, strict=True)
         ]
         if len(changes):
             first.append((int(changes[0]["at_ns"]), make_key(EventKind.CHANGE)))

@@ -87,6 +87,11 @@ def kind_of(key: int) -> EventKind:
     return EventKind(key >> KIND_SHIFT)
 
 
+def cell_of(key: int) -> int:
+    """Row of the cell of the event that a key names."""
+    return (key >> CELL_SHIFT) & CELL_MASK
+
+
 def cycle_of(key: int) -> int:
     """Cycle, or what else the caller counts, of the event that a key names."""
     return (key >> CYCLE_SHIFT) & CYCLE_MASK

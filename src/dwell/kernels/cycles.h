@@ -221,7 +221,8 @@ void send_outputs(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
       } else {
         if (!S::kPlain && s.cell(to).parent >= 0) {
           // No more than 64 bits hold, as with times.
-          s.shadow_bytes[cycle] = later(s.shadow_bytes[cycle], s.hops[hop].payload_bytes);
+          i64& bytes = s.shadow_bytes[s.cell(to).parent * s.clock[0].n_cycles + cycle];
+          bytes = later(bytes, s.hops[hop].payload_bytes);
         }
         send(s, to, cycle, flow, hop, 0, now);
       }

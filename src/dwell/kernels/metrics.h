@@ -47,7 +47,7 @@ void measure(S& s, i64 cell, i64 window, i64 first, i64 now) {
 
   const i64 at = snapshot_row(s, cell, window), n_resources = s.clock[0].n_resources;
   const f64 span_ns = static_cast<f64>(now - of.release_ns[first]);
-  for (i64 part = 0; part < 3; ++part) {
+  for (i64 part = 0; part < kParts; ++part) {
     for (i64 i = 0; i < of.n_resources; ++i) {
       const i64 place = at + part * n_resources + i;
       const f64 used_ns = s.closed[place] - s.opened[place];

@@ -58,7 +58,14 @@ def stream(seed: int, name: str) -> np.random.SeedSequence:
     return np.random.SeedSequence(seed, spawn_key=words)
 
 
-def draw(problem: Problem, *, scenario: str = "baseline", seed: int, windows: int) -> Realisation:
+def draw(
+    problem: Problem,
+    *,
+    scenario: str = "baseline",
+    seed: int,
+    windows: int,
+    streams: str = "",
+) -> Realisation:
     """Draw a realisation of a scenario.
 
     Parameters
@@ -69,6 +76,8 @@ def draw(problem: Problem, *, scenario: str = "baseline", seed: int, windows: in
         At least 0; the same seed gives the same realisation on any machine.
     windows : int
         Number of windows, at least 1; the run has ``windows * window_cycles`` cycles.
+    streams : str
+        What the names of its streams begin with, where several are drawn of one seed.
 
     Raises
     ------
@@ -86,7 +95,8 @@ def draw(problem: Problem, *, scenario: str = "baseline", seed: int, windows: in
         raise SimulationError(f"seed is {seed!r}; it must be a whole number of at least 0")
     _require_memory(problem, windows)
     try:
-        return Drawing(problem, scenario, seed=seed, windows=windows).take(windows)
+        drawing = Drawing(problem, scenario, seed=seed, windows=windows, streams=streams)
+        return drawing.take(windows)
     except MemoryError:
         raise SimulationError(
             f"{windows} windows of {scenario!r} need more memory than there is, for their cycles, "
@@ -166,6 +176,7 @@ def draw_shadows(
             windows=realisation.windows,
             shadow=True,
             wraps=wraps,
+            streams=realisation.streams,
         )
         drawing.release_ns, drawing.sent = realisation.release_ns, sent
         return drawing
@@ -193,6 +204,8 @@ class Drawing:
         Whether what belongs to one job or message is drawn for shadow jobs.
     wraps : bool
         Whether every trace begins anew where it ends.
+    streams : str
+        What the names of its streams begin with.
 
     Raises
     ------
@@ -209,9 +222,11 @@ class Drawing:
         windows: int,
         shadow: bool = False,
         wraps: bool = False,
+        streams: str = "",
     ) -> None:
         self.problem, self.name, self.scenario = problem, scenario, problem.scenario(scenario)
         self.seed, self.windows, self.shadow, self.wraps = seed, windows, shadow, wraps
+        self.streams = streams
         self.cycles = problem.cycles_of(windows)
         self.drawn = 0
         #: The cycles that are drawn, where it is not every one (see `draw_shadows`).
@@ -271,6 +286,7 @@ class Drawing:
             link_segments=link_segments,
             phases=self._phases(),
             trace_starts=tuple(self._trace_starts()),
+            streams=self.streams,
         )
 
     def take_sent(self, realisation: Realisation, whole: Realisation | None) -> Realisation:
@@ -332,8 +348,8 @@ class Drawing:
         if self.shadow and name.startswith(OF_A_JOB):
             # Losses have a key, whichever cycles are drawn.
             sent = self.sent is not None and not name.startswith("loss/")
-            return stream(self.seed, f"shadow/sent/{name}" if sent else f"shadow/{name}")
-        return stream(self.seed, name)
+            name = f"shadow/sent/{name}" if sent else f"shadow/{name}"
+        return stream(self.seed, f"{self.streams}{name}")
 
     def _path(self, process: Process, name: str) -> Path:
         """Return the path of a stream, from where it was left."""

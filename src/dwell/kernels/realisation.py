@@ -215,6 +215,8 @@ class Realisation:
         Phases of the nodes whose kernel checks quotas at ticks; a node left out has phase 0.
     trace_starts : tuple of TraceStart
         Where each replayed trace began.
+    streams : str
+        What the names of its streams begin with.
     """
 
     scenario: str
@@ -232,6 +234,7 @@ class Realisation:
     link_segments: Sequence[LinkSegment]
     phases: Mapping[str, Phase] = field(default_factory=dict)
     trace_starts: tuple[TraceStart, ...] = ()
+    streams: str = ""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "node_changes", NodeChanges.of(self.node_changes))

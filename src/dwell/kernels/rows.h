@@ -31,6 +31,7 @@ using Times = const i64*;
 #define DWELL_CLOCK(field)                                                                       \
   field(i64, n_slots) field(i64, n_tasks) field(i64, n_flows) field(i64, n_layers)               \
   field(i64, n_resources) /* of a cell */                                                        \
+  field(i64, has_shared) /* whether cells have servers in common */                              \
   field(i64, n_cycles) field(i64, n_windows) field(i64, n_priced) /* columns of the outputs */    \
   field(i64, margin) field(i64, budget)                                                          \
   field(i64, logs_all) /* whether logs are of all cycles, or of those in the ring */             \

@@ -129,10 +129,10 @@ class Tables(NamedTuple):
     compute_ns: Ints
     network_ns: Ints
     outcome: NDArray[np.int8]
-    opened: Floats  # (cells, windows, 3, resources) busy, own and shadow at first releases
-    closed: Floats  # (cells, windows, 3, resources) busy, own and shadow at closes
+    opened: Floats  # (cells, windows, PARTS, resources) at first releases
+    closed: Floats  # (cells, windows, PARTS, resources) at closes
     seen: Rows  # (cells, windows) metrics as they could be known at closes
-    shares: Floats  # (cells, windows, 3, resources) of the cores or places: busy, own and shadow
+    shares: Floats  # (cells, windows, PARTS, resources) of the cores or places
     decided: Rows  # (windows,)
     priced: (
         Floats  # (windows, columns) by candidate: J, L95, V_D, U of each node, is within, excess

@@ -5,7 +5,35 @@
 
 namespace dwell {
 
-// Writes the core-nanoseconds of a cell's resources up to now: busy, the cell's own, its shadow's.
+// Of what the core-nanoseconds of a resource are told: busy, the cell's own, its shadow's, and
+// those of other cells that have it, too, with their shadows.
+constexpr i64 kParts = 4;
+
+// Core-nanoseconds of a server that all cells and their shadows have had up to now.
+template <class S>
+f64 of_all_cells(S& s, Server& server, i64 row) {
+  const i64 n_resources = s.clock[0].n_resources;
+  f64 sum = 0.0;
+  for (i64 cell = 0; cell < s.cells.size; ++cell) {
+    const Cell& of = s.cell(cell);
+    for (i64 i = 0; i < of.n_resources; ++i) {
+      if (s.cell_servers[of.resource_0 + i] == row) sum += s.own_ns[cell * n_resources + i];
+    }
+  }
+  for (i64 at = 0; at < server.n_run + server.n_wait; ++at) {
+    const Progress found = progress(s, server, at);
+    if (found.key != kForeign) sum += found.received_ns;
+  }
+  if (!has_below(s, server)) return sum;
+  const Server& below = s.servers[server.below];
+  for (i64 at = 0; at < below.n_run + below.n_wait; ++at) {
+    const Progress found = progress(s, below, at);
+    if (found.key != kForeign) sum += found.received_ns;
+  }
+  return sum;
+}
+
+// Writes the core-nanoseconds of a cell's resources up to now, in `kParts` parts.
 // Of an accelerator they are those of its places.
 template <class S>
 [[gnu::noinline]] void snapshot(S& s, f64* out, i64 cell, i64 now) {
@@ -21,22 +49,31 @@ template <class S>
     }
     out[i] = server.busy_ns * server.pace + server.behind_ns;
     out[n_resources + i] = own;
-    if (!has_below(s, server)) continue;
-    Server& below = s.servers[server.below];
-    tick(s, below, now);
-    f64 extra = s.own_ns[of.shadow * n_resources + i];
-    for (i64 at = 0; at < below.n_run + below.n_wait; ++at) {
-      extra += progress(s, below, at).received_ns;
+    if (has_below(s, server)) {
+      Server& below = s.servers[server.below];
+      tick(s, below, now);
+      out[i] += below.busy_ns * below.pace + below.behind_ns;
+      if (of.shadow >= 0) {
+        f64 extra = s.own_ns[of.shadow * n_resources + i];
+        for (i64 at = 0; at < below.n_run + below.n_wait; ++at) {
+          const Progress found = progress(s, below, at);
+          if (cell_of(found.key) == of.shadow) extra += found.received_ns;
+        }
+        out[2 * n_resources + i] = extra;
+      }
     }
-    out[i] += below.busy_ns * below.pace + below.behind_ns;
-    out[2 * n_resources + i] = extra;
+    if (s.clock[0].has_shared) {
+      const f64 mine = own + out[2 * n_resources + i];
+      out[3 * n_resources + i] =
+          std::max(of_all_cells(s, server, s.cell_servers[of.resource_0 + i]) - mine, 0.0);
+    }
   }
 }
 
 // Place of a snapshot in `opened` and `closed`.
 template <class S>
 i64 snapshot_row(const S& s, i64 cell, i64 window) {
-  return (cell * s.clock[0].n_windows + window) * 3 * s.clock[0].n_resources;
+  return (cell * s.clock[0].n_windows + window) * kParts * s.clock[0].n_resources;
 }
 
 // Window that a cycle is the first of, as far as is known; -1 for none.

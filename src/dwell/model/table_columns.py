@@ -22,8 +22,8 @@ Kind: TypeAlias = Literal[
 ]
 #: What a run has that not every run has: `live` processes; cycles that may be sent through
 #: alternatives, too (`shadows`); an estimator that says what stands behind its estimates
-#: (`support`).
-Feature: TypeAlias = Literal["live", "shadows", "support"]
+#: (`support`); a cell of a `fleet`.
+Feature: TypeAlias = Literal["live", "shadows", "support", "fleet"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class Column:
         Unit of a number; empty for a count, a share and a bare number.
     null : str
         When it is null; empty where it never is. NaN is null there, too.
-    of : tuple of {"live", "shadows", "support"}
+    of : tuple of {"live", "shadows", "support", "fleet"}
         Runs that have it: those with one of these; all where empty.
     """
 
@@ -87,6 +87,8 @@ UNTOLD = "not counted"
 LIVE: tuple[Feature, ...] = ("live",)
 SHADOWS: tuple[Feature, ...] = ("shadows",)
 SUPPORT: tuple[Feature, ...] = ("support",)
+FLEET: tuple[Feature, ...] = ("fleet",)
+UNASKED = "the ledger was not asked"
 
 CYCLES = (
     Column("cycle", "Int64", "Number of the cycle, from 0 without gaps."),
@@ -234,13 +236,16 @@ DECISIONS = (
         GUARD,
         SUPPORT,
     ),
+    Column("phi_before", "Float64", "Φ of the fleet as it is, as played.", null=UNASKED, of=FLEET),
+    Column("phi_after", "Float64", "Φ with the move that was looked at.", null=UNASKED, of=FLEET),
+    Column("round", "Int64", "The ledger's round that it is of.", null="no ledger", of=FLEET),
     Column(
         "refused",
         "String",
         "What was decided and not done, and why: `migrated` is false then, `placement` the old "
         "one, and `reason` the policy's.",
         null="what was decided was done",
-        of=LIVE,
+        of=("live", "fleet"),
     ),
 )
 JOBS = (

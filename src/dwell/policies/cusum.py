@@ -59,6 +59,8 @@ class Cusum(PricingPolicy):
         different tasks.
     """
 
+    by_price = True
+
     SETTINGS = MappingProxyType({"slack": "min_improvement"})
 
     def __init__(

@@ -62,6 +62,8 @@ class DTP(PricingPolicy):
         different tasks.
     """
 
+    by_price = True
+
     SETTINGS = MappingProxyType(
         {"min_dwell": "min_dwell", "min_improvement": "min_improvement", "escape": "escape"}
     )

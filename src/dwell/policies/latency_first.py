@@ -26,6 +26,8 @@ class LatencyFirst(CandidatePolicy):
         Where given, J of every candidate is recorded; it decides nothing.
     """
 
+    by_price = True
+
     def _decide(self, observed: QoS, estimates: Mapping[str, QoS] | None) -> tuple[Decision, None]:
         known, now = self._known(estimates), self.incumbent
         name = now

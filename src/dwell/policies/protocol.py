@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from dwell.model.objective import Objective
 from dwell.model.problem import Problem
@@ -63,11 +63,15 @@ class Proposer(ABC):
         What it prices by; the problem's where None.
     guarded : bool
         Whether a guard may move the cell.
+    by_price : bool
+        Whether it moves to any candidate that is cheap enough, so that in a fleet another one may
+        be taken in the place of its own.
     """
 
     initial: str | None = None
     objective: Objective | None = None
     guarded: bool = True
+    by_price: ClassVar[bool] = False
 
     @property
     def given(self) -> object:

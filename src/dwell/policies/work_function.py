@@ -72,6 +72,8 @@ class WorkFunction(PricingPolicy):
         As in `dwell.policies.DTP`.
     """
 
+    by_price = True
+
     def __init__(
         self,
         *,

@@ -1,6 +1,7 @@
 """The Run: its schema, tables, open, save; the journal of one that is still going on."""
 
 from dwell.model.table_columns import Feature
+from dwell.record.fleet_run import FleetRun, open_fleet
 from dwell.record.journal import Journal
 from dwell.record.run import Run, open_run, require_free, seal_run
 from dwell.record.schema import (
@@ -25,6 +26,7 @@ __all__ = [
     "SCHEMA_VERSION",
     "Columns",
     "Feature",
+    "FleetRun",
     "Journal",
     "Names",
     "Row",
@@ -35,6 +37,7 @@ __all__ = [
     "arrays_of",
     "column_types",
     "frame_of",
+    "open_fleet",
     "open_run",
     "require_free",
     "row_of",

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 ALWAYS = tuple(name for name, table in TABLES.items() if not table.on_request)
 #: Scenario by which a cell has the disturbances as they were played.
 PLAYED = "played"
+#: Last file of a fleet's folder (see `dwell.record.fleet_run`).
+FLEET = "fleet.json"
 ON_REQUEST = tuple(name for name, table in TABLES.items() if table.on_request)
 
 Table: TypeAlias = "pl.DataFrame | Callable[[], pl.DataFrame]"
@@ -222,7 +224,7 @@ class Run(Displayed):
             raise RunError(f"{target.parent}: cannot be written ({error.strerror})") from None
         try:
             for name in self._tables:
-                _write_table(self._table(name), draft / f"{name}.parquet")
+                write_table(self._table(name), draft / f"{name}.parquet")
             text = json.dumps(self.meta, indent=2, allow_nan=False)
             (draft / "run.json").write_text(text + "\n", encoding="utf-8")
             draft.chmod(0o755)
@@ -316,6 +318,8 @@ def open_run(path: str | os.PathLike[str]) -> Run:
     try:
         meta = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
+        if (folder / FLEET).is_file():
+            raise RunError(f"{folder} is a fleet's folder; name the run of a cell in it") from None
         raise RunError(f"{folder}: not a run (it has no run.json)") from None
     except (OSError, ValueError) as error:
         raise RunError(f"{file}: cannot be read ({error})") from None
@@ -329,7 +333,7 @@ def open_run(path: str | os.PathLike[str]) -> Run:
         raise RunError(f"{folder}: incomplete run, without {', '.join(missing)}")
     more = [name for name in ON_REQUEST if (folder / f"{name}.parquet").is_file()]
     names = [*ALWAYS, *more]
-    return Run(meta, {name: _reader(folder / f"{name}.parquet") for name in names})
+    return Run(meta, {name: read_table(folder / f"{name}.parquet") for name in names})
 
 
 def _in_todays_words(meta: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -371,7 +375,7 @@ def seal_run(path: str | os.PathLike[str], **meta: object) -> Run:
         text = json.dumps(told, indent=2) + "\n"
         try:
             for name in () if sealed else run._tables:
-                table = partial(_write_table, run._table(name))
+                table = partial(write_table, run._table(name))
                 write_whole(folder / f"{name}.parquet", table)
             # From here on the folder is a finished run.
             write_whole(file, text)
@@ -384,7 +388,7 @@ def seal_run(path: str | os.PathLike[str], **meta: object) -> Run:
     return open_run(folder)
 
 
-def _write_table(table: pl.DataFrame, file: Path) -> None:
+def write_table(table: pl.DataFrame, file: Path) -> None:
     """Write a table; a disk that is full is an OSError, whatever Polars calls it."""
     import polars as pl
 
@@ -394,7 +398,9 @@ def _write_table(table: pl.DataFrame, file: Path) -> None:
         raise OSError(str(error)) from None
 
 
-def _reader(file: Path) -> Callable[[], pl.DataFrame]:
+def read_table(file: Path) -> Callable[[], pl.DataFrame]:
+    """Return the function that reads a table."""
+
     def read() -> pl.DataFrame:
         import polars as pl
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from dwell.kernels.advance import post_event, send_state
-from dwell.kernels.arrays import Arrays
-from dwell.kernels.codes import CYCLE_BITS, EventKind, cycle_of, item_of, make_key
+from dwell.kernels.arrays import CellArrays
+from dwell.kernels.codes import CYCLE_BITS, EventKind, cycle_of, item_of
 from dwell.kernels.realisation import Realisation
 from dwell.model import Problem
 
@@ -36,7 +36,7 @@ class ColdMigration:
         self.hops: dict[int, int] = {}
 
     def begin(
-        self, arrays: Arrays, incumbent: str, order: str, boundary: int, arrival_ns: int
+        self, arrays: CellArrays, incumbent: str, order: str, boundary: int, arrival_ns: int
     ) -> bool:
         """Start a worker of every task that an order moves; False if there is none."""
         self.boundary, self.number = boundary, self.number + 1
@@ -49,7 +49,7 @@ class ColdMigration:
                 self._announce(arrays, row, 0, self.hops[row] < 0, started_ns)
         return bool(self.hops)
 
-    def step(self, arrays: Arrays) -> bool:
+    def step(self, arrays: CellArrays) -> bool:
         """Take the step that is due; True if the last task is ready now."""
         clock = arrays.tables.clock[0]
         key, now = int(clock["step_key"]), int(clock["step_ns"])
@@ -70,6 +70,6 @@ class ColdMigration:
         """Forget the migration that is under way, if there is one: its order is void."""
         self.hops.clear()
 
-    def _announce(self, arrays: Arrays, row: int, attempt: int, ready: bool, t: int) -> None:
+    def _announce(self, arrays: CellArrays, row: int, attempt: int, ready: bool, t: int) -> None:
         field = ((self.number & NUMBERS) << NUMBER_SHIFT) | ((attempt & ATTEMPTS) << 1) | ready
-        post_event(arrays, t, make_key(EventKind.MIGRATE, cycle=field, item=row))
+        post_event(arrays, t, EventKind.MIGRATE, cycle=field, item=row)

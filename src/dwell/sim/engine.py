@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import bisect
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
-from typing import Any, cast
+from typing import Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,8 @@ from dwell.control import (
 )
 from dwell.errors import SimulationError
 from dwell.kernels.advance import logged_instants, play
-from dwell.kernels.arrays import Arrays, flow_rows, lay_out
-from dwell.kernels.codes import BuiltInPolicy, EventKind, Status, Tier, kind_of
+from dwell.kernels.arrays import CellArrays, flow_rows, lay_out
+from dwell.kernels.codes import BuiltInPolicy, EventKind, Status, Tier, cell_of, kind_of
 from dwell.kernels.random_draws import draw, draw_shadows
 from dwell.kernels.realisation import NodeChanges, Realisation
 from dwell.model import Problem
@@ -36,6 +36,8 @@ from dwell.sim.simulated_guard import SimulatedGuard
 from dwell.sim.tables import PlayedRealisation, make_tables
 from dwell.sim.versions import versions
 
+#: Told how much of how much is done.
+Progress: TypeAlias = Callable[[int, int], None]
 #: Columns of the kernel's table `seen`.
 SEEN = "first_cycle", "missed", "l95_ms", "uncut_ms"
 
@@ -107,7 +109,7 @@ def simulate_realisation(
     # the first has played. Shadows in every run that may want probes would cost all runs more.
     played = cast("PlayedRealisation", _play(*asked) or _play(*asked, shadow=True))
     meta = partial(
-        _meta,
+        meta_of,
         problem,
         played.controller,
         scenario=realisation.scenario,
@@ -143,7 +145,7 @@ def describe(
     """
     problem.scenario(scenario)
     controller = Controller(problem, policy, estimator)
-    meta = _meta(problem, controller, scenario=scenario, seed=seed, windows=windows, guard=guard)
+    meta = meta_of(problem, controller, scenario=scenario, seed=seed, windows=windows, guard=guard)
     return Run(meta, {}).meta
 
 
@@ -160,28 +162,102 @@ def _play(
 ) -> PlayedRealisation | None:
     """Play a realisation with or without a shadow; None where probes are wanted and it has none."""
     controller = Controller(problem, policy, estimator)
-    fraction = controller.shadow_fraction
-    shadow = shadow or fraction > 0
-    guarded = guard and controller.guarded
-    plan = shadows = None
-    if shadow:
-        plan = ShadowPlan(0, realisation.cycles, len(problem.candidates), fraction)
-        # Probes may be of any cycle.
-        shadows = draw_shadows(problem, realisation, plan.sent, others=guarded)
-    arrays = lay_out(
-        [(problem, realisation)], log_jobs=jobs, log_windows=controller.learns, shadows=shadows
+    cell = PlayedCell(problem, realisation, controller, guard and controller.guarded)
+    played = play_cells([cell], jobs=jobs, by_window=by_window, shadow=shadow)
+    return None if played is None else played[0]
+
+
+class PlayedCell(NamedTuple):
+    """A cell that is to be played.
+
+    Parameters
+    ----------
+    problem, realisation, controller
+        What decides has seen no window.
+    guarded : bool
+        Whether its guard acts.
+    """
+
+    problem: Problem
+    realisation: Realisation
+    controller: Controller
+    guarded: bool
+
+
+def play_cells(
+    cells: Sequence[PlayedCell],
+    *,
+    shared: Collection[str] = (),
+    jobs: bool = False,
+    by_window: bool = False,
+    shadow: bool = False,
+    progress: Progress | None = None,
+) -> list[PlayedRealisation] | None:
+    """Play cells together; None where probes are wanted of a cell without a shadow.
+
+    Parameters
+    ----------
+    shared : collection of str
+        Nodes that they have in common.
+    jobs : bool
+        Whether every job is kept.
+    by_window : bool
+        See `simulate_realisation`.
+    shadow : bool
+        Whether guarded cells have a shadow, too, whose estimators want none.
+    progress : callable, optional
+        Told how many of how many windows have closed.
+    """
+    plans = [_shadow_plan(cell, shadow and cell.guarded) for cell in cells]
+    whole = lay_out(
+        [(cell.problem, cell.realisation) for cell in cells],
+        shared=shared,
+        log_jobs=jobs,
+        log_windows=any(cell.controller.learns for cell in cells),
+        shadows=[
+            # Probes may be of any cycle.
+            draw_shadows(cell.problem, cell.realisation, plan.sent, others=cell.guarded)
+            if plan is not None
+            else None
+            for cell, plan in zip(cells, plans, strict=True)
+        ],
     )
-    stamper = _Stamper(problem, realisation, controller, arrays, plan, guarded=guarded)
-    if not (guarded or by_window or any(stamper.host_down)):
-        stamper.leave_to_kernel()
-    while (status := play(arrays)) != Status.FINISHED:
+    stampers = [
+        _Stamper(cell, CellArrays(whole, i), plan, shared)
+        for i, (cell, plan) in enumerate(zip(cells, plans, strict=True))
+    ]
+    first = stampers[0]
+    if len(cells) == 1 and not (cells[0].guarded or by_window or any(first.host_down)):
+        first.leave_to_kernel()
+    by_row = {stamper.arrays.part.row: stamper for stamper in stampers}
+    closed, total = 0, sum(cell.realisation.windows for cell in cells)
+    while (status := play(whole)) != Status.FINISHED:
+        clock = whole.tables.clock[0]
         if status == Status.STEP:
+            stamper = by_row[cell_of(int(clock["step_key"]))]
             stamper.step()
         else:
+            stamper = by_row[int(clock["closed_cell"])]
             stamper.close_window()
+            closed += 1
+            if progress is not None:
+                progress(closed, total)
         if stamper.lacks_shadow:
             return None
-    return PlayedRealisation(problem, realisation, controller, arrays, stamper.metrics)
+    return [
+        PlayedRealisation(
+            cell.problem, cell.realisation, cell.controller, stamper.arrays, stamper.metrics
+        )
+        for cell, stamper in zip(cells, stampers, strict=True)
+    ]
+
+
+def _shadow_plan(cell: PlayedCell, probes: bool) -> ShadowPlan | None:
+    """Return which cycles of a cell have a shadow; None where it needs none."""
+    fraction = cell.controller.shadow_fraction
+    if not (probes or fraction > 0):
+        return None
+    return ShadowPlan(0, cell.realisation.cycles, len(cell.problem.candidates), fraction)
 
 
 def _check_fit(problem: Problem, realisation: Realisation) -> None:
@@ -213,14 +289,12 @@ class _Stamper:
 
     def __init__(
         self,
-        problem: Problem,
-        realisation: Realisation,
-        controller: Controller,
-        arrays: Arrays,
+        cell: PlayedCell,
+        arrays: CellArrays,
         plan: ShadowPlan | None,
-        *,
-        guarded: bool,
+        shared: Collection[str] = (),
     ) -> None:
+        problem, realisation, controller, guarded = cell
         self.controller, self.arrays = controller, arrays
         self.release_ns = realisation.release_ns
         self.cycles = realisation.cycles
@@ -235,6 +309,12 @@ class _Stamper:
         self.host_at_ns, self.host_down = table[:, 0].tolist(), table[:, 3].tolist()
         self.cold = ColdMigration(problem, realisation) if settings.migration == "cold" else None
         self.plan = plan
+        #: Whether shadows may be sent to shared nodes with each cycle, and who is there.
+        self.turns: NDArray[np.bool_] | None = None
+        if plan is not None and controller.coordination is not None:
+            self.turns = controller.coordination.turns(realisation.release_ns[:-1])
+        placed = problem.candidates.values()
+        self.there = [i for i, one in enumerate(placed) if not set(shared).isdisjoint(one.values())]
         #: Whether probes are wanted of a run that was laid out without a shadow.
         self.lacks_shadow = False
         self.course = controller.course
@@ -262,7 +342,10 @@ class _Stamper:
         stamps[0, start:stop] = code
         if self.plan is not None and start < self.cycles:
             stop = min(stop, self.cycles)
-            stamps[1, start:stop] = self.plan.stamps(start, stop, code)
+            shadows = self.plan.stamps(start, stop, code)
+            if self.turns is not None:
+                shadows[~self.turns[start:stop] & np.isin(shadows, self.there)] = -1
+            stamps[1, start:stop] = shadows
         if self.watch is not None:
             self.watch.stamp(start, stop)
 
@@ -291,7 +374,7 @@ class _Stamper:
             "stamped": self.stamped,
         }
         tiers = [Tier[tier.upper()] if tier else Tier.NONE for tier in plain.tiers]
-        self.arrays.use_rule(
+        self.arrays.whole.use_rule(
             numbers,
             plain.options,
             work=plain.work,
@@ -427,7 +510,7 @@ class _Stamper:
 
 
 def _evidence(
-    problem: Problem, realisation: Realisation, arrays: Arrays
+    problem: Problem, realisation: Realisation, arrays: CellArrays
 ) -> Callable[[int, int, int], Evidence]:
     """Return the function that cuts a window's evidence out of the logs."""
     flows = flow_rows(problem.pipeline)
@@ -449,7 +532,7 @@ def _evidence(
     return cut
 
 
-def _meta(
+def meta_of(
     problem: Problem,
     controller: Controller,
     *,
@@ -458,6 +541,7 @@ def _meta(
     windows: int,
     guard: bool,
 ) -> dict[str, Any]:
+    """Return what the record of a simulated run says of it."""
     return {
         "kind": "simulated",
         "cell": problem.name,

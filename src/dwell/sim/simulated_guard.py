@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from dwell.control import CellGuard
 from dwell.control.guard import MOST_OPEN
 from dwell.kernels.advance import post_event
-from dwell.kernels.arrays import Arrays
-from dwell.kernels.codes import LAST_NS, EventKind, make_key
+from dwell.kernels.arrays import CellArrays
+from dwell.kernels.codes import LAST_NS, EventKind
 from dwell.kernels.realisation import LinkSegments, NodeChanges, Realisation
 from dwell.kernels.rows import Row
 from dwell.model import Problem
@@ -30,11 +30,11 @@ class SimulatedGuard:
     ----------
     problem : Problem
         With fallbacks.
-    arrays : Arrays
+    arrays : CellArrays
         The simulation about to be played.
     """
 
-    def __init__(self, problem: Problem, realisation: Realisation, arrays: Arrays) -> None:
+    def __init__(self, problem: Problem, realisation: Realisation, arrays: CellArrays) -> None:
         self.problem, self.realisation, self.arrays = problem, realisation, arrays
         self.release_ns, self.cycles = realisation.release_ns, realisation.cycles
         self.names = tuple(problem.candidates)
@@ -105,7 +105,7 @@ class SimulatedGuard:
         """Be woken at an instant, and not before."""
         self._cell["wakes_ns"] = at_ns
         if at_ns < LAST_NS:
-            post_event(self.arrays, at_ns, make_key(EventKind.GUARD))
+            post_event(self.arrays, at_ns, EventKind.GUARD)
 
     def moved(self, first: int) -> None:
         """Take note of an order that takes effect at a cycle."""

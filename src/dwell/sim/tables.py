@@ -12,7 +12,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from dwell.control import Controller, final_l95_ms
-from dwell.kernels.arrays import Arrays
+from dwell.kernels.arrays import CellArrays
 from dwell.kernels.realisation import Realisation
 from dwell.kernels.rows import Rows
 from dwell.model import REASONS, Problem
@@ -44,7 +44,7 @@ class PlayedRealisation:
     problem: Problem
     realisation: Realisation
     controller: Controller
-    arrays: Arrays
+    arrays: CellArrays
     metrics: list[tuple[float | None, ...]]
 
     @cached_property
@@ -60,7 +60,7 @@ class PlayedRealisation:
 
     @property
     def shares(self) -> Floats:
-        """Busy, own and shadow share of every resource, shape (windows, 3, resources)."""
+        """Busy, own, shadow and others' share of every resource, shape (windows, 4, resources)."""
         return self.arrays.tables.shares[0, : len(self.seen)]
 
     @property
@@ -128,7 +128,6 @@ def make_tables(
         Columns of the tables that need not be frames to be computed with.
     """
     problem, controller = played.problem, played.controller
-    support: tuple[Feature, ...] = ("support",) if controller.supports else ()
     arrays: dict[str, Callable[[], TableArrays]] = {
         "cycles": cache(lambda: _cycles(played)),
         "windows": cache(lambda: _windows(played, _seen(played))),
@@ -136,7 +135,7 @@ def make_tables(
             lambda: _decided_by_kernel(played) if played.by_kernel else _decisions(controller)
         ),
     }
-    features = {"windows": played.features, "decisions": support}
+    features = {"windows": played.features, "decisions": controller.features}
 
     def frame(name: str) -> pl.DataFrame:
         return frame_of(name, problem, arrays[name]().columns(), features.get(name, ()))
@@ -246,9 +245,11 @@ def _seen(played: PlayedRealisation) -> dict[str, Floats]:
 def _decisions(controller: Controller) -> TableArrays:
     """Decisions of the controller, their names found among those that there may be."""
     columns, rows = controller.decision_columns, controller.decisions
-    # Last in a row is why it was not carried out: here every order is.
     columns_of_rows = zip(*rows, strict=True) if rows else [()] * (len(columns) + 1)
-    decided: dict[str, object] = dict(zip(columns, columns_of_rows, strict=False))
+    decided: dict[str, object] = dict(zip((*columns, "refused"), columns_of_rows, strict=True))
+    if controller.coordination is None:
+        # Every decision is carried out.
+        del decided["refused"]
     known = dict.fromkeys(("incumbent", "placement"), tuple(controller.problem.candidates))
     known["reason"] = REASONS
     names = {
@@ -290,13 +291,12 @@ def _jobs(played: PlayedRealisation) -> pl.DataFrame:
     problem, tables = played.problem, played.arrays.tables
     tasks = tuple(problem.pipeline.tasks)
     nodes = tuple(problem.fabric.nodes)
-    cells, cycles = len(tables.cells), played.realisation.cycles
-    log = tables.log.reshape(cells, cycles, len(tasks))
-    outcome = tables.log_outcome.reshape(cells, cycles, len(tasks))
+    cells = len(tables.cells)
+    log, outcome = played.arrays.logs()
     # Sites of a shadow follow those of its cell in the same order.
     site_node = np.array([nodes.index(node) for _, node in played.realisation.sites] * cells)
-    site = tables.site_of[: len(problem.candidates)]
-    node = site_node[site[np.maximum(tables.stamps, 0).astype(np.int64)]]
+    site = tables.site_of - played.arrays.part.site_0
+    node = site_node[site[np.maximum(tables.stamps[:, : log.shape[1]], 0).astype(np.int64)]]
     cycle, cell, task = np.nonzero(log["ready_ns"].transpose(1, 0, 2) >= 0)
     picked = log[cell, cycle, task]
     started, ended = picked["start_ns"] >= 0, picked["end_ns"] >= 0

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from dwell.study.over_seeds import over_seeds, windows_behind
 
 if TYPE_CHECKING:
+    from dwell.study.capacity import Capacity, CapacityPoint, Limiting, capacity_of, what_ifs
     from dwell.study.comparison import AIM, Comparison, compare
     from dwell.study.demo import (
         canonical_demo,
@@ -40,12 +41,15 @@ __all__ = [
     "AIM",
     "SAME_RUN",
     "UNTOLD",
+    "Capacity",
+    "CapacityPoint",
     "Comparison",
     "Contender",
     "Example",
     "Family",
     "Hindsight",
     "Interval",
+    "Limiting",
     "PairedDifference",
     "PairedMedian",
     "Point",
@@ -54,6 +58,7 @@ __all__ = [
     "StudyRuns",
     "Validation",
     "canonical_demo",
+    "capacity_of",
     "compare",
     "keeps",
     "load_study",
@@ -74,6 +79,7 @@ __all__ = [
     "under",
     "untold",
     "validate",
+    "what_ifs",
     "windows_behind",
 ]
 
@@ -81,12 +87,15 @@ _HOME = {
     "AIM": "dwell.study.comparison",
     "SAME_RUN": "dwell.study.family",
     "UNTOLD": "dwell.study.family",
+    "Capacity": "dwell.study.capacity",
+    "CapacityPoint": "dwell.study.capacity",
     "Comparison": "dwell.study.comparison",
     "Contender": "dwell.study.study",
     "Example": "dwell.study.player",
     "Family": "dwell.study.family",
     "Hindsight": "dwell.study.hindsight",
     "Interval": "dwell.study.intervals",
+    "Limiting": "dwell.study.capacity",
     "PairedDifference": "dwell.study.pairs",
     "PairedMedian": "dwell.study.pairs",
     "Point": "dwell.study.study",
@@ -95,6 +104,7 @@ _HOME = {
     "StudyRuns": "dwell.study.results",
     "Validation": "dwell.study.validation",
     "canonical_demo": "dwell.study.demo",
+    "capacity_of": "dwell.study.capacity",
     "compare": "dwell.study.comparison",
     "keeps": "dwell.study.kept_bounds",
     "load_study": "dwell.study.study",
@@ -114,6 +124,7 @@ _HOME = {
     "under": "dwell.study.intervals",
     "untold": "dwell.study.family",
     "validate": "dwell.study.validation",
+    "what_ifs": "dwell.study.capacity",
 }
 
 

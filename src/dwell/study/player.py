@@ -104,6 +104,8 @@ class Player:
                 f"a worker has other software than the process that asks it: {has}, not {needs}"
             )
         take_over(self.prices)
+        if self.study.points[item.points[0]].fleet is not None:
+            return PlayedItem(tuple(self._play_fleets(item)), {})
         realisation = draw(
             self.study.points[item.points[0]].problem,
             scenario=item.scenario,
@@ -125,14 +127,35 @@ class Player:
         What is named wrongly is found before the work begins.
         """
         from dwell.sim import draw
+        from dwell.sim.fleet import simulate_fleet
 
-        problem = self.study.points[0].problem
+        first = self.study.points[0]
+        problem = first.problem
         for scenario in self.study.scenarios:
+            if first.fleet is not None:
+                fleet = replace(first.fleet, coordination="none")
+                for contender in self.study.contenders:
+                    simulate_fleet(contender.fleet(fleet, scenario), seed=0, windows=1)
+                continue
             realisation = draw(problem, scenario=scenario, seed=0, windows=1)
             alone = play_alone(problem, realisation) if self._in_hindsight else None
             for contender in self.study.contenders:
                 self._simulate(contender, 0, realisation, alone)
         self.prices.update(known_prices())
+
+    def _play_fleets(self, item: Item) -> Iterator[tuple[int, Summary]]:
+        """Yield what the fleet of every point comes to under every contender."""
+        from dwell.sim.fleet import simulate_fleet
+        from dwell.study.fleet_summary import summarise_fleet
+
+        for point in item.points:
+            fleet = self.study.points[point].fleet
+            if fleet is None:
+                continue
+            for contender in self.study.contenders:
+                played = contender.fleet(fleet, item.scenario)
+                run = simulate_fleet(played, seed=item.seed, windows=self.study.windows)
+                yield point, summarise_fleet(run, fleet, _labels(item, contender.name))
 
     def _play(
         self, point: int, item: Item, realisation: Realisation

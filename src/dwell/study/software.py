@@ -15,13 +15,14 @@ from dwell.errors import SimulationError
 from dwell.model import FrozenDict
 from dwell.model.document import to_document
 from dwell.model.user_classes import is_class_path, source_digest
+from dwell.record.fleet_run import fleet_document
 from dwell.study.study import Contender, Study
 
 #: Python sources of this package that make numbers; the kernel has a digest of its own.
 SOURCES = (
     *("control", "cost.py", "estimators", "kernels", "model", "policies", "sim"),
     "record/table_arrays.py",
-    *(f"study/{name}.py" for name in ("clairvoyant", "hindsight", "player")),
+    *(f"study/{name}.py" for name in ("clairvoyant", "fleet_summary", "hindsight", "player")),
     *(f"study/{name}.py" for name in ("quality", "reference", "runner", "script", "summary")),
 )
 
@@ -64,6 +65,7 @@ def describe(study: Study) -> dict[str, Any]:
         If a policy or an estimator is an object that does not pickle.
     """
     cells = [to_document(point.problem) for point in study.points]
+    fleets = [fleet_document(one.fleet) for one in study.points if one.fleet is not None]
     own = _own_sources(study)
     return {
         "name": study.name,
@@ -77,6 +79,7 @@ def describe(study: Study) -> dict[str, Any]:
         "points": [list(point.values.values()) for point in study.points],
         "cell": cells[0],
         "cells": hashlib.sha256(json.dumps(cells).encode()).hexdigest(),
+        **({"fleets": hashlib.sha256(json.dumps(fleets).encode()).hexdigest()} if fleets else {}),
         **({"modules": own} if own else {}),
     }
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from typing import TYPE_CHECKING
 
@@ -14,6 +14,7 @@ from dwell.cellfile.study_paths import with_settings
 from dwell.errors import SimulationError
 from dwell.model import FrozenDict, Problem
 from dwell.model.bounds import counted
+from dwell.model.fleet import Fleet
 from dwell.model.problem import Drawn
 from dwell.model.semantics import nearest
 from dwell.study.reference import CLAIRVOYANT, CLAIRVOYANT_DWELL
@@ -68,6 +69,24 @@ class Contender:
             settings["controller.estimator"] = self.estimator
         return with_settings(problem, settings) if settings else problem
 
+    def fleet(self, fleet: Fleet, scenario: str) -> Fleet:
+        """Return the fleet as this contender plays it, the first entry in a scenario.
+
+        Raises
+        ------
+        ProblemError
+            If a setting is wrong.
+        """
+        first, *others = fleet.entries
+        entries = (replace(first, scenario=scenario), *others)
+        if self.settings:
+            entries = tuple(
+                replace(one, cell=with_settings(one.cell, self.settings)) for one in entries
+            )
+        named = {"policy": self.policy, "estimator": self.estimator}
+        given = {name: one for name, one in named.items() if isinstance(one, str)}
+        return replace(fleet, entries=entries).changed(**given)
+
     def is_candidate(self, problem: Problem) -> bool:
         """Whether it is a bare candidate's placement, which never moves."""
         plain = self.estimator is None and not self.settings
@@ -83,11 +102,14 @@ class Point:
     values : mapping of str to float, int or str
         By the parameter's path in the cell.
     problem : Problem
-        With these values put in.
+        With these values put in; of a fleet the first cell.
+    fleet : Fleet, optional
+        With these values put in, where it is a point of a fleet's study.
     """
 
     values: Mapping[str, Value]
     problem: Problem
+    fleet: Fleet | None = None
 
     def __post_init__(self) -> None:
         # Numbers of arrays are no numbers to JSON.
@@ -99,6 +121,13 @@ class Point:
 
     def __repr__(self) -> str:
         return f"<Point of {self.problem.name}: {dict(self.values)}>"
+
+    @property
+    def window_cycles(self) -> int:
+        """Cycles of a window, of all cells."""
+        if self.fleet is None:
+            return self.problem.window_cycles
+        return sum(cell.problem.window_cycles for cell in self.fleet.cells)
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +195,9 @@ class Study:
             if path not in self.parameters:
                 hint = nearest(path, self.parameters)
                 raise SimulationError(f"labels: {path!r} is none of the parameters; {hint}")
+        objects = [one.name for one in self.contenders if not isinstance(one.policy, str)]
+        if objects and any(point.fleet is not None for point in self.points):
+            raise SimulationError(f"{objects[0]}: the policies of a fleet have to be named")
         reserved = [name for name in names if self.references and name in REFERENCES]
         if reserved:
             raise SimulationError(f"{reserved[0]!r} is a reference's name; choose another")
@@ -218,7 +250,7 @@ class Study:
     def cycles(self) -> int:
         """Number of cycles of all these runs."""
         pairs = len(self.scenarios) * len(self.seeds) * len(self.contenders)
-        return pairs * self.windows * sum(point.problem.window_cycles for point in self.points)
+        return pairs * self.windows * sum(point.window_cycles for point in self.points)
 
     def items(self) -> tuple[Item, ...]:
         """Return the items in the order in which they are done: all scenarios of a seed, then on.
@@ -241,9 +273,10 @@ class Study:
 
     def _drawn_alike(self) -> Iterator[tuple[int, ...]]:
         """Yield points whose realisations are the same."""
-        groups: dict[Drawn, list[int]] = {}
+        groups: dict[Drawn | int, list[int]] = {}
         for index, point in enumerate(self.points):
-            groups.setdefault(point.problem.drawn, []).append(index)
+            alike = point.problem.drawn if point.fleet is None else index
+            groups.setdefault(alike, []).append(index)
         yield from (tuple(group) for group in groups.values())
 
 
@@ -270,7 +303,7 @@ def load_study(path: str | PathLike[str]) -> Study:
     declared = read_study(path, references=REFERENCES)
     return Study(
         name=declared.name,
-        points=tuple(Point(point.values, point.problem) for point in declared.points),
+        points=tuple(Point(point.values, point.problem, point.fleet) for point in declared.points),
         scenarios=declared.scenarios,
         contenders=tuple(
             Contender(one.name, one.policy, one.estimator, one.settings)

@@ -39,9 +39,9 @@ def spread(
     units: Sequence[Unit],
     *,
     processes: int,
-    take: Callable[[Unit, Result], None],
+    take: Callable[[Unit, Result], bool | None],
 ) -> None:
-    """Do a task on every unit.
+    """Do a task on every unit, or until there is enough.
 
     Parameters
     ----------
@@ -53,7 +53,8 @@ def spread(
         How many to use; 1 stays in this one. A script that asks for more has to begin its work
         under ``if __name__ == "__main__":``, as every process imports it again.
     take : callable
-        Called in this process with each unit and its result, as soon as that is ready.
+        Called in this process with each unit and its result, as soon as that is ready. Where it
+        returns True, the units that are left are not done.
 
     Raises
     ------
@@ -62,7 +63,8 @@ def spread(
     """
     if min(processes, len(units)) <= 1:
         for unit in units:
-            take(unit, task(unit))
+            if take(unit, task(unit)):
+                break
         return
     pool = ProcessPoolExecutor(
         max_workers=min(processes, len(units)),
@@ -75,7 +77,8 @@ def spread(
             waiting = {pool.submit(_work, unit): unit for unit in units}
         for future in as_completed(waiting):
             # A future keeps its result: it is let go, so that only what is taken is kept.
-            take(waiting.pop(future), cast("Result", future.result()))
+            if take(waiting.pop(future), cast("Result", future.result())):
+                break
     except BrokenProcessPool:
         raise SimulationError(
             "a worker process ended before its work was done: out of memory, killed, or a script "

@@ -1,0 +1,513 @@
+"""`dwell fleet`: cells that share nodes, played together; how many of them there may be."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+import dwell
+from dwell.cli.completion import estimators, policies
+from dwell.cli.options import Json, Processes, Seed
+from dwell.cli.output import (
+    aligned,
+    block,
+    file_name,
+    print_json,
+    progress,
+    warn,
+    working,
+    write_report,
+)
+from dwell.cli.run import default_folder
+from dwell.display import milliseconds
+from dwell.errors import ExitCode, Fault
+from dwell.model.bounds import counted
+
+if TYPE_CHECKING:
+    from dwell.model.fleet import Fleet
+    from dwell.record import FleetRun
+    from dwell.study.capacity import Capacity, WhatIf
+    from dwell.study.fleet_plan import FleetPlan
+    from dwell.study.intervals import Interval
+
+#: Cells, and rounds, that the terminal shows, and columns that time has there.
+SHOWN, TIMES = 24, 40
+
+fleet = typer.Typer(
+    no_args_is_help=True,
+    help="Play cells that share nodes, and find out how many of them there may be.",
+)
+
+FleetArgument = Annotated[Path, typer.Argument(metavar="FILE", help="Fleet file (YAML).")]
+Policy = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help="Policy of every cell, as dtp or cusum+corrected, or a candidate's name for the "
+        "placement that never moves; what the file says if not given.",
+        autocompletion=policies,
+    ),
+]
+Estimator = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help="Estimator of every cell; what the file says if not given.",
+        autocompletion=estimators,
+    ),
+]
+Coordination = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help="What a move is asked for: none, random or ledger; what the file says if not given.",
+    ),
+]
+Phases = Annotated[
+    str | None,
+    typer.Option(
+        metavar="HOW",
+        help="When each cell begins: sync, even, random, or so many ms with commas between; what "
+        "the file says if not given.",
+    ),
+]
+
+
+@fleet.command()
+def run(
+    file: FleetArgument,
+    seed: Seed = 1,
+    windows: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Length in windows, the warm-up included.")
+    ] = 100,
+    policy: Policy = None,
+    estimator: Estimator = None,
+    coordination: Coordination = None,
+    phases: Phases = None,
+    guard: Annotated[
+        bool, typer.Option("--guard", help="Let the robots' guards move to a fallback.")
+    ] = False,
+    jobs: Annotated[bool, typer.Option("--jobs", help="Keep every job's instants.")] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Where to save the runs; runs/FLEET-POLICY-COORDINATION-PHASES-SEED if not given.",
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Simulate the cells of a fleet together, save a run a cell, sum them up."""
+    from dwell.record.fleet_run import describe_fleet, require_free_or_same
+    from dwell.sim.fleet import phases_ms
+
+    given = dwell.load_fleet(file)
+    warn(file, warnings_of(given))
+    played = given.changed(
+        policy=policy, estimator=estimator, coordination=coordination, phases=read_phases(phases)
+    )
+    how = played.phases if isinstance(played.phases, str) else "listed"
+    named = [one for one in (policy, estimator) if one is not None]
+    folder = out or default_folder(played.name, *named, played.coordination, how, str(seed))
+    settings = {"seed": seed, "guard": guard, "windows": windows, "versions": None}
+    offsets = phases_ms(played, seed)
+    require_free_or_same(folder, describe_fleet(played, phases=offsets, **settings))
+    cells = counted(len(played.cells), "cell")
+    try:
+        with progress(f"simulating {cells}, {counted(windows, 'window')} of each") as shown:
+            result = dwell.simulate_fleet(
+                played, seed=seed, windows=windows, guard=guard, jobs=jobs, progress=shown
+            )
+        with working(f"writing {cells}"):
+            result.save(folder)
+    except KeyboardInterrupt:
+        whole = sum((folder / cell.name / "run.json").is_file() for cell in played.cells)
+        typer.echo(
+            f"interrupted: {whole} of {len(played.cells)} runs are whole in {folder}; the same "
+            "command makes them all",
+            err=True,
+        )
+        raise typer.Exit(ExitCode.INTERRUPTED) from None
+    summary = _summed_up(result)
+    if as_json:
+        print_json({**_head(result, windows), "run": folder, **summary})
+    else:
+        typer.echo(_text(result, windows, summary))
+        typer.echo(f"\nsaved to {folder}")
+
+
+@fleet.command()
+def plan(file: FleetArgument, seed: Seed = 1, phases: Phases = None, as_json: Json = False) -> None:
+    """Find where the cells are best placed while their scenarios go on, all at once.
+
+    Φ of the table of loads is least there; what the placements come to is played.
+    """
+    from dwell.study.fleet_plan import plan_fleet
+
+    given = dwell.load_fleet(file)
+    warn(file, warnings_of(given))
+    planned = given.changed(phases=read_phases(phases))
+    with progress(f"playing loads of {counted(len(planned.cells), 'cell')}") as shown:
+        found = plan_fleet(planned, seed=seed, progress=shown)
+    if as_json:
+        head = {"fleet": planned.name, "seed": seed, "phases": planned.phases}
+        print_json(head | found.as_json())
+        return
+    typer.echo(_plan_text(planned, found, seed))
+
+
+@fleet.command()
+def capacity(
+    file: FleetArgument,
+    limit: Annotated[
+        float,
+        typer.Option(metavar="SHARE", help="V_D that the worst cell may have at most."),
+    ] = 0.05,
+    policy: Policy = None,
+    phases: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HOW",
+            help="When each cell begins: sync, even or random; what the file says if not given.",
+        ),
+    ] = None,
+    most: Annotated[
+        int, typer.Option(min=1, max=1000, metavar="N", help="Robots beyond are not asked for.")
+    ] = 128,
+    what_if: Annotated[
+        bool,
+        typer.Option(
+            "--what-if",
+            help="Also with a core more on a shared node, with phases evenly spread, and on every "
+            "other placement that uses a shared node.",
+        ),
+    ] = False,
+    processes: Processes = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Page to write; capacity/FLEET-POLICY-PHASES.html if not given, none with --json.",
+        ),
+    ] = None,
+    figures: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Also write the curve for a paper: PDF, SVG, CSV."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Find how many robots a fleet may have, so that no cell misses more than a limit.
+
+    The count of the first entry is varied, the others stay: 10 seeds of 2,000 cycles a cell each.
+    """
+    from dwell.report.capacity_page import capacity_page
+    from dwell.study.capacity import WhatIf, capacity_of, what_ifs
+
+    if not 0 < limit < 1:
+        raise typer.BadParameter(f"--limit: {limit:g} is not allowed; it must be between 0 and 1")
+    given = dwell.load_fleet(file)
+    warn(file, warnings_of(given))
+    asked = given.changed(policy=policy, phases=read_phases(phases))
+    settings: dict[str, Any] = {"limit": limit, "most": most, "processes": processes}
+    with progress(f"playing up to {most} robots") as shown:
+        found = capacity_of(asked, **settings, progress=shown)
+    changes = []
+    # Numbers of robots compare where the limit is on the same.
+    settings["on_excess"] = found.limit_on == "excess"
+    for change, changed in what_ifs(asked) if what_if else ():
+        with progress(f"what if: {change}") as shown:
+            changes.append(WhatIf(change, capacity_of(changed, **settings, progress=shown)))
+    page = out
+    if page is None and not as_json:
+        page = Path("capacity", file_name(f"{asked.name}-{found.policy}-{found.phases}.html"))
+    if page is not None or figures is not None:
+        shown_page = capacity_page(asked.name, found, changes)
+        with working("writing the report"):
+            write_report(shown_page, page, figures=figures, static=False)
+    if as_json:
+        more = {"what_if": [one.as_json() for one in changes]} if what_if else {}
+        print_json({"fleet": asked.name, **found.as_json(), **more, "report": page})
+        return
+    typer.echo(_capacity_text(asked, found, changes))
+    typer.echo(f"\nreport: {page}")
+    if figures is not None:
+        typer.echo(f"figures: {figures}")
+
+
+def _plan_text(of: Fleet, found: FleetPlan, seed: int) -> str:
+    phases = of.phases if isinstance(of.phases, str) else "listed"
+    counts = Counter(found.placements.values())
+    placed = ", ".join(f"{count} on {name}" for name, count in counts.most_common())
+    rows = [
+        [
+            name,
+            found.placements[name],
+            f"{qos.violation_rate * 100:.2f}",
+            milliseconds(qos.l95_ms, 2),
+        ]
+        for name, qos in sorted(
+            found.cells.items(), key=lambda one: one[1].violation_rate, reverse=True
+        )
+    ]
+    lines = [
+        f"{of.name}: {counted(len(found.placements), 'cell')}; phases: {phases}; seed {seed}",
+        f"best: {placed}",
+        f"Φ/n   {found.phi:.3f} as played, {found.table_phi:.3f} by the table of loads",
+        "",
+        aligned(["cell, the worst first", "placement", "V_D (%)", "L95 (ms)"], rows[:SHOWN]),
+    ]
+    if len(rows) > SHOWN:
+        lines.append(f"{len(rows) - SHOWN} more, with fewer misses, are in --json")
+    return "\n".join(lines)
+
+
+def read_phases(text: str | None) -> str | tuple[float, ...] | None:
+    """Return what an option says of phases: a word, or a number a cell."""
+    if text is None:
+        return None
+    try:
+        return tuple(float(one) for one in text.split(","))
+    except ValueError:
+        return text
+
+
+def warnings_of(of: Fleet) -> Iterator[Fault]:
+    """Yield what is allowed in a fleet and seldom meant."""
+    for name in of.unused():
+        yield Fault(f"shared.{name}", "no candidate of any cell uses this node")
+
+
+def _head(result: FleetRun, windows: int) -> dict[str, Any]:
+    fleet = result.fleet
+    return {
+        "fleet": fleet.name,
+        "seed": result.seed,
+        "windows": windows,
+        "coordination": fleet.coordination,
+        "phases": fleet.phases,
+        "phases_ms": result.phases_ms,
+        "guard": result.guard,
+    }
+
+
+def _summed_up(result: FleetRun) -> dict[str, Any]:
+    """Return what a fleet comes to: its cells, the worst first, its shared nodes and its moves."""
+    import polars as pl
+
+    windows = result.windows.filter(~pl.col("warmup"))
+    means = windows.group_by("cell").agg(
+        pl.col("violation_rate", "seen_l95_ms", "cost").mean(),
+    )
+    moved = result.decisions.filter(pl.col("migrated"))
+    moves = dict(moved.group_by("cell").len().iter_rows())
+    by_guard = moved.filter(pl.col("reason") == "guard").height
+    cells = [
+        {
+            "cell": row["cell"],
+            "violation_rate": row["violation_rate"],
+            "l95_ms": _known(row["seen_l95_ms"]),
+            "cost": _known(row["cost"]),
+            "moves": moves.get(row["cell"], 0),
+        }
+        for row in means.sort("violation_rate", "cell", descending=[True, False]).to_dicts()
+    ]
+    load = {
+        name.removeprefix("u_"): {"mean": values.mean(), "most": values.max()}
+        for name, values in result.load.to_dict().items()
+        if name.startswith("u_") and len(values)
+    }
+    return {
+        "cells": cells,
+        "cost": _known(means["cost"].mean()),
+        "load": load,
+        "moves": moved.height,
+        "guard_moves": by_guard,
+        "refused": _refused(result),
+        "rounds": _rounds(result),
+    }
+
+
+def _refused(result: FleetRun) -> dict[str, int]:
+    """Return how many moves were refused, by who refused them: ``ledger``, ``cap``, ``chance``."""
+    if "refused" not in result.decisions.columns:
+        return {}
+    # ``SO: ledger: Φ would rise by 0.2``, ``SO: cap of canonical-07``
+    whys = result.decisions["refused"].drop_nulls().to_list()
+    return dict(Counter(why.partition(": ")[2].split()[0].rstrip(":") for why in whys))
+
+
+def _known(mean: object) -> float:
+    """Return a mean; NaN where the controller saw no window."""
+    return mean if isinstance(mean, float) else math.nan
+
+
+def _rounds(result: FleetRun) -> list[dict[str, Any]]:
+    """Return Φ before and after every round in which the ledger was asked."""
+    import polars as pl
+
+    decisions = result.decisions
+    if not {"round", "phi_before", "phi_after"} <= set(decisions.columns):
+        return []
+    asked = decisions.filter(pl.col("phi_before").is_not_null())
+    rounds = asked.group_by("round", maintain_order=True).agg(
+        pl.col("phi_before").first(),
+        pl.col("phi_after").last(),
+        pl.col("cell").filter(pl.col("migrated")).alias("moved"),
+    )
+    return rounds.sort("round").to_dicts()
+
+
+# --------------------------------------------------------------------------- on a terminal
+
+
+def _text(result: FleetRun, windows: int, summary: Mapping[str, Any]) -> str:
+    fleet = result.fleet
+    shared = ", ".join(fleet.shared) or "nothing"
+    phases = fleet.phases if isinstance(fleet.phases, str) else "listed"
+    lines = [
+        f"{fleet.name}: {counted(len(result.cells), 'cell')}; shared: {shared}; phases: {phases}; "
+        f"coordination: {fleet.coordination}; seed {result.seed}; {counted(windows, 'window')}",
+        "",
+        *_cells(result, summary["cells"]),
+        "",
+        *_nodes(result, summary["load"]),
+        f"mean J: {summary['cost']:.3f}",
+        f"moves: {summary['moves']}, of guards {summary['guard_moves']}{_told(summary['refused'])}",
+        *_round_lines(summary["rounds"]),
+    ]
+    return "\n".join(lines)
+
+
+def _told(refused: Mapping[str, int]) -> str:
+    listed = ", ".join(f"{count} by {who}" for who, count in refused.items())
+    return f"; refused: {listed}" if listed else ""
+
+
+def _cells(result: FleetRun, cells: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Yield the table of cells, with where each is over time."""
+    candidates = dict.fromkeys(
+        name for entry in result.fleet.entries for name in entry.cell.candidates
+    )
+    letters = _letters(candidates)
+    legend = ", ".join(f"{letter} {name}" for name, letter in letters.items())
+    rows = [
+        [
+            str(row["cell"]),
+            f"{row['violation_rate'] * 100:.2f}",
+            milliseconds(row["l95_ms"], 2),
+            f"{row['cost']:.3f}",
+            str(row["moves"]),
+            "".join(letters[name] for name in _placements(result, str(row["cell"]))),
+        ]
+        for row in cells[:SHOWN]
+    ]
+    if not rows:
+        yield "no window is after the warm-up: nothing to sum up; ask for more"
+        return
+    head = ["cell, the worst first", "V_D (%)", "L95 (ms)", "J", "moves", "where over time"]
+    yield aligned(head, rows)
+    if len(cells) > SHOWN:
+        yield f"{len(cells) - SHOWN} more, with fewer misses, are in the folder"
+    yield f"where: {legend}; V_D, L95 and J leave the warm-up out"
+
+
+def _letters(names: Iterable[str]) -> dict[str, str]:
+    """Return a letter for each of some names: one of its own, if there is one left."""
+    letters: dict[str, str] = {}
+    for name in names:
+        free = (sign for sign in (*name.upper(), *"0123456789", "?") if sign.isalnum())
+        letters[name] = next((sign for sign in free if sign not in letters.values()), "?")
+    return letters
+
+
+def _placements(result: FleetRun, cell: str) -> list[str]:
+    """Return where a cell is over time, in at most so many columns as are shown."""
+    placed = result.cells[cell].windows["placement"].to_list()
+    count = min(len(placed), TIMES)
+    return [str(placed[i * len(placed) // count]) for i in range(count)]
+
+
+def _nodes(result: FleetRun, load: Mapping[str, Mapping[str, float]]) -> Iterator[str]:
+    """Yield the table of shared nodes, with their load over time."""
+    rows = []
+    for name, shares in load.items():
+        values = result.load[f"u_{name}"].to_list()
+        count = min(len(values), TIMES)
+        parts = [
+            values[i * len(values) // count : (i + 1) * len(values) // count] for i in range(count)
+        ]
+        line = "".join(block(sum(part) / len(part)) for part in parts)
+        rows.append([name, f"{shares['mean'] * 100:.1f}", f"{shares['most'] * 100:.1f}", line])
+    if rows:
+        yield aligned(["shared", "mean (%)", "most (%)", "busy over time"], rows)
+
+
+def _round_lines(rounds: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    moving = [one for one in rounds if one["moved"]]
+    for one in moving[:SHOWN]:
+        moved = ", ".join(one["moved"])
+        phi = f"Φ {one['phi_before']:.3f} to {one['phi_after']:.3f}"
+        yield f"round {one['round']}: {phi}; {moved}"
+    if len(moving) > SHOWN:
+        yield f"{len(moving) - SHOWN} more rounds moved cells"
+
+
+def _capacity_text(of: Fleet, found: Capacity, changes: Sequence[WhatIf]) -> str:
+    from dwell.report.capacity_page import written
+
+    limits = found.limits
+    excess = " beyond that of one cell" if found.limit_on == "excess" else ""
+    low, high = found.interval
+    facts = [
+        ("robots", f"{written(found)} [{low}, {high}]"),
+        ("limit", f"V_D of the worst cell{excess}: {found.limit * 100:g} %"),
+        ("played", f"{found.policy}, phases {found.phases}"),
+    ]
+    if limits is not None:
+        share = f"{limits.share:.0%} of what cycles that missed have waited"
+        facts.append(("what limits", f"{limits.kind} {limits.name}, {share}"))
+    if found.reason:
+        facts.append(("why none", found.reason))
+    width = max(len(name) for name, _ in facts)
+    scale = 2 * found.bound
+    rows = [
+        [
+            str(point.robots),
+            f"{point.violation_rate.value * 100:.2f}",
+            _ends(point.violation_rate),
+            _bar(point.violation_rate.value / scale),
+        ]
+        for point in found.curve
+    ]
+    lines = [
+        f"{of.name}: {', '.join(of.shared)} shared by {of.entries[0].cell.name}",
+        *(f"{name.ljust(width)}  {value}" for name, value in facts),
+        "",
+        aligned(
+            ["robots", "V_D (%)", "95 % interval", f"{'the limit'.rjust(TIMES // 2 + 4)}"], rows
+        ),
+    ]
+    if changes:
+        table = [
+            [one.change, written(one.capacity), "[{}, {}]".format(*one.capacity.interval)]
+            for one in changes
+        ]
+        lines += ["", aligned(["what if", "robots", "95 % interval"], table)]
+    return "\n".join(lines)
+
+
+def _ends(rate: Interval) -> str:
+    return f"[{rate.low * 100:.2f}, {rate.high * 100:.2f}]" if rate.known else "-"
+
+
+def _bar(share: float) -> str:
+    """Return a bar that reaches the limit in the middle, where a stroke stands."""
+    filled = min(round(share * TIMES), TIMES)
+    signs = ["█" if place < filled else " " for place in range(TIMES)]
+    middle = TIMES // 2
+    return "".join([*signs[:middle], "│", *signs[middle:]])

@@ -1,0 +1,402 @@
+"""Ledger: who of a fleet is where, and which move is good for all.
+
+Closes are looked at one after another. What cells know of themselves (their *presents*, see
+`dwell.estimators.presents`) and where they are is frozen from one close to the next; a cell that
+may move is asked for if something of it is new. A table of loads says which of its candidates are
+worth a look; then the fleet is played as it is and as it would be, on the same draws. The move is
+made if
+
+* Φ as played falls by more than the mover owes, Δ_min + α_S·S, and
+* no cell comes over a cap that it was under.
+
+A move counts from then on, before any window shows it. Under given presents Φ is a function of the
+placements alone, and every move lowers it by more than the least Δ_min: the number of moves is
+finite, whatever the table says, and at most (Φ at first − least Φ) / least Δ_min.
+
+What is lowered is the sum of the cells' costs; or the worst of them: costs are rounded up to
+multiples of the least Δ_min and sorted from the largest, the smaller list is the better one, and
+of equal lists that with the smaller sum.
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.control.coordination import Coordination, Verdict, Wish
+from dwell.cost import excess, hamming
+from dwell.estimators.fleet_prices import CellTerms, FleetPrice, FleetPrices, PricedCell
+from dwell.estimators.load_table import LoadTable, load_table
+from dwell.estimators.presents import Present
+from dwell.estimators.prices import prices_of
+from dwell.estimators.protocol import CellEstimator
+from dwell.model import Caps, Decision, QoS
+from dwell.model.fleet import FleetObjective
+
+__all__ = ["FleetLedger", "Loads", "PricedCell", "Seat"]
+
+#: So many of a cell's candidates are played at a close, those that the table thinks best of.
+LOOKS = 2
+
+
+class FleetLedger:
+    """Knows where all cells of a fleet are, and lets them move where that is good for all.
+
+    Parameters
+    ----------
+    cells : sequence of PricedCell
+    shared : sequence of str
+        Nodes that are one computer for all cells.
+    objective : {"sum", "worst"}
+    table : LoadTable, optional
+        What proposes; made of the cells where None.
+    prices : FleetPrices, optional
+        What plays.
+    progress : callable, optional
+        Told how many of how many levels of the table have been played.
+
+    Attributes
+    ----------
+    placements : list of str
+        Where every cell is.
+    presents : list of Present
+        What each cell knows of itself.
+    alone : list of mapping of str to float
+        By cell and candidate, J where no other cell is there, without switching and shared nodes.
+    loads : Loads
+        The table, added up.
+    round : int
+        Number of the round: of the closes since the fleet was last played.
+    """
+
+    def __init__(
+        self,
+        cells: Sequence[PricedCell],
+        shared: Sequence[str],
+        objective: FleetObjective = "sum",
+        *,
+        table: LoadTable | None = None,
+        prices: FleetPrices | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        self.cells, self.shared, self.objective = tuple(cells), tuple(shared), objective
+        problems = [cell.problem for cell in cells]
+        self.table = load_table(cells, shared, progress) if table is None else table
+        self.prices = prices or FleetPrices(cells, shared)
+        self.loads = Loads(self.table)
+        self._terms = [CellTerms(problem, shared) for problem in problems]
+        self.placements = [problem.initial for problem in problems]
+        self._at = self.loads.at(self.placements)
+        self.alone = [
+            {name: terms.cost(price.qos) for name, price in prices_of(problem).items()}
+            for problem, terms in zip(problems, self._terms, strict=True)
+        ]
+        self.presents = [Present()] * len(self.cells)
+        self._revisions = [-1] * len(self.cells)
+        self._has_caps = any(problem.objective.caps != Caps() for problem in problems)
+        self._least = min(problem.controller.min_improvement for problem in problems)
+        names = sorted(cell.name for cell in cells)
+        #: Place of each cell where they take turns, and how long one is.
+        self.order = [names.index(cell.name) for cell in cells]
+        self.turn_ns = max(
+            round(problem.window_cycles * problem.pipeline.period_ms * 1e6) for problem in problems
+        )
+        #: How often any cell has moved; and of each cell what it was when it was looked at.
+        self._moves = 0
+        self._looked = [(-1, -1)] * len(self.cells)
+        self._refusals: list[dict[str, str]] = [{} for _ in self.cells]
+        self.round = 0
+
+    def __repr__(self) -> str:
+        return f"<FleetLedger of {len(self.cells)} cells: round {self.round}>"
+
+    def place(self, index: int, name: str) -> None:
+        """Take note of where a cell is."""
+        if name != self.placements[index]:
+            self.placements[index] = name
+            self._at = self.loads.at(self.placements)
+            self._moves += 1
+
+    def note(self, index: int, estimates: Mapping[str, QoS], estimator: CellEstimator) -> None:
+        """Take note of what a cell knows of itself, where that is new."""
+        revision = estimator.revision
+        if revision == self._revisions[index]:
+            return
+        self._revisions[index] = revision
+        self.alone[index] = {name: self._terms[index].cost(qos) for name, qos in estimates.items()}
+        if estimator.present is not None:
+            self.presents[index] = estimator.present
+
+    def consider(self, index: int, decision: Decision, *, by_price: bool) -> Verdict:
+        """Say where a cell is to be that its policy has decided on (see `Wish`)."""
+        wished = decision.name
+        state = self._moves, self._revisions[index]
+        if self._looked[index] != state:
+            self._looked[index] = state
+            self._refusals[index] = {}
+        elif not decision.migrated or wished in self._refusals[index]:
+            return self._refused(index, wished)
+        if not by_price:
+            names = [wished] if decision.migrated else []
+        elif decision.costs and decision.reason != "dwell":
+            names = self._promising(index)
+        else:
+            # It may be looked at again as soon as it is free to move.
+            self._looked[index] = -1, -1
+            return self._refused(index, wished)
+        asked: tuple[float, float] | None = None
+        for name in names:
+            before, after = self._played(index, name)
+            asked = before.phi, after.phi
+            why = self._objection(index, name, before, after)
+            if why is None:
+                verdict = Verdict(name, None, (*asked, self.round))
+                self.round += 1
+                self.place(index, name)
+                return verdict
+            self._refusals[index][name] = why
+        verdict = self._refused(index, wished, asked)
+        self.round += asked is not None
+        return verdict
+
+    def _refused(
+        self, index: int, wished: str, asked: tuple[float, float] | None = None
+    ) -> Verdict:
+        here = self.placements[index]
+        why = None
+        if wished != here:
+            why = self._refusals[index].get(wished, "ledger: Φ would not fall")
+        return Verdict(here, why, (*(asked or (None, None)), self.round))
+
+    def _promising(self, index: int) -> list[str]:
+        """Candidates by which the table's Φ falls by more than is owed; best first."""
+        found = []
+        for name in self.cells[index].problem.candidates:
+            if name != self.placements[index]:
+                rise = self.loads.rise(self._at, index, self.placements[index], name)
+                rise += self.alone[index][name] - self.alone[index][self.placements[index]]
+                if -rise > self.owed(index, name) or self._helps_the_worst(index, name):
+                    found.append((rise, name))
+        return [name for _, name in sorted(found)[:LOOKS]]
+
+    def _helps_the_worst(self, index: int, name: str) -> bool:
+        """Whether the table thinks so."""
+        if self.objective != "worst":
+            return False
+        before = self.loads.costs(self.placements, self.alone)
+        after = self.loads.costs(self._with(index, name), self.alone)
+        return self._from_the_worst(after) < self._from_the_worst(before)
+
+    def _with(self, index: int, name: str) -> list[str]:
+        return [*self.placements[:index], name, *self.placements[index + 1 :]]
+
+    def owed(self, index: int, name: str) -> float:
+        """What Φ has to fall by at least for a cell to move: Δ_min + α_S·S."""
+        problem = self.cells[index].problem
+        here, there = problem.candidates[self.placements[index]], problem.candidates[name]
+        weight = problem.objective.weights.switching
+        return problem.controller.min_improvement + weight * hamming(there, here)
+
+    def _played(self, index: int, name: str) -> tuple[FleetPrice, FleetPrice]:
+        self.prices.begin(self.presents)
+        before = self.prices.price(tuple(self.placements))
+        return before, self.prices.price(tuple(self._with(index, name)))
+
+    def _objection(
+        self, index: int, name: str, before: FleetPrice, after: FleetPrice
+    ) -> str | None:
+        """Why a cell must not move, by what has been played."""
+        costs = [*before.costs, before.shared], [*after.costs, after.shared]
+        if not self._is_better(*costs, self.owed(index, name)):
+            rises = after.phi - before.phi
+            if rises > 0:
+                return f"ledger: Φ would rise by {rises:.3g}"
+            return f"ledger: Φ would fall by {-rises:.3g}, {self.owed(index, name):.3g} is owed"
+        if self._has_caps:
+            for cell, one, other in zip(self.cells, before.cells, after.cells, strict=True):
+                caps = cell.problem.objective
+                if one and other and excess(one.qos, caps) <= 0 < excess(other.qos, caps):
+                    return f"cap of {cell.name}"
+        return None
+
+    def _is_better(self, before: Sequence[float], after: Sequence[float], owed: float) -> bool:
+        if self.objective == "worst":
+            one, other = self._from_the_worst(before), self._from_the_worst(after)
+            if one != other:
+                return other < one
+        return sum(before) - sum(after) > owed
+
+    def _from_the_worst(self, costs: Sequence[float]) -> list[int]:
+        """Costs of cells in steps of the least Δ_min, the largest first."""
+        step = self._least or 1e-9
+        return sorted((math.ceil(cost / step) for cost in costs[: len(self.cells)]), reverse=True)
+
+
+class Seat(Coordination):
+    """A cell's place in a ledger."""
+
+    knows_others: ClassVar[bool] = True
+
+    def __init__(self, ledger: FleetLedger, index: int) -> None:
+        self.ledger, self._index = ledger, index
+
+    def __repr__(self) -> str:
+        return f"<Seat of {self.ledger.cells[self._index].name}>"
+
+    def meet(self, estimator: CellEstimator) -> None:
+        """Have the estimator take notice of the fleet."""
+        if len(self.ledger.cells) > 1:
+            estimator.share(self.ledger.shared, len(self.ledger.cells))
+
+    def turns(self, release_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether it is the cell's turn at each cycle: one window after another, by name."""
+        ledger = self.ledger
+        turn = release_ns // ledger.turn_ns % len(ledger.cells)
+        return np.equal(turn, ledger.order[self._index])
+
+    def place(self, name: str) -> None:
+        """Take note of where the cell is."""
+        self.ledger.place(self._index, name)
+
+    def consider(self, wish: Wish) -> Verdict:
+        """Have the ledger look at what the policy has decided."""
+        self.ledger.place(self._index, wish.incumbent)
+        self.ledger.note(self._index, wish.estimates, wish.estimator)
+        return self.ledger.consider(self._index, wish.decision, by_price=wish.by_price)
+
+
+class AtLoad(NamedTuple):
+    """What placements come to on shared resources.
+
+    Parameters
+    ----------
+    loads : mapping of str to float
+        Cores, or places, that are kept busy, by resource.
+    waiting : mapping of (kind, candidate) to int
+        How many cells there are of each that has work there.
+    """
+
+    loads: Mapping[str, float]
+    waiting: Mapping[tuple[int, str], int]
+
+
+class Loads:
+    """Costs of a fleet's cells at any placements, as a table of loads has them."""
+
+    def __init__(self, table: LoadTable) -> None:
+        self._kinds, self._work = table.kinds, table.work
+        #: Loads and what J is more there, by kind and candidate.
+        self._waits: dict[tuple[int, str], tuple[list[float], list[float]]] = {}
+        for group, column in table.columns.items():
+            objective = table.cells[group[0]].problem.objective
+            weights = objective.weights
+            j = weights.latency * column.l95_ms / objective.targets.latency_ms
+            j = j + weights.violations * column.violation_rate
+            self._waits[group] = column.level.tolist(), (j - j[0]).tolist()
+        terms = [CellTerms(cell.problem, table.shared).of_one() for cell in table.cells]
+        #: What a busy core, or place, of each shared resource costs the fleet.
+        self._of_one = {
+            name: sum(one.get(name, 0.0) for one in terms) / len(terms)
+            for name in dict.fromkeys(name for work in self._work for name, _ in work.values())
+        }
+
+        self._filling = {
+            name: [group for group in self._waits if self.resource(*group) == name]
+            for name in self._of_one
+        }
+
+    def __repr__(self) -> str:
+        return f"<Loads of {len(self._kinds)} cells on {', '.join(self.resources) or 'nothing'}>"
+
+    @property
+    def resources(self) -> tuple[str, ...]:
+        """Resources of shared nodes that any candidate fills most."""
+        return tuple(self._of_one)
+
+    def most(self, resource: str) -> float:
+        """Work that all cells together may have for a resource: cores, or places."""
+        return sum(
+            max((work for where, work in of.values() if where == resource), default=0.0)
+            for of in self._work
+        )
+
+    def group(self, index: int, name: str) -> tuple[int, str]:
+        """Cells that wait alike: the kind of a cell, and a candidate."""
+        return self._kinds[index], name
+
+    def resource(self, index: int, name: str) -> str | None:
+        """Shared resource that a cell's candidate fills most."""
+        return self._work[index].get(name, (None, 0.0))[0]
+
+    def work(self, index: int, name: str) -> float:
+        """How much of it."""
+        return self._work[index].get(name, (None, 0.0))[1]
+
+    def wait(self, index: int, name: str, load: float) -> float:
+        """What J of a cell's candidate grows by at a load of its shared resource."""
+        of = self._waits.get(self.group(index, name))
+        return 0.0 if of is None else _between(load, *of)
+
+    def at(self, placements: Sequence[str]) -> AtLoad:
+        """Add up what placements come to."""
+        loads, waiting = dict.fromkeys(self._of_one, 0.0), Counter[tuple[int, str]]()
+        for i, name in enumerate(placements):
+            if name in self._work[i]:
+                resource, work = self._work[i][name]
+                loads[resource] += work
+                waiting[self.group(i, name)] += 1
+        return AtLoad(loads, waiting)
+
+    def rise(self, at: AtLoad, index: int, here: str, there: str) -> float:
+        """What Φ rises by, but for J alone, where a cell goes from one candidate to another."""
+        loads = dict(at.loads)
+        for name, sign in ((here, -1.0), (there, 1.0)):
+            if name in self._work[index]:
+                resource, work = self._work[index][name]
+                loads[resource] += sign * work
+        of_here, of_there = self.group(index, here), self.group(index, there)
+        rise = 0.0
+        for resource, load in loads.items():
+            before = at.loads[resource]
+            rise += self._of_one[resource] * (load - before)
+            for group in self._filling[resource]:
+                count = at.waiting[group]
+                if group == of_here:
+                    rise -= _between(before, *self._waits[group])
+                    count -= 1
+                elif group == of_there:
+                    rise += _between(load, *self._waits[group])
+                if count and load != before:
+                    waits = self._waits[group]
+                    rise += count * (_between(load, *waits) - _between(before, *waits))
+        return rise
+
+    def costs(self, placements: Sequence[str], alone: Sequence[Mapping[str, float]]) -> list[float]:
+        """J of every cell, without switching; then what shared resources cost.
+
+        Parameters
+        ----------
+        alone : sequence of mapping of str to float
+            J of every candidate of each cell where no other is there.
+        """
+        loads = self.at(placements).loads
+        costs = [
+            mine[name] + self.wait(i, name, loads.get(self.resource(i, name) or "", 0.0))
+            for i, (name, mine) in enumerate(zip(placements, alone, strict=True))
+        ]
+        return [*costs, sum(self._of_one[one] * load for one, load in loads.items())]
+
+
+def _between(x: float, xs: Sequence[float], ys: Sequence[float]) -> float:
+    """Interpolate; beyond an end it is as there."""
+    i = bisect.bisect_right(xs, x)
+    if i == 0 or i == len(xs):
+        return ys[max(i - 1, 0)]
+    x0, x1, y0, y1 = xs[i - 1], xs[i], ys[i - 1], ys[i]
+    return y0 + (y1 - y0) * (x - x0) / (x1 - x0)

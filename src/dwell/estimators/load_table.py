@@ -1,0 +1,170 @@
+"""Load table: what candidates of a fleet's cells come to by how loaded a shared node is.
+
+Of every kind of cell and every candidate that uses a shared node, one cell after another is played
+on it together, until all cells of the fleet are there: those of the kind first, the others beside
+them on what they have most work with. The table says what would be worth a look; Φ itself is
+played (see `dwell.estimators.fleet_prices`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.estimators.fleet_prices import FleetPrices, PricedCell
+from dwell.estimators.prices import prices_of
+from dwell.model.problem import Problem
+
+Floats: TypeAlias = NDArray[np.float64]
+
+#: Cycles of a cell that are played at each level.
+CYCLES = 3_000
+#: How many fleets are remembered.
+KEPT = 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadColumn:
+    """A candidate of a kind of cell, by the load of the shared resource that it fills most.
+
+    Parameters
+    ----------
+    level : float64 array, shape (levels,)
+        Cores, or places, that all cells keep busy there, ascending; the first is that of one cell.
+    l95_ms, violation_rate : float64 array, shape (levels,)
+        Mean over the cells of the kind.
+    l95_error_ms, violation_error : float64 array, shape (levels,)
+        Their standard errors.
+    """
+
+    level: Floats
+    l95_ms: Floats
+    violation_rate: Floats
+    l95_error_ms: Floats
+    violation_error: Floats
+
+    def __repr__(self) -> str:
+        return f"<LoadColumn: {len(self.level)} levels up to {self.level[-1]:.3g} cores>"
+
+
+class LoadTable:
+    """What candidates come to by load.
+
+    Parameters
+    ----------
+    cells : sequence of PricedCell
+    shared : sequence of str
+    progress : callable, optional
+        Told how many of how many levels have been played.
+
+    Attributes
+    ----------
+    kinds : tuple of int
+        Kind of each cell: the first one that is as it is, but for its phase.
+    work : tuple of mapping of str to (resource, work)
+        By cell and candidate, the resource of a shared node that it fills most: the CPU, or a kind
+        of accelerators; and how many cores, or places, it keeps busy.
+    columns : mapping of (kind, candidate) to LoadColumn
+    """
+
+    def __init__(
+        self,
+        cells: Sequence[PricedCell],
+        shared: Sequence[str],
+        *,
+        cycles: int = CYCLES,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        self.cells, self.shared = tuple(cells), tuple(shared)
+        self.kinds = kinds_of(cells)
+        self.work = tuple(_work(cell.problem, shared) for cell in cells)
+        plays = FleetPrices(cells, shared, cycles * len(cells))
+        asked = [(kind, name) for kind in dict.fromkeys(self.kinds) for name in self.work[kind]]
+        self.columns: dict[tuple[int, str], LoadColumn] = {}
+        done, levels = 0, len(asked) * sum(map(bool, self.work))
+        for group in asked:
+            rows = []
+            for row in self._levels(plays, *group):
+                rows.append(row)
+                done += 1
+                if progress is not None:
+                    progress(done, levels)
+            level, l95_ms, rate, l95_error_ms, error = np.array(rows, float).T
+            self.columns[group] = LoadColumn(level, l95_ms, rate, l95_error_ms, error)
+
+    def __repr__(self) -> str:
+        return f"<LoadTable: {len(self.cells)} cells, {len(self.columns)} candidates of kinds>"
+
+    def _asked(self, index: int, name: str) -> float:
+        return self.work[index][name][1]
+
+    def _levels(self, plays: FleetPrices, kind: int, name: str) -> Iterator[tuple[float, ...]]:
+        """Yield rows of a column, one cell more at each."""
+        mine = [i for i, of in enumerate(self.kinds) if of == kind]
+        others = [i for i, of in enumerate(self.kinds) if of != kind and self.work[i]]
+        placements: list[str | None] = [None] * len(self.cells)
+        asked, level = self.work[kind][name][0], 0.0
+        for i in mine + others:
+            # The others ask for as much as they may.
+            placed = name if i in mine else max(self.work[i], key=partial(self._asked, i))
+            placements[i], (resource, work) = placed, self.work[i][placed]
+            level += work if resource == asked else 0.0
+            found = plays.price(tuple(placements)).cells
+            seen = [cell.qos for j in mine if (cell := found[j]) is not None]
+            l95_ms = np.array([qos.l95_ms for qos in seen])
+            rate = np.array([qos.violation_rate for qos in seen])
+            yield level, l95_ms.mean(), rate.mean(), _error(l95_ms), _error(rate)
+
+
+_known: dict[tuple[tuple[PricedCell, ...], tuple[str, ...]], LoadTable] = {}
+
+
+def load_table(
+    cells: Sequence[PricedCell],
+    shared: Sequence[str],
+    progress: Callable[[int, int], None] | None = None,
+) -> LoadTable:
+    """Return the table of a fleet; what was asked before is not played again."""
+    asked = tuple(cells), tuple(shared)
+    if asked not in _known:
+        _known[asked] = LoadTable(*asked, progress=progress)
+        for old in list(_known)[:-KEPT]:
+            del _known[old]
+    return _known[asked]
+
+
+def kinds_of(cells: Sequence[PricedCell]) -> tuple[int, ...]:
+    """Return of every cell the first one of its kind: equal but for phase and name."""
+    firsts: dict[object, int] = {}
+    return tuple(firsts.setdefault(_kind(cell.problem), i) for i, cell in enumerate(cells))
+
+
+def _kind(problem: Problem) -> object:
+    pipeline = problem.pipeline
+    tasks, flows = tuple(pipeline.tasks.items()), pipeline.flows
+    return problem.name, pipeline.period_ms, pipeline.deadline_ms, tasks, flows, problem.candidates
+
+
+def _work(problem: Problem, shared: Sequence[str]) -> Mapping[str, tuple[str, float]]:
+    """Of every candidate that has work on shared nodes, the resource that it fills most."""
+    prices, resources = prices_of(problem), problem.fabric.resources
+    found = {}
+    for name in problem.candidates:
+        own = prices[name].own
+        here = [one for one, of in resources.items() if of.node in shared and own[one] > 0]
+        if here:
+            most = max(here, key=own.__getitem__)
+            found[name] = most, own[most] * resources[most].capacity
+    return found
+
+
+def _error(values: Floats) -> float:
+    """Standard error of the mean over cells; of a single one it is not known."""
+    if len(values) < 2:
+        return float("inf")
+    return float(values.std(ddof=1) / np.sqrt(len(values)))

@@ -1,0 +1,242 @@
+"""Fleet: several cells that share nodes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal, TypeAlias
+
+from dwell.errors import Fault, ProblemError
+from dwell.model.bounds import Bound, as_read, counted
+from dwell.model.declaration import declared, declared_fields, key
+from dwell.model.fabric import Node
+from dwell.model.problem import Problem
+from dwell.model.semantics import nearest, nearest_of
+
+Phases: TypeAlias = "Literal['sync', 'even', 'random'] | tuple[float, ...]"
+Coordination: TypeAlias = Literal["none", "random", "ledger"]
+FleetObjective: TypeAlias = Literal["sum", "worst"]
+
+#: What the phases of a fleet may be, beside a list of them.
+PHASES = ("sync", "even", "random")
+PHASE_WAYS = f"one of {', '.join(PHASES)}, or a list of ms"
+MOST_CELLS = 1_000
+COUNT = Bound(1, MOST_CELLS, whole=True)
+
+#: Count and cell of an entry; None for a cell that could not be read.
+Kind: TypeAlias = "tuple[int, Problem | None]"
+
+
+@declared()
+class FleetEntry:
+    """Cells of one kind."""
+
+    cell: Problem
+    count: int = key("How many cells of it there are.", COUNT, default=1)
+    scenario: str = key("What befalls them.", default="baseline")
+    policy: str | None = key("Their policy.", default=None, usual="the fleet's, or the cell's")
+    estimator: str | None = key(
+        "Their estimator.", default=None, usual="the fleet's, or the cell's"
+    )
+    phase_ms: float | None = key(
+        "Offset of their releases, below P.", Bound(0), default=None, usual="as `phases` says"
+    )
+
+    def __post_init__(self) -> None:
+        faults = []
+        if self.scenario not in self.cell.scenarios:
+            hint = nearest_of(self.scenario, self.cell.scenarios, "scenarios")
+            faults.append(Fault("scenario", f"unknown scenario {self.scenario!r}; {hint}"))
+        period_ms = self.cell.pipeline.period_ms
+        if self.phase_ms is not None and self.phase_ms >= period_ms:
+            bound = f"it must be less than period_ms, {period_ms:g}"
+            faults.append(Fault("phase_ms", f"{self.phase_ms:g} is not allowed; {bound}"))
+        if faults:
+            raise ProblemError(faults)
+
+
+@dataclass(frozen=True, slots=True)
+class FleetCell:
+    """One cell of a fleet.
+
+    Parameters
+    ----------
+    name : str
+        Its own, ``canonical-01``.
+    copy : int
+        Which of the cells of its file it is, from 1.
+    entry : FleetEntry
+    """
+
+    name: str
+    copy: int
+    entry: FleetEntry
+
+    @property
+    def problem(self) -> Problem:
+        """What it is."""
+        return self.entry.cell
+
+    @property
+    def streams(self) -> str:
+        """What the names of its random streams begin with: nothing for the first of its file."""
+        return "" if self.copy == 1 else f"{self.problem.name}-{self.copy}/"
+
+
+@declared()
+class Fleet:
+    """Several cells that share nodes, each with a controller of its own."""
+
+    name: str
+    entries: tuple[FleetEntry, ...]
+    shared: tuple[str, ...] = key("Nodes that are one computer for all cells.", default=())
+    phases: Phases = key(
+        "When each cell begins: all at once, evenly spread, drawn, or by a list.", default="random"
+    )
+    coordination: Coordination = key(
+        "What a move is asked for: nothing, a chance, or the ledger.", default="ledger"
+    )
+    objective: FleetObjective = key(
+        "What the ledger lowers: the sum over cells, or what the worst of them has.", default="sum"
+    )
+    policy: str | None = key("Policy of cells that name none.", default=None, usual="the cell's")
+    estimator: str | None = key(
+        "Estimator of cells that name none.", default=None, usual="the cell's"
+    )
+    #: That it was read from; nothing where it was made otherwise.
+    file: str = field(default="", compare=False)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.phases, str):
+            object.__setattr__(self, "phases", tuple(self.phases))
+        kinds = [(entry.count, entry.cell) for entry in self.entries]
+        faults = [*fleet_faults(kinds, self.shared, self.phases)]
+        if faults:
+            raise ProblemError(faults)
+
+    def __repr__(self) -> str:
+        kinds = ", ".join(f"{one.count} {one.cell.name}" for one in self.entries)
+        return f"<Fleet {self.name}: {kinds}; shared: {', '.join(self.shared) or 'nothing'}>"
+
+    @property
+    def cells(self) -> tuple[FleetCell, ...]:
+        """Every cell, in the order of the file; copies are counted over all entries of a file."""
+        cells: list[FleetCell] = []
+        copies = Counter[str]()
+        for entry in self.entries:
+            for _ in range(entry.count):
+                copies[entry.cell.name] += 1
+                copy = copies[entry.cell.name]
+                cells.append(FleetCell(f"{entry.cell.name}-{copy:02}", copy, entry))
+        return tuple(cells)
+
+    def changed(
+        self,
+        *,
+        policy: str | None = None,
+        estimator: str | None = None,
+        coordination: str | None = None,
+        phases: str | Sequence[float] | None = None,
+    ) -> Fleet:
+        """Return the fleet with other settings, those of entries included; None keeps them.
+
+        Raises
+        ------
+        ProblemError
+            If one is none of those that there are.
+        """
+        given = {
+            "policy": policy,
+            "estimator": estimator,
+            "coordination": coordination,
+            "phases": phases,
+        }
+        new: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+        own: Any = {name: None for name in ("policy", "estimator") if name in new}
+        return replace(self, entries=tuple(replace(one, **own) for one in self.entries), **new)
+
+    def with_count(self, count: int) -> Fleet:
+        """Return the fleet with so many cells of the first entry.
+
+        Raises
+        ------
+        ProblemError
+            If that is out of bounds, or phases are given one by one.
+        """
+        first, *others = self.entries
+        return replace(self, entries=(replace(first, count=count), *others))
+
+    def unused(self) -> tuple[str, ...]:
+        """Return the shared nodes that no candidate of any cell uses."""
+        used = {
+            node
+            for entry in self.entries
+            for placement in entry.cell.candidates.values()
+            for node in placement.values()
+        }
+        return tuple(name for name in self.shared if name not in used)
+
+
+def fleet_faults(kinds: Sequence[Kind], shared: Sequence[str], phases: Phases) -> Iterator[Fault]:
+    """Yield what is wrong with a fleet beyond its single entries."""
+    if not kinds:
+        yield Fault("cells", "the list is empty; name at least one cell")
+    count = sum(of for of, _ in kinds)
+    if count > MOST_CELLS:
+        yield Fault("cells", f"{count} cells are more than {MOST_CELLS}; give fewer")
+    known: dict[str, tuple[int, Problem]] = {}
+    for place, (_, cell) in enumerate(kinds):
+        if cell is not None and known.setdefault(cell.name, (place, cell))[1] != cell:
+            message = f"{cell.name!r} is the name of another cell, too; give it its own"
+            yield Fault(f"cells[{place}].cell", message)
+    for i, name in enumerate(shared):
+        if name in shared[:i]:
+            yield Fault(f"shared[{i}]", f"{name!r} is given twice; name each once")
+        else:
+            yield from _node_faults(f"shared[{i}]", name, [*known.values()])
+    if isinstance(phases, str):
+        if phases not in PHASES:
+            hint = nearest(phases, PHASES)
+            remedy = f"; {hint}" if hint.startswith("did") else ""
+            yield Fault(
+                "phases", f"{as_read(phases)} is not allowed; it must be {PHASE_WAYS}{remedy}"
+            )
+    elif kinds:
+        yield from _phase_faults(kinds, phases)
+
+
+def _node_faults(path: str, name: str, cells: Sequence[tuple[int, Problem]]) -> Iterator[Fault]:
+    """Yield where a shared node is missing in a cell, or another one than in those before."""
+    first: Problem | None = None
+    for place, cell in cells:
+        nodes = cell.fabric.nodes
+        if name not in nodes:
+            hint = nearest_of(name, nodes, "nodes")
+            yield Fault(path, f"{cell.name} has no node {name!r}; {hint}")
+            continue
+        first = first or cell
+        of = first.fabric.nodes[name]
+        yield from _differences(f"cells[{place}].cell", nodes[name], of, first.name)
+
+
+def _phase_faults(kinds: Sequence[Kind], phases: Sequence[float]) -> Iterator[Fault]:
+    cells = [cell for count, cell in kinds for _ in range(count)]
+    if len(phases) != len(cells):
+        has = f"{counted(len(phases), 'phase')} for {counted(len(cells), 'cell')}"
+        yield Fault("phases", f"{has}; give one for each, in the order of the file")
+        return
+    for i, (phase_ms, cell) in enumerate(zip(phases, cells, strict=True)):
+        if cell is not None and not 0 <= phase_ms < cell.pipeline.period_ms:
+            bound = f"it must be at least 0 and less than period_ms, {cell.pipeline.period_ms:g}"
+            yield Fault(f"phases[{i}]", f"{phase_ms:g} is not allowed; {bound}")
+
+
+def _differences(path: str, node: Node, other: Node, of: str) -> Iterator[Fault]:
+    """Yield a fault for every key by which a shared node differs from that of the first cell."""
+    named: Mapping[str, str] = {one.name: one.named for one in declared_fields(Node)}
+    for one in fields(node):
+        here, there = getattr(node, one.name), getattr(other, one.name)
+        if here != there:
+            what = f"{node.name}.{named.get(one.name, one.name)}"
+            yield Fault(path, f"{what} is {here!r}, and {there!r} in {of}; a shared node is one")

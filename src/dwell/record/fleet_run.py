@@ -1,0 +1,268 @@
+"""FleetRun: the runs of the cells of a fleet that were played together.
+
+Its folder has a run's folder for every cell, ``fleet-windows.parquet`` with the load of the shared
+nodes, and ``fleet.json``, which is put in its place when all the others are there.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dwell.errors import DwellError, ProblemError, RunError
+from dwell.files import write_whole
+from dwell.model.declaration import declared_fields
+from dwell.model.document import Document, to_document
+from dwell.model.fleet import Fleet, FleetEntry
+from dwell.record.run import FLEET, Run, open_run, read_table, write_table
+
+if TYPE_CHECKING:
+    import numpy as np
+    import polars as pl
+    from numpy.typing import NDArray
+
+VERSION = 1
+#: `FLEET` until all the rest is written.
+UNFINISHED = f".{FLEET}.unfinished"
+LOAD = "fleet-windows.parquet"
+#: How many runs that are not whole are told of.
+LISTED = 4
+
+
+class FleetRun:
+    """What became of a fleet.
+
+    Parameters
+    ----------
+    fleet : Fleet
+        As it was played.
+    cells : mapping of str to Run
+        By the cells' names.
+    load : mapping of str to array, or function that makes a DataFrame
+        Of every shared node over time (see `dwell.sim.shared_load`).
+    seed : int
+    guard : bool
+        Whether guards acted.
+    phases_ms : mapping of str to float
+        Offset of every cell's releases.
+    """
+
+    def __init__(
+        self,
+        fleet: Fleet,
+        cells: Mapping[str, Run],
+        load: Mapping[str, NDArray[np.generic]] | Callable[[], pl.DataFrame],
+        *,
+        seed: int,
+        guard: bool,
+        phases_ms: Mapping[str, float],
+    ) -> None:
+        self.fleet, self.cells, self._load = fleet, dict(cells), load
+        self.seed, self.guard, self.phases_ms = seed, guard, dict(phases_ms)
+
+    def __repr__(self) -> str:
+        return f"<FleetRun of {self.fleet.name}: {len(self.cells)} cells, seed {self.seed}>"
+
+    @property
+    def windows(self) -> pl.DataFrame:
+        """Windows of all cells, with a column `cell`; what a cell does not have is null."""
+        return self._all("windows")
+
+    @property
+    def decisions(self) -> pl.DataFrame:
+        """Decisions of all cells, with a column `cell`; what a cell does not have is null.
+
+        Φ and rounds are there also where nobody was asked.
+        """
+        import polars as pl
+
+        found = self._all("decisions")
+        asked = {"phi_before": pl.Float64, "phi_after": pl.Float64, "round": pl.Int64}
+        missing = [(name, kind) for name, kind in asked.items() if name not in found.columns]
+        return found.with_columns(pl.lit(None, kind).alias(name) for name, kind in missing)
+
+    @cached_property
+    def load(self) -> pl.DataFrame:
+        """Load of every shared node over time, and each cell's share of it."""
+        import polars as pl
+
+        return self._load() if callable(self._load) else pl.DataFrame(self._load)
+
+    def _all(self, table: str) -> pl.DataFrame:
+        import polars as pl
+
+        frames: list[pl.DataFrame] = [
+            getattr(run, table).select(pl.lit(name).alias("cell"), pl.all())
+            for name, run in self.cells.items()
+        ]
+        # A column of names has those of all cells.
+        names: dict[str, dict[str, None]] = {}
+        for frame in frames:
+            for column, kind in frame.schema.items():
+                if isinstance(kind, pl.Enum):
+                    names.setdefault(column, {}).update(dict.fromkeys(kind.categories))
+        kinds = {column: pl.Enum([*known]) for column, known in names.items()}
+        casts = [frame.cast({c: kinds[c] for c in frame.columns if c in kinds}) for frame in frames]
+        return pl.concat(casts, how="diagonal_relaxed")
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the fleet's folder: a run's folder a cell, and ``fleet.json`` last.
+
+        Parameters
+        ----------
+        path : path-like
+            Folder to make. One that holds this fleet's runs already gets them again; anything else
+            is refused.
+
+        Raises
+        ------
+        RunError
+            If the folder holds something else, or cannot be written.
+        """
+        folder = Path(path)
+        described = self._described()
+        require_free_or_same(folder, described)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / FLEET).unlink(missing_ok=True)
+            write_whole(folder / UNFINISHED, json.dumps(described, indent=2) + "\n")
+            for name, run in self.cells.items():
+                run.save(folder / name)
+            write_table(self.load, folder / LOAD)
+            (folder / UNFINISHED).replace(folder / FLEET)
+        except OSError as error:
+            raise RunError(f"{folder}: cannot be written ({error.strerror or error})") from None
+        return folder
+
+    def _described(self) -> dict[str, Any]:
+        meta = next(iter(self.cells.values())).meta
+        return describe_fleet(
+            self.fleet,
+            seed=self.seed,
+            guard=self.guard,
+            phases=self.phases_ms,
+            windows=meta["windows"],
+            versions=meta["versions"],
+        )
+
+
+def describe_fleet(fleet: Fleet, **settings: Any) -> dict[str, Any]:
+    """Return what ``fleet.json`` says of a fleet that was played with some settings.
+
+    Parameters
+    ----------
+    **settings : JSON-able
+        Seed, guard, windows, versions, and the phases as drawn, ms by cell.
+    """
+    document = fleet_document(fleet)
+    digest = hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
+    return {
+        "schema_version": VERSION,
+        "name": fleet.name,
+        "file": fleet.file or None,
+        "hash": digest,
+        "coordination": fleet.coordination,
+        **settings,
+        "cells": [cell.name for cell in fleet.cells],
+        "fleet": document,
+    }
+
+
+def fleet_document(fleet: Fleet) -> Document:
+    """Return a fleet as plain values: as its file has it, but with every cell in its place."""
+    entries = [{"cell": to_document(entry.cell), **_keys(entry)} for entry in fleet.entries]
+    return {"name": fleet.name, "cells": entries, **_keys(fleet)}
+
+
+def _keys(of: Fleet | FleetEntry) -> Document:
+    values = {one.named: getattr(of, one.name) for one in declared_fields(type(of))}
+    return {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in values.items()
+        if value is not None
+    }
+
+
+def _fleet_of(document: Mapping[str, Any], file: str) -> Fleet:
+    from dwell.cellfile import from_record
+
+    given = dict(document)
+    entries = tuple(
+        FleetEntry(**{**entry, "cell": from_record(entry["cell"])}) for entry in given.pop("cells")
+    )
+    return Fleet(entries=entries, file=file, **given)
+
+
+def require_free_or_same(folder: Path, described: Mapping[str, Any]) -> None:
+    """Refuse a folder to which a fleet's runs may not be written.
+
+    Raises
+    ------
+    RunError
+        If it holds anything but the runs of this fleet under the same settings.
+    """
+    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+        return
+    file = next((folder / one for one in (FLEET, UNFINISHED) if (folder / one).is_file()), None)
+    if file is None:
+        raise RunError(f"{folder} exists and is no fleet's; choose another folder")
+    same = {"versions": None, "file": None}
+    if {**_read(file), **same} != {**json.loads(json.dumps(described)), **same}:
+        raise RunError(f"{folder} holds the runs of another fleet; choose another folder")
+
+
+def open_fleet(path: str | os.PathLike[str]) -> FleetRun:
+    """Open a fleet's folder; tables are read when first asked for.
+
+    Raises
+    ------
+    RunError
+        If the folder is missing or none of a fleet, or not all runs are whole.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise RunError(f"{folder}: no such folder")
+    finished = (folder / FLEET).is_file()
+    file = folder / (FLEET if finished else UNFINISHED)
+    if not file.is_file():
+        raise RunError(f"{folder}: no fleet's folder (it has no {FLEET})")
+    described = _read(file)
+    version = described.get("schema_version")
+    if not isinstance(version, int) or version > VERSION:
+        raise RunError(f"{file}: schema_version is {version!r}; this version reads up to {VERSION}")
+    try:
+        names = [str(name) for name in described["cells"]]
+        fleet = _fleet_of(described["fleet"], str(described.get("file") or ""))
+        seed, guard = int(described["seed"]), bool(described["guard"])
+        phases_ms = {name: float(described["phases"][name]) for name in names}
+    except (KeyError, TypeError, ValueError) as error:
+        why = "; ".join(str(error).splitlines()) if isinstance(error, ProblemError) else repr(error)
+        raise RunError(f"{file}: cannot be read ({why})") from None
+    runs, faults = {}, []
+    for name in names:
+        try:
+            runs[name] = open_run(folder / name)
+        except DwellError as error:
+            faults.append(f"  {error}")
+    if faults or not finished:
+        more = [f"  and {len(faults) - LISTED} more"] if len(faults) > LISTED else []
+        whole = f"{folder}: {len(runs)} of {len(names)} runs are whole"
+        remedy = "remove what is damaged, and the same command makes the others again"
+        raise RunError("\n".join([f"{whole}; {remedy}", *faults[:LISTED], *more]))
+    load = read_table(folder / LOAD)
+    return FleetRun(fleet, runs, load, seed=seed, guard=guard, phases_ms=phases_ms)
+
+
+def _read(file: Path) -> dict[str, Any]:
+    try:
+        known = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise RunError(f"{file}: cannot be read ({error})") from None
+    if not isinstance(known, dict):
+        raise RunError(f"{file}: describes no fleet")
+    return known

@@ -1,0 +1,94 @@
+"""Waiting: where the cycles of a cell that missed have waited, on nodes and links."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.kernels.arrays import CellArrays, flow_rows
+from dwell.kernels.realisation import LinkSegments, Realisation
+from dwell.model import Problem
+
+Ints: TypeAlias = NDArray[np.int64]
+#: Nanoseconds by what was waited for: ("node", "E"), or ("link", "R1->E").
+Waiting: TypeAlias = Counter[tuple[str, str]]
+
+
+def waiting_of(problem: Problem, real: Realisation, arrays: CellArrays) -> Waiting:
+    """Sum up what the cycles after the warm-up that missed have waited.
+
+    On a node it is the time from readiness to completion beyond what the job takes alone; on a link
+    the time before the message is sent, and what sending it again takes.
+
+    Parameters
+    ----------
+    arrays : CellArrays
+        As played, with the log of all jobs.
+    """
+    tables, pipeline = arrays.tables, problem.pipeline
+    first, last = problem.warmup_windows * problem.window_cycles, real.cycles
+    late_ns = tables.latency_ns[0, :last] > round(pipeline.deadline_ms * 1e6)
+    cycles = first + np.flatnonzero(late_ns[first:])
+    log = arrays.logs()[0][0][cycles]
+    stamps = tables.stamps[0, cycles]
+    names = [*pipeline.tasks]
+    arrived = _arrivals(problem, arrays)[cycles]
+    waits = Waiting()
+    for code, placement in enumerate(problem.candidates.values()):
+        under = stamps == code
+        if not under.any():
+            continue
+        of, these = log[under], cycles[under]
+        for i, task in enumerate(names):
+            node = placement[task]
+            exec_ns = real.exec_ns[real.sites.index((task, node)), these]
+            spent = of["end_ns"][:, i] - of["ready_ns"][:, i] - exec_ns
+            waits["node", node] += _sum(spent, of["end_ns"][:, i] >= 0)
+        for j, flow in enumerate(pipeline.flows):
+            here, there = placement[flow.source], placement[flow.target]
+            if here == there:
+                continue
+            link = f"{here}->{there}"
+            sent = of["end_ns"][:, names.index(flow.source)]
+            own = _unhindered(
+                real, (flow.source, flow.target, link), flow.payload_bytes, these, sent
+            )
+            known = (sent >= 0) & (arrived[under][:, j] >= 0)
+            waits["link", link] += _sum(arrived[under][:, j] - sent - own, known)
+    return waits
+
+
+def _sum(waited_ns: Ints, known: NDArray[np.bool_]) -> int:
+    return int(waited_ns[known].clip(min=0).sum())
+
+
+def _arrivals(problem: Problem, arrays: CellArrays) -> Ints:
+    """Return when messages arrived, shape (cycles, flows); -1 where they did not."""
+    whole, part = arrays.whole.tables, arrays.part
+    clock = whole.clock[0]
+    shape = -1, int(clock["n_cycles"]), int(clock["n_flows"])
+    by_row = whole.log_arrived.reshape(shape)
+    arrived: Ints = by_row[part.row, : part.cycles, flow_rows(problem.pipeline)].T
+    return arrived
+
+
+def _unhindered(
+    real: Realisation, hop: tuple[str, str, str], payload_bytes: int, cycles: Ints, sent: Ints
+) -> Ints:
+    """Return what messages take that find their link free, and are not lost."""
+    row = real.hops.index(hop)
+    taken = real.delay_ns[row, cycles].astype(np.float64)
+    pieces = LinkSegments.of(real.link_segments)
+    if hop[2] in pieces.links:
+        own = pieces.table[:, 1] == pieces.links.index(hop[2])
+        segments, rates = pieces.table[own], pieces.table_f[own, 0]
+        at = np.searchsorted(segments[:, 0], sent, side="right").clip(min=1) - 1
+        taken += np.rint(payload_bytes * 8000.0 / rates[at])
+        for extra, (of, layer) in zip(real.extra_ns, real.layers, strict=True):
+            if of == row:
+                taken += extra[cycles] * (segments[at, 3] >> layer & 1)
+    whole: Ints = taken.astype(np.int64)
+    return whole

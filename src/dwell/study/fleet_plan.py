@@ -1,0 +1,244 @@
+"""Plan: where the cells of a fleet are best placed, by the table of loads, and played.
+
+Of the table's Φ the least is found over one shared resource by dynamic programming: of every load
+that it may have, cell after cell takes the candidates by which the sum of costs at that load is
+least and the work no more than it (a knapsack). With several it is a mixed-integer program.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.control.ledger import Loads
+from dwell.estimators.fleet_prices import CellTerms, FleetPrice, FleetPrices, PricedCell
+from dwell.estimators.load_table import load_table
+from dwell.estimators.prices import prices_of
+from dwell.model.fleet import Fleet
+from dwell.model.qos import QoS
+from dwell.record import FleetRun
+from dwell.sim.fleet import phased
+
+Floats: TypeAlias = NDArray[np.float64]
+
+#: Levels of the load of a shared resource: of the only one, of each of several.
+LEVELS, LEVELS_OF_SEVERAL = 400, 40
+#: Cycles of a cell that a plan is played for.
+CYCLES = 3_000
+
+
+@dataclass(frozen=True, slots=True)
+class FleetPlan:
+    """Where the cells of a fleet are best placed.
+
+    Parameters
+    ----------
+    placements : mapping of str to str
+        Candidate of each cell.
+    table_phi : float
+        Φ a cell, as the table has it.
+    played : FleetPrice
+        What the fleet comes to there.
+    """
+
+    placements: Mapping[str, str]
+    table_phi: float
+    played: FleetPrice
+
+    def __repr__(self) -> str:
+        return f"<FleetPlan: {len(self.placements)} cells, {self.phi:.4g} a cell>"
+
+    @property
+    def phi(self) -> float:
+        """Φ a cell, as played."""
+        return self.played.phi / len(self.placements)
+
+    @property
+    def cells(self) -> dict[str, QoS]:
+        """What each cell comes to."""
+        priced = zip(self.placements, self.played.cells, strict=True)
+        return {name: cell.qos for name, cell in priced if cell is not None}
+
+    def regret(self, run: FleetRun) -> float:
+        """How far Φ of a run, by what its windows show, is above that of the plan: a share of it.
+
+        Windows of the warm-up do not count.
+        """
+        return phi_of(run) / self.phi - 1.0
+
+    def as_json(self) -> dict[str, object]:
+        """Return it as plain values."""
+        return {
+            "phi": self.phi,
+            "table_phi": self.table_phi,
+            "cells": [
+                {
+                    "cell": name,
+                    "placement": self.placements[name],
+                    "violation_rate": qos.violation_rate,
+                    "l95_ms": qos.l95_ms,
+                }
+                for name, qos in self.cells.items()
+            ],
+        }
+
+
+def phi_of(run: FleetRun) -> float:
+    """Φ a cell of a run, by the means of what its windows showed after the warm-up."""
+    own, shared = 0.0, 0.0
+    for name, one in run.cells.items():
+        cell = next(cell for cell in run.fleet.cells if cell.name == name)
+        terms, windows = CellTerms(cell.problem, run.fleet.shared), one.arrays("windows")
+        counts = ~windows["warmup"]
+
+        def mean(column: str, windows: Any = windows, counts: Any = counts) -> float:
+            return float(np.nanmean(windows[column][counts]))
+
+        used = {name: mean(f"u_{name}") for name in terms.resources}
+        qos = QoS(mean("seen_l95_ms"), mean("seen_violation_rate"), used)
+        own, shared = own + terms.cost(qos), shared + terms.shared_cost(qos)
+    count = len(run.cells)
+    return (own + shared / count) / count
+
+
+def plan_fleet(
+    fleet: Fleet, *, seed: int = 1, progress: Callable[[int, int], None] | None = None
+) -> FleetPlan:
+    """Find where the cells of a fleet are best placed while their scenarios go on.
+
+    Parameters
+    ----------
+    seed : int
+        Of the phases, where these are random.
+    progress : callable, optional
+        Told how many of how many levels of the table have been played.
+    """
+    cells = [
+        PricedCell(cell.name, problem, cell.streams, cell.entry.scenario)
+        for cell, problem in zip(fleet.cells, phased(fleet, seed), strict=True)
+    ]
+    undisturbed = [replace(cell, scenario="baseline") for cell in cells]
+    table = load_table(undisturbed, fleet.shared, progress)
+    loads = Loads(table)
+    alone = [
+        {
+            name: CellTerms(cell.problem, fleet.shared).cost(price.qos)
+            for name, price in prices_of(cell.problem, cell.scenario).items()
+        }
+        for cell in cells
+    ]
+    best = best_placements(loads, alone)
+    played = FleetPrices(cells, fleet.shared, CYCLES * len(cells)).price(tuple(best))
+    names = [cell.name for cell in cells]
+    phi = sum(loads.costs(best, alone)) / len(cells)
+    return FleetPlan(dict(zip(names, best, strict=True)), phi, played)
+
+
+def best_placements(loads: Loads, alone: Sequence[Mapping[str, float]]) -> list[str]:
+    """Return the placements of which the table's Φ is least.
+
+    Parameters
+    ----------
+    alone : sequence of mapping of str to float
+        J of every candidate of each cell where no other is there.
+    """
+    if len(loads.resources) > 1:
+        return _by_program(loads, alone)
+    most = max(map(loads.most, loads.resources), default=0.0)
+    levels = np.linspace(0.0, most, LEVELS + 1) if most else np.zeros(1)
+    found = (_at_level(loads, alone, levels, last) for last in range(len(levels)))
+    return min(
+        (one for one in found if one is not None), key=lambda one: sum(loads.costs(one, alone))
+    )
+
+
+def _at_level(
+    loads: Loads, alone: Sequence[Mapping[str, float]], levels: Floats, last: int
+) -> list[str] | None:
+    """Least sum of costs at a level of the load, with no more work than it; a knapsack."""
+    step = levels[1] if len(levels) > 1 else 1.0
+    #: By work that is asked so far, the least sum of the cells before.
+    least = np.zeros(last + 1)
+    chosen = []
+    for i, costs in enumerate(alone):
+        rows = []
+        for name in costs:
+            work = loads.work(i, name)
+            units = round(work / step)
+            row = np.full(last + 1, np.inf)
+            if units <= last:
+                row[units:] = least[: last + 1 - units] + costs[name]
+                row[units:] += loads.wait(i, name, levels[last])
+            rows.append(row)
+        chosen.append(np.argmin(rows, axis=0))
+        least = np.min(rows, axis=0)
+    left = last
+    if not np.isfinite(least[left]):
+        return None
+    names = []
+    for i in reversed(range(len(alone))):
+        name = list(alone[i])[chosen[i][left]]
+        left -= round(loads.work(i, name) / step)
+        names.append(name)
+    return names[::-1]
+
+
+def _by_program(loads: Loads, alone: Sequence[Mapping[str, float]]) -> list[str]:
+    """Return the best placements over several resources; every load is rounded up to a level.
+
+    Of every cell one candidate is taken, of every resource one level. What candidates of one kind
+    wait at a level is paid for as often as they are taken while it is.
+    """
+    from scipy.optimize import Bounds, LinearConstraint, milp
+
+    taken = [(i, name) for i, costs in enumerate(alone) for name in costs]
+    held = [
+        (resource, level)
+        for resource in loads.resources
+        for level in np.linspace(0.0, loads.most(resource), LEVELS_OF_SEVERAL).tolist()
+    ]
+    groups = list(dict.fromkeys(loads.group(i, name) for i, name in taken if loads.work(i, name)))
+    waits = [(group, one) for group in groups for one in held if one[0] == loads.resource(*group)]
+    count = len(taken) + len(held) + len(waits)
+    column: dict[Any, int] = {one: place for place, one in enumerate([*taken, *held, *waits])}
+    cost = np.zeros(count)
+    cost[: len(taken)] = [alone[i][name] for i, name in taken]
+    for group, one in waits:
+        cost[column[group, one]] = loads.wait(*group, one[1])
+    rows, low, high = [], [], []
+
+    def require(terms: Mapping[Any, float], at_least: float, at_most: float) -> None:
+        row = np.zeros(count)
+        for one, factor in terms.items():
+            row[column[one]] += factor
+        rows.append(row)
+        low.append(at_least)
+        high.append(at_most)
+
+    for i, costs in enumerate(alone):
+        require({(i, name): 1.0 for name in costs}, 1.0, 1.0)
+    for resource in loads.resources:
+        mine = [one for one in held if one[0] == resource]
+        require(dict.fromkeys(mine, 1.0), 1.0, 1.0)
+        work = {one: loads.work(*one) for one in taken if loads.resource(*one) == resource}
+        require(work | {one: -one[1] for one in mine}, -np.inf, 0.0)
+    for group in groups:
+        of: dict[Any, float] = {one: -1.0 for one in taken if loads.group(*one) == group}
+        paid = [one for one in waits if one[0] == group]
+        require(of | dict.fromkeys(paid, 1.0), 0.0, 0.0)
+        for wait in paid:
+            require({wait: 1.0, wait[1]: -float(len(of))}, -np.inf, 0.0)
+    whole = np.zeros(count)
+    whole[: len(taken) + len(held)] = 1
+    most = np.where(whole, 1.0, np.inf)
+    found = milp(
+        cost,
+        constraints=LinearConstraint(np.array(rows), low, high),
+        integrality=whole,
+        bounds=Bounds(np.zeros(count), most),
+    )
+    return [max(costs, key=lambda name: found.x[column[i, name]]) for i, costs in enumerate(alone)]

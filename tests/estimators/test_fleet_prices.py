@@ -1,0 +1,163 @@
+"""What a fleet comes to: as the simulator plays it, whoever plays alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dwell
+from dwell.estimators.fleet_prices import CellPrice, FleetPrice, FleetPrices, PricedCell
+from dwell.estimators.load_table import LoadTable, load_table
+from dwell.estimators.measured import Message, Site
+from dwell.estimators.presents import Playing, Present, realised
+from dwell.estimators.prices import SEED
+from dwell.kernels.advance import play
+from dwell.kernels.arrays import lay_out
+from dwell.model import FrozenDict, Problem
+from dwell.model.fleet import Fleet, FleetEntry
+from dwell.sim.fleet import phased, simulate_fleet
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+CANONICAL = dwell.load(EXAMPLES / "canonical.yaml")
+FAN_IN = dwell.load(EXAMPLES / "fan-in.yaml")
+
+
+def fleet_of(*entries: FleetEntry, shared: tuple[str, ...] = ("E",)) -> Fleet:
+    return Fleet("hall", entries, shared, phases="even", coordination="none")
+
+
+def priced(fleet: Fleet, cycles: int = 1000) -> FleetPrices:
+    problems = phased(fleet, 1)
+    cells = [
+        PricedCell(cell.name, problem, cell.streams, cell.entry.scenario)
+        for cell, problem in zip(fleet.cells, problems, strict=True)
+    ]
+    return FleetPrices(cells, fleet.shared, cycles)
+
+
+def cell_of(price: FleetPrice, index: int) -> CellPrice:
+    cell = price.cells[index]
+    assert cell is not None
+    return cell
+
+
+def test_a_fleet_is_priced_as_the_simulator_plays_it() -> None:
+    entries = [FleetEntry(CANONICAL, 2, policy="SO"), FleetEntry(CANONICAL, 1, policy="HYB")]
+    fleet = fleet_of(*entries)
+    price = priced(fleet).price(("SO", "SO", "HYB"))
+    run = simulate_fleet(fleet, seed=SEED, windows=5)
+    for i, one in enumerate(run.cells.values()):
+        windows = one.windows[1:]
+        seen = cell_of(price, i).qos
+        assert seen.l95_ms == pytest.approx(windows["seen_l95_ms"].mean(), rel=1e-12)
+        assert seen.violation_rate == pytest.approx(windows["seen_violation_rate"].mean())
+        assert seen.utilisation["E"] == pytest.approx(windows["u_E"].mean())
+
+
+def test_phi_is_j_without_switching_and_the_shared_node_once() -> None:
+    fleet = fleet_of(FleetEntry(CANONICAL, 2))
+    price = priced(fleet).price(("SO", "LOC"))
+    weights, targets = CANONICAL.objective.weights, CANONICAL.objective.targets
+    expected = 0.0
+    for i in range(2):
+        seen = cell_of(price, i).qos
+        robot = max(seen.utilisation["R1"], seen.utilisation["R2"])
+        expected += seen.l95_ms / targets.latency_ms + weights.violations * seen.violation_rate
+        expected += weights.robot * robot / targets.robot
+        expected += weights.edge * seen.utilisation["E"] / targets.edge / 2
+    assert price.phi == pytest.approx(expected)
+
+
+def test_a_cell_that_meets_nobody_is_played_once_and_alike() -> None:
+    prices = priced(fleet_of(FleetEntry(CANONICAL, 3)))
+    together = prices.price(("LOC", "SO", "SO"))
+    beside = prices.price(("LOC", "HYB", "LOC"))
+    assert cell_of(together, 0) is cell_of(beside, 0)
+    alone = priced(fleet_of(FleetEntry(CANONICAL, 3))).price(("LOC", None, None))
+    assert cell_of(alone, 0).qos.l95_ms == cell_of(together, 0).qos.l95_ms
+    assert alone.cells[1:] == (None, None)
+
+
+def test_cells_of_several_kinds_are_played_for_about_as_long() -> None:
+    prices = priced(fleet_of(FleetEntry(CANONICAL, 1), FleetEntry(FAN_IN, 1), shared=()))
+    price = prices.price(tuple(next(iter(cell.problem.candidates)) for cell in prices.cells))
+    assert all(cell_of(price, i).cost > 0 for i in range(2))
+
+
+def presents(problem: Problem) -> dict[str, Present]:
+    rng = np.random.default_rng(3)
+    site, message = Site("perception", "E"), Message("sensing", "perception", "R1->E")
+    late = rng.uniform(1, 9, 70)
+    late[::10] = np.inf
+    return {
+        "demands": Present(FrozenDict({site: rng.uniform(5, 20, 37), message: late})),
+        "threads": Present(threads=FrozenDict({"R1": 2.4, "E": -0.5})),
+        "down": Present(down=frozenset({"R2"})),
+    }
+
+
+@pytest.mark.parametrize("name", ["demands", "threads", "down"])
+def test_a_present_is_played_as_estimators_play_it(name: str) -> None:
+    present = presents(CANONICAL)[name]
+    playing = Playing(CANONICAL)
+    playing.begin(present)
+    names = list(CANONICAL.candidates)
+    playing.go_on(present, names, steps=4)
+    real = realised(CANONICAL, playing.declared.realisation, present)
+    for index, candidate in enumerate(names):
+        arrays = lay_out([(CANONICAL, real)])
+        arrays.replace(stamps=np.full_like(arrays.tables.stamps, index))
+        play(arrays)
+        seen = arrays.tables.seen[0, 1:4]
+        twin = playing._twins[candidate].arrays.tables.seen[0, 1:4]
+        assert seen.tolist() == twin.tolist()
+
+
+def test_of_a_shared_node_the_middle_of_what_cells_say_holds() -> None:
+    prices = priced(fleet_of(FleetEntry(CANONICAL, 3)))
+    declared = prices.price(("SO", "LOC", "LOC"))
+    said = [Present(threads=FrozenDict({"E": threads})) for threads in (0.0, 16.0, 40.0)]
+    prices.begin(said)
+    stressed = prices.price(("SO", "LOC", "LOC"))
+    assert cell_of(stressed, 0).cost > cell_of(declared, 0).cost + 0.1
+    prices.begin([Present(), Present(), said[2]])
+    assert prices.price(("SO", "LOC", "LOC")).phi == declared.phi
+
+
+def test_a_table_has_a_level_for_every_cell_and_grows() -> None:
+    fleet = fleet_of(FleetEntry(CANONICAL, 4))
+    cells = [
+        PricedCell(c.name, p, c.streams) for c, p in zip(fleet.cells, phased(fleet, 1), strict=True)
+    ]
+    told: list[tuple[int, int]] = []
+    table = LoadTable(cells, ["E"], cycles=200, progress=lambda *done: told.append(done))
+    assert set(table.columns) == {(0, "SO"), (0, "HYB")}
+    assert told == [(i, 8) for i in range(1, 9)]
+    for (_, name), column in table.columns.items():
+        cores = table.work[0][name][1]
+        assert column.level == pytest.approx(cores * np.arange(1, 5))
+        assert np.isinf(column.l95_error_ms[0])
+        assert np.isfinite(column.l95_error_ms[1:]).all()
+    assert load_table(cells, ["E"]) is load_table(list(cells), ("E",))
+
+
+def test_others_of_another_kind_are_beside_those_of_one() -> None:
+    big = replace(CANONICAL, name="big", window_cycles=50)
+    fleet = fleet_of(FleetEntry(CANONICAL, 2), FleetEntry(big, 1))
+    cells = [
+        PricedCell(c.name, p, c.streams) for c, p in zip(fleet.cells, phased(fleet, 1), strict=True)
+    ]
+    table = LoadTable(cells, ["E"], cycles=200)
+    assert [group for group, _ in islice(table.columns.items(), 4)] == [
+        (0, "SO"),
+        (0, "HYB"),
+        (2, "SO"),
+        (2, "HYB"),
+    ]
+    heaviest = max(cores for _, cores in table.work[2].values())
+    mine = table.work[0]["HYB"][1]
+    assert table.columns[0, "HYB"].level == pytest.approx([mine, 2 * mine, 2 * mine + heaviest])

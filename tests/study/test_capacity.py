@@ -1,0 +1,197 @@
+"""Capacity: by hand, by its definition, and what limits a fleet."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import dwell
+from dwell.errors import ProblemError
+from dwell.model import evolve
+from dwell.model.fleet import Fleet, FleetEntry
+from dwell.study import capacity
+from dwell.study.capacity import Capacity, Sizes, capacity_of, what_ifs
+from tests.cells.fleets import fleet_of, one_job, within
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+FEW: dict[str, Any] = {"seeds": (1, 2), "cycles": 100, "processes": 1}
+
+
+@pytest.fixture(scope="module")
+def quiet() -> Fleet:
+    """Canonical cells on an edge server without other tenants."""
+    canonical = dwell.load(EXAMPLES / "canonical.yaml")
+    alone = evolve(canonical, {"nodes.E.bursts": None})
+    return Fleet("quiet", (FleetEntry(alone, 1),), ("E",), coordination="none")
+
+
+@pytest.mark.parametrize(
+    ("deadline_ms", "phases", "robots"),
+    [(9.9, "even", 5), (6.1, "sync", 3), (6.0, "sync", 2), (2.1, "even", 5), (2.0, "even", 0)],
+)
+def test_one_fifo_core_by_hand(deadline_ms: float, phases: str, robots: int) -> None:
+    """P = 10 ms, jobs of 2 ms, 1 µs before and after."""
+    fleet = fleet_of((within(one_job(), deadline_ms), 1))
+    found = capacity_of(fleet, policy="OFF", phases=phases, most=12, **FEW)
+    assert (found.robots, found.at_least, found.interval) == (robots, False, (robots, robots))
+    assert (found.limit_on, found.phases) == ("violation_rate", phases)
+    assert bool(found.reason) == (robots == 0)
+
+
+def test_what_was_not_asked_for_is_at_least(quiet: Fleet) -> None:
+    found = capacity_of(fleet_of((one_job(), 1)), policy="OFF", phases="even", most=4, **FEW)
+    assert (found.robots, found.at_least, found.interval) == (4, True, (4, 4))
+    assert found.limits is None
+
+
+def test_where_one_alone_is_over_the_limit_the_excess_counts() -> None:
+    """A tenant halves the core for 4 ms in 53, so that one cell alone misses more than it may."""
+    bursts = {"every_ms": 53, "for_ms": 4, "threads": 1}
+    cell = evolve(within(one_job(scheduler="fair"), 3.0), {"nodes.E.bursts": bursts})
+    fleet = fleet_of((cell, 1))
+    found = capacity_of(fleet, policy="OFF", phases="even", most=6, **{**FEW, "cycles": 400})
+    alone = found.curve[0].violation_rate.value
+    assert 0.05 < alone < 0.5
+    assert found.limit_on == "excess"
+    assert found.bound == pytest.approx(0.05 + alone)
+    assert found.robots >= 1
+    rates = [point.violation_rate.value for point in found.curve]
+    assert all(rate <= found.bound for rate in rates[: found.robots])
+    assert found.at_least or rates[found.robots] > found.bound
+
+
+@pytest.mark.parametrize("phases", ["sync", "even", "random"])
+def test_static_fleets_are_what_a_fleet_s_run_shows(quiet: Fleet, phases: Any) -> None:
+    """V_D of the worst cell of every size, exactly."""
+    seeds = (3, 4)
+    found = capacity_of(
+        quiet, policy="SO", phases=phases, most=3, limit=0.9, seeds=seeds, cycles=300, processes=1
+    )
+    for point in found.curve:
+        worst = []
+        for seed in seeds:
+            run = dwell.simulate_fleet(
+                quiet.with_count(point.robots), seed=seed, windows=8, policy="SO", phases=phases
+            )
+            worst.append(
+                max(
+                    float(one.arrays("windows")["violation_rate"][5:].mean())
+                    for one in run.cells.values()
+                )
+            )
+        assert point.violation_rate.value == pytest.approx(sum(worst) / len(seeds), abs=1e-15)
+
+
+def test_it_is_the_same_however_many_processes_there_are() -> None:
+    fleet = fleet_of((within(one_job(), 6.1), 1))
+    one, two = (
+        capacity_of(fleet, policy="OFF", most=12, seeds=(1, 2), cycles=40, processes=count)
+        for count in (1, 2)
+    )
+    assert one == two
+
+
+def test_synchronous_cameras_cost_a_third(quiet: Fleet) -> None:
+    """Of canonical cells on SO, without other tenants."""
+    found = {
+        phases: capacity_of(quiet, policy="SO", phases=phases, most=12, seeds=(1, 2, 3, 4))
+        for phases in ("sync", "random", "even")
+    }
+    assert found["sync"].robots == 6
+    assert 9 <= found["random"].robots <= 10
+    assert 9 <= found["even"].robots <= 10
+    limits = found["sync"].limits
+    assert limits is not None
+    assert (limits.kind, limits.name) == ("node", "E")
+    assert limits.share > 0.9
+
+
+def test_a_policy_that_moves_has_a_capacity_too(quiet: Fleet) -> None:
+    found = capacity_of(
+        quiet, policy="dtp", phases="even", most=2, seeds=(1,), cycles=200, processes=1
+    )
+    assert (found.robots, found.at_least, found.policy) == (2, True, "dtp")
+
+
+def test_other_entries_stay(quiet: Fleet) -> None:
+    """They count neither as robots nor as nothing."""
+    cell = within(one_job(), 6.1)
+    both = fleet_of((cell, 1), (replace(cell, name="other"), 1))
+    found = capacity_of(both, policy="OFF", phases="sync", most=8, **FEW)
+    assert found.robots == 2
+
+
+class Rates:
+    """A player whose V_D by size, the same under every seed, is known."""
+
+    def __init__(self, *rates: float) -> None:
+        self.rates, self.placements = rates, {"one": "OFF"}
+
+    def __call__(self, unit: Sizes) -> list[float]:
+        sizes = range(unit.first, unit.last + 1)
+        return [self.rates[min(size, len(self.rates)) - 1] for size in sizes]
+
+    def limiting(self, robots: int, seeds: object) -> None:
+        return None
+
+
+def by_rates(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Capacity]:
+    def found(*rates: float, most: int = 16, on_excess: bool = False) -> Capacity:
+        monkeypatch.setattr(capacity, "FleetPlayer", lambda *_: Rates(*rates))
+        fleet = fleet_of((one_job(), 1))
+        return capacity_of(
+            fleet,
+            policy="OFF",
+            phases="even",
+            most=most,
+            seeds=(1, 2, 3),
+            on_excess=on_excess,
+            processes=1,
+        )
+
+    return found
+
+
+def test_no_smaller_size_may_be_over_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = by_rates(monkeypatch)
+    assert found(0.01, 0.02, 0.06, 0.01, 0.01, 0.9).robots == 2
+    assert found(0.05, 0.05, 0.0501).robots == 2
+    assert found(0.01, 0.02, 0.03, most=3).at_least
+    assert found(0.06, 0.11, 0.12).limit_on == "excess"
+    assert found(0.06, 0.11, 0.12).robots == 2
+    assert found(0.04, 0.09, 0.12, on_excess=True).robots == 2
+    useless = found(0.6, 0.6)
+    assert (useless.robots, useless.reason) == (0, "one cell alone misses 60% of its deadlines")
+
+
+def test_what_cannot_be_answered_is_refused(quiet: Fleet) -> None:
+    def told(fleet: Fleet, **more: object) -> list[str]:
+        with pytest.raises(ProblemError) as error:
+            capacity_of(fleet, **more)  # type: ignore[arg-type]
+        return str(error.value).splitlines()
+
+    assert told(replace(quiet, phases=(1.0,)), policy="LOC") == [
+        "phases: a list is of one size; give one of sync, even, random",
+        "policy: LOC never uses a shared node (E), so that there may be any number of canonical; "
+        "name another one",
+    ]
+    assert told(replace(quiet, shared=())) == [
+        "shared: no node is shared, so that there may be any number of cells"
+    ]
+    assert "must be a whole number from 1 to 1000" in told(quiet, policy="SO", most=2000)[0]
+
+
+def test_changes_that_may_help(quiet: Fleet) -> None:
+    found = dict(what_ifs(quiet, "SO"))
+    assert list(found) == ["a core more on E", "phases evenly spread", "HYB instead of SO"]
+    assert found["a core more on E"].entries[0].cell.fabric.nodes["E"].cores == 9
+    assert found["phases evenly spread"].phases == "even"
+    assert found["HYB instead of SO"].policy == "HYB"
+    assert list(dict(what_ifs(quiet.changed(phases="even"), "HYB"))) == [
+        "a core more on E",
+        "SO instead of HYB",
+    ]
