@@ -136,9 +136,7 @@ def _opened(address: str, say: Callable[[str], None]) -> Iterator[None]:
     user can read, which leads to the address.
     """
     if sys.platform == "linux" and not (os.environ.keys() & {"DISPLAY", "WAYLAND_DISPLAY"}):
-        say(
-            "no display here: open the address in a browser, through `ssh -L` from another computer"
-        )
+        say("no display here: open the address in a browser; from elsewhere, through `ssh -L`")
         yield
         return
     folder = Path(tempfile.mkdtemp(prefix="dwell-dash-"))

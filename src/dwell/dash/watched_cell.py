@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from dwell.dash.observer import MOST_CYCLES, ObservedCycle, ObservedWindow, Observer
-from dwell.dash.paged_cell import Plain, cell_document, cycle_since, job_since
+from dwell.dash.paged_cell import Plain, cell_document, cycle_since, finite, job_since
 from dwell.dash.strip import Strip, binned_means
 
 #: Cycles at most whose jobs are told.
@@ -112,7 +112,7 @@ class WatchedCell:
         """See `PagedCell`; it is the present, whatever the place."""
         now = self.observer.now()
         status, window = now.status, now.status.get("window") or {}
-        return {
+        state = {
             "at": now.at_s,
             "cycle": self._strip.number[-1].item() if len(self._strip.number) else None,
             "placement": now.placement or None,
@@ -124,14 +124,14 @@ class WatchedCell:
             "processes": _processes(status),
             **(self._window_state(window) if window else {}),
         }
+        return {name: finite(value) for name, value in state.items()}
 
     def _window_state(self, window: Mapping[str, Any]) -> Plain:
         length_s = self.problem.window_cycles * self.problem.pipeline.period_ms / 1e3
         seen = {name: window[name] for name in ("l95_ms", "violation_rate", "cost")}
-        windows = self._windows
-        before = windows[-2].said if len(windows) > 1 else None
-        known = [one for one in windows if one.number == window["number"]]
-        end_s = known[0].at_s if known else 0.0
+        ends = {one.number: one for one in self._windows[-3:]}
+        known, before = ends.get(window["number"]), ends.get(window["number"] - 1)
+        end_s = 0.0 if known is None else known.at_s
         return {
             "window": {
                 "number": window["number"],
@@ -140,12 +140,10 @@ class WatchedCell:
                 "placement": window["placement"],
                 "seen": seen,
             },
-            "predicted": None
-            if before is None
-            else {"cost": before["estimates"].get(window["placement"])},
+            "predicted": before and _estimate(before.said, window["placement"]),
             "used": window["utilisation"],
             "decision": {"incumbent": window["placement"], "reason": window["reason"]},
-            "candidates": {name: {"cost": cost} for name, cost in window["estimates"].items()},
+            "candidates": {name: _estimate(window, name) for name in window["estimates"]},
         }
 
     def jobs(self, begin: float, end: float) -> Plain:
@@ -173,6 +171,11 @@ class WatchedCell:
         told = observer.cycles.upto, observer.windows.upto, observer.events.upto
         self._told, before = told, self._told
         return told != before
+
+
+def _estimate(window: Mapping[str, Any], name: str) -> Plain:
+    """Return what was believed of a candidate at a window's close."""
+    return {"cost": window["estimates"].get(name), **window["predicted"][name]}
 
 
 def _applied_age_ms(status: Mapping[str, Any]) -> float | None:
