@@ -29,9 +29,9 @@ def dash(
     port: Annotated[
         int, typer.Option(min=0, max=65_535, metavar="P", help="Of loopback; 0 takes a free one.")
     ] = PORT,
-    browser: Annotated[
-        bool, typer.Option("--browser/--no-browser", help="Whether to open it in a browser.")
-    ] = True,
+    no_browser: Annotated[
+        bool, typer.Option("--no-browser", help="Print the address only, and open no browser.")
+    ] = False,
     control: Annotated[
         bool,
         typer.Option(
@@ -51,7 +51,7 @@ def dash(
     if where.is_dir():
         if control:
             raise typer.BadParameter("--control: a recorded run cannot be acted on")
-        show_run(where, beside, port=port, browser=browser, say=say)
+        show_run(where, beside, port=port, browser=not no_browser, say=say)
         return
     if beside is not None:
         raise typer.BadParameter("--beside: a run stands beside a run, not beside a live cell")
@@ -60,4 +60,4 @@ def dash(
     from dwell.live.security import environment
 
     settings = environment(keys, insecure=insecure)
-    show_cell(where, settings, port=port, browser=browser, control=control, say=say)
+    show_cell(where, settings, port=port, browser=not no_browser, control=control, say=say)
