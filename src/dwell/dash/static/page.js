@@ -303,6 +303,8 @@ class Page {
   }
 }
 
+// A page that plays for hours asks a million times; the browser need not remember when.
+performance.setResourceTimingBufferSize(0);
 // The token is in the cookie by now: it need not stay in the address, nor in the history.
 history.replaceState(null, "", location.pathname);
 try {
