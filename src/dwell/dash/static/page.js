@@ -21,6 +21,7 @@ class CellView {
     Object.assign(this, { cell, i, page });
     this.root = element("cell").content.firstElementChild.cloneNode(true);
     this.root.querySelector(".name").textContent = cell.name;
+    this.root.querySelector(".source").textContent = cell.source;
     element("cells").append(this.root);
     this.describe(cell);
     this.topology = new Topology(this.root.querySelector(".topology"), cell);
