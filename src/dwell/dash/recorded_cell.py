@@ -216,9 +216,7 @@ class _Contents:
         """Return a column of texts of the decisions; empty where there is none."""
         if column not in self._decisions:
             return [""] * len(self._decided_at)
-        if "String" in str(self.run.decisions.schema[column]):
-            return [text or "" for text in self.run.decisions[column].to_list()]
-        return [""] * len(self._decided_at)
+        return [text or "" for text in self.run.decisions[column].to_list()]
 
     def _place(self, at_s: float) -> float:
         """Return the place on the time line of an instant, seconds since the first release."""

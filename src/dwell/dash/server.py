@@ -31,8 +31,8 @@ TYPES = {
     ".js": "text/javascript; charset=utf-8",
     ".svg": "image/svg+xml",
 }
-#: Time between two looks at the cells, and at those that are recorded.
-TICK_S, RECORDED_TICK_S = 0.1, 1.0
+#: Time between two looks at cells that run while somebody reads, and at all cells otherwise.
+TICK_S, IDLE_TICK_S = 0.1, 1.0
 #: Readers of events at a time, and how long one may take for one of them.
 MOST_READERS, READER_S = 32, 10.0
 #: A comment keeps a connection, and notices who is gone.
@@ -158,13 +158,11 @@ class Dash:
 
     async def _look_on(self) -> None:
         """Tell all readers of events together what is new; nobody is waited for."""
-        every_s = TICK_S if any(cell.live for cell in self.cells) else RECORDED_TICK_S
+        live = any(cell.live for cell in self.cells)
         while True:
-            await asyncio.sleep(every_s)
-            if not self._readers:
-                continue
+            await asyncio.sleep(TICK_S if live and self._readers else IDLE_TICK_S)
             news = await run_in_threadpool(self._new_states)
-            if news:
+            if news and self._readers:
                 number, _ = self._tick
                 async with self._news:
                     self._tick = number + 1, f"data: {json.dumps(news)}\n\n".encode()
