@@ -9,16 +9,22 @@ from typing import Any
 import numpy as np
 
 from dwell.dash.observer import ObservedCycle, ObservedWindow, Observer
-from dwell.dash.paged_cell import Plain, cell_document, cycle_since, finite, job_since
+from dwell.dash.paged_cell import (
+    MOST_WITH_JOBS,
+    Plain,
+    cell_document,
+    cycle_since,
+    finite,
+    job_since,
+)
 from dwell.dash.strip import Strip, binned_means
 
-#: Cycles of the time line, which reaches farther back than the observer; and those of which the
-#: jobs are told at a time.
-MOST_CYCLES, MOST_WITH_JOBS = 40_000, 400
+#: Cycles of the time line, which reaches farther back than the observer.
+MOST_CYCLES = 40_000
 #: Parts of a controller's status that the page shows as they are.
 SHOWN = (
     *("health", "headline", "mode", "fallback", "moving_to", "proving", "pinned", "drained"),
-    *("migrations", "guard_moves", "record", "complaints", "unproven", "bound_ms", "silent"),
+    *("migrations", "guard_moves", "unproven", "bound_ms"),
 )
 
 
