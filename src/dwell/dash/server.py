@@ -183,7 +183,7 @@ class Dash:
         for place, cell in enumerate(self.cells):
             grew = cell.refreshed()
             if cell.live:
-                news.append({"cell": place, "grew": grew, "state": cell.state(math.inf)})
+                news.append({"cell": place, "grew": grew, "state": cell.state(0.0)})
             elif grew:
                 news.append({"cell": place, "grew": True, "described": cell.described()})
         return news
