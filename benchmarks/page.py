@@ -43,7 +43,7 @@ def measure(quick: bool) -> Section:
     notes = [
         f"a run of {cycles:,} cycles; the browser runs already, the file cache is warm",
         f"misses in the bins of the whole line: {drawn:,}; in the table: {misses:,}",
-        f"grown: in an hour at {SPEED} times its speed, from its first tenth on, played once before",
+        f"grown: in an hour at {SPEED} times its speed, the second time, from its first tenth on",
     ]
     return Section(
         "the page of a recorded run",
