@@ -17,7 +17,7 @@ from dwell.dash.paged_cell import (
     finite,
     job_since,
 )
-from dwell.dash.strip import Strip, binned_means
+from dwell.dash.strip import Floats, Strip, binned_means
 
 #: Cycles of the time line, which reaches farther back than the observer.
 MOST_CYCLES = 40_000
@@ -40,7 +40,8 @@ class WatchedCell:
         self._strip, self._cycles_upto = Strip.empty(), 0
         self._windows: list[ObservedWindow] = []
         self._windows_upto = -1
-        self._columns: dict[str, Any] = {}
+        # When the windows closed, and their values: what is drawn as lines.
+        self._lines: tuple[Floats, dict[str, Floats]] = (np.zeros(0), {})
         self._told = (0, 0, 0)
 
     def __repr__(self) -> str:
@@ -57,7 +58,7 @@ class WatchedCell:
             if observer.windows.upto != self._windows_upto:
                 kept = observer.windows.since(0)
                 self._windows, self._windows_upto = kept.items, kept.upto
-                self._columns = self._columns_of(kept.items)
+                self._lines = self._lines_of(kept.items)
             return self._strip
 
     def _strip_of(self, cycles: Sequence[ObservedCycle]) -> Strip:
@@ -70,7 +71,7 @@ class WatchedCell:
             number=np.array([one.number for one in cycles], np.int64),
         )
 
-    def _columns_of(self, windows: Sequence[ObservedWindow]) -> dict[str, Any]:
+    def _lines_of(self, windows: Sequence[ObservedWindow]) -> tuple[Floats, dict[str, Floats]]:
         said = [window.said for window in windows]
         resources = self.problem.fabric.resources
         columns: dict[str, list[float | None]] = {
@@ -78,7 +79,8 @@ class WatchedCell:
             **{f"u {name}": [one["utilisation"].get(name) for one in said] for name in resources},
             "cost": [one["cost"] for one in said],
         }
-        return {name: np.array(values, np.float64) for name, values in columns.items()}
+        closes = np.array([window.at_s for window in windows], np.float64)
+        return closes, {name: np.array(values, np.float64) for name, values in columns.items()}
 
     def described(self) -> Plain:
         """See `PagedCell`."""
@@ -100,8 +102,7 @@ class WatchedCell:
 
     def view(self, begin: float, end: float, bins: int) -> Plain:
         """See `PagedCell`."""
-        strip = self._take()
-        closes = np.array([window.at_s for window in self._windows], np.float64)
+        strip, (closes, columns) = self._take(), self._lines
         events = [
             {"at": event.at_s, "kind": event.kind, "text": event.text}
             for event in self.observer.events.since(0).items
@@ -111,7 +112,7 @@ class WatchedCell:
             "begin": begin,
             "end": end,
             **strip.view(begin, end, bins),
-            "windows": binned_means(closes, self._columns, begin, end, bins // 2),
+            "windows": binned_means(closes, columns, begin, end, bins // 2),
             "events": events,
             "more_events": 0,
         }
@@ -152,7 +153,7 @@ class WatchedCell:
             "used": window["utilisation"],
             "decision": {
                 "incumbent": window["placement"],
-                "placement": window["decided"],
+                "placement": window.get("decided"),
                 "reason": window["reason"],
             },
             "candidates": {name: _estimate(window, name) for name in window["estimates"]},
@@ -188,7 +189,7 @@ class WatchedCell:
 
 def _estimate(window: Mapping[str, Any], name: str) -> Plain:
     """Return what was believed of a candidate at a window's close."""
-    return {"cost": window["estimates"].get(name), **window["predicted"][name]}
+    return {"cost": window["estimates"].get(name), **window.get("predicted", {}).get(name, {})}
 
 
 def _applied_age_ms(status: Mapping[str, Any]) -> float | None:
