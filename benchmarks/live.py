@@ -30,14 +30,14 @@ CONTROLLER_SHARE = 2.0
 MOVES = 21
 
 
-def _everywhere() -> None:
+def everywhere() -> None:
     """Undo the pinning of the parent: a cell's processes take what cores there are."""
     os.sched_setaffinity(0, range(os.cpu_count() or 1))
 
 
 @contextmanager
 def cell_of(found: dict[str, Any], *, links: bool) -> Iterator[LightCell]:
-    _everywhere()
+    everywhere()
     with (
         tempfile.TemporaryDirectory() as folder,
         LightCell(found, Path(folder) / "cell", links=links) as cell,
