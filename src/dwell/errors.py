@@ -45,6 +45,8 @@ OPTIONAL = {
     "polars": ("Polars", "sim"),
     "psutil": ("psutil", "live"),
     "scipy": ("SciPy", "sim"),
+    "starlette": ("Starlette", "dash"),
+    "uvicorn": ("uvicorn", "dash"),
     "vl_convert": ("vl-convert", "report"),
     "zenoh": ("Zenoh", "live"),
 }

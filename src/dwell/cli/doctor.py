@@ -39,6 +39,7 @@ EXTRAS = {
     "report": "dwell report",
     "live": "dwell live, agent, controller, keys",
     "dask": "dwell study --dask",
+    "dash": "dwell dash",
 }
 #: How many ports are looked at where no cell says which.
 DEFAULT_PORTS = 50

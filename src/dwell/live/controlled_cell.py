@@ -621,6 +621,8 @@ class ControlledCell:
         decision, problem = proposal.decision, self.place.problem
         l95_ms, _, cost = proposal.seen
         used = last.used[0].tolist()
+        columns = self.controller.decision_columns[-len(proposal.priced) :]
+        priced = dict(zip(columns, proposal.priced, strict=True))
         return {
             "number": last.number,
             "placement": last.cycles[0].placement,
@@ -628,7 +630,12 @@ class ControlledCell:
             "violation_rate": last.violation_rate(round(problem.pipeline.deadline_ms * 1e6)),
             "cost": cost,
             "reason": decision.reason,
+            "decided": decision.name,
             "estimates": {name: decision.costs.get(name) for name in problem.candidates},
+            "predicted": {
+                name: {of: priced[f"est_{of}_{name}"] for of in ("l95_ms", "violation_rate")}
+                for name in problem.candidates
+            },
             "utilisation": {
                 name: None if math.isnan(share) else share
                 for name, share in zip(self.controller.resources, used, strict=True)

@@ -3,7 +3,7 @@
 from dwell.model.table_columns import Feature
 from dwell.record.fleet_run import FleetRun, open_fleet
 from dwell.record.journal import Journal
-from dwell.record.run import Run, open_run, require_free, seal_run
+from dwell.record.run import Run, is_run, open_run, require_free, seal_run
 from dwell.record.schema import (
     OUTCOME_SENTENCES,
     OUTCOMES,
@@ -37,6 +37,7 @@ __all__ = [
     "arrays_of",
     "column_types",
     "frame_of",
+    "is_run",
     "open_fleet",
     "open_run",
     "require_free",
