@@ -41,6 +41,7 @@ OPTIONAL = {
     "cryptography": ("cryptography", "live"),
     "distributed": ("distributed", "dask"),
     "jinja2": ("Jinja2", "report"),
+    "mcap": ("mcap", "mcap"),
     "msgspec": ("msgspec", "live"),
     "polars": ("Polars", "sim"),
     "psutil": ("psutil", "live"),
