@@ -40,15 +40,15 @@ class OperatorClient:
 
     def __init__(self, problem: Problem, environment: Mapping[str, str] | None = None) -> None:
         self.problem = problem
-        self._name = f"visitor-{uuid.uuid4().hex[:8]}"
+        self.name = f"visitor-{uuid.uuid4().hex[:8]}"
         self._controller = f"controller@{problem.controller_node}"
         self._keys = Keys(problem.name)
         self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         self._answered_s: float | None = None
-        role = Role(self._name, problem.controller_node, "visitor")
+        role = Role(self.name, problem.controller_node, "visitor")
         security = self._security = Security.of(problem, role, environment)
-        self._transport = security.visit(self._name, self._controller)
-        self._transport.subscribe(self._keys.answer(self._name), self._heard)
+        self._transport = security.visit(self.name, self._controller)
+        self._transport.subscribe(self._keys.answer(self.name), self._heard)
 
     def __enter__(self) -> OperatorClient:
         """Return itself."""
@@ -113,7 +113,7 @@ class OperatorClient:
 
     def _answer(self, what: str, about: str, patience_s: float) -> Answer | None:
         """Ask until there is an answer, or patience ends."""
-        ask = encode(Ask(self._name, what, about))
+        ask = encode(Ask(self.name, what, about))
         # Who only looks may do so with the keys of an observer.
         key = self._keys.look() if what == "status" else self._keys.ask()
         # One question is sent several times; what was answered to the one before is old.

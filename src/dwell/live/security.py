@@ -133,10 +133,10 @@ class Security:
         most_peers = 2 * wiring.peers(who) + VISITORS_AT_ONCE
         return ZenohTransport(wiring.entry(who), self._settings(most_peers))
 
-    def visit(self, who: str, to: str) -> ZenohTransport:
-        """Open a session of somebody who is no part of the cell, to a process that is."""
+    def visit(self, who: str, *to: str) -> ZenohTransport:
+        """Open a session of somebody who is no part of the cell, to processes that are."""
         wiring = wire(self.problem, protocol=self._protocol)
-        return ZenohTransport(wiring.visitor(who, to), self._settings(VISITORS_AT_ONCE))
+        return ZenohTransport(wiring.visitor(who, *to), self._settings(VISITORS_AT_ONCE))
 
     def place(
         self, who: str, node: str, transport: Transport, say: Callable[[str], None]

@@ -189,13 +189,14 @@ class Wiring:
         entry = self.entry(source)
         return session_of(entry, lane, key) in self.connected(source, target)
 
-    def visitor(self, who: str, to: str) -> WiringEntry:
-        """Return the endpoints of a process outside the cell that talks to a process of it."""
-        host = self.entry(to)
-        if "control" not in host.listen:
-            raise LiveError(f"{to} of cell {self.cell!r} does not listen to anybody")
-        role = Role(who, host.role.node, "visitor")
-        return WiringEntry(role, {}, {"control": (host.listen["control"],)})
+    def visitor(self, who: str, *to: str) -> WiringEntry:
+        """Return the endpoints of a process outside the cell that talks to processes of it."""
+        hosts = [self.entry(one) for one in to]
+        for host in hosts:
+            if "control" not in host.listen:
+                raise LiveError(f"{host.role.who} of cell {self.cell!r} does not listen to anybody")
+        role = Role(who, hosts[0].role.node, "visitor")
+        return WiringEntry(role, {}, {"control": tuple(host.listen["control"] for host in hosts)})
 
 
 def roles(problem: Problem) -> tuple[Role, ...]:

@@ -1,0 +1,1 @@
+"""The web page of a live cell, and of a recorded run."""
