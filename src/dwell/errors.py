@@ -44,6 +44,7 @@ OPTIONAL = {
     "mcap": ("mcap", "mcap"),
     "msgspec": ("msgspec", "live"),
     "polars": ("Polars", "sim"),
+    "prometheus_client": ("prometheus-client", "dash"),
     "psutil": ("psutil", "live"),
     "scipy": ("SciPy", "sim"),
     "vl_convert": ("vl-convert", "report"),

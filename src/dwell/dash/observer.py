@@ -40,6 +40,9 @@ LEAST_ASK_S, MOST_ASK_S = 0.1, 0.5
 #: A cycle that nobody has told the end of is given up so long after its deadline.
 LATE_S = 1.0
 
+#: What may become of a cycle, as far as it can be heard.
+OUTCOMES = ("actuated", "not_applied", "behind", "stale", "replaced", "lost", "untold")
+
 EventKind: TypeAlias = Literal["move", "guard", "refused", "pin", "drain", "health"]
 
 
@@ -58,7 +61,7 @@ class ObservedCycle:
     known : bool
         False where it could not be heard what became of it; it is then not missed.
     outcome : str
-        ``actuated``, ``not_applied``, ``behind``, ``stale``, ``replaced``, ``lost`` or ``untold``.
+        One of `OUTCOMES`.
     jobs : tuple of mapping
         Rows of the table ``jobs`` (`dwell.model.table_columns`), its shadow's included; ``cycle``
         is its number.

@@ -76,7 +76,7 @@ class McapFile:
         }
         self._unwritten = sum(map(len, schemas.values())) + SUMMARY_BYTES
         self._ending = self._unwritten
-        self._written = self._reserved = 0
+        self._written = self._reserved = self._rows = 0
         self._reserve(0)
         self._writer.start()
         self._channels = {
@@ -91,25 +91,21 @@ class McapFile:
     def __repr__(self) -> str:
         return f"<McapFile of {', '.join(self._channels)}>"
 
-    def add(self, message: Message) -> None:
-        """Write a row.
+    def add(self, *messages: Message) -> None:
+        """Write rows: all of them, or none.
 
         Raises
         ------
         OSError
-            If there is no room for it.
+            If there is no room for them.
         """
-        at_ns, table, values = message
-        known = {
-            name: value
-            for name, value in values.items()
-            if value is not None and not (isinstance(value, float) and not math.isfinite(value))
-        }
-        text = _encode(known).encode()
-        self._reserve(len(text) + MESSAGE_BYTES)
-        self._writer.add_message(self._channels[table], at_ns, text, at_ns)
+        texts = [_text(values) for _, _, values in messages]
+        self._reserve(sum(len(text) + MESSAGE_BYTES for text in texts))
+        for (at_ns, table, _), text in zip(messages, texts, strict=True):
+            self._writer.add_message(self._channels[table], at_ns, text, at_ns)
+        self._rows += len(texts)
         if self._unwritten >= CHUNK_BYTES:
-            self._end_chunk()
+            self.flush()
 
     def _reserve(self, more_bytes: int) -> None:
         """Take the disk's space for what is to be written, and as much again for what follows."""
@@ -120,9 +116,12 @@ class McapFile:
             self._reserved = needed + CHUNK_BYTES
         self._unwritten = unwritten
 
-    def _end_chunk(self) -> None:
+    def flush(self) -> None:
+        """Hand all rows to the operating system, compressed together."""
+        if not self._rows:
+            return
         self._writer.flush()
-        self._written, self._unwritten = self._file.tell(), 0
+        self._written, self._unwritten, self._rows = self._file.tell(), 0, 0
         self._ending += INDEX_BYTES
 
     def finish(self, about: Mapping[str, object]) -> None:
@@ -133,11 +132,21 @@ class McapFile:
         about : mapping
             What the file is of, for its metadata.
         """
-        self._end_chunk()
+        self.flush()
         self._writer.add_metadata(NAMESPACE, {name: str(value) for name, value in about.items()})
         self._writer.finish()
         self._file.flush()
         self._file.truncate(self._file.tell())
+
+
+def _text(values: Values) -> bytes:
+    """Return a row as JSON, without what that has no word for: nulls, NaN and infinities."""
+    known = {
+        name: value
+        for name, value in values.items()
+        if value is not None and not (isinstance(value, float) and not math.isfinite(value))
+    }
+    return _encode(known).encode()
 
 
 def write_mcap(run: Run, path: Path) -> None:
