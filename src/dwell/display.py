@@ -1,16 +1,24 @@
-"""Display of results: a summary on a screen, and a picture in a notebook.
+"""Display of results: a summary on a screen, a picture in a notebook, the colours of placements.
 
-Both are made by what the package `dwell` has given `Displayed`, and only when something is shown.
+Summary and picture are made by what the package `dwell` has given `Displayed`, and only when
+something is shown.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import ClassVar, Protocol
 
 #: Decimals of a nanosecond in milliseconds: nobody asks for what is behind them.
 OF_A_NANOSECOND = 6
+#: Hues that colour-blind readers tell apart, too: those of Okabe and Ito (2008).
+HUES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#b8a800")
+
+
+def placement_hues(candidates: Iterable[str]) -> dict[str, str]:
+    """Give every candidate its hue, in the order of the cell file."""
+    return {name: HUES[i % len(HUES)] for i, name in enumerate(candidates)}
 
 
 def decimals_for(value: float, decimals: int) -> int:

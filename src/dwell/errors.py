@@ -47,6 +47,8 @@ OPTIONAL = {
     "prometheus_client": ("prometheus-client", "dash"),
     "psutil": ("psutil", "live"),
     "scipy": ("SciPy", "sim"),
+    "starlette": ("Starlette", "dash"),
+    "uvicorn": ("uvicorn", "dash"),
     "vl_convert": ("vl-convert", "report"),
     "zenoh": ("Zenoh", "live"),
 }

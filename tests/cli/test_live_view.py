@@ -12,7 +12,7 @@ from rich.console import Console
 import dwell
 from dwell.cli.live_view import CellState, Lines, Screen
 from dwell.model import Problem
-from dwell.report.phases import Disturbed, disturbed
+from dwell.model.disturbed import Disturbed, disturbed
 
 CELL = Path(__file__).parents[2] / "examples" / "visual_servoing" / "cell.yaml"
 

@@ -6,10 +6,10 @@ import re
 
 import pytest
 
+from dwell.display import HUES
 from dwell.report.page import TEMPLATES
 from dwell.report.palette import (
     APART,
-    HUES,
     INK,
     MUTED,
     PAPER,

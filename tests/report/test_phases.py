@@ -19,7 +19,8 @@ from dwell.model import (
     Normal,
     Scenario,
 )
-from dwell.report.phases import CALM, Disturbed, disturbed, phase_rows, phases
+from dwell.model.disturbed import Disturbed, disturbed
+from dwell.report.phases import CALM, phase_rows, phases
 from dwell.report.run_header import RunHeader
 from tests.report.live_runs import PLAYED, TRACKING, live_run
 

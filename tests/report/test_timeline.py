@@ -10,9 +10,9 @@ import polars as pl
 import pytest
 
 import dwell
+from dwell.model.disturbed import Disturbed
 from dwell.report.figure import Figure, printed_svg, svg
 from dwell.report.palette import Palette
-from dwell.report.phases import Disturbed
 from dwell.report.timeline import (
     MOST_BINS,
     MOST_MARKS,

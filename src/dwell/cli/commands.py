@@ -11,6 +11,7 @@ from typer.core import TyperGroup
 from dwell import __version__
 from dwell.cli.check import check
 from dwell.cli.completion import completion
+from dwell.cli.dash import dash
 from dwell.cli.demo import demo
 from dwell.cli.keys import keys
 from dwell.cli.live import agent, controller, live
@@ -102,7 +103,7 @@ def doctor(
 
 
 for command in (
-    *(check, run, study, report, validate, new, schema, demo, doctor, completion),
+    *(check, run, study, report, dash, validate, new, schema, demo, doctor, completion),
     *(agent, controller),
 ):
     app.command()(command)

@@ -19,11 +19,12 @@ from dwell.errors import ExitCode, LiveError, installing, not_installed
 from dwell.live.stage_modules import require_stages
 from dwell.model import Problem, Scenario
 from dwell.model.bounds import counted
+from dwell.model.disturbed import Disturbed, disturbed
 from dwell.record import Run, open_run, seal_run
 from dwell.record.journal import note_in_journal, read_plain_journal
 from dwell.report import run_html
 from dwell.report.formatting import listed, percent, write_ms
-from dwell.report.phases import Disturbed, PhaseRow, disturbed, phase_rows
+from dwell.report.phases import PhaseRow, phase_rows
 from dwell.report.run_header import RunHeader
 from dwell.testbed.cell_observer import CellObserver, load_observer
 from dwell.testbed.loopback import Loopback, on_this_machine

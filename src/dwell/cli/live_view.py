@@ -19,8 +19,8 @@ from rich.text import Text
 
 from dwell.cli.live import proof
 from dwell.model import Problem
+from dwell.model.disturbed import Disturbed
 from dwell.report.palette import Palette
-from dwell.report.phases import Disturbed
 
 MOST_COLUMNS = 100
 LABEL, VALUE = 10, 10

@@ -123,9 +123,8 @@ class CellRecorder:
             return
         self.recorded += 1
         if self._trouble:
-            self._say(
-                f"{self._path}: can be written again; {self.dropped} cycles and windows were dropped"
-            )
+            lost = f"{self.dropped} cycles and windows were dropped"
+            self._say(f"{self._path}: can be written again; {lost}")
             self._trouble = ""
 
     def _of_window(self, window: ObservedWindow) -> Iterator[Message]:

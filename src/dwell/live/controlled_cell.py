@@ -42,7 +42,7 @@ RESEND_NS = 40_000_000
 #: Stamps in a row that say that the cell has been moved, where no answer says so.
 CONFIRMATIONS = 3
 
-#: Why a cell is moved: the policy's reasons, the guard, a person's wish, an order that is not known.
+#: Why a cell is moved: the policy's reasons, the guard, a person's wish, an unknown order.
 MOVED_BY = ("migrate", "capped", "infeasible", "guard", "pinned", "drained", "ordered")
 
 Phase: TypeAlias = Literal["fork", "state", "order"]
@@ -639,6 +639,8 @@ class ControlledCell:
         decision, problem = proposal.decision, self.place.problem
         l95_ms, _, cost = proposal.seen
         used = last.used[0].tolist()
+        columns = self.controller.decision_columns[-len(proposal.priced) :]
+        priced = dict(zip(columns, proposal.priced, strict=True))
         return {
             "number": last.number,
             "placement": last.cycles[0].placement,
@@ -647,6 +649,10 @@ class ControlledCell:
             "cost": cost,
             "reason": decision.reason,
             "estimates": {name: decision.costs.get(name) for name in problem.candidates},
+            "predicted": {
+                name: {of: priced[f"est_{of}_{name}"] for of in ("l95_ms", "violation_rate")}
+                for name in problem.candidates
+            },
             "utilisation": {
                 name: None if math.isnan(share) else share
                 for name, share in zip(self.controller.resources, used, strict=True)

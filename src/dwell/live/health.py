@@ -145,10 +145,9 @@ def _symptoms(
         if _heard(status, role) and age_ms > limit_ms:
             why = [*_kept_back(problem, sink["outcome"]), *_notes(status, [role.who])]
             yield f"{role.who} has applied nothing since {_time(age_ms)}{_because(why)}"
-    recent, limit = status["recent"], problem.live.degraded_at
+    recent = status["recent"]
     rates = recent["violation_rates"]
-    # What is over shall not count for as long as it lasted.
-    if rates and min(sum(rates) / len(rates), rates[-1]) > limit:
+    if problem.live.degraded_by(rates):
         placed = problem.candidates[status["placement"]].items()
         names = [*(f"{task}@{node}" for task, node in placed), *(role.who for role in sinks)]
         why = [*_unreached(problem, status, recent["unreached"]), *_notes(status, names)]

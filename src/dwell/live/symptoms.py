@@ -15,9 +15,8 @@ from dwell.live.cycle_ledger import SHADOW, Ledger, LiveCycle
 from dwell.live.messages import ACTUATED, Completion
 from dwell.live.run_rows import LiveWindow
 from dwell.model import Problem
+from dwell.model.live import RECENT_WINDOWS
 
-#: Closed windows whose V_D counts.
-RECENT = 3
 #: Windows' worth of cycles without a shadow through a candidate, after which those before it that
 #: failed say nothing more.
 SILENT_WINDOWS = 2
@@ -32,7 +31,7 @@ class Symptoms:
         self._failures = problem.controller.failures_in_a_row
         self._deadline_ns = round(problem.pipeline.deadline_ms * 1e6)
         self._begun_ns: int | None = None
-        self._recent: deque[LiveWindow] = deque(maxlen=RECENT)
+        self._recent: deque[LiveWindow] = deque(maxlen=RECENT_WINDOWS)
         # By sink: when a command was heard to be applied last, and what came of the last command.
         self._applied_ns: dict[str, int] = {}
         self._outcomes: dict[str, str] = {}

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 from dwell.model.bounds import LARGEST, MAX_COUNT, Bound, require
 from dwell.model.declaration import declared, key
 from dwell.model.frozen import FrozenDict
+
+#: Closed windows whose V_D says whether a cell is degraded.
+RECENT_WINDOWS = 3
 
 PORT = Bound(1024, 65_000, whole=True)
 
@@ -101,6 +104,13 @@ class LiveSettings:
             require_callable_name(f"live.actuators.{task}", name)
         if self.observer is not None:
             require_callable_name("live.observer", self.observer)
+
+    def degraded_by(self, rates: Sequence[float]) -> bool:
+        """Whether V_D of the last windows is too high: in the mean, and in the last.
+
+        What is over shall not count for as long as it lasted.
+        """
+        return bool(rates) and min(sum(rates) / len(rates), rates[-1]) > self.degraded_at
 
 
 def require_callable_name(path: str, name: str) -> None:

@@ -2,7 +2,7 @@
 
 from dwell.model.table_columns import Feature
 from dwell.record.journal import Journal
-from dwell.record.run import Run, open_run, require_free, seal_run
+from dwell.record.run import Run, is_run, open_run, require_free, seal_run
 from dwell.record.schema import (
     OUTCOME_SENTENCES,
     OUTCOMES,
@@ -35,6 +35,7 @@ __all__ = [
     "arrays_of",
     "column_types",
     "frame_of",
+    "is_run",
     "open_run",
     "require_free",
     "row_of",

@@ -292,6 +292,11 @@ def _replace(draft: Path, target: Path) -> None:
         draft.replace(target)
 
 
+def is_run(path: str | os.PathLike[str]) -> bool:
+    """Whether a folder has a run in it, finished, or a live one that goes on or was killed."""
+    return any((Path(path) / name).is_file() for name in ("run.json", JOURNAL))
+
+
 def open_run(path: str | os.PathLike[str]) -> Run:
     """Open a run's folder; tables are read when first asked for.
 

@@ -1,11 +1,9 @@
 """Colours: one a placement, the same in every figure, told apart by colour-blind readers too.
 
-The hues are those of Okabe and Ito (2008). Candidates take them from the front, in the order of
-the cell file; a policy that moves has a colour of its own, DTP that of the text and several DTPs
-one each, and a marker and dashes that say what it believes, so that no two lines differ by their
-colour alone. Colours of
-text, rules and paper are CSS variables that the page gives a value to, light or dark, and paper
-another.
+Candidates have the hues of `dwell.display`, from the front; a policy that moves has a colour of its
+own, DTP that of the text and several DTPs one each, and a marker and dashes that say what it
+believes, so that no two lines differ by their colour alone. Colours of text, rules and paper are
+CSS variables that the page gives a value to, light or dark, and paper another.
 """
 
 from __future__ import annotations
@@ -15,13 +13,12 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
+from dwell.display import HUES, placement_hues
 from dwell.estimators.registry import REGISTRY as ESTIMATORS
 from dwell.policies import registry
 
 #: Lengths of strokes and gaps in turn, pixels.
 Dashes: TypeAlias = tuple[int, ...]
-
-HUES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#b8a800")
 
 INK, MUTED, RULE = "var(--ink)", "var(--muted)", "var(--rule)"
 PAPER, SHADE, BAD = "var(--paper)", "var(--shade)", "var(--bad)"
@@ -158,7 +155,7 @@ class Palette:
             Estimator that the cell gives its policies. Where any of them says so itself, the others
             are drawn as who believes this: ``dtp`` is then another line than ``dtp+corrected``.
         """
-        placements = {name: HUES[i % len(HUES)] for i, name in enumerate(candidates)}
+        placements = placement_hues(candidates)
         policies = tuple(dict.fromkeys(policies))
         moving = {name: contended(name) for name in policies if name not in placements}
         if any(known.belief for known in moving.values() if known):

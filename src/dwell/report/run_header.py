@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from dwell.errors import RunError
 from dwell.model import Problem
+from dwell.model.disturbed import Disturbed, disturbed
 from dwell.record import Run
-from dwell.report.phases import Disturbed, disturbed
 from dwell.study.drawn_disturbances import disturbances_of
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from dwell.model import Problem
-    from dwell.report.phases import Disturbed
+    from dwell.model.disturbed import Disturbed
     from dwell.report.run_header import Tracking
 
 #: Marks of a panel at most, each a window; of longer runs there are fewer, each of several windows.

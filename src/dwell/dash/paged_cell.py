@@ -1,0 +1,128 @@
+"""PagedCell: a cell as the page sees it, whether it runs or is recorded.
+
+A page shows one cell or several on one time line. All instants that pass between page and server
+are places on it: seconds since the first release, or numbers of cycles.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, Literal, Protocol, TypeAlias
+
+from dwell.display import placement_hues
+from dwell.model import Link, Problem, Trace
+
+#: What a place on the time line counts.
+Unit: TypeAlias = Literal["s", "cycle"]
+#: Plain values, ready for JSON.
+Plain: TypeAlias = dict[str, Any]
+
+
+class PagedCell(Protocol):
+    """See the module; every method returns at once, from any thread."""
+
+    live: bool
+
+    def described(self) -> Plain:
+        """Return what does not change, and where its time line begins and ends."""
+        ...
+
+    def view(self, begin: float, end: float, bins: int) -> Plain:
+        """Return what is drawn between two places, in so many bins at most."""
+        ...
+
+    def state(self, at: float) -> Plain:
+        """Return how the cell was at a place; a cell that runs, how it is."""
+        ...
+
+    def jobs(self, begin: float, end: float) -> Plain:
+        """Return the jobs of the cycles between two places, as far as they are known."""
+        ...
+
+    def refreshed(self) -> bool:
+        """Whether there is more of it than at the last call."""
+        ...
+
+
+def cell_document(problem: Problem) -> Plain:
+    """Return what a page draws of a cell: its computers, stages and candidates."""
+    fabric, pipeline = problem.fabric, problem.pipeline
+    hues = placement_hues(problem.candidates)
+    return {
+        "name": problem.name,
+        "period_ms": pipeline.period_ms,
+        "deadline_ms": pipeline.deadline_ms,
+        "window_cycles": problem.window_cycles,
+        "nodes": [
+            {"name": node.name, "tier": node.tier, "cores": node.cores}
+            for node in fabric.nodes.values()
+        ],
+        "links": [
+            {"source": link.source, "target": link.target, "text": _link(link)}
+            for link in fabric.links.values()
+        ],
+        "tasks": [
+            {"name": name, "on": list(pipeline.tasks[name].on)} for name in pipeline.topological()
+        ],
+        "flows": [[flow.source, flow.target] for flow in pipeline.flows],
+        "candidates": [
+            {"name": name, "hue": hues[name], "nodes": dict(placement)}
+            for name, placement in problem.candidates.items()
+        ],
+        "resources": [
+            {"name": one.name, "node": one.node, "kind": one.kind or "CPU"}
+            for one in fabric.resources.values()
+        ],
+    }
+
+
+def job_since(job: Mapping[str, Any], origin_ns: int) -> Plain:
+    """Return a row of ``jobs`` with its instants in milliseconds since an origin."""
+    since = {
+        f"{name}_ms": None if (at_ns := job[f"{name}_ns"]) is None else (at_ns - origin_ns) / 1e6
+        for name in ("ready", "start", "end")
+    }
+    names = {name: str(job[name]) for name in ("task", "node", "outcome")}
+    return {**names, **since, "cycle": job["cycle"], "shadow": bool(job.get("shadow"))}
+
+
+def cycle_since(
+    number: int, release_ns: int, latency_ns: float | None, origin_ns: int, *, missed: bool
+) -> Plain:
+    """Return a cycle beside its jobs, in milliseconds since their origin."""
+    return {
+        "cycle": number,
+        "release_ms": (release_ns - origin_ns) / 1e6,
+        "latency_ms": None if latency_ns is None else latency_ns / 1e6,
+        "missed": missed,
+    }
+
+
+def finite(value: Any) -> Any:
+    """Return plain values of which the numbers that are not finite are None: JSON has no others."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {name: finite(one) for name, one in value.items()}
+    return [finite(one) for one in value] if isinstance(value, list | tuple) else value
+
+
+def _link(link: Link) -> str:
+    """Return delay and rate of a link, as written beside it."""
+    delay = "as recorded" if isinstance(link.delay_ms, Trace) else None
+    parts = [delay or f"{link.delay_ms.expectation:.3g} ms"]
+    if not math.isinf(link.rate_mbps):
+        parts.append(f"{link.rate_mbps:.4g} Mbit/s")
+    return ", ".join(parts)
+
+
+def health_by(problem: Problem, rates: list[float]) -> Mapping[str, str | None]:
+    """Return health and headline of a cell of which the last windows' V_D is all that is known."""
+    if not problem.live.degraded_by(rates):
+        return {"health": "ok", "headline": None}
+    rate = sum(rates) / len(rates)
+    return {
+        "health": "degraded",
+        "headline": f"V_D is {rate:.0%} in the last {len(rates)} windows",
+    }

@@ -1,0 +1,144 @@
+"""Pages: what `dwell dash` shows of a run, of two, or of a live cell."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from dwell.errors import DwellError, RunError, TrustError
+from dwell.live.log import printable
+from dwell.record import is_run
+
+if TYPE_CHECKING:
+    from dwell.dash.observer import Observer
+    from dwell.dash.recorded_cell import RecordedCell
+
+#: Prints a line for people.
+Say: TypeAlias = Callable[[str], None]
+
+#: Folders of runs that are named.
+MOST_NAMED = 8
+
+
+def show_run(folder: Path, beside: Path | None, *, port: int, browser: bool, say: Say) -> None:
+    """Show a recorded run until interrupted, or two on one time line.
+
+    Raises
+    ------
+    RunError
+        If a folder is no run, or damaged.
+    """
+    from dwell.dash.server import Dash
+    from dwell.dash.serving import serve
+
+    for one in (folder, beside):
+        if one is not None:
+            _require_run(one)
+    cells, line = _on_one_line(folder, beside)
+    serve(Dash(cells, line), port, browser=browser, say=say)
+
+
+def _require_run(folder: Path) -> None:
+    """Refuse a folder that is not one run, and name those in it."""
+    if is_run(folder) or not folder.is_dir():
+        return
+    if (folder / "fleet.json").is_file():
+        raise RunError(f"{folder}: a fleet; name the folder of one of its cells")
+    runs = sorted(path.relative_to(folder).as_posix() for path in _runs_in(folder))
+    if runs:
+        more = f", and {len(runs) - MOST_NAMED} more" if len(runs) > MOST_NAMED else ""
+        named = ", ".join(runs[:MOST_NAMED])
+        raise RunError(
+            f"{folder}: not a run, and no fleet (it has no fleet.json); it holds {named}{more}: "
+            "name one of them, and another with --beside"
+        )
+
+
+def _runs_in(folder: Path) -> list[Path]:
+    return [path for path in (*folder.glob("*"), *folder.glob("runs/*")) if is_run(path)]
+
+
+def _on_one_line(folder: Path, beside: Path | None) -> tuple[list[RecordedCell], str]:
+    """Return the runs, and what their time line counts: cycles where these are the same."""
+    from dwell.dash.recorded_cell import RecordedCell, same_realisation
+
+    one = RecordedCell(folder)
+    if beside is None:
+        return [one], ""
+    other = RecordedCell(beside)
+    if same_realisation(one.meta, other.meta):
+        line = "by number of the cycle: both runs met the same realisation"
+        return [RecordedCell(folder, "cycle"), RecordedCell(beside, "cycle")], line
+    return [one, other], "by seconds since the first release: the runs met different realisations"
+
+
+def show_cell(
+    file: Path,
+    environment: Mapping[str, str],
+    *,
+    port: int,
+    browser: bool,
+    control: bool,
+    say: Say,
+) -> None:
+    """Show a live cell until interrupted.
+
+    Parameters
+    ----------
+    environment : mapping of str to str
+        With the variables of `dwell.live.security`.
+    control : bool
+        Whether the page may act.
+
+    Raises
+    ------
+    TrustError
+        If it may not with these keys, or without any.
+    """
+    from dwell.cellfile import load_without_traces
+    from dwell.dash.observer import Observer
+    from dwell.dash.server import Dash
+    from dwell.dash.serving import serve
+    from dwell.dash.watched_cell import WatchedCell
+
+    with Observer(load_without_traces(file), environment) as observer:
+        dash = Dash([WatchedCell(observer)])
+        if control:
+            _require_operator(observer)
+            dash.act = _logged(observer, say)
+        serve(dash, port, browser=browser, say=say)
+
+
+def _require_operator(observer: Observer) -> None:
+    """Refuse to act with the keys of somebody who may only look, or without keys on a network."""
+    from dwell.live.security import exposed
+
+    keyring = observer.security.keyring
+    if keyring is None:
+        if faults := list(exposed(observer.problem)):
+            raise TrustError(
+                f"--control without keys is for cells on this computer alone: {faults[0]}"
+            )
+    elif keyring.own.role == "observer":
+        raise TrustError(f"{keyring.folder}: keys of an observer, who may look and no more")
+
+
+def _logged(observer: Observer, say: Say) -> Callable[[str, str], Mapping[str, Any]]:
+    """Return what carries out acts, and says of each when, what, by whose certificate, and how."""
+    keyring = observer.security.keyring
+    who = "without keys" if keyring is None else f"by {keyring.own.common_name}"
+
+    def act(what: str, about: str) -> Mapping[str, Any]:
+        words = printable(f"{what} {about}".strip())[:200]
+        said = f"{datetime.now().astimezone().isoformat(timespec='milliseconds')} {words} {who}"
+        try:
+            status = observer.act(what, about)
+        except DwellError as error:
+            say(f"{said}: {error}")
+            raise
+        say(f"{said}: done")
+        return status
+
+    return act

@@ -1,0 +1,303 @@
+"""The page's application: what it serves of its cells, and how people act on them."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass, field
+from functools import cache, partial
+from http import HTTPStatus
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.routing import Route
+from starlette.types import Receive, Scope, Send
+
+from dwell.dash.paged_cell import PagedCell, Plain
+from dwell.errors import DwellError
+
+STATIC = Path(__file__).with_name("static")
+TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".svg": "image/svg+xml",
+}
+#: Time between two looks at the cells, and at those that are recorded.
+TICK_S, RECORDED_TICK_S = 0.1, 1.0
+#: Readers of events at a time, and how long one may take for one of them.
+MOST_READERS, READER_S = 32, 10.0
+#: A comment keeps a connection, and notices who is gone.
+QUIET_S = 15.0
+MOST_BODY_BYTES = 4_096
+LEAST_BINS, MOST_BINS = 10, 1_500
+
+#: Name of an act, and what it is about, to the controller's status.
+Act: TypeAlias = Callable[[str, str], Mapping[str, Any]]
+
+#: What acts, and what the body of the request says that it is about.
+ACTS = {"pin": "candidate", "unpin": None, "drain": "node", "undrain": "node"}
+
+
+@dataclass(slots=True)
+class Dash:
+    """Cells on one page.
+
+    Parameters
+    ----------
+    cells : sequence of PagedCell
+        On one time line.
+    line : str
+        What the time line counts where there are several, and why; empty for one.
+    act : callable, optional
+        What carries out acts on the first cell; the page is read-only without.
+    read_only : str
+        Why it is.
+    """
+
+    cells: Sequence[PagedCell]
+    line: str = ""
+    act: Act | None = None
+    read_only: str = "this page only looks; `dwell dash --control` lets it act"
+    _news: asyncio.Condition = field(default_factory=asyncio.Condition, repr=False)
+    _tick: tuple[int, bytes] = field(default=(0, b""), repr=False)
+    _readers: int = field(default=0, repr=False)
+
+    def application(self) -> Starlette:
+        """Return what a server serves; who may ask is not its business (`dwell.dash.gate`)."""
+        routes = [
+            Route("/", partial(_file, "index.html")),
+            *(Route(f"/static/{name}", partial(_file, name)) for name in static_files()),
+            Route("/cells", self._cells),
+            Route("/view", self._view),
+            Route("/state", self._state),
+            Route("/jobs", self._jobs),
+            Route("/events", self._events),
+            Route("/healthz", _alive),
+            Route("/readyz", self._ready),
+            *(Route(f"/{what}", partial(self._act, what), methods=["POST"]) for what in ACTS),
+        ]
+        handlers = {HTTPException: _refused, DwellError: _failed}
+        return Starlette(routes=routes, lifespan=self._ticking, exception_handlers=handlers)
+
+    # ---------------------------------------------------------------------- what is read
+
+    async def _cells(self, _: Request) -> Response:
+        described = [await run_in_threadpool(cell.described) for cell in self.cells]
+        control = self.act is not None
+        return _json(
+            {
+                "cells": described,
+                "line": self.line,
+                "control": control,
+                "read_only": None if control else self.read_only,
+            }
+        )
+
+    async def _view(self, request: Request) -> Response:
+        cell, begin, end = self._cell(request), *_places(request)
+        bins = round(_number(request, "bins", 600.0))
+        bins = min(max(bins, LEAST_BINS), MOST_BINS)
+        return _json(await run_in_threadpool(cell.view, begin, end, bins))
+
+    async def _state(self, request: Request) -> Response:
+        cell = self._cell(request)
+        return _json(await run_in_threadpool(cell.state, _number(request, "at")))
+
+    async def _jobs(self, request: Request) -> Response:
+        cell, begin, end = self._cell(request), *_places(request)
+        return _json(await run_in_threadpool(cell.jobs, begin, end))
+
+    def _cell(self, request: Request) -> PagedCell:
+        place = request.query_params.get("cell", "0")
+        if not place.isascii() or not place.isdigit() or int(place) >= len(self.cells):
+            raise HTTPException(HTTPStatus.NOT_FOUND, f"no cell {place!r}")
+        return self.cells[int(place)]
+
+    async def _ready(self, _: Request) -> Response:
+        """Whether a live cell is heard, and well; says nothing else of it."""
+        live = [cell for cell in self.cells if cell.live]
+        states = [await run_in_threadpool(cell.state, 0.0) for cell in live]
+        well = bool(states) and all(state.get("health") == "ok" for state in states)
+        status = HTTPStatus.OK if well else HTTPStatus.SERVICE_UNAVAILABLE
+        return PlainTextResponse("ready\n" if well else "not ready\n", status)
+
+    # ------------------------------------------------------------------------- what acts
+
+    async def _act(self, what: str, request: Request) -> Response:
+        if self.act is None:
+            raise HTTPException(HTTPStatus.FORBIDDEN, self.read_only)
+        key = ACTS[what]
+        about = "" if key is None else await _about(request, key)
+        status = await run_in_threadpool(self.act, what, about)
+        shown = ("pinned", "drained", "placement", "moving_to")
+        return _json({name: status.get(name) for name in shown})
+
+    # ------------------------------------------------------------------------- what is new
+
+    @asynccontextmanager
+    async def _ticking(self, _: Starlette) -> AsyncIterator[None]:
+        task = asyncio.create_task(self._look_on())
+        try:
+            yield
+        finally:
+            task.cancel()
+            with suppress(asyncio.CancelledError):
+                await task
+
+    async def _look_on(self) -> None:
+        """Tell all readers of events together what is new; nobody is waited for."""
+        every_s = TICK_S if any(cell.live for cell in self.cells) else RECORDED_TICK_S
+        while True:
+            await asyncio.sleep(every_s)
+            if not self._readers:
+                continue
+            news = await run_in_threadpool(self._new_states)
+            if news:
+                number, _ = self._tick
+                async with self._news:
+                    self._tick = number + 1, f"data: {json.dumps(news)}\n\n".encode()
+                    self._news.notify_all()
+
+    def _new_states(self) -> list[Plain]:
+        """Return the state of every live cell, and where the recorded ones that grew end."""
+        news = []
+        for place, cell in enumerate(self.cells):
+            grew = cell.refreshed()
+            if cell.live:
+                news.append({"cell": place, "grew": grew, "state": cell.state(math.inf)})
+            elif grew:
+                news.append({"cell": place, "grew": True, "described": cell.described()})
+        return news
+
+    async def _events(self, _: Request) -> Response:
+        if self._readers >= MOST_READERS:
+            raise HTTPException(
+                HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_READERS} pages are open already"
+            )
+        return _EventStream(self)
+
+    async def next_tick(self, number: int) -> tuple[int, bytes]:
+        """Return the newest tick after a number; a comment where there is none for a while."""
+        async with self._news:
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self._news.wait_for(lambda: self._tick[0] > number), QUIET_S)
+                return self._tick
+        return number, b": quiet\n\n"
+
+    @asynccontextmanager
+    async def reading(self) -> AsyncIterator[None]:
+        """Count a reader of events."""
+        self._readers += 1
+        try:
+            yield
+        finally:
+            self._readers -= 1
+
+
+class _EventStream(Response):
+    """Server-sent events to one reader: the newest; one that does not read is let go."""
+
+    def __init__(self, dash: Dash) -> None:
+        super().__init__()
+        self._dash = dash
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        gone = asyncio.create_task(_gone(receive))
+        async with self._dash.reading():
+            told = asyncio.create_task(self._tell(send))
+            _, waiting = await asyncio.wait({gone, told}, return_when=asyncio.FIRST_COMPLETED)
+            for task in waiting:
+                task.cancel()
+            for task in (gone, told):
+                with suppress(asyncio.CancelledError, TimeoutError):
+                    await task
+
+    async def _tell(self, send: Send) -> None:
+        headers = [(b"content-type", b"text/event-stream")]
+        await send({"type": "http.response.start", "status": 200, "headers": headers})
+        data, number = b"retry: 1000\n\n", 0
+        while True:
+            message = {"type": "http.response.body", "body": data, "more_body": True}
+            await asyncio.wait_for(send(message), READER_S)
+            number, data = await self._dash.next_tick(number)
+
+
+async def _gone(receive: Receive) -> None:
+    """Wait until a reader is gone."""
+    while (await receive())["type"] != "http.disconnect":
+        pass
+
+
+@cache
+def static_files() -> Mapping[str, bytes]:
+    """Return all files that are served, by their paths: nothing else of the disk is ever read."""
+    files = (path for path in STATIC.rglob("*") if path.suffix in TYPES)
+    return {path.relative_to(STATIC).as_posix(): path.read_bytes() for path in files}
+
+
+async def _file(name: str, _: Request) -> Response:
+    return Response(static_files()[name], media_type=TYPES[Path(name).suffix])
+
+
+async def _alive(_: Request) -> Response:
+    return PlainTextResponse("alive\n")
+
+
+def _json(value: object) -> Response:
+    return JSONResponse(value)
+
+
+async def _refused(_: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)  # noqa: S101 (registered for that)
+    return JSONResponse({"error": error.detail}, error.status_code, error.headers)
+
+
+async def _failed(_: Request, error: Exception) -> Response:
+    return JSONResponse({"error": str(error)}, HTTPStatus.CONFLICT)
+
+
+async def _about(request: Request, key: str) -> str:
+    """Return what an act is about, from the request's body."""
+    body = b""
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > MOST_BODY_BYTES:
+            raise HTTPException(
+                HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"at most {MOST_BODY_BYTES} bytes are read"
+            )
+    try:
+        about = json.loads(body)[key]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        about = None
+    if not isinstance(about, str):
+        raise HTTPException(HTTPStatus.BAD_REQUEST, f'the body has to be {{"{key}": NAME}}')
+    return about
+
+
+def _places(request: Request) -> tuple[float, float]:
+    begin, end = _number(request, "begin"), _number(request, "end")
+    if not begin < end:
+        raise HTTPException(HTTPStatus.BAD_REQUEST, f"begin {begin:g} is not before end {end:g}")
+    return begin, end
+
+
+def _number(request: Request, name: str, usual: float | None = None) -> float:
+    text = request.query_params.get(name)
+    if text is None and usual is not None:
+        return usual
+    try:
+        value = float(text or "")
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise HTTPException(HTTPStatus.BAD_REQUEST, f"{name} has to be a number, not {text!r}")
+    return value

@@ -1,0 +1,164 @@
+"""Serves a page: its port, its address, the browser that opens it, and its end."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import html
+import logging
+import os
+import shutil
+import signal
+import socket
+import sys
+import tempfile
+import webbrowser
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import uvicorn
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from dwell.dash.gate import Gate
+from dwell.dash.server import Dash
+from dwell.errors import DwellError
+
+LOOPBACK = "127.0.0.1"
+#: Connections at a time, and how long one may take to ask for something.
+MOST_CONNECTIONS, REQUEST_S = 512, 10.0
+#: How long requests may take to end when the process is to.
+GRACE_S = 1
+
+
+def serve(dash: Dash, port: int, *, browser: bool, say: Callable[[str], None]) -> None:
+    """Serve a page until this process is interrupted.
+
+    Its address, with the token, is the only line on stdout.
+
+    Parameters
+    ----------
+    port : int
+        0 takes one that is free.
+    browser : bool
+        Whether to open it in one.
+    say : callable
+        Prints a line for people.
+
+    Raises
+    ------
+    DwellError
+        If the port is taken.
+    KeyboardInterrupt
+        If that is what ended it.
+    """
+    with _listening(port) as listener:
+        gate = Gate(dash.application(), listener.getsockname()[1])
+        address = f"http://{LOOPBACK}:{gate.port}/?token={gate.token}"
+        print(address, flush=True)
+        with _opened(address, say) if browser else _nothing():
+            if asyncio.run(_served(gate, listener)) == signal.SIGINT:
+                raise KeyboardInterrupt
+
+
+@contextmanager
+def _listening(port: int) -> Iterator[socket.socket]:
+    try:
+        listener = socket.create_server((LOOPBACK, port), backlog=MOST_CONNECTIONS)
+    except OSError as error:
+        why = "is taken" if error.errno == errno.EADDRINUSE else f"cannot be had ({error.strerror})"
+        raise DwellError(
+            f"port {port} of {LOOPBACK} {why}; --port 0 takes one that is free"
+        ) from None
+    with listener:
+        yield listener
+
+
+class _Protocol(H11Protocol):
+    """HTTP that closes connections which never ask for anything."""
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self.loop.call_later(REQUEST_S, self._close_if_silent)
+
+    def _close_if_silent(self) -> None:
+        if self.cycle is None:
+            self.transport.close()
+
+
+class _Server(uvicorn.Server):
+    """A server that leaves signals to whoever runs it."""
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+
+async def _served(gate: Gate, listener: socket.socket) -> int | None:
+    """Serve until a signal; returns it."""
+    logging.getLogger("uvicorn").setLevel(logging.CRITICAL)
+    server = _Server(
+        uvicorn.Config(
+            gate,
+            http=_Protocol,
+            ws="none",
+            log_config=None,
+            access_log=False,
+            proxy_headers=False,
+            server_header=False,
+            limit_concurrency=MOST_CONNECTIONS,
+            timeout_graceful_shutdown=GRACE_S,
+        )
+    )
+    caught: list[int] = []
+
+    def end(number: int) -> None:
+        caught.append(number)
+        server.should_exit = True
+
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, end, number)
+    await server.serve([listener])
+    return caught[0] if caught else None
+
+
+@contextmanager
+def _nothing() -> Iterator[None]:
+    yield
+
+
+@contextmanager
+def _opened(address: str, say: Callable[[str], None]) -> Iterator[None]:
+    """Open an address in a browser, as long as this lasts.
+
+    What a process is started with, others can read. So the browser is given a file that only this
+    user can read, which leads to the address.
+    """
+    if sys.platform == "linux" and not (os.environ.keys() & {"DISPLAY", "WAYLAND_DISPLAY"}):
+        say("no display here: open the address in a browser; from elsewhere, through `ssh -L`")
+        yield
+        return
+    folder = Path(tempfile.mkdtemp(prefix="dwell-dash-"))
+    try:
+        page = folder / "open.html"
+        escaped = html.escape(address)
+        descriptor = os.open(page, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+            file.write(
+                '<!doctype html><meta charset="utf-8"><title>Dwell</title>'
+                '<meta name="referrer" content="no-referrer">'
+                f'<meta http-equiv="refresh" content="0; url={escaped}">'
+                f'<a href="{escaped}">Open the page</a>\n'
+            )
+        if not _shown(page.as_uri()):
+            say("no browser could be started: open the address in one")
+        yield
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _shown(address: str) -> bool:
+    with suppress(webbrowser.Error, OSError):
+        return webbrowser.open(address)
+    return False

@@ -1,0 +1,277 @@
+// Strips along the time line: latency with the deadline and the misses, placement, J, load.
+
+import { colour, count, draw, make, number, percent, say } from "./dom.js";
+
+const DASHES = [[], [7, 3], [2, 2], [7, 2, 2, 2], [11, 3, 3, 3], [4, 4], [9, 2, 2, 2, 2, 2]];
+/** Bins in which a miss is a cross; in more of them, a line. */
+const CROSSES = 120;
+const LEFT = 50;
+const LANE = 16;
+
+/** Set up one strip; all of them have one x, one cursor, and one way to zoom: by dragging. */
+const strip = (root, page, height, { series, scales, axes, drawn, padding }) => {
+  const select = (u) => {
+    const { left, width } = u.select;
+    if (width < 4) return;
+    const [begin, end] = [u.posToVal(left, "x"), u.posToVal(left + width, "x")];
+    u.setSelect({ left: 0, top: 0, width: 0, height: 0 }, false);
+    page.zoom(begin, end);
+  };
+  const options = {
+    width: Math.max(root.clientWidth, 200),
+    height,
+    padding: padding ?? [8, 6, 0, 0],
+    legend: { show: false },
+    cursor: { sync: { key: "page" }, y: false, drag: { x: true, y: false, setScale: false }, points: { show: false } },
+    scales: { x: { time: false, range: () => page.view }, ...scales },
+    series: [{}, ...series],
+    axes,
+    hooks: { setSelect: [select], draw: [(u) => drawn?.(u), (u) => playhead(u, page)] },
+  };
+  const plot = new uPlot(options, [[], ...series.map(() => [])], root);
+  plot.over.addEventListener("click", (event) => {
+    const box = plot.over.getBoundingClientRect();
+    page.moveTo(plot.posToVal(event.clientX - box.left, "x"));
+  });
+  new ResizeObserver(() => {
+    const width = Math.max(root.clientWidth, 200);
+    if (width !== plot.width) plot.setSize({ width, height });
+  }).observe(root);
+  return plot;
+};
+
+const playhead = (u, page) => {
+  const x = u.valToPos(page.at, "x", true);
+  const { left, top, width, height } = u.bbox;
+  if (page.live || x < left || x > left + width) return;
+  u.ctx.save();
+  u.ctx.strokeStyle = colour("--ink");
+  u.ctx.lineWidth = 1.5 * devicePixelRatio;
+  u.ctx.setLineDash([]);
+  line(u.ctx, x, top, x, top + height);
+  u.ctx.restore();
+};
+
+const line = (ctx, x1, y1, x2, y2) => {
+  ctx.beginPath();
+  ctx.moveTo(x1, y1);
+  ctx.lineTo(x2, y2);
+  ctx.stroke();
+};
+
+const axis = (more) => ({
+  stroke: () => colour("--muted"),
+  grid: { stroke: () => colour("--rule"), width: 1 },
+  ticks: { show: false },
+  font: "11.5px system-ui, sans-serif",
+  ...more,
+});
+
+const across = (page, shown) =>
+  axis({ size: shown ? 24 : 4, grid: { show: false }, values: shown ? page.ticks : () => [] });
+
+const upright = (more = {}) => axis({ size: LEFT, ...more });
+
+/** Latency: a bar from the least to the largest of each bin; above it a mark for every bin with a miss. */
+const latency = (root, page, cell) => {
+  let data = null;
+  let top = 1;
+  const drawn = (u) => {
+    if (data === null) return;
+    const { ctx, bbox } = u;
+    const { at, low, high, missed, lost, count: counts } = data.bins;
+    const ratio = devicePixelRatio;
+    const x = (value) => u.valToPos(value, "x", true);
+    const y = (value) => u.valToPos(Math.min(value, top), "y", true);
+    ctx.save();
+    ctx.strokeStyle = ctx.fillStyle = colour("--ink");
+    ctx.globalAlpha = 0.62;
+    ctx.lineWidth = Math.min(Math.max((0.8 * bbox.width) / Math.max(at.length, 1), 1), 3 * ratio);
+    at.forEach((place, i) => {
+      if (high[i] === null) return;
+      if (counts[i] === 1 || high[i] - low[i] < top / 200) {
+        ctx.fillRect(x(place) - 1.5 * ratio, y(high[i]) - 1.5 * ratio, 3 * ratio, 3 * ratio);
+      } else line(ctx, x(place), y(low[i]), x(place), y(high[i]));
+      // What is above the scale has an arrow.
+      if (high[i] > top) triangle(ctx, x(place), bbox.top + 4 * ratio, 3.5 * ratio);
+    });
+    ctx.globalAlpha = 1;
+    ctx.strokeStyle = ctx.fillStyle = colour("--bad");
+    ctx.lineWidth = 1.5 * ratio;
+    ctx.setLineDash([6 * ratio, 4 * ratio]);
+    const due = y(cell.deadline_ms);
+    line(ctx, bbox.left, due, bbox.left + bbox.width, due);
+    ctx.setLineDash([]);
+    const middle = bbox.top - 8 * ratio;
+    const marked = missed.flatMap((misses, i) => (misses > 0 ? [[x(at[i]), lost[i]]] : []));
+    const size = (marked.length > CROSSES ? 5 : 3.5) * ratio;
+    for (const [place] of marked) {
+      if (marked.length > CROSSES) line(ctx, place, middle - size, place, middle + size);
+      else {
+        line(ctx, place - size, middle - size, place + size, middle + size);
+        line(ctx, place - size, middle + size, place + size, middle - size);
+      }
+    }
+    ctx.fillStyle = colour("--muted");
+    ctx.font = `${11.5 * ratio}px system-ui, sans-serif`;
+    ctx.textAlign = "right";
+    ctx.fillText("misses", bbox.left - 5 * ratio, middle + 4 * ratio);
+    ctx.restore();
+  };
+  const plot = strip(root.querySelector(".plot"), page, 190, {
+    series: [{ paths: () => null, points: { show: false } }],
+    scales: { y: { range: () => [0, top] } },
+    axes: [across(page, false), upright()],
+    drawn,
+    padding: [LANE + 8, 6, 0, 0],
+  });
+  return (view) => {
+    data = view;
+    const highest = Math.max(...view.bins.high.filter((value) => value !== null), 0);
+    top = Math.min(Math.max(highest * 1.06, cell.deadline_ms * 1.25), cell.deadline_ms * 3);
+    plot.setData([view.bins.at, view.bins.high]);
+    const share = view.cycles ? ` (${percent(view.missed / view.cycles, 2)})` : "";
+    say(root.querySelector(".said"), `${count(view.missed)} of ${count(view.cycles)} cycles missed in view${share}; dashed: the deadline, ${number(cell.deadline_ms, 1)} ms`);
+    plot.root.setAttribute("role", "img");
+    plot.root.setAttribute("aria-label", `Latency: ${root.querySelector(".said").textContent}`);
+    return plot;
+  };
+};
+
+const triangle = (ctx, x, y, size) => {
+  ctx.beginPath();
+  ctx.moveTo(x, y - size);
+  ctx.lineTo(x + size, y + size);
+  ctx.lineTo(x - size, y + size);
+  ctx.fill();
+};
+
+/** Placement: a lane a candidate, so that a colour need not be told from another. */
+const ribbon = (root, page, cell) => {
+  let data = null;
+  const names = cell.candidates.map(({ name }) => name);
+  const drawn = (u) => {
+    if (data === null) return;
+    const { ctx, bbox } = u;
+    const lane = bbox.height / names.length;
+    const { begin, end, placement } = data.ribbon;
+    ctx.save();
+    begin.forEach((from, i) => {
+      const left = Math.max(u.valToPos(from, "x", true), bbox.left);
+      const right = Math.min(u.valToPos(end[i], "x", true), bbox.left + bbox.width);
+      if (placement[i] < 0) return;
+      ctx.fillStyle = cell.candidates[placement[i]].hue;
+      const y = bbox.top + placement[i] * lane;
+      ctx.fillRect(left, y + lane * 0.16, Math.max(right - left, 1), lane * 0.68);
+    });
+    for (const event of data.events) {
+      if (event.kind !== "guard") continue;
+      const x = u.valToPos(event.at, "x", true);
+      ctx.fillStyle = colour("--bad");
+      triangle(ctx, x, bbox.top + 5 * devicePixelRatio, 4 * devicePixelRatio);
+    }
+    ctx.fillStyle = colour("--ink");
+    ctx.font = `${11.5 * devicePixelRatio}px system-ui, sans-serif`;
+    ctx.textAlign = "right";
+    ctx.textBaseline = "middle";
+    names.forEach((name, i) => {
+      const short = name.length > 7 ? `${name.slice(0, 6)}…` : name;
+      ctx.fillText(short, bbox.left - 6 * devicePixelRatio, bbox.top + (i + 0.5) * lane);
+    });
+    ctx.restore();
+  };
+  const height = 12 + Math.max(names.length * 17, 34);
+  const plot = strip(root.querySelector(".plot"), page, height, {
+    series: [{ paths: () => null, points: { show: false } }],
+    scales: { y: { range: () => [0, 1] } },
+    axes: [across(page, false), upright({ values: () => [], grid: { show: false } })],
+    drawn,
+    padding: [4, 6, 0, 0],
+  });
+  return (view) => {
+    data = view;
+    const stretches = view.ribbon.placement;
+    const used = [...new Set(stretches)].map((code) => names[code]).filter(Boolean);
+    const changes = view.ribbon.exact ? `${Math.max(stretches.length - 1, 0)} changes` : "more changes than can be drawn";
+    say(root.querySelector(".said"), `${used.join(", ") || "none"}; ${changes} in view`);
+    plot.setData([view.bins.at, view.bins.high]);
+    plot.root.setAttribute("role", "img");
+    plot.root.setAttribute("aria-label", `Placement: ${root.querySelector(".said").textContent}`);
+    return plot;
+  };
+};
+
+/** Lines of a value a window; a legend names them, by dashes too, with the values at the place. */
+const lines = (root, page, height, named, { scale, written, last }) => {
+  const series = named.map(({ hue, dash, width }) => ({
+    stroke: () => (hue.startsWith("--") ? colour(hue) : hue),
+    dash,
+    width: width ?? 1.6,
+    spanGaps: false,
+    points: { show: (u, _, from, to) => to - from < 60, size: 4 },
+  }));
+  const plot = strip(root.querySelector(".plot"), page, height, {
+    series,
+    scales: { y: scale },
+    axes: [across(page, last), upright({ values: (_, splits) => splits.map(written) })],
+  });
+  const values = named.map(({ label, hue, dash, width }) => {
+    const value = make("b");
+    const sample = draw("line", { x1: 0, y1: 5, x2: 26, y2: 5, "stroke-width": width ?? 1.6, "stroke-dasharray": dash.join(" ") || null });
+    sample.style.stroke = hue.startsWith("--") ? `var(${hue})` : hue;
+    const swatch = draw("svg", { width: 26, height: 10, "aria-hidden": "true" }, sample);
+    root.querySelector(".legend").append(make("li", {}, swatch, `${label} `, value));
+    return value;
+  });
+  return {
+    set: (view) => {
+      plot.setData([view.windows.at, ...named.map(({ key }) => view.windows.of[key] ?? view.windows.at.map(() => null))]);
+      plot.root.setAttribute("role", "img");
+      plot.root.setAttribute("aria-label", root.querySelector("h3").textContent);
+      return plot;
+    },
+    read: (found) => named.forEach(({ key }, i) => say(values[i], found(key))),
+  };
+};
+
+export const charts = (root, page, cell) => {
+  const part = (name) => root.querySelector(`.${name}`);
+  const costs = lines(
+    part("costs"),
+    page,
+    130,
+    [
+      ...cell.candidates.map(({ name, hue }, i) => ({ key: `j ${name}`, label: name, hue, dash: DASHES[i % DASHES.length] })),
+      { key: "cost", label: "seen", hue: "--ink", dash: [], width: 2.4 },
+    ],
+    { scale: { range: (_, low, high) => (low === null ? [0, 1] : uPlot.rangeNum(low, high, 0.1, false)) }, written: (value) => number(value, 2) },
+  );
+  const used = lines(
+    part("used"),
+    page,
+    120,
+    cell.resources.map(({ name, kind }, i) => ({
+      key: `u ${name}`,
+      label: kind === "CPU" ? name : `${name}`,
+      hue: i % 2 ? "--muted" : "--ink",
+      dash: DASHES[i % DASHES.length],
+    })),
+    { scale: { range: (_, low, high) => [0, Math.max(1, high ?? 1)] }, written: (value) => `${Math.round(100 * value)}`, last: true },
+  );
+  const setters = [latency(part("latency"), page, cell), ribbon(part("ribbon"), page, cell), costs.set, used.set];
+  let plots = [];
+  return {
+    /** Draw what is between two places. */
+    set: (view) => {
+      plots = setters.map((set) => set(view));
+    },
+    /** Say the values of one state in the legends. */
+    read: (state) => {
+      costs.read((key) =>
+        key === "cost" ? number(state.window?.seen.cost, 2) : number(state.candidates?.[key.slice(2)]?.cost, 2),
+      );
+      used.read((key) => percent(state.used?.[key.slice(2)]));
+    },
+    redraw: () => plots.forEach((plot) => plot.redraw(false)),
+  };
+};

@@ -1,0 +1,313 @@
+// The page: one time line, the cells on it, and how people go along it.
+
+import { charts } from "./charts.js";
+import { count, make, place, say } from "./dom.js";
+import { gantt } from "./gantt.js";
+import * as panel from "./panel.js";
+import { act, get, latest } from "./server.js";
+import { Topology } from "./topology.js";
+
+/** Seconds that a live page shows, and cycles that are few enough to show their jobs. */
+const FOLLOWED_S = 60;
+const FEW_CYCLES = 40;
+const BINS = 700;
+/** Without news for so long, a live page does not claim to show the present. */
+const STALE_MS = 3000;
+
+const element = (id) => document.getElementById(id);
+
+class CellView {
+  constructor(cell, i, page) {
+    Object.assign(this, { cell, i, page });
+    this.root = element("cell").content.firstElementChild.cloneNode(true);
+    this.root.querySelector(".name").textContent = cell.name;
+    element("cells").append(this.root);
+    this.describe(cell);
+    this.topology = new Topology(this.root.querySelector(".topology"), cell);
+    this.charts = charts(this.root, page, cell);
+    this.decided = panel.decided(this.root, cell, page);
+    this.load = latest(() => this.loadView(), (error) => page.failed(error));
+    this.loadState = latest(() => this.stateAt(), (error) => page.failed(error));
+    this.state = null;
+  }
+
+  describe(cell) {
+    this.cell = cell;
+    const about = Object.entries(cell.about).map(([name, value]) => `${name} ${value}`);
+    this.root.querySelector(".where-caption").textContent = about.join(" · ");
+    const notes = this.root.querySelector(".notes");
+    notes.replaceChildren(...cell.notes.map((text) => make("li", { text })));
+  }
+
+  async loadView() {
+    const [begin, end] = this.page.view;
+    const bins = Math.min(BINS, Math.max(150, Math.round(this.root.clientWidth)));
+    const view = await get("/view", { cell: this.i, begin, end, bins });
+    this.charts.set(view);
+    panel.events(this.root, this.cell, view, this.page);
+    const part = this.root.querySelector(".gantt");
+    const few = view.cycles > 0 && view.cycles <= FEW_CYCLES && this.cell.has_jobs;
+    part.hidden = !few;
+    if (few) gantt(part, this.cell, await get("/jobs", { cell: this.i, begin, end }));
+  }
+
+  async stateAt() {
+    this.show(await get("/state", { cell: this.i, at: this.page.at }));
+  }
+
+  show(state) {
+    this.state = state;
+    this.topology.show(state);
+    this.decided(state);
+    panel.health(this.root, state, this.page.stale);
+    panel.facts(this.root, this.cell, state);
+    panel.heard(this.root, state);
+    this.charts.read(state);
+  }
+}
+
+class Page {
+  constructor({ cells, line, control, read_only }) {
+    this.control = control;
+    this.readOnly = read_only;
+    this.unit = cells[0].unit;
+    this.live = cells.some((cell) => cell.live);
+    this.span = [Math.min(...cells.map((cell) => cell.begin)), Math.max(...cells.map((cell) => cell.end))];
+    this.view = this.live ? [this.span[1] - FOLLOWED_S, this.span[1]] : [...this.span];
+    this.at = this.live ? this.span[1] : this.span[0];
+    this.playing = false;
+    this.following = this.live;
+    this.heardMs = performance.now();
+    this.ticks = (_, splits) => splits.map((at) => (this.unit === "cycle" ? count(at) : String(+at.toFixed(3))));
+    document.title = `${cells.map((cell) => cell.name).join(" and ")} – Dwell`;
+    element("about").textContent = [this.live ? "live" : "replay", line, this.live && !control ? "read-only" : ""].filter(Boolean).join(" · ");
+    element("cells").classList.toggle("two", cells.length > 1);
+    this.cells = cells.map((cell, i) => new CellView(cell, i, this));
+    this.windowLength = (cell) => (this.unit === "cycle" ? cell.window_cycles : (cell.window_cycles * cell.period_ms) / 1000);
+    this.listen();
+    this.setView(...this.view);
+    this.moveTo(this.at);
+    this.readEvents();
+  }
+
+  get stale() {
+    return this.live && performance.now() - this.heardMs > STALE_MS;
+  }
+
+  // ------------------------------------------------------------------ along the time line
+
+  setView(begin, end) {
+    const [first, last] = this.span;
+    const least = 2 * (this.unit === "cycle" ? 1 : this.cells[0].cell.period_ms / 1000);
+    const length = Math.min(Math.max(end - begin, least), Math.max(last - first, least));
+    const low = this.following ? end - length : Math.min(Math.max(begin, first), last - length);
+    this.view = [low, low + length];
+    for (const cell of this.cells) cell.load();
+    this.showPlace();
+  }
+
+  zoom(begin, end) {
+    this.follow(false);
+    this.setView(begin, end);
+    if (this.at < begin || this.at >= end) this.moveTo(begin);
+  }
+
+  zoomBy(factor) {
+    const [begin, end] = this.view;
+    const inside = this.at >= begin && this.at <= end;
+    const centre = this.following ? end : inside ? this.at : (begin + end) / 2;
+    if (this.following) this.setView(end - (end - begin) * factor, end);
+    else this.setView(centre - (centre - begin) * factor, centre + (end - centre) * factor);
+  }
+
+  moveTo(at) {
+    if (this.live) return;
+    this.at = Math.min(Math.max(at, this.span[0]), this.span[1]);
+    const [begin, end] = this.view;
+    const length = end - begin;
+    if (this.at < begin) this.setView(this.at - 0.1 * length, this.at + 0.9 * length);
+    else if (this.at > end) this.setView(this.at - 0.1 * length, this.at + 0.9 * length);
+    for (const cell of this.cells) {
+      cell.loadState();
+      cell.charts.redraw();
+    }
+    this.showPlace();
+  }
+
+  step(windows) {
+    this.play(false);
+    const length = this.windowLength(this.cells[0].cell);
+    if (this.live) {
+      this.follow(false);
+      this.setView(this.view[0] + windows * length, this.view[1] + windows * length);
+    } else this.moveTo(this.at + windows * length);
+  }
+
+  /** Show the window that closes at a place, with one before it and one after. */
+  toWindow(at) {
+    const length = this.windowLength(this.cells[0].cell);
+    this.follow(false);
+    this.setView(at - 2 * length, at + length);
+    this.moveTo(at);
+  }
+
+  toCycles() {
+    const each = this.unit === "cycle" ? 1 : this.cells[0].cell.period_ms / 1000;
+    const at = this.live ? this.view[1] - 12 * each : this.at;
+    this.follow(false);
+    this.setView(at - 2 * each, at + 10 * each);
+  }
+
+  play(on) {
+    this.playing = on && !this.live;
+    element("play").textContent = this.playing ? "Pause" : "Play";
+    if (!this.playing) return;
+    if (this.at >= this.span[1]) this.moveTo(this.span[0]);
+    let before = performance.now();
+    const frame = (now) => {
+      if (!this.playing) return;
+      const seconds = ((now - before) / 1000) * Number(element("speed").value);
+      before = now;
+      const each = this.unit === "cycle" ? 1000 / this.cells[0].cell.period_ms : 1;
+      this.moveTo(this.at + seconds * each);
+      if (this.at >= this.span[1]) this.play(false);
+      else setTimeout(() => requestAnimationFrame(frame), 60);
+    };
+    requestAnimationFrame(frame);
+  }
+
+  follow(on) {
+    this.following = on && this.live;
+    element("follow").setAttribute("aria-pressed", String(this.following));
+  }
+
+  showPlace() {
+    const [first, last] = this.span;
+    const at = this.live ? this.view[1] : this.at;
+    const slider = element("at");
+    slider.value = String((1000 * (at - first)) / Math.max(last - first, 1e-9));
+    slider.setAttribute("aria-valuetext", place(at, this.unit));
+    element("place").textContent = `${place(at, this.unit)} of ${place(last, this.unit)}`;
+  }
+
+  listen() {
+    const on = (id, what) => element(id).addEventListener("click", what);
+    element("timeline").hidden = false;
+    element("follow").hidden = !this.live;
+    element("play").hidden = this.live;
+    element("speed").parentElement.hidden = this.live;
+    on("play", () => this.play(!this.playing));
+    on("back", () => this.step(-1));
+    on("forth", () => this.step(1));
+    on("closer", () => this.zoomBy(0.5));
+    on("farther", () => this.zoomBy(2));
+    on("window", () => this.toWindow(this.live ? this.view[1] : this.at));
+    on("cycles", () => this.toCycles());
+    on("whole", () => this.zoom(...this.span));
+    on("follow", () => {
+      this.follow(!this.following);
+      if (this.following) this.setView(this.span[1] - FOLLOWED_S, this.span[1]);
+    });
+    element("at").addEventListener("input", (event) => {
+      const at = this.span[0] + (event.target.value / 1000) * (this.span[1] - this.span[0]);
+      if (!this.live) return this.moveTo(at);
+      this.follow(false);
+      this.setView(at - (this.view[1] - this.view[0]), at);
+    });
+    const keys = {
+      " ": () => this.play(!this.playing),
+      ArrowLeft: () => this.step(-1),
+      ArrowRight: () => this.step(1),
+      Home: () => this.moveTo(this.span[0]),
+      End: () => this.moveTo(this.span[1]),
+      "+": () => this.zoomBy(0.5),
+      "-": () => this.zoomBy(2),
+      0: () => this.zoom(...this.span),
+      w: () => this.toWindow(this.live ? this.view[1] : this.at),
+      c: () => this.toCycles(),
+    };
+    document.addEventListener("keydown", (event) => {
+      const busy = event.target.closest("button, input, select, a");
+      if (event.ctrlKey || event.metaKey || event.altKey || !(event.key in keys)) return;
+      if (busy && [" ", "ArrowLeft", "ArrowRight", "Home", "End"].includes(event.key)) return;
+      event.preventDefault();
+      keys[event.key]();
+    });
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+      for (const cell of this.cells) cell.charts.redraw();
+    });
+  }
+
+  // ------------------------------------------------------------------------ what is new
+
+  readEvents() {
+    const source = new EventSource("/events");
+    source.addEventListener("open", () => this.heard());
+    source.addEventListener("error", () => this.failed(new Error("the page's process is silent")));
+    source.addEventListener("message", ({ data }) => {
+      this.heard();
+      for (const news of JSON.parse(data)) this.take(this.cells[news.cell], news);
+    });
+    if (!this.live) return;
+    setInterval(() => {
+      if (this.stale) for (const cell of this.cells) if (cell.state) panel.health(cell.root, cell.state, true);
+    }, 1000);
+  }
+
+  take(cell, { state, described }) {
+    if (described) {
+      cell.describe(described);
+      this.span[1] = Math.max(this.span[1], described.end);
+      cell.load();
+      this.showPlace();
+    }
+    if (!state) return;
+    cell.show(state);
+    this.span[1] = Math.max(this.span[1], state.at);
+    if (this.following) this.setView(state.at - (this.view[1] - this.view[0]), state.at);
+  }
+
+  heard() {
+    this.heardMs = performance.now();
+    element("connection").classList.remove("bad");
+    say(element("connection"), "");
+  }
+
+  failed(error) {
+    element("connection").classList.add("bad");
+    say(element("connection"), `✕ ${error.message}`);
+  }
+
+  // ---------------------------------------------------------------------------- acting
+
+  async act(what, about, words) {
+    if (!confirm(`${words}?`)) return;
+    try {
+      await act(what, about);
+    } catch (error) {
+      this.failed(error);
+    }
+  }
+
+  pin(candidate) {
+    return this.act("pin", { candidate }, `Pin the cell to ${candidate}`);
+  }
+
+  unpin() {
+    return this.act("unpin", {}, "Let the policy decide again");
+  }
+
+  drain(node) {
+    const drained = (this.cells[0].state?.drained ?? []).includes(node);
+    return this.act(drained ? "undrain" : "drain", { node }, drained ? `Let stages run on ${node} again` : `Have no stage run on ${node}`);
+  }
+}
+
+// The token is in the cookie by now: it need not stay in the address, nor in the history.
+history.replaceState(null, "", location.pathname);
+try {
+  window.page = new Page(await get("/cells"));
+} catch (error) {
+  element("connection").classList.add("bad");
+  say(element("connection"), `✕ ${error.message}`);
+}

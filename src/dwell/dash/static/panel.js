@@ -1,0 +1,156 @@
+// What a cell's state says in words: health, candidates, the last decision, events, who is heard.
+
+import { ago, count, make, number, percent, place, say } from "./dom.js";
+
+const HEALTH = { ok: "●", degraded: "▲", stalled: "■", silent: "✕", absent: "✕" };
+const REASONS = {
+  dwell: "the last move is too young",
+  hold: "no other candidate is better by enough",
+  migrate: "another candidate is better by enough",
+  capped: "the cheaper candidate is over a cap",
+  infeasible: "every candidate is over a cap",
+  guard: "the guard moved it by itself",
+};
+
+export const health = (root, state, stale) => {
+  const word = stale ? "absent" : (state.health ?? "absent");
+  const element = root.querySelector(".health");
+  element.classList.toggle("ok", word === "ok");
+  element.classList.toggle("bad", word !== "ok");
+  say(element, `${HEALTH[word] ?? "?"} ${word}${state.headline ? `: ${state.headline}` : ""}`);
+};
+
+const head = (words) =>
+  make("thead", {}, make("tr", {}, ...words.map((text, i) => make("th", { scope: "col", text, class: i ? "num" : null }))));
+
+const cells = (values) => values.map((text) => make("td", { class: "num", text }));
+
+/** Build what is said of decisions once; returns what shows a state there. */
+export const decided = (root, cell, page) => {
+  const rows = new Map();
+  const body = make("tbody");
+  const words = ["candidate", "J", "L95 (ms)", "V_D", ""];
+  for (const { name, hue } of cell.candidates) {
+    const values = ["", "", ""].map(() => make("td", { class: "num" }));
+    const mark = make("td");
+    const head = make("th", { scope: "row" }, make("span", { class: "swatch", hue, "aria-hidden": "true" }), name);
+    const button = page.control ? make("button", { type: "button", text: "Pin", "data-pin": name, onclick: () => page.pin(name) }) : null;
+    body.append(make("tr", {}, head, ...values, mark, ...(button ? [make("td", {}, button)] : [])));
+    rows.set(name, { row: body.lastChild, values, mark, button });
+  }
+  const caption = make("caption", { text: "Candidates, as estimated at the last close" });
+  const table = make("table", { class: "candidates" }, caption, head(page.control ? [...words, ""] : words), body);
+  const why = make("p", { class: "last" });
+  const predicted = make("tbody");
+  const against = make("table", { class: "against" }, make("caption"), head(["", "J", "L95 (ms)", "V_D"]), predicted);
+  const acts = make("p", { class: "acts" });
+  root.querySelector(".decided").replaceChildren(make("div", { class: "scroll" }, table), why, make("div", { class: "scroll" }, against), acts);
+  if (page.control) {
+    acts.append(make("button", { type: "button", text: "Unpin", "data-unpin": true, onclick: () => page.unpin() }), " ");
+    for (const { name } of cell.nodes)
+      acts.append(make("button", { type: "button", text: `Drain ${name}`, "data-drain": name, onclick: () => page.drain(name) }), " ");
+  }
+  return (state) => {
+    for (const [name, { row, values, mark, button }] of rows) {
+      const known = state.candidates?.[name] ?? {};
+      const texts = [number(known.cost, 2), number(known.l95_ms, 1), percent(known.violation_rate, 1)];
+      values.forEach((value, i) => say(value, texts[i]));
+      row.classList.toggle("here", name === state.placement);
+      const marks = [];
+      if (name === state.placement) marks.push("◀ here");
+      if (name === state.moving_to) marks.push("… moving there");
+      if (name === state.pinned) marks.push("pinned");
+      if (known.eligible === false) marks.push("over a cap");
+      say(mark, marks.join(", "));
+      button?.toggleAttribute("disabled", name === state.pinned);
+    }
+    say(why, decision(state));
+    const { window } = state;
+    say(against.querySelector("caption"), window ? `Predicted against seen: window ${window.number}, under ${window.placement}` : "Predicted against seen: no window yet");
+    const line = (name, value) => [name, number(value?.cost, 2), number(value?.l95_ms, 1), percent(value?.violation_rate, 1)];
+    predicted.replaceChildren(
+      ...[line("predicted", state.predicted), line("seen", window?.seen)].map(([name, ...texts]) =>
+        make("tr", {}, make("th", { scope: "row", text: name }), ...cells(texts)),
+      ),
+    );
+    if (!page.control) return;
+    root.querySelector("[data-unpin]").toggleAttribute("disabled", !state.pinned);
+    for (const button of root.querySelectorAll("[data-drain]"))
+      say(button, `${(state.drained ?? []).includes(button.dataset.drain) ? "Undrain" : "Drain"} ${button.dataset.drain}`);
+  };
+};
+
+const decision = (state) => {
+  const { decision: last, proving } = state;
+  const parts = [];
+  if (last) {
+    const moves = last.placement && last.placement !== last.incumbent;
+    const where = moves ? `${last.incumbent} → ${last.placement}` : `${last.incumbent}`;
+    parts.push(`Last decision: ${where}, ${last.reason}: ${REASONS[last.reason] ?? "see the reasons in the documentation"}.`);
+    if (last.delta_j !== null && last.delta_j !== undefined) parts.push(`ΔJ ${number(last.delta_j, 3)}.`);
+  } else parts.push("No decision yet.");
+  if (state.fallback) parts.push("The guard has put it there.");
+  if (proving) parts.push(`Proving ${proving.candidate}: ${proving.done} of ${proving.needed} probes.`);
+  if (state.mode === "advise") parts.push("Mode: advise; nothing is ordered.");
+  return parts.join(" ");
+};
+
+export const facts = (root, cell, state) => {
+  const parts = [];
+  if (state.placement) parts.push(`placed ${state.placement}`);
+  if (state.cycle !== null && state.cycle !== undefined) parts.push(`cycle ${count(state.cycle)}`);
+  parts.push(`age of the command ${state.age_ms === null || state.age_ms === undefined ? "–" : `${number(state.age_ms, 0)} ms`}`);
+  if (cell.live) {
+    parts.push(`${count(state.migrations ?? 0)} migrations, ${count(state.guard_moves ?? 0)} moves of the guard`);
+    parts.push(`answer of the controller ${ago(state.answer_age_ms)} old`);
+    if (state.unproven) parts.push("clocks unproven");
+    if (state.bound_ms !== null && state.bound_ms !== undefined) parts.push(`clocks within ${number(state.bound_ms, 1)} ms`);
+  } else parts.push(`${count(cell.missed)} of ${count(cell.cycles)} cycles missed in all`);
+  say(root.querySelector(".facts"), parts.join(" · "));
+};
+
+const LOUD = new Set(["guard", "refused", "health"]);
+const MARKS = { move: "→ move", guard: "▲ guard", refused: "✕ refused", pin: "◆ pin", drain: "◇ drain", health: "! health", disturbance: "~ scenario" };
+
+export const events = (root, cell, view, page) => {
+  const list = root.querySelector(".events");
+  const key = JSON.stringify([view.events, view.more_events]);
+  if (list.dataset.key === String(key.length) + key.slice(-200)) return;
+  list.dataset.key = String(key.length) + key.slice(-200);
+  const more = view.more_events ? `; ${count(view.more_events)} before them: come closer` : "";
+  say(root.querySelector(".events-said"), `${count(view.events.length)} in view${more}`);
+  list.replaceChildren(
+    ...view.events.toReversed().map((event) =>
+      make(
+        "li",
+        {},
+        make(
+          "button",
+          { type: "button", onclick: () => page.toWindow(event.at) },
+          make("span", { text: place(event.at, cell.unit) }),
+          make("span", { class: LOUD.has(event.kind) ? "kind bad" : "kind", text: MARKS[event.kind] ?? event.kind }),
+          make("span", { class: "text", text: event.text }),
+        ),
+      ),
+    ),
+  );
+};
+
+export const heard = (root, state) => {
+  const part = root.querySelector(".heard");
+  part.hidden = !state.processes;
+  if (part.hidden) return;
+  const rows = state.processes.toSorted((a, b) => a.heard - b.heard || a.who.localeCompare(b.who));
+  const well = rows.filter((one) => one.heard && one.ready).length;
+  say(part.querySelector(".heard-said"), `${well} of ${rows.length} heard and ready`);
+  const body = part.querySelector("tbody");
+  while (body.children.length > rows.length) body.lastChild.remove();
+  rows.forEach((one, i) => {
+    if (!body.children[i]) body.append(make("tr", {}, make("th", { scope: "row" }), make("td"), make("td", { class: "note" })));
+    const [who, told, note] = body.children[i].children;
+    say(who, one.who);
+    const silent = one.age_ms === undefined ? "✕ never" : `✕ silent for ${ago(one.age_ms)}`;
+    say(told, one.heard ? (one.ready ? "● ready" : "▲ not ready") : silent);
+    say(note, one.note ?? "");
+  });
+};

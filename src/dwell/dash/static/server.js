@@ -1,0 +1,42 @@
+// What the page asks its server: the same host it came from, and nobody else.
+
+export class Refused extends Error {}
+
+const answered = async (response) => {
+  const value = await response.json();
+  if (!response.ok) throw new Refused(value.error ?? response.statusText);
+  return value;
+};
+
+export const get = async (path, query = {}) =>
+  answered(await fetch(`${path}?${new URLSearchParams(query)}`));
+
+export const act = async (what, about) =>
+  answered(
+    await fetch(`/${what}`, {
+      method: "POST",
+      headers: { "Content-Type": "application/json", "X-Dwell-Act": what },
+      body: JSON.stringify(about),
+    }),
+  );
+
+/** Have one call of a function under way at most; of the calls meanwhile, the last follows. */
+export const latest = (call, failed) => {
+  let busy = false;
+  let next = null;
+  return async (...words) => {
+    next = words;
+    if (busy) return;
+    busy = true;
+    while (next !== null) {
+      const now = next;
+      next = null;
+      try {
+        await call(...now);
+      } catch (error) {
+        failed(error);
+      }
+    }
+    busy = false;
+  };
+};

@@ -1,0 +1,156 @@
+// Computers by tier, and the stages where they run; a stage that moves slides.
+
+import { draw, percent } from "./dom.js";
+
+const TIERS = ["cloud", "edge", "robot"];
+const SLOT = 26;
+const HEAD = 24;
+const FOOT = 18;
+const GAP = 14;
+const LEAST_NODE = 150;
+const BETWEEN = 46;
+
+/** Rows of nodes, the cloud on top and the robots below, as many side by side as fit. */
+const rowsOf = (nodes, width) => {
+  const most = Math.max(1, Math.floor((width + GAP) / (LEAST_NODE + GAP)));
+  return TIERS.flatMap((tier) => {
+    const mine = nodes.filter((node) => node.tier === tier);
+    const rows = [];
+    for (let i = 0; i < mine.length; i += most) rows.push(mine.slice(i, i + most));
+    return rows;
+  });
+};
+
+export class Topology {
+  constructor(root, cell) {
+    this.root = root;
+    this.cell = cell;
+    this.state = null;
+    this.width = 0;
+    new ResizeObserver(() => this.resize()).observe(root);
+    this.resize();
+  }
+
+  resize() {
+    const width = Math.max(280, Math.round(this.root.clientWidth));
+    if (width === this.width) return;
+    this.width = width;
+    this.build();
+    if (this.state !== null) this.show(this.state);
+  }
+
+  build() {
+    const { nodes, tasks, links } = this.cell;
+    const wide = Math.min(this.width, 620);
+    this.narrow = wide < 480;
+    const mayRun = (node) => tasks.filter((task) => task.on.includes(node.name));
+    this.boxes = new Map();
+    this.slots = new Map();
+    let y = 2;
+    for (const row of rowsOf(nodes, wide)) {
+      const width = Math.min(230, (wide - GAP * (row.length + 1)) / row.length);
+      const height = HEAD + FOOT + SLOT * Math.max(1, ...row.map((node) => mayRun(node).length));
+      const left = (wide - row.length * width - (row.length - 1) * GAP) / 2;
+      row.forEach((node, i) => {
+        const x = row.length === 2 ? (i === 0 ? GAP / 2 : wide - width - GAP / 2) : left + i * (width + GAP);
+        this.boxes.set(node.name, { x, y, width, height });
+        mayRun(node).forEach((task, slot) =>
+          this.slots.set(`${task.name}@${node.name}`, [x + 8, y + HEAD + slot * SLOT, width - 16]),
+        );
+      });
+      y += height + BETWEEN;
+    }
+    const svg = draw("svg", { viewBox: `0 0 ${wide} ${y - BETWEEN + 4}`, role: "img" });
+    this.title = draw("title");
+    svg.append(this.title, ...this.links(links));
+    this.nodes = new Map(nodes.map((node) => [node.name, this.node(node)]));
+    svg.append(...[...this.nodes.values()].map((parts) => parts.group));
+    for (const [x, top, width] of this.slots.values())
+      svg.append(draw("rect", { class: "slot", x, y: top, width, height: SLOT - 6, rx: 4 }));
+    this.stages = new Map(tasks.map((task, i) => [task.name, this.stage(task, i)]));
+    svg.append(...this.stages.values());
+    svg.style.maxWidth = `${wide}px`;
+    this.root.replaceChildren(svg);
+  }
+
+  links(links) {
+    const seen = new Set();
+    return links.flatMap(({ source, target, text }) => {
+      const key = [source, target].sort().join("\n");
+      if (seen.has(key)) return [];
+      seen.add(key);
+      const [a, b] = [this.boxes.get(source), this.boxes.get(target)];
+      const [x1, y1] = [a.x + a.width / 2, a.y + a.height / 2];
+      const [x2, y2] = [b.x + b.width / 2, b.y + b.height / 2];
+      const line = draw("line", { x1, y1, x2, y2 });
+      const words = this.narrow ? text.split(",")[0] : text;
+      // Between two rows there is room for a label; beside each other there often is none.
+      const [upper, lower] = a.y < b.y ? [a, b] : [b, a];
+      if (upper.y === lower.y) {
+        const [left, right] = a.x < b.x ? [a, b] : [b, a];
+        if (right.x - left.x - left.width < 120) return [draw("g", { class: "link" }, line)];
+        const label = draw("text", { x: (left.x + left.width + right.x) / 2, y: y1 + 4, text: words });
+        return [draw("g", { class: "link" }, line, label)];
+      }
+      const y = (upper.y + upper.height + lower.y) / 2 + 4;
+      const share = (y - y1) / (y2 - y1);
+      const label = draw("text", { x: x1 + share * (x2 - x1), y, text: words });
+      return [draw("g", { class: "link" }, line, label)];
+    });
+  }
+
+  node(node) {
+    const { x, y, width, height } = this.boxes.get(node.name);
+    const bar = { x: x + 8, y: y + height - 13, height: 6, rx: 3 };
+    const busy = draw("rect", { class: "busy", ...bar, width: 0 });
+    const share = draw("text", { class: "percent", x: x + width - 8, y: y + height - 6 });
+    const tier = draw("tspan", { class: "tier", text: ` ${node.tier}, ${node.cores} ${node.cores === 1 ? "core" : "cores"}` });
+    const name = draw("text", { x: x + 9, y: y + 16 }, draw("tspan", { text: node.name, "font-weight": 650 }), tier);
+    const group = draw(
+      "g",
+      { class: "node" },
+      draw("rect", { class: "box", x, y, width, height, rx: 6 }),
+      name,
+      draw("rect", { class: "bar", ...bar, width: width - 56 }),
+      busy,
+      share,
+    );
+    return { group, busy, share, room: width - 56, tier, words: tier.textContent };
+  }
+
+  stage(task, i) {
+    const [x, y, width] = this.slots.get(`${task.name}@${task.on[0]}`);
+    const anchored = task.on.length === 1;
+    const shape = draw("rect", { width, height: SLOT - 6, rx: 4 });
+    const text = draw("text", { x: 8, y: 14.5, text: `${i + 1} ${task.name}` });
+    const group = draw("g", { class: anchored ? "stage anchored" : "stage", "data-task": task.name }, shape, text);
+    group.style.transform = `translate(${x}px, ${y}px)`;
+    return group;
+  }
+
+  /** Put every stage where it runs, and say how busy every computer is. */
+  show(state) {
+    this.state = state;
+    const candidate = this.cell.candidates.find(({ name }) => name === state.placement);
+    const words = [];
+    for (const task of this.cell.tasks) {
+      const node = candidate?.nodes[task.name] ?? task.on[0];
+      const [x, y, width] = this.slots.get(`${task.name}@${node}`);
+      const group = this.stages.get(task.name);
+      group.style.transform = `translate(${x}px, ${y}px)`;
+      group.style.setProperty("--hue", candidate?.hue ?? "gray");
+      group.dataset.node = node;
+      group.firstChild.setAttribute("width", width);
+      words.push(`${task.name} on ${node}`);
+    }
+    const drained = new Set(state.drained ?? []);
+    for (const [name, parts] of this.nodes) {
+      const share = state.used?.[name];
+      parts.busy.setAttribute("width", parts.room * Math.min(Math.max(share ?? 0, 0), 1));
+      parts.share.textContent = percent(share);
+      parts.group.classList.toggle("drained", drained.has(name));
+      parts.tier.textContent = drained.has(name) ? " drained" : parts.words;
+    }
+    this.title.textContent = `${state.placement ?? "unknown"}: ${words.join(", ")}`;
+  }
+}

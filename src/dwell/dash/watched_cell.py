@@ -1,0 +1,195 @@
+"""WatchedCell: a live cell as the page sees it, by what its observer hears."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from dwell.dash.observer import MOST_CYCLES, ObservedCycle, ObservedWindow, Observer
+from dwell.dash.paged_cell import Plain, cell_document, cycle_since, finite, job_since
+from dwell.dash.strip import Strip, binned_means
+
+#: Cycles at most whose jobs are told.
+MOST_WITH_JOBS = 400
+#: Parts of a controller's status that the page shows as they are.
+SHOWN = (
+    *("health", "headline", "mode", "fallback", "moving_to", "proving", "pinned", "drained"),
+    *("migrations", "guard_moves", "record", "complaints", "unproven", "bound_ms", "silent"),
+)
+
+
+class WatchedCell:
+    """See the module and `PagedCell`; its time line counts seconds."""
+
+    live = True
+
+    def __init__(self, observer: Observer) -> None:
+        self.observer, self.problem = observer, observer.problem
+        self._taking = threading.Lock()
+        self._codes = {name: code for code, name in enumerate(self.problem.candidates)}
+        self._strip, self._cycles_upto = Strip.empty(), 0
+        self._windows: list[ObservedWindow] = []
+        self._windows_upto = -1
+        self._columns: dict[str, Any] = {}
+        self._told = (0, 0, 0)
+
+    def __repr__(self) -> str:
+        return f"<WatchedCell of {self.problem.name}>"
+
+    def _take(self) -> Strip:
+        """Take in what the observer has heard since."""
+        observer = self.observer
+        with self._taking:
+            news = observer.cycles.since(self._cycles_upto)
+            if news.items:
+                self._cycles_upto = news.upto
+                self._strip = self._strip.followed_by(self._strip_of(news.items), MOST_CYCLES)
+            if observer.windows.upto != self._windows_upto:
+                kept = observer.windows.since(0)
+                self._windows, self._windows_upto = kept.items, kept.upto
+                self._columns = self._columns_of(kept.items)
+            return self._strip
+
+    def _strip_of(self, cycles: Sequence[ObservedCycle]) -> Strip:
+        latency_ns = [np.nan if one.latency_ns is None else one.latency_ns for one in cycles]
+        return Strip(
+            at=np.array([one.release_ns for one in cycles], np.int64) / 1e9,
+            latency_ms=np.array(latency_ns, np.float64) / 1e6,
+            missed=np.array([one.missed for one in cycles], bool),
+            placement=np.array([self._codes[one.placement] for one in cycles], np.int32),
+            number=np.array([one.number for one in cycles], np.int64),
+        )
+
+    def _columns_of(self, windows: Sequence[ObservedWindow]) -> dict[str, Any]:
+        said = [window.said for window in windows]
+        resources = self.problem.fabric.resources
+        columns: dict[str, list[float | None]] = {
+            **{f"j {name}": [one["estimates"].get(name) for one in said] for name in self._codes},
+            **{f"u {name}": [one["utilisation"].get(name) for one in said] for name in resources},
+            "cost": [one["cost"] for one in said],
+        }
+        return {name: np.array(values, np.float64) for name, values in columns.items()}
+
+    def described(self) -> Plain:
+        """See `PagedCell`."""
+        now, strip = self.observer.now(), self._take()
+        keyring = self.observer.security.keyring
+        return {
+            **cell_document(self.problem),
+            "live": True,
+            "growing": True,
+            "unit": "s",
+            "begin": float(strip.at[0]) if len(strip.at) else now.at_s,
+            "end": now.at_s,
+            "about": {"kind": "live", "mode": self.problem.live.mode},
+            "certificate": None if keyring is None else keyring.own.common_name,
+            "has_jobs": True,
+            "notes": [],
+        }
+
+    def view(self, begin: float, end: float, bins: int) -> Plain:
+        """See `PagedCell`."""
+        strip = self._take()
+        closes = np.array([window.at_s for window in self._windows], np.float64)
+        events = [
+            {"at": event.at_s, "kind": event.kind, "text": event.text}
+            for event in self.observer.events.since(0).items
+            if begin <= event.at_s < end
+        ]
+        return {
+            "begin": begin,
+            "end": end,
+            **strip.view(begin, end, bins),
+            "windows": binned_means(closes, self._columns, begin, end, bins // 2),
+            "events": events,
+            "more_events": 0,
+        }
+
+    def state(self, at: float) -> Plain:
+        """See `PagedCell`; it is the present, whatever the place."""
+        now = self.observer.now()
+        status, window = now.status, now.status.get("window") or {}
+        state = {
+            "at": now.at_s,
+            "cycle": self._strip.number[-1].item() if len(self._strip.number) else None,
+            "placement": now.placement or None,
+            "answer_age_ms": None if now.answer_age_s is None else round(now.answer_age_s * 1e3),
+            "age_ms": _applied_age_ms(status),
+            "cycles": dict(now.cycles),
+            "missed": now.missed,
+            **{name: status.get(name) for name in SHOWN},
+            "processes": _processes(status),
+            **(self._window_state(window) if window else {}),
+        }
+        return {name: finite(value) for name, value in state.items()}
+
+    def _window_state(self, window: Mapping[str, Any]) -> Plain:
+        length_s = self.problem.window_cycles * self.problem.pipeline.period_ms / 1e3
+        seen = {name: window[name] for name in ("l95_ms", "violation_rate", "cost")}
+        ends = {one.number: one for one in self._windows[-3:]}
+        known, before = ends.get(window["number"]), ends.get(window["number"] - 1)
+        end_s = 0.0 if known is None else known.at_s
+        return {
+            "window": {
+                "number": window["number"],
+                "begin": end_s - length_s,
+                "end": end_s,
+                "placement": window["placement"],
+                "seen": seen,
+            },
+            "predicted": before and _estimate(before.said, window["placement"]),
+            "used": window["utilisation"],
+            "decision": {"incumbent": window["placement"], "reason": window["reason"]},
+            "candidates": {name: _estimate(window, name) for name in window["estimates"]},
+        }
+
+    def jobs(self, begin: float, end: float) -> Plain:
+        """See `PagedCell`."""
+        cycles = self.observer.cycles.since(0).items
+        mine = [one for one in cycles if begin <= one.release_ns / 1e9 < end][-MOST_WITH_JOBS:]
+        if not mine:
+            return {"origin_s": 0.0, "jobs": [], "cycles": [], "known": True}
+        origin_ns = min(one.release_ns for one in mine)
+        return {
+            "origin_s": origin_ns / 1e9,
+            "jobs": [job_since(job, origin_ns) for one in mine for job in one.jobs],
+            "cycles": [
+                cycle_since(
+                    *(one.number, one.release_ns, one.latency_ns, origin_ns), missed=one.missed
+                )
+                for one in mine
+            ],
+            "known": True,
+        }
+
+    def refreshed(self) -> bool:
+        """See `PagedCell`."""
+        observer = self.observer
+        told = observer.cycles.upto, observer.windows.upto, observer.events.upto
+        self._told, before = told, self._told
+        return told != before
+
+
+def _estimate(window: Mapping[str, Any], name: str) -> Plain:
+    """Return what was believed of a candidate at a window's close."""
+    return {"cost": window["estimates"].get(name), **window["predicted"][name]}
+
+
+def _applied_age_ms(status: Mapping[str, Any]) -> float | None:
+    """Return the age of the oldest sink's last applied command."""
+    ages = [sink["applied_age_ms"] for sink in (status.get("sinks") or {}).values()]
+    return None if not ages or None in ages else max(ages)
+
+
+def _processes(status: Mapping[str, Any]) -> list[Plain]:
+    """Return who was ever heard, who never was, and who is another's."""
+    known = [{"who": who, **told} for who, told in (status.get("processes") or {}).items()]
+    silent = [{"who": who, "heard": False} for who in status.get("silent") or ()]
+    strangers = [
+        {"who": who, "heard": False, "note": why}
+        for who, why in (status.get("strangers") or {}).items()
+    ]
+    return [*known, *silent, *strangers]
