@@ -107,7 +107,7 @@ def test_cycles_that_nobody_asked_for_in_time_are_counted_as_such() -> None:
 def test_exemplars_name_run_and_cycle(cell: StandIn) -> None:
     page, content_type = CellMetrics(cell.observer).page(OPENMETRICS)
     assert content_type.startswith("application/openmetrics-text; version=1.0.0")
-    families = {family.name: family for family in openmetrics(page.decode())}
+    families = {family.name: family for family in openmetrics(page.decode())}  # type: ignore[no-untyped-call]
     found = {
         sample.labels["le"]: (sample.exemplar.labels, sample.exemplar.value)
         for sample in families["dwell_cycle_latency_seconds"].samples

@@ -41,6 +41,7 @@ WINDOW = {
     "cost": 1.25,
     "reason": "hold",
     "estimates": {"LOC": 1.5, "SO": None, "HYB": 2.5},
+    "predicted": {"LOC": {"l95_ms": 30.0, "violation_rate": 0.2}},
     "utilisation": {"R1": 0.5, "R2": 0.25, "E": None},
     "age_ms": 20.0,
 }
@@ -81,6 +82,7 @@ def test_what_is_heard_is_in_the_file_at_the_time_of_day(tmp_path: Path) -> None
     assert (window["seen_l95_ms"], window["u_R1"], "u_E" in window) == (31.5, 0.5, False)
     ((_, decision),) = of_topic(file, "/decisions")
     assert (decision["reason"], decision["j_HYB"], "j_SO" in decision) == ("hold", 2.5, False)
+    assert (decision["est_l95_ms_LOC"], "est_l95_ms_SO" in decision) == (30.0, False)
 
 
 def test_what_it_is_too_late_for_is_dropped_and_counted(tmp_path: Path) -> None:
@@ -130,6 +132,7 @@ def test_where_the_disk_has_room_again_it_goes_on(
     assert said == [
         f"error: {file}: cannot be written (No space left on device); what is heard is dropped",
         f"{file}: can be written again; 3 cycles and windows were dropped",
+        f"{file}: 5 cycles and windows recorded + 3 dropped = 8 published",
     ]
 
 

@@ -78,7 +78,7 @@ class CellMetrics(Collector):
         yield self._metric(
             "gauge", "dwell_deadline_seconds", "Deadline of a cycle.", [({}, self._deadline_s)]
         )
-        placed = problem.candidates.get(now.placement, {})
+        placed: Mapping[str, str] = problem.candidates.get(now.placement, {})
         yield self._metric(
             "info",
             "dwell_placement",

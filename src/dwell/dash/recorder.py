@@ -16,6 +16,7 @@ from typing import TypeVar
 from dwell.dash.feed import Feed
 from dwell.dash.observer import ObservedCycle, ObservedWindow, Observer
 from dwell.live.failures import start_thread
+from dwell.model.table_columns import LIVE
 from dwell.record import column_types
 from dwell.record.mcap_file import TIME_OF_DAY, McapFile, Message
 
@@ -41,7 +42,7 @@ class CellRecorder:
     path : Path
         File to make; there must be none.
     say : callable
-        Takes a line where the file cannot be written, and where it can be again.
+        Takes a line where the file cannot be written, where it can be again, and at the end.
 
     Attributes
     ----------
@@ -64,7 +65,7 @@ class CellRecorder:
         problem = observer.problem
         path.parent.mkdir(parents=True, exist_ok=True)
         self._stream = path.open("xb")
-        columns = {table: column_types(table, problem, ("live",)) for table in TABLES}
+        columns = {table: column_types(table, problem, LIVE) for table in TABLES}
         self._file = McapFile(self._stream, problem, columns)
 
     def __repr__(self) -> str:
@@ -84,6 +85,10 @@ class CellRecorder:
         cell = self._observer.problem.name
         self._file.finish({"cell": cell, "kind": "live", "clock": TIME_OF_DAY, **counts})
         self._stream.close()
+        self._say(
+            f"{self._path}: {self.recorded} cycles and windows recorded + {self.dropped} dropped = "
+            f"{self.published} published"
+        )
 
     def _go_on(self) -> None:
         while not self._stopped.wait(EVERY_S):
@@ -130,7 +135,9 @@ class CellRecorder:
     def _of_window(self, window: ObservedWindow) -> Iterator[Message]:
         """Yield a window and the decision on it."""
         said, at_ns = window.said, round(window.at_s * 1e9)
-        used, costs = said.get("utilisation") or {}, said.get("estimates") or {}
+        used, costs, predicted = (
+            said.get(name) or {} for name in ("utilisation", "estimates", "predicted")
+        )
         known = self._observer.problem
         yield (
             at_ns,
@@ -152,6 +159,11 @@ class CellRecorder:
                 "incumbent": said.get("placement"),
                 "reason": said.get("reason"),
                 **{f"j_{name}": costs.get(name) for name in known.candidates},
+                **{
+                    f"est_{of}_{name}": (predicted.get(name) or {}).get(of)
+                    for name in known.candidates
+                    for of in ("l95_ms", "violation_rate")
+                },
             },
         )
 
