@@ -32,9 +32,9 @@ def dash(
     port: Annotated[
         int, typer.Option(min=0, max=65_535, metavar="P", help="Of loopback; 0 takes a free one.")
     ] = PORT,
-    browser: Annotated[
-        bool, typer.Option("--browser/--no-browser", help="Whether to open it in a browser.")
-    ] = True,
+    no_browser: Annotated[
+        bool, typer.Option("--no-browser", help="Print the address only, and open no browser.")
+    ] = False,
     control: Annotated[
         bool,
         typer.Option(
@@ -71,7 +71,7 @@ def dash(
             raise typer.BadParameter("--control: a recorded run cannot be acted on")
         if mcap is not None:
             raise typer.BadParameter(f"--mcap: dwell report {where} --mcap {mcap} writes a run's")
-        show_run(where, beside, port=port, browser=browser, say=say, token=kept)
+        show_run(where, beside, port=port, browser=not no_browser, say=say, token=kept)
         return
     if beside is not None:
         raise typer.BadParameter("--beside: a run stands beside a run, not beside a live cell")
@@ -83,7 +83,7 @@ def dash(
     show_cell(
         *(where, settings),
         port=port,
-        browser=browser,
+        browser=not no_browser,
         control=control,
         say=say,
         mcap=mcap,

@@ -90,7 +90,9 @@ class Dash:
             *(Route(f"/{what}", partial(self._act, what), methods=["POST"]) for what in ACTS),
         ]
         handlers = {HTTPException: _refused, DwellError: _failed}
-        return Starlette(routes=routes, lifespan=self._ticking, exception_handlers=handlers)
+        app = Starlette(routes=routes, lifespan=self._ticking, exception_handlers=handlers)
+        app.router.redirect_slashes = False
+        return app
 
     # ---------------------------------------------------------------------- what is read
 
@@ -122,9 +124,10 @@ class Dash:
 
     def _cell(self, request: Request) -> PagedCell:
         place = request.query_params.get("cell", "0")
-        if not place.isascii() or not place.isdigit() or int(place) >= len(self.cells):
-            raise HTTPException(HTTPStatus.NOT_FOUND, f"no cell {place!r}")
-        return self.cells[int(place)]
+        cell = {str(i): cell for i, cell in enumerate(self.cells)}.get(place)
+        if cell is None:
+            raise HTTPException(HTTPStatus.NOT_FOUND, f"no cell {place[:20]!r}")
+        return cell
 
     async def _ready(self, _: Request) -> Response:
         """Whether a live cell is heard, and well; says nothing else of it."""

@@ -1,0 +1,48 @@
+"""A real browser, headless: the system's Chromium, driven by Playwright."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from urllib.parse import urlsplit
+
+import pytest
+from playwright.sync_api import Browser, Page, sync_playwright
+
+from tests.dash.served import until
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+in_browser = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+
+
+@contextmanager
+def chromium() -> Iterator[Browser]:
+    """Start the browser."""
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+def wait_for(page: Page, expression: str) -> None:
+    """Wait until an expression is true; Playwright's own way needs `unsafe-eval`."""
+    until(lambda: page.evaluate(f"Boolean({expression})"))
+
+
+@contextmanager
+def opened(browser: Browser, address: str, **settings: object) -> Iterator[Page]:
+    """Open an address; the page's console has to be silent, and it may ask its own host alone."""
+    context = browser.new_context(**{"viewport": {"width": 1280, "height": 1000}, **settings})  # type: ignore[arg-type]
+    page = context.new_page()
+    said: list[str] = []
+    asked: set[str] = set()
+    page.on("console", lambda message: said.append(message.text))
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.on("request", lambda request: asked.add(urlsplit(request.url).netloc))
+    page.goto(address)
+    wait_for(page, "document.querySelector('.latency .said')?.textContent")
+    yield page
+    context.close()
+    assert said == []
+    assert asked == {urlsplit(address).netloc}

@@ -1,0 +1,26 @@
+"""What tests of the page share: a run, and a page of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.dash.recorded import small_run
+from tests.dash.served import Served, serving
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a run that kept its jobs."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    small_run(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def page(run_folder: Path) -> Iterator[Served]:
+    """Return a page of that run."""
+    with serving(run_folder.parent, run_folder) as served:
+        yield served

@@ -1,0 +1,120 @@
+"""A page served by a process of its own, and requests to it as bytes."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from http.client import HTTPConnection
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import parse_qs, urlsplit
+
+from tests.cli.small_cell import environment
+
+PATIENCE_S = 60.0
+
+
+class Answer(NamedTuple):
+    """What came back."""
+
+    status: int
+    headers: Mapping[str, str]
+    body: bytes
+
+    @property
+    def value(self) -> Any:
+        return json.loads(self.body)
+
+
+class Served:
+    """A page that is served.
+
+    Parameters
+    ----------
+    address : str
+        As it was printed.
+    err : Path
+        What it says on stderr.
+    """
+
+    def __init__(self, process: subprocess.Popen[bytes], address: str, err: Path) -> None:
+        self.process, self.address, self._err = process, address, err
+        parts = urlsplit(address)
+        assert parts.port is not None
+        self.port, self.host = parts.port, parts.netloc
+        (self.token,) = parse_qs(parts.query)["token"]
+        self.bearer = {"Authorization": f"Bearer {self.token}"}
+
+    @property
+    def said(self) -> str:
+        """What it has said on stderr."""
+        return self._err.read_text(encoding="utf-8")
+
+    def ask(
+        self,
+        path: str,
+        headers: Mapping[str, str] | None = None,
+        *,
+        method: str = "GET",
+        body: bytes = b"",
+    ) -> Answer:
+        """Ask for a path with exactly these headers, beside `Host` where it is not among them."""
+        connection = HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE_S)
+        given = {"Host": self.host, **(headers or {})}
+        try:
+            connection.putrequest(method, path, skip_host=True, skip_accept_encoding=True)
+            for name, value in given.items():
+                connection.putheader(name, value)
+            if body or method == "POST":
+                connection.putheader("Content-Length", str(len(body)))
+            connection.endheaders(body or None)
+            answer = connection.getresponse()
+            lowered = {name.lower(): value for name, value in answer.getheaders()}
+            return Answer(answer.status, lowered, answer.read())
+        finally:
+            connection.close()
+
+    def get(self, path: str) -> Any:
+        """Return what a path says, as JSON."""
+        answer = self.ask(path, self.bearer)
+        assert answer.status == 200, answer
+        return answer.value
+
+    def act(self, what: str, about: object, **changes: str | None) -> Answer:
+        """Act as the page does; a header that is None is left out."""
+        headers = {**self.bearer, "Origin": f"http://{self.host}", "X-Dwell-Act": what, **changes}
+        sent = {name.replace("_", "-"): value for name, value in headers.items() if value}
+        return self.ask(f"/{what}", sent, method="POST", body=json.dumps(about).encode())
+
+
+@contextmanager
+def serving(folder: Path, *arguments: str | Path) -> Iterator[Served]:
+    """Serve a page with `dwell dash`, at a free port; it has to end when it is told to."""
+    words = [sys.executable, "-m", "dwell", "dash", *map(str, arguments), "--port", "0"]
+    err = folder / "dash.err"
+    with err.open("wb") as log:
+        process = subprocess.Popen(
+            [*words, "--no-browser"], stdout=subprocess.PIPE, stderr=log, env=environment()
+        )
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline().decode()
+        assert line.startswith("http://127.0.0.1:"), err.read_text(encoding="utf-8")
+        yield Served(process, line.strip(), err)
+    finally:
+        process.send_signal(signal.SIGTERM)
+        process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0
+
+
+def until(holds: Callable[[], object]) -> None:
+    """Wait until something holds."""
+    limit_s = time.monotonic() + PATIENCE_S
+    while not holds():
+        assert time.monotonic() < limit_s, "it has not come about"
+        time.sleep(0.05)

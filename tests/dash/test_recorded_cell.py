@@ -1,0 +1,120 @@
+"""A recorded run on the time line says what its tables say."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+import dwell
+from dwell.dash.recorded_cell import RecordedCell, same_realisation
+from dwell.errors import RunError
+from tests.dash.recorded import small_run
+
+
+@pytest.fixture(scope="module")
+def cell(run_folder: Path) -> RecordedCell:
+    return RecordedCell(run_folder)
+
+
+@pytest.fixture(scope="module")
+def run(run_folder: Path) -> dwell.Run:
+    return dwell.open_run(run_folder)
+
+
+def test_the_whole_line_has_all_cycles_misses_and_moves(cell: RecordedCell, run: dwell.Run) -> None:
+    whole = cell.described()
+    view = cell.view(whole["begin"], whole["end"], 50)
+    assert view["cycles"] == whole["cycles"] == run.cycles.height
+    assert view["missed"] == sum(view["bins"]["missed"]) == run.cycles["missed"].sum()
+    moves = [event for event in view["events"] if event["kind"] == "move"]
+    assert len(moves) == run.decisions["migrated"].sum() > 0
+    json.dumps([whole, view], allow_nan=False)
+
+
+def test_a_state_is_what_was_known_then(cell: RecordedCell, run: dwell.Run) -> None:
+    window = run.windows.row(20, named=True)
+    size, period_s = 10, 0.020
+    close_s = (window["first_cycle"] + size) * period_s
+    state = cell.state(close_s + 0.001)
+    assert state["window"]["number"] == 20
+    assert state["window"]["seen"]["violation_rate"] == pytest.approx(
+        window["seen_violation_rate"], abs=1e-4
+    )
+    decision = run.decisions.filter(pl.col("window") == 20).row(0, named=True)
+    assert state["decision"]["reason"] == decision["reason"]
+    assert state["candidates"]["OFF"]["cost"] == pytest.approx(decision["j_OFF"], abs=1e-4)
+    before = run.decisions.filter(pl.col("window") == 19).row(0, named=True)
+    predicted = before[f"est_l95_ms_{window['placement']}"]
+    assert state["predicted"]["l95_ms"] == pytest.approx(predicted, abs=1e-4)
+    assert cell.state(close_s - 0.001)["window"]["number"] == 19
+    assert cell.state(0.0).get("window") is None
+    json.dumps(state, allow_nan=False)
+
+
+def test_the_age_is_that_of_the_newest_cycle_in_effect(cell: RecordedCell, run: dwell.Run) -> None:
+    at_s = 5.003
+    done = run.cycles.filter(pl.col("release_ns") + pl.col("latency_ns") <= at_s * 1e9)
+    newest_ms = done["release_ns"].max()
+    assert isinstance(newest_ms, int)
+    assert cell.state(at_s)["age_ms"] == pytest.approx(at_s * 1e3 - newest_ms / 1e6, abs=1e-3)
+
+
+def test_a_cell_that_misses_is_degraded(cell: RecordedCell) -> None:
+    ends = cell.described()["end"]
+    words = {cell.state(at * ends / 40)["health"] for at in range(41)}
+    assert "degraded" in words
+
+
+def test_jobs_are_those_of_the_cycles_in_view(cell: RecordedCell, run: dwell.Run) -> None:
+    found = cell.jobs(1.0, 1.1)
+    numbers = [cycle["cycle"] for cycle in found["cycles"]]
+    assert numbers == [50, 51, 52, 53, 54]
+    expected = run.jobs.filter(pl.col("cycle").is_between(50, 54))
+    assert len(found["jobs"]) == expected.height
+    first = expected.row(0, named=True)
+    assert found["jobs"][0]["node"] == first["node"]
+    assert found["jobs"][0]["ready_ms"] == (first["ready_ns"] - 1_000_000_000) / 1e6
+
+
+def test_a_run_without_jobs_says_so(tmp_path: Path) -> None:
+    small_run(tmp_path / "run", jobs=False)
+    cell = RecordedCell(tmp_path / "run")
+    assert not cell.described()["has_jobs"]
+    assert cell.jobs(0.0, 1.0)["known"] is False
+
+
+def test_runs_of_one_realisation_go_by_cycles(tmp_path: Path) -> None:
+    metas = [
+        small_run(tmp_path / f"{policy}-{seed}", policy=policy, seed=seed).meta
+        for policy, seed in (("dtp", 1), ("LOC", 1), ("dtp", 2))
+    ]
+    assert same_realisation(metas[0], metas[1])
+    assert not same_realisation(metas[0], metas[2])
+    assert not same_realisation({**metas[0], "kind": "live"}, metas[1])
+    cell = RecordedCell(tmp_path / "dtp-1", "cycle")
+    assert cell.described()["end"] == cell.described()["cycles"]
+    assert cell.state(100.5)["cycle"] == 100
+    assert [one["cycle"] for one in cell.jobs(100, 102)["cycles"]] == [100, 101]
+
+
+def test_disturbances_stand_among_the_events(tmp_path: Path) -> None:
+    run = small_run(tmp_path / "run")
+    document = run.meta
+    document["problem"]["scenarios"]["stress"][0].update({"at_s": 2.0, "for_s": 3.0})
+    dwell.Run(
+        document, {name: getattr(run, name) for name in ("cycles", "windows", "decisions")}
+    ).save(tmp_path / "run")
+    view = RecordedCell(tmp_path / "run").view(0.0, 20.0, 50)
+    at = [event["at"] for event in view["events"] if event["kind"] == "disturbance"]
+    assert at == [2.0, 5.0]
+
+
+def test_a_damaged_table_is_named(tmp_path: Path) -> None:
+    small_run(tmp_path / "run")
+    file = tmp_path / "run" / "windows.parquet"
+    file.write_bytes(file.read_bytes()[:300])
+    with pytest.raises(RunError, match=r"windows\.parquet"):
+        RecordedCell(tmp_path / "run")
