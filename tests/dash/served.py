@@ -16,6 +16,7 @@ from urllib.parse import parse_qs, urlsplit
 
 from tests.cli.small_cell import environment
 
+ROOT = Path(__file__).parents[2]
 PATIENCE_S = 60.0
 
 
@@ -95,11 +96,22 @@ class Served:
 @contextmanager
 def serving(folder: Path, *arguments: str | Path) -> Iterator[Served]:
     """Serve a page with `dwell dash`, at a free port; it has to end when it is told to."""
-    words = [sys.executable, "-m", "dwell", "dash", *map(str, arguments), "--port", "0"]
+    words = ["-m", "dwell", "dash", *map(str, arguments), "--port", "0", "--no-browser"]
+    with started(folder, *words) as served:
+        yield served
+
+
+@contextmanager
+def started(folder: Path, *words: str) -> Iterator[Served]:
+    """Start a Python process that serves a page."""
     err = folder / "dash.err"
     with err.open("wb") as log:
         process = subprocess.Popen(
-            [*words, "--no-browser"], stdout=subprocess.PIPE, stderr=log, env=environment()
+            [sys.executable, *words],
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=log,
+            env=environment(),
         )
     try:
         assert process.stdout is not None

@@ -1,14 +1,24 @@
-"""A cell that is observed, without a cell: what a test says that an observer has heard."""
+"""A cell that is observed, without a cell: what a test says that an observer has heard.
+
+As a program it serves the page of a cell that has a cycle every 33 ms, with the token that it is
+given.
+"""
 
 from __future__ import annotations
 
+import sys
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import count
 from typing import Any, cast
 
 from dwell.dash.feed import Feed
 from dwell.dash.observer import ObservedCell, ObservedCycle, ObservedWindow, Observer
+from dwell.live.controlled_cell import MOVED_BY
+from dwell.live.failures import start_thread
 from dwell.live.security import Security
+from dwell.live.wiring import roles
 from dwell.model import Problem
 from tests.cells.small import make_problem
 
@@ -60,3 +70,47 @@ class StandIn:
     @property
     def observer(self) -> Observer:
         return cast("Observer", self)
+
+    def well(self) -> None:
+        """Have its controller say that it is well."""
+        members = [role.who for role in roles(self.problem) if role.kind != "controller"]
+        self.status = {
+            "health": "ok",
+            "headline": None,
+            "fallback": False,
+            "windows": 12,
+            "moves": {**dict.fromkeys(MOVED_BY, 0), "migrate": 2, "guard": 1},
+            "bound_ms": 0.25,
+            "unproven": False,
+            "window": {
+                "number": 11,
+                "violation_rate": 0.1,
+                "estimates": {"LOC": 1.5, "SO": None, "HYB": 2.5},
+                "utilisation": {"R1": 0.5, "R2": 0.25, "E": None},
+            },
+            "processes": {who: {"heard": True, "ready": True, "note": ""} for who in members},
+        }
+
+
+def serve_page(token: str) -> None:
+    """Serve the page of a cell that goes on, until this process is told to end."""
+    from dwell.dash.metrics import CellMetrics
+    from dwell.dash.server import Dash
+    from dwell.dash.serving import serve
+
+    cell = StandIn()
+    cell.well()
+
+    def go_on() -> None:
+        for number in count():
+            cell.cycle(number, 10 + number % 7 * 5)
+            time.sleep(PERIOD_NS / 1e9)
+
+    start_thread("cycles", go_on)
+    serve(
+        Dash([], metrics=CellMetrics(cell.observer).page), 0, browser=False, say=print, token=token
+    )
+
+
+if __name__ == "__main__":
+    serve_page(sys.argv[1])

@@ -5,48 +5,24 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
-from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import cast
 
 import pytest
 from prometheus_client.openmetrics.parser import text_string_to_metric_families as openmetrics
 from prometheus_client.parser import text_string_to_metric_families as plain_text
 
 from dwell.dash.metrics import CellMetrics
-from dwell.live.controlled_cell import MOVED_BY
 from dwell.live.security import Security
 from dwell.live.trust.authority import Authority
-from dwell.live.wiring import roles
 from tests.dash.stand_in import StandIn
 
 ROOT = Path(__file__).parents[2]
 OPENMETRICS = "application/openmetrics-text;version=1.0.0,text/plain;version=0.0.4;q=0.5,*/*;q=0.1"
 PLAIN = "text/plain;version=0.0.4"
 MARKUP = "<script>alert(1)</script>"
-
-
-def told(cell: StandIn) -> Mapping[str, Any]:
-    """What a controller's status says of a cell that is well."""
-    members = [role.who for role in roles(cell.problem) if role.kind != "controller"]
-    return {
-        "health": "ok",
-        "headline": None,
-        "fallback": False,
-        "windows": 12,
-        "moves": {**dict.fromkeys(MOVED_BY, 0), "migrate": 2, "guard": 1},
-        "bound_ms": 0.25,
-        "unproven": False,
-        "window": {
-            "number": 11,
-            "violation_rate": 0.1,
-            "estimates": {"LOC": 1.5, "SO": None, "HYB": 2.5},
-            "utilisation": {"R1": 0.5, "R2": 0.25, "E": None},
-        },
-        "processes": {who: {"heard": True, "ready": True, "note": MARKUP} for who in members},
-    }
 
 
 def samples(cell: StandIn) -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
@@ -68,7 +44,7 @@ def value(cell: StandIn, name: str, **labels: str) -> float | None:
 @pytest.fixture
 def cell() -> StandIn:
     cell = StandIn()
-    cell.status = told(cell)
+    cell.well()
     for number, latency_ms in enumerate((12, 20, 31, 45, None, 28)):
         cell.cycle(number, latency_ms)
     return cell

@@ -57,9 +57,9 @@ class ObservedCycle:
     release_ns : int
         Since the first release of the run.
     latency_ns : int or None
-        None where no sink has completed it.
+        None where no sink has completed it, or it is not known when.
     known : bool
-        False where it could not be heard what became of it; it is then not missed.
+        False where it could not be heard what became of it, or when; it is then not missed.
     outcome : str
         One of `OUTCOMES`.
     jobs : tuple of mapping
@@ -332,7 +332,10 @@ class Observer:
         # Nothing came from the relay since: who knows.
         quiet_ns = time.monotonic_ns() - self._told_ns
         cycle.deaf = quiet_ns > round(LATE_S * 1e9)
-        missed, outcome = cycle.missed(self._deadline_ns), _outcome(cycle)
+        outcome, completed = _outcome(cycle), cycle.latency_ns < NEVER_NS
+        # Before the clocks are compared, nobody knows when it was completed.
+        known = not cycle.untold and (completed or outcome not in ("actuated", "behind"))
+        missed = known and cycle.missed(self._deadline_ns)
         jobs = tuple({**row, "cycle": cycle.number} for row in self._ledger.jobs(cycle))
         self.cycles.append(
             ObservedCycle(
@@ -341,9 +344,9 @@ class Observer:
                 term=cycle.term,
                 placement=cycle.placement,
                 release_ns=cycle.at_ns,
-                latency_ns=None if cycle.latency_ns >= NEVER_NS else cycle.latency_ns,
+                latency_ns=cycle.latency_ns if completed else None,
                 missed=missed,
-                known=not cycle.untold,
+                known=known,
                 outcome=outcome,
                 jobs=jobs,
             )
