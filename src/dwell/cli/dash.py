@@ -98,7 +98,7 @@ def _kept(file: Path) -> str:
 
     if not file.exists():
         write_whole(file, new_token(), private=True)
-    token = file.read_text(encoding="ascii").strip()
+    token = file.read_text(encoding="utf-8").strip()
     if not TOKEN.fullmatch(token):
         raise typer.BadParameter(f"--token: {file} has no token: 22 to 200 letters, digits, - or _")
     return token

@@ -38,7 +38,8 @@ EXTRAS = {
     "sim": "dwell run, study, demo, validate",
     "report": "dwell report",
     "live": "dwell live, agent, controller, keys",
-    "mcap": "dwell report --mcap",
+    "dash": "dwell dash",
+    "mcap": "dwell report --mcap, dwell dash --mcap",
     "dask": "dwell study --dask",
 }
 #: How many ports are looked at where no cell says which.
