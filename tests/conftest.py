@@ -54,6 +54,7 @@ TOGETHER = {
         "cli/test_live_run.py",
         "cli/test_live_secure.py",
         "cli/test_new.py",
+        "dash/test_live_page.py",
         "dash/test_live_recording.py",
         "live/test_security.py",
         "live/transport",

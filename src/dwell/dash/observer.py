@@ -228,7 +228,9 @@ class Observer:
             If the keys are those of somebody who may only look.
         """
         with self._asking:
-            return self._client.ask(what, about)
+            status = self._client.ask(what, about)
+        self._answer(status)
+        return status
 
     def now(self) -> ObservedCell:
         """Return how the cell is."""
@@ -366,6 +368,10 @@ class Observer:
     def _look(self) -> None:
         with self._asking:
             status = self._client.look(patience_s=MOST_ASK_S)
+        self._answer(status)
+
+    def _answer(self, status: Mapping[str, Any]) -> None:
+        """Take in how the cell is, and what has happened since the answer before."""
         with self._lock:
             before, self._status = self._status, status
             if status["health"] != "absent":
@@ -392,7 +398,9 @@ class Observer:
         guarded = status["guard_moves"] > before.get("guard_moves", status["guard_moves"])
         for move_s, old, new in moved:
             kind: EventKind = "guard" if guarded else "move"
-            yield CellEvent(move_s, kind, f"{old} → {new}: {_why(status, new, guarded=guarded)}")
+            yield CellEvent(
+                move_s, kind, f"{old} → {new}: {_why((status, before), new, guarded=guarded)}"
+            )
         if "mode" not in before:
             return
         if status["refused"] and status["refused"] != before["refused"]:
@@ -405,15 +413,16 @@ class Observer:
             yield CellEvent(at_s, "drain", f"{node} {word}")
 
 
-def _why(status: Mapping[str, Any], new: str, *, guarded: bool) -> str:
-    """Return why a cell was moved."""
+def _why(answers: Sequence[Mapping[str, Any]], new: str, *, guarded: bool) -> str:
+    """Return why a cell was moved, by the answers of the controller about it, the newest first."""
     if guarded:
         return "guard"
-    if status["pinned"] == new:
+    if any(status.get("pinned") == new for status in answers):
         return "pinned"
-    if status["drained"]:
-        return f"{', '.join(status['drained'])} drained"
-    return str((status.get("window") or {}).get("reason") or "ordered")
+    for status in answers:
+        if status.get("drained"):
+            return f"{', '.join(status['drained'])} drained"
+    return str((answers[0].get("window") or {}).get("reason") or "ordered")
 
 
 def _outcome(cycle: LiveCycle) -> str:

@@ -1,0 +1,310 @@
+"""A live cell on the page: real processes, heard from outside, and acted on."""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dwell.dash.observer import Observer
+from dwell.dash.watched_cell import WatchedCell
+from tests.cli.live_cell import MOODY, RealCell, invoke
+from tests.cli.test_live_secure import SecureCell
+from tests.dash.browser import chromium, in_browser, opened, wait_for
+from tests.dash.served import Served, serving, until
+
+MARKUP = "<script>window.pwned=1</script><img src=x onerror=window.pwned=1>"
+
+
+#: Bodies of a request that name no candidate.
+NO_CANDIDATES: tuple[object, ...] = (None, [], "LOC", {}, {"candidate": 1}, {"node": "E"})
+
+
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RealCell]:
+    made = RealCell(tmp_path_factory.mktemp("live"))
+    made.module.write_text(MOODY.replace('"no light"', repr(MARKUP)))
+    try:
+        made.begin()
+        yield made
+    finally:
+        made.close()
+
+
+@pytest.fixture(scope="module")
+def acting(cell: RealCell) -> Iterator[Served]:
+    """Return a page that may act."""
+    with serving(cell.folder, cell.file, "--control") as served:
+        yield served
+
+
+def state(page: Served) -> Mapping[str, Any]:
+    found: Mapping[str, Any] = page.get("/state?at=0")
+    return found
+
+
+def events(page: Served) -> set[str]:
+    return {event["text"] for event in page.get("/view?begin=0&end=1e6")["events"]}
+
+
+def until_state(page: Served, holds: Callable[[Mapping[str, Any]], object]) -> None:
+    until(lambda: holds(state(page)))
+
+
+# ----------------------------------------------------------------------------- the observer
+
+
+def test_an_observer_hears_every_cycle_once_and_every_job(cell: RealCell) -> None:
+    with Observer(cell.problem) as observer:
+        until(lambda: observer.cycles.upto >= 60 and observer.windows.upto >= 2)
+        cycles = observer.cycles.since(0).items
+        now = observer.now()
+    numbers = [cycle.number for cycle in cycles]
+    assert len(numbers) == len(set(numbers))
+    assert sum(now.cycles.values()) >= len(cycles)
+    done = [cycle for cycle in cycles if cycle.latency_ns is not None]
+    assert len(done) >= 50
+    tasks = set(cell.problem.pipeline.tasks)
+    with_jobs = [one for one in done if {job["task"] for job in one.jobs} == tasks]
+    assert len(with_jobs) >= len(done) - 5
+    assert now.status["placement"] == now.placement == "LOC"
+    windows = observer.windows.since(0).items
+    assert [window.number for window in windows] == sorted({one.number for one in windows})
+    assert windows[-1].said["predicted"].keys() == cell.problem.candidates.keys()
+
+
+def test_an_observer_says_nothing_but_questions(cell: RealCell) -> None:
+    """It has no place among who is heard, and nobody is asked to hear it."""
+    with Observer(cell.problem) as observer:
+        until(lambda: observer.cycles.upto >= 20)
+        status = cell.until(lambda status: status["window"])
+    assert not [who for who in status["processes"] if "visitor" in who]
+    assert status["strangers"] == {}
+
+
+def test_what_is_watched_is_ready_for_json(cell: RealCell) -> None:
+    with Observer(cell.problem) as observer:
+        watched = WatchedCell(observer)
+        until(lambda: observer.cycles.upto >= 60 and observer.windows.upto >= 2)
+        whole = watched.described()
+        view = watched.view(whole["begin"], whole["end"], 100)
+        found = [whole, view, watched.state(0.0), watched.jobs(whole["begin"], whole["end"])]
+        assert watched.refreshed()
+    json.dumps(found, allow_nan=False)
+    assert view["cycles"] == sum(view["bins"]["count"]) > 0
+    assert view["windows"]["of"].keys() >= {"j LOC", "u R1", "cost"}
+    assert found[3]["jobs"]
+
+
+# --------------------------------------------------------------------------------- the page
+
+
+def test_events_come_again_and_again(acting: Served) -> None:
+    head = f"GET /events HTTP/1.1\r\nHost: {acting.host}\r\nAuthorization: Bearer {acting.token}"
+    with socket.create_connection(("127.0.0.1", acting.port), timeout=60) as reader:
+        reader.sendall(f"{head}\r\n\r\n".encode())
+        heard = b""
+        while heard.count(b"data: ") < 5:
+            part = reader.recv(65_536)
+            assert part
+            heard += part
+    first = heard.partition(b"data: ")[2].partition(b"\n\n")[0]
+    (news,) = json.loads(first)
+    assert news["state"]["placement"] in {"LOC", "SO", "HYB"}
+    assert {one["who"] for one in news["state"]["processes"]} >= {"stamper@R1", "planning@E"}
+
+
+def test_a_reader_who_does_not_read_holds_nobody_up(acting: Served) -> None:
+    head = f"GET /events HTTP/1.1\r\nHost: {acting.host}\r\nAuthorization: Bearer {acting.token}"
+    slow = []
+    for _ in range(8):
+        one = socket.socket()
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2_048)
+        one.connect(("127.0.0.1", acting.port))
+        one.sendall(f"{head}\r\n\r\n".encode())
+        slow.append(one)
+    try:
+        before = state(acting)["at"]
+        test_events_come_again_and_again(acting)
+        until_state(acting, lambda found: found["at"] > before)
+    finally:
+        for one in slow:
+            one.close()
+
+
+def test_it_is_ready_while_the_cell_is_well(acting: Served) -> None:
+    until(lambda: acting.ask("/readyz").status == 200)
+    assert acting.ask("/readyz").body == b"ready\n"
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"Origin": None},
+        {"Origin": "null"},
+        {"Origin": "http://evil.example"},
+        {"Origin": "http://127.0.0.1:1"},
+        {"X_Dwell_Act": None, "X-Dwell-Act": None},
+        {"Sec_Fetch_Site": "cross-site"},
+        {"Sec_Fetch_Site": "same-site"},
+        {"Host": "evil.example", "Origin": "http://evil.example"},
+    ],
+    ids=str,
+)
+def test_what_acts_has_to_come_from_the_page(
+    acting: Served, changes: Mapping[str, str | None]
+) -> None:
+    assert acting.act("pin", {"candidate": "SO"}, **changes).status == 403
+    assert state(acting)["pinned"] is None
+
+
+def test_what_acts_needs_the_token(acting: Served) -> None:
+    assert acting.act("pin", {"candidate": "SO"}, Authorization=None).status == 401
+
+
+@pytest.mark.parametrize(
+    ("about", "status"),
+    [
+        *((wrong, 400) for wrong in NO_CANDIDATES),
+        ({"candidate": "x" * 5_000}, 413),
+        ({"candidate": "NONE"}, 409),
+        ({"candidate": "x" * 500}, 409),
+        ({"candidate": MARKUP}, 409),
+    ],
+    ids=lambda value: str(value)[:40],
+)
+def test_an_act_that_cannot_be_is_refused_with_why(
+    acting: Served, about: object, status: int
+) -> None:
+    answer = acting.act("pin", about)
+    assert answer.status == status
+    assert answer.value["error"]
+
+
+def test_acts_are_done_and_said(acting: Served) -> None:
+    assert acting.act("pin", {"candidate": "HYB"}).value["pinned"] == "HYB"
+    until(lambda: "LOC → HYB: pinned" in events(acting))
+    assert acting.act("drain", {"node": "E"}).status == 409
+    assert acting.act("unpin", {}).value["pinned"] is None
+    assert acting.act("drain", {"node": "E"}).value["drained"] == ["E"]
+    until(lambda: "HYB → LOC: E drained" in events(acting))
+    assert acting.act("undrain", {"node": "E"}).value["drained"] == []
+    assert {"pinned to HYB", "unpinned", "E drained", "E no longer drained"} <= events(acting)
+    said = acting.said
+    for line in ("pin HYB without keys: done", "unpin without keys: done", "undrain E"):
+        assert line in said
+    assert "drain E without keys: refused" in said
+    assert acting.token not in said
+
+
+@in_browser
+def test_a_person_pins_it_in_a_browser(acting: Served) -> None:
+    with chromium() as browser, opened(browser, acting.address) as shown:
+        shown.on("dialog", lambda dialog: dialog.accept())
+        shown.locator("[data-pin=SO]").click()
+        wait_for(shown, "document.querySelector('[data-task=planning]').dataset.node === 'E'")
+        wait_for(shown, "document.querySelector('tr.here th').textContent === 'SO'")
+        shown.locator("[data-unpin]").click()
+        wait_for(shown, "document.querySelector('[data-unpin]').disabled")
+        acting.act("pin", {"candidate": "LOC"})
+        wait_for(shown, "document.querySelector('[data-task=planning]').dataset.node === 'R2'")
+        acting.act("unpin", {})
+        wait_for(shown, "document.querySelector('.heard-said').textContent.includes('ready')")
+
+
+@in_browser
+def test_a_stage_that_raises_markup_is_only_text(cell: RealCell, acting: Served) -> None:
+    cell.mood.write_text("raise")
+    try:
+        until_state(
+            acting,
+            lambda found: (
+                found["health"] != "ok"
+                and any(MARKUP in one.get("note", "") for one in found["processes"])
+            ),
+        )
+        assert acting.ask("/readyz").status == 503
+        with chromium() as browser, opened(browser, acting.address) as shown:
+            wait_for(shown, "document.querySelector('.heard').textContent.includes('<script>')")
+            wait_for(shown, "document.querySelector('.health').textContent.includes('<script>')")
+            assert shown.evaluate("window.pwned") is None
+            assert shown.locator("main img, main script").count() == 0
+    finally:
+        cell.mood.unlink()
+    until(lambda: acting.ask("/readyz").status == 200)
+
+
+def test_without_control_it_only_looks(cell: RealCell) -> None:
+    with serving(cell.folder, cell.file) as page:
+        answer = page.act("pin", {"candidate": "SO"})
+        assert answer.status == 403
+        assert "--control" in answer.value["error"]
+        assert page.get("/cells")["read_only"]
+
+
+def test_a_cell_that_nobody_controls_is_absent(tmp_path: Path) -> None:
+    made = RealCell(tmp_path)
+    try:
+        with serving(tmp_path, made.file) as page:
+            found = state(page)
+            assert found["health"] == "absent"
+            assert "controller" in found["headline"]
+            assert page.ask("/readyz").status == 503
+            made.begin()
+            until_state(page, lambda found: found["health"] == "ok" and found.get("window"))
+    finally:
+        made.close()
+
+
+# ---------------------------------------------------------------------------------- keys
+
+
+@pytest.fixture(scope="module")
+def secure(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SecureCell]:
+    made = SecureCell(tmp_path_factory.mktemp("secure"))
+    try:
+        made.begin()
+        yield made
+    finally:
+        made.close()
+
+
+def test_an_observer_sees_and_may_not_act(secure: SecureCell) -> None:
+    keys = secure.host / "watcher"
+    code, stdout, stderr = invoke(
+        *("dash", secure.file, "--control", "--keys", keys, "--port", "0", "--no-browser")
+    )
+    assert (code, stdout) == (2, "")
+    assert "observer" in stderr
+    with serving(secure.folder, secure.file, "--keys", keys) as page:
+        until_state(page, lambda found: found["health"] == "ok")
+        until(lambda: page.get("/view?begin=0&end=1e6")["cycles"] > 20)
+        assert page.act("pin", {"candidate": "SO"}).status == 403
+
+
+def test_an_operator_acts_by_name(secure: SecureCell) -> None:
+    with serving(
+        secure.folder, secure.file, "--control", "--keys", secure.host / "operator"
+    ) as page:
+        assert page.get("/cells")["cells"][0]["certificate"].startswith("operator.")
+        assert page.act("pin", {"candidate": "SO"}).status == 200
+        until_state(page, lambda found: found["placement"] == "SO")
+        assert page.act("unpin", {}).status == 200
+        assert "pin SO by operator." in page.said
+
+
+def test_without_keys_it_acts_on_this_computer_alone(tmp_path: Path) -> None:
+    made = RealCell(tmp_path)
+    text = made.file.read_text()
+    assert "address: 127.0.0.1" in text
+    made.file.write_text(text.replace("address: 127.0.0.1", "address: 10.255.0.9", 1))
+    words = ("dash", made.file, "--port", "0", "--no-browser")
+    for more in ((), ("--insecure", "--control")):
+        code, stdout, stderr = invoke(*words, *more)
+        assert code in {1, 2}
+        assert stdout == ""
+        assert "beyond this computer" in stderr
