@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import dwell
-from dwell.record import Run
+from dwell.record import Journal, Run, column_types
 from tests.cli.small_cell import SMALL
 
 
@@ -13,6 +13,7 @@ def small_run(
     folder: Path, *, policy: str = "dtp", seed: int = 1, windows: int = 60, jobs: bool = True
 ) -> Run:
     """Simulate the small cell under stress, and save the run."""
+    folder.parent.mkdir(exist_ok=True)
     file = folder.parent / "small.yaml"
     file.write_text(SMALL, encoding="utf-8")
     problem = dwell.load(file)
@@ -21,3 +22,31 @@ def small_run(
     )
     run.save(folder)
     return run
+
+
+class WrittenRun:
+    """A run that is being written: the rows of another one, in a journal, as far as it has come."""
+
+    def __init__(self, folder: Path, run: Run) -> None:
+        self._run, self._upto = run, 0
+        columns = {name: column_types(name, run.problem, []) for name in TABLES}
+        self._journal = Journal(folder, run="1", meta=run.meta, columns=columns)
+
+    def go_on(self, windows: int) -> None:
+        """Write some windows more, with their cycles and decisions."""
+        begin, self._upto = self._upto, self._upto + windows
+        size = self._run.problem.window_cycles
+        cycles = self._run.cycles.slice(begin * size, windows * size)
+        tables = {name: getattr(self._run, name) for name in TABLES[1:]}
+        rows = {
+            name: table.filter(table["window"].is_between(begin, self._upto - 1)).rows()
+            for name, table in tables.items()
+        }
+        self._journal.append({"cycles": cycles.rows(), **rows})
+
+    def close(self) -> None:
+        """End, without tables."""
+        self._journal.close()
+
+
+TABLES = ("cycles", "windows", "decisions")

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import signal
+import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from http.client import HTTPConnection
 from pathlib import Path
@@ -86,6 +87,17 @@ class Served:
         assert answer.status == 200, answer
         return answer.value
 
+    def events(self, *, receives: int | None = None) -> socket.socket:
+        """Ask for events, with a small buffer if wanted, and read nothing of them."""
+        reader = socket.socket()
+        reader.settimeout(PATIENCE_S)
+        if receives is not None:
+            reader.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receives)
+        reader.connect(("127.0.0.1", self.port))
+        head = f"Host: {self.host}\r\nAuthorization: Bearer {self.token}"
+        reader.sendall(f"GET /events HTTP/1.1\r\n{head}\r\n\r\n".encode())
+        return reader
+
     def act(self, what: str, about: object, **changes: str | None) -> Answer:
         """Act as the page does; a header that is None is left out."""
         headers = {**self.bearer, "Origin": f"http://{self.host}", "X-Dwell-Act": what, **changes}
@@ -93,25 +105,35 @@ class Served:
         return self.ask(f"/{what}", sent, method="POST", body=json.dumps(about).encode())
 
 
+#: Runs a command where some modules, its first word, are not installed.
+LACKING = """
+import sys
+sys.modules.update(dict.fromkeys(sys.argv.pop(1).split(",")))
+from dwell.cli import main
+main(sys.argv[1:])
+"""
+
+
+def dash(*arguments: str | Path, without: Sequence[str] = ()) -> list[str]:
+    """Return the words of a command `dwell dash`, where some modules are not installed."""
+    words = ["dash", *map(str, arguments), "--port", "0", "--no-browser"]
+    return [sys.executable, "-c", LACKING, ",".join(("none", *without)), *words]
+
+
 @contextmanager
-def serving(folder: Path, *arguments: str | Path) -> Iterator[Served]:
+def serving(folder: Path, *arguments: str | Path, without: Sequence[str] = ()) -> Iterator[Served]:
     """Serve a page with `dwell dash`, at a free port; it has to end when it is told to."""
-    words = ["-m", "dwell", "dash", *map(str, arguments), "--port", "0", "--no-browser"]
-    with started(folder, *words) as served:
+    with started(folder, dash(*arguments, without=without)) as served:
         yield served
 
 
 @contextmanager
-def started(folder: Path, *words: str) -> Iterator[Served]:
-    """Start a Python process that serves a page."""
+def started(folder: Path, words: Sequence[str]) -> Iterator[Served]:
+    """Start a process that serves a page; it has to end when it is told to."""
     err = folder / "dash.err"
     with err.open("wb") as log:
         process = subprocess.Popen(
-            [sys.executable, *words],
-            cwd=ROOT,
-            stdout=subprocess.PIPE,
-            stderr=log,
-            env=environment(),
+            words, cwd=ROOT, stdout=subprocess.PIPE, stderr=log, env=environment()
         )
     try:
         assert process.stdout is not None

@@ -171,7 +171,7 @@ def test_200_connections_that_say_nothing_keep_nobody_out(page: Served) -> None:
 
 
 def test_readers_beyond_the_most_are_refused_and_others_go_on(page: Served) -> None:
-    crowd = [read_events(page) for _ in range(40)]
+    crowd = [page.events() for _ in range(40)]
     try:
         assert {one.recv(64).split()[1] for one in crowd} == {b"200", b"503"}
         assert page.ask("/cells", page.bearer).status == 200
@@ -181,16 +181,8 @@ def test_readers_beyond_the_most_are_refused_and_others_go_on(page: Served) -> N
     until(lambda: _is_read(page))
 
 
-def read_events(page: Served) -> socket.socket:
-    """Ask for events, and read nothing of them."""
-    reader = socket.create_connection(("127.0.0.1", page.port), timeout=PATIENCE_S)
-    head = f"Host: {page.host}\r\nAuthorization: Bearer {page.token}"
-    reader.sendall(f"GET /events HTTP/1.1\r\n{head}\r\n\r\n".encode())
-    return reader
-
-
 def _is_read(page: Served) -> bool:
-    with read_events(page) as one:
+    with page.events() as one:
         return one.recv(64).split()[1] == b"200"
 
 

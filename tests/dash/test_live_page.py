@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -104,9 +103,7 @@ def test_what_is_watched_is_ready_for_json(cell: RealCell) -> None:
 
 
 def test_events_come_again_and_again(acting: Served) -> None:
-    head = f"GET /events HTTP/1.1\r\nHost: {acting.host}\r\nAuthorization: Bearer {acting.token}"
-    with socket.create_connection(("127.0.0.1", acting.port), timeout=60) as reader:
-        reader.sendall(f"{head}\r\n\r\n".encode())
+    with acting.events() as reader:
         heard = b""
         while heard.count(b"data: ") < 5:
             part = reader.recv(65_536)
@@ -119,14 +116,7 @@ def test_events_come_again_and_again(acting: Served) -> None:
 
 
 def test_a_reader_who_does_not_read_holds_nobody_up(acting: Served) -> None:
-    head = f"GET /events HTTP/1.1\r\nHost: {acting.host}\r\nAuthorization: Bearer {acting.token}"
-    slow = []
-    for _ in range(8):
-        one = socket.socket()
-        one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2_048)
-        one.connect(("127.0.0.1", acting.port))
-        one.sendall(f"{head}\r\n\r\n".encode())
-        slow.append(one)
+    slow = [acting.events(receives=2_048) for _ in range(8)]
     try:
         before = state(acting)["at"]
         test_events_come_again_and_again(acting)

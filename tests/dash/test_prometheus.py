@@ -7,6 +7,7 @@ import re
 import shutil
 import socket
 import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.client import HTTPConnection
@@ -37,7 +38,7 @@ def tool(name: str) -> str:
 def live_page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """Return the page of a live cell."""
     folder = tmp_path_factory.mktemp("page")
-    with started(folder, "-m", "tests.dash.stand_in", TOKEN) as served:
+    with started(folder, [sys.executable, "-m", "tests.dash.stand_in", TOKEN]) as served:
         assert served.token == TOKEN
         yield served
 

@@ -12,9 +12,10 @@ import signal
 import socket
 import sys
 import tempfile
+import threading
 import webbrowser
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 
 import uvicorn
@@ -59,10 +60,10 @@ def serve(
     with _listening(port) as listener:
         gate = Gate(dash.application(), listener.getsockname()[1], token or new_token())
         address = f"http://{LOOPBACK}:{gate.port}/?token={gate.token}"
-        print(address, flush=True)
-        with _opened(address, say) if browser else _nothing():
-            if asyncio.run(_served(gate, listener)) == signal.SIGINT:
-                raise KeyboardInterrupt
+        with _opened(address, say) if browser else nullcontext():
+            caught = asyncio.run(_served(gate, listener, lambda: print(address, flush=True)))
+    if caught == signal.SIGINT:
+        raise KeyboardInterrupt
 
 
 @contextmanager
@@ -98,8 +99,8 @@ class _Server(uvicorn.Server):
         yield
 
 
-async def _served(gate: Gate, listener: socket.socket) -> int | None:
-    """Serve until a signal; returns it."""
+async def _served(gate: Gate, listener: socket.socket, ready: Callable[[], None]) -> int | None:
+    """Serve until a signal, and return it; `ready` is called once a signal ends it in order."""
     logging.getLogger("uvicorn").setLevel(logging.CRITICAL)
     server = _Server(
         uvicorn.Config(
@@ -123,13 +124,9 @@ async def _served(gate: Gate, listener: socket.socket) -> int | None:
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, end, number)
+    ready()
     await server.serve([listener])
     return caught[0] if caught else None
-
-
-@contextmanager
-def _nothing() -> Iterator[None]:
-    yield
 
 
 @contextmanager
@@ -155,14 +152,15 @@ def _opened(address: str, say: Callable[[str], None]) -> Iterator[None]:
                 f'<meta http-equiv="refresh" content="0; url={escaped}">'
                 f'<a href="{escaped}">Open the page</a>\n'
             )
-        if not _shown(page.as_uri()):
-            say("no browser could be started: open the address in one")
+        # Some browsers are waited for, and all of them for the page.
+        threading.Thread(target=_show, args=(page.as_uri(), say), daemon=True).start()
         yield
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _shown(address: str) -> bool:
+def _show(address: str, say: Callable[[str], None]) -> None:
     with suppress(webbrowser.Error, OSError):
-        return webbrowser.open(address)
-    return False
+        if webbrowser.open(address):
+            return
+    say("no browser could be started: open the address in one")
