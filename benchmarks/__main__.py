@@ -29,6 +29,7 @@ BENCHMARKS = {
     "start": ("starting", "measure"),
     "size": ("size", "measure"),
     "import": ("importing", "measure"),
+    "page": ("page", "measure"),
     "link": ("link", "measure"),
     "testbed-link": ("testbed_link", "measure"),
     "transport": ("transport", "measure"),

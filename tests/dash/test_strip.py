@@ -73,7 +73,7 @@ def test_a_long_run_takes_little_room_at_any_zoom() -> None:
 @given(strips(), st.integers(1, 40))
 def test_means_are_of_what_is_known(strip: Strip, bins: int) -> None:
     found = binned_means(strip.at, {"x": strip.latency_ms}, 0.0, 9.0, bins)
-    inside = strip.latency_ms[(strip.at < 9.0)]
+    inside = strip.latency_ms[: int((strip.at < 9.0).sum()) + 1]
     values = [value for value in found["of"]["x"] if value is not None]
     known = inside[~np.isnan(inside)]
     assert bool(values) == bool(len(known))

@@ -60,7 +60,7 @@ class RecordedCell:
 
     def _read(self) -> _Contents:
         began_s = time.monotonic()
-        contents = _Contents(open_run(self.folder), self.unit)
+        contents = _Contents(open_run(self.folder), self.unit, self.folder.resolve().name)
         took_s = time.monotonic() - began_s
         self._read_again_s = time.monotonic() + max(REST * took_s, LEAST_REST_S)
         return contents
@@ -118,8 +118,8 @@ def same_realisation(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
 class _Contents:
     """The tables of a run as arrays, on its time line."""
 
-    def __init__(self, run: Run, unit: Unit) -> None:
-        self.run, self.unit, self.problem = run, unit, run.problem
+    def __init__(self, run: Run, unit: Unit, source: str) -> None:
+        self.run, self.unit, self.source, self.problem = run, unit, source, run.problem
         recovered = run.meta.get("recovered", {})
         self.growing = bool(recovered) and not recovered.get("sealed", True)
         self._candidates = tuple(self.problem.candidates)
@@ -244,6 +244,7 @@ class _Contents:
         told = ("kind", "scenario", "policy", "estimator", "seed")
         return {
             **cell_document(self.problem),
+            "source": self.source,
             "live": False,
             "growing": self.growing,
             "unit": self.unit,

@@ -107,7 +107,10 @@ class Strip:
         changes = np.concatenate(([0], np.flatnonzero(np.diff(placement)) + 1))
         exact = len(changes) <= MOST_STRETCHES
         if exact:
-            begins, ends, codes = at[changes], np.append(at[changes[1:]], end), placement[changes]
+            # The placement that comes first held before, too.
+            first = begin if rows.start else at[0]
+            begins = np.concatenate(([first], at[changes[1:]]))
+            ends, codes = np.append(begins[1:], end), placement[changes]
         else:
             starts = bin_starts(at, begin, end, RIBBON_BINS)
             bin_ends = np.append(at[starts[1:]], end)
@@ -138,12 +141,15 @@ def binned_means(
 ) -> dict[str, Any]:
     """Return columns between two places: their means in each bin, of what is not NaN.
 
+    The row before and the row after are told, too, so that a line leads in and out.
+
     Returns
     -------
     dict
         ``at``, and ``of`` the columns by name.
     """
     low, high = np.searchsorted(at, (begin, end))
+    low, high = max(int(low) - 1, 0), int(high) + 1
     at = at[low:high]
     starts = bin_starts(at, begin, end, bins)
     means = {}

@@ -79,6 +79,7 @@ class WatchedCell:
         keyring = self.observer.security.keyring
         return {
             **cell_document(self.problem),
+            "source": "",
             "live": True,
             "growing": True,
             "unit": "s",

@@ -86,11 +86,12 @@ const latency = (root, page, cell) => {
     ctx.save();
     ctx.strokeStyle = ctx.fillStyle = colour("--ink");
     ctx.globalAlpha = 0.62;
+    const dot = (at.length > CROSSES ? 3 : 5) * ratio;
     ctx.lineWidth = Math.min(Math.max((0.8 * bbox.width) / Math.max(at.length, 1), 1), 3 * ratio);
     at.forEach((place, i) => {
       if (high[i] === null) return;
       if (counts[i] === 1 || high[i] - low[i] < top / 200) {
-        ctx.fillRect(x(place) - 1.5 * ratio, y(high[i]) - 1.5 * ratio, 3 * ratio, 3 * ratio);
+        ctx.fillRect(x(place) - dot / 2, y(high[i]) - dot / 2, dot, dot);
       } else line(ctx, x(place), y(low[i]), x(place), y(high[i]));
       // What is above the scale has an arrow.
       if (high[i] > top) triangle(ctx, x(place), bbox.top + 4 * ratio, 3.5 * ratio);
@@ -102,7 +103,7 @@ const latency = (root, page, cell) => {
     const due = y(cell.deadline_ms);
     line(ctx, bbox.left, due, bbox.left + bbox.width, due);
     ctx.setLineDash([]);
-    const middle = bbox.top - 8 * ratio;
+    const middle = bbox.top - 13 * ratio;
     const marked = missed.flatMap((misses, i) => (misses > 0 ? [[x(at[i]), lost[i]]] : []));
     const size = (marked.length > CROSSES ? 5 : 3.5) * ratio;
     for (const [place] of marked) {
@@ -123,7 +124,7 @@ const latency = (root, page, cell) => {
     scales: { y: { range: () => [0, top] } },
     axes: [across(page, false), upright()],
     drawn,
-    padding: [LANE + 8, 6, 0, 0],
+    padding: [LANE + 10, 6, 0, 0],
   });
   return (view) => {
     data = view;

@@ -21,6 +21,7 @@ class CellView {
     Object.assign(this, { cell, i, page });
     this.root = element("cell").content.firstElementChild.cloneNode(true);
     this.root.querySelector(".name").textContent = cell.name;
+    this.root.querySelector(".source").textContent = cell.source;
     element("cells").append(this.root);
     this.describe(cell);
     this.topology = new Topology(this.root.querySelector(".topology"), cell);
@@ -303,6 +304,8 @@ class Page {
   }
 }
 
+// A page that plays for hours asks a million times; the browser need not remember when.
+performance.setResourceTimingBufferSize(0);
 // The token is in the cookie by now: it need not stay in the address, nor in the history.
 history.replaceState(null, "", location.pathname);
 try {

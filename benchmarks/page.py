@@ -1,0 +1,159 @@
+"""The page of a recorded run: from the command to the strip, what it sends, and what it keeps."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.client import HTTPConnection
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from playwright.sync_api import Browser, Page, sync_playwright
+
+import dwell
+from benchmarks.canonical import CELL
+from benchmarks.figures import Figure, Goal, Section
+
+CYCLES, PLAYED_CYCLES = 1_000_000, 108_000
+STRIP_S, SENT_MB, GROWN = 2.0, 1.0, 0.05
+SPEED = 100
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+#: Parts of the time line that are looked at, as shares.
+ZOOMS = ((0.0, 1.0), (0.2, 0.3), (0.5, 0.501), (0.9, 0.90001))
+
+
+def measure(quick: bool) -> Section:
+    """See the module."""
+    if CHROMIUM is None:
+        return Section("the page of a recorded run", [], ["skipped: there is no Chromium here"])
+    cycles = CYCLES // 10 if quick else CYCLES
+    with tempfile.TemporaryDirectory() as folder, _browser(CHROMIUM) as browser:
+        long, played = Path(folder) / "long", Path(folder) / "played"
+        misses = _recorded(long, cycles)
+        _recorded(played, PLAYED_CYCLES // 10 if quick else PLAYED_CYCLES)
+        strips = [_strip_s(browser, long) for _ in range(3 if quick else 5)]
+        sent_mb, drawn = _sent(long)
+        server, heap = _grown(browser, played)
+    notes = [
+        f"a run of {cycles:,} cycles; the browser runs already, the file cache is warm",
+        f"misses in the bins of the whole line: {drawn:,}; in the table: {misses:,}",
+        f"grown: from the first tenth to the last of an hour played at {SPEED} times its speed",
+    ]
+    return Section(
+        "the page of a recorded run",
+        [
+            Figure("from the command to the strip", strips, "s", Goal(high=STRIP_S)),
+            Figure("largest answer, any zoom", sent_mb, "MB", Goal(high=SENT_MB)),
+            Figure("misses drawn over misses in the table", [drawn / misses], "", Goal(1.0, 1.0)),
+            Figure("memory of the server, grown by", [server], "", Goal(high=GROWN)),
+            Figure("heap of the page, grown by", [heap], "", Goal(high=GROWN)),
+        ],
+        notes,
+    )
+
+
+def _recorded(folder: Path, cycles: int) -> int:
+    """Record a run; returns its misses."""
+    problem = dwell.load(CELL)
+    run = dwell.simulate(problem, seed=1, windows=cycles // problem.window_cycles)
+    run.save(folder)
+    return int(run.cycles["missed"].sum())
+
+
+@contextmanager
+def _browser(path: str) -> Iterator[Browser]:
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=path, args=["--no-sandbox", "--js-flags=--expose-gc"]
+        )
+        yield browser
+        browser.close()
+
+
+@contextmanager
+def _served(folder: Path) -> Iterator[tuple[int, str]]:
+    """Serve a run; gives the process and the address."""
+    command = [sys.executable, "-m", "dwell", "dash", str(folder), "--port", "0", "--no-browser"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        yield process.pid, process.stdout.readline().strip()
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def _strip_s(browser: Browser, folder: Path) -> float:
+    page = browser.new_page()
+    begin = time.perf_counter()
+    with _served(folder) as (_, address):
+        page.goto(address)
+        while not page.evaluate("document.querySelector('.latency .said')?.textContent"):
+            time.sleep(0.005)
+        taken_s = time.perf_counter() - begin
+    page.close()
+    return taken_s
+
+
+def _sent(folder: Path) -> tuple[list[float], int]:
+    """Return the length of the longest answers, MB, by zoom; and the misses that the first has."""
+    sizes, drawn = [], 0
+    with _served(folder) as (_, address):
+        parts = urlsplit(address)
+        token = parts.query.removeprefix("token=")
+        connection = HTTPConnection(parts.netloc)
+
+        def get(path: str) -> bytes:
+            connection.request("GET", path, headers={"Authorization": f"Bearer {token}"})
+            return connection.getresponse().read()
+
+        cell = json.loads(get("/cells"))["cells"][0]
+        begin, length = cell["begin"], cell["end"] - cell["begin"]
+        for low, high in ZOOMS:
+            ends = f"begin={begin + low * length}&end={begin + high * length}"
+            answers = [get(f"/view?{ends}&bins=1500"), get(f"/jobs?{ends}"), get("/cells")]
+            sizes.append(max(map(len, answers)) / 1e6)
+            if (low, high) == (0.0, 1.0):
+                drawn = sum(json.loads(answers[0])["bins"]["missed"])
+    return sizes, drawn
+
+
+def _grown(browser: Browser, folder: Path) -> tuple[float, float]:
+    """Play a whole run; returns by how much server and page grew from the first tenth on."""
+    page = browser.new_page()
+    found: list[tuple[float, float]] = []
+    with _served(folder) as (pid, address):
+        page.goto(address)
+        while not page.evaluate("Boolean(window.page)"):
+            time.sleep(0.05)
+        end = page.evaluate("window.page.span[1]")
+        page.evaluate(f"document.getElementById('speed').value = '{SPEED}'")
+        page.evaluate("window.page.zoom(0, 60)")
+        page.evaluate("window.page.play(true)")
+        for share in (0.1, 0.999):
+            while page.evaluate("window.page.at") < share * end:
+                time.sleep(0.2)
+            page.evaluate("window.page.play(false)")
+            time.sleep(0.5)
+            found.append((_resident(pid), _heap(page)))
+            page.evaluate("window.page.play(true)")
+    page.close()
+    ((server, server_last), (heap, heap_last)) = (pair for pair in zip(*found, strict=True))
+    return server_last / server - 1, heap_last / heap - 1
+
+
+def _resident(pid: int) -> float:
+    return float(Path(f"/proc/{pid}/statm").read_text().split()[1])
+
+
+def _heap(page: Page) -> float:
+    for _ in range(3):
+        page.evaluate("gc()")
+        time.sleep(0.05)
+    return float(page.evaluate("performance.memory.usedJSHeapSize"))
