@@ -41,6 +41,15 @@ def test_what_records_has_to_be_installed(tmp_path: Path, monkeypatch: pytest.Mo
 def test_a_token_that_can_be_guessed_is_refused(text: str, tmp_path: Path) -> None:
     file = tmp_path / "dwell.token"
     file.write_text(text, encoding="utf-8")
+    file.chmod(0o640)
     refused = call("dash", CELL, "--no-browser", "--port", "0", "--token", file)
     assert_refused(refused, "22 to 200 letters")
     assert file.read_text(encoding="utf-8") == text
+
+
+def test_a_token_that_everybody_here_can_read_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "dwell.token"
+    file.write_text("a-token-that-nobody-would-guess", encoding="utf-8")
+    file.chmod(0o644)
+    refused = call("dash", CELL, "--no-browser", "--port", "0", "--token", file)
+    assert_refused(refused, "chmod o-rwx")

@@ -112,6 +112,18 @@ def test_a_file_that_is_there_is_left_alone(tmp_path: Path) -> None:
     assert file.read_text() == "somebody's"
 
 
+def test_where_there_is_no_room_at_all_no_file_is_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.posix_fallocate", full)
+    with pytest.raises(OSError, match=r"No space left on device: '.*cell\.mcap'"):
+        CellRecorder(StandIn().observer, tmp_path / "cell.mcap", print)
+    assert not list(tmp_path.iterdir())
+
+
 def test_where_the_disk_has_room_again_it_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

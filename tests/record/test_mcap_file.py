@@ -44,6 +44,7 @@ def read(file: Path) -> Iterator[tuple[str, int, dict[str, Any]]]:
                 of.check_schema(found)
                 validators[channel.topic] = of(found)
             content = json.loads(message.data)
+            assert content.keys() <= validators[channel.topic].schema["properties"].keys()
             validators[channel.topic].validate(content)
             yield channel.topic, message.log_time, content
 

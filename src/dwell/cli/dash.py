@@ -45,7 +45,7 @@ def dash(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Also record the live cell to an MCAP file for Foxglove, PlotJuggler and Rerun.",
+            help="Also record the live cell to an MCAP file for Foxglove, PlotJuggler and others.",
         ),
     ] = None,
     token: Annotated[
@@ -99,6 +99,8 @@ def _kept(file: Path) -> str:
     if not file.exists():
         write_whole(file, new_token(), private=True)
     token = file.read_text(encoding="utf-8").strip()
+    if file.stat().st_mode & 0o007:
+        raise typer.BadParameter(f"--token: everybody here can read {file}; chmod o-rwx {file}")
     if not TOKEN.fullmatch(token):
         raise typer.BadParameter(f"--token: {file} has no token: 22 to 200 letters, digits, - or _")
     return token

@@ -66,7 +66,12 @@ class CellRecorder:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._stream = path.open("xb")
         columns = {table: column_types(table, problem, LIVE) for table in TABLES}
-        self._file = McapFile(self._stream, problem, columns)
+        try:
+            self._file = McapFile(self._stream, problem, columns)
+        except OSError as error:
+            self._stream.close()
+            path.unlink()
+            raise OSError(error.errno, error.strerror, str(path)) from None
 
     def __repr__(self) -> str:
         return f"<CellRecorder of {self._observer.problem.name} in {str(self._path)!r}>"

@@ -468,8 +468,8 @@ class ControlledCell:
             if task.state_bytes and old[task.name] != new[task.name]
         )
         phase: Phase = "fork" if forks else "order"
-        by = "pinned" if self.pinned else "drained"
-        reason = by if proposal is None else proposal.decision.reason
+        wish = "pinned" if self.pinned else "drained"
+        reason = wish if proposal is None else proposal.decision.reason
         self._move = _Move(name, reason, now_ns, phase, forks, proposal=proposal)
         self.refused = ""
         if self.windows is not None:

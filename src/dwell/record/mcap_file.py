@@ -1,4 +1,4 @@
-"""MCAP files of a run's rows, as Foxglove, PlotJuggler and Rerun open them.
+"""MCAP files of a run's rows, as Foxglove, PlotJuggler and others open them.
 
 A table is a topic, a row a JSON message of it, with the JSON Schema of the table's columns
 (`dwell.record.schema.json_schema`). A cycle stands at its release, a window at its close, a
@@ -196,7 +196,7 @@ def _instants(run: Run) -> tuple[int | None, dict[str, pl.DataFrame]]:
         tables["jobs"] = run.jobs.with_columns(pl.col("ready_ns").alias(AT))
     if run.has_processes:
         tables["processes"] = run.processes.sort("window").join_asof(closes, on="window")
-    origins = windows.select(pl.col("^closed_unix_ns$") - pl.col(AT))
+    origins = windows.select(pl.col("^closed_unix_ns$") - pl.col(AT)).drop_nulls()
     if origins.is_empty():
         return None, tables
     # A clock that was put right meanwhile, and a close that came late, move the middle one least.

@@ -83,12 +83,14 @@ def json_schema(table: str, problem: Problem, columns: Collection[str]) -> dict[
     table : str
         One of `TABLES`.
     columns : collection of str
-        Columns that there are; those that are not declared are left out.
+        Columns that there are; of those that are not declared nothing is said.
     """
     properties = {}
     for name, column, kind in _columns(table, problem, get_args(Feature)):
         if name in columns:
-            typed = {"type": JSON_TYPES[kind]} if isinstance(kind, str) else _enumeration(kind)
+            typed: dict[str, Any] = {"type": "string", "enum": kind}
+            if isinstance(kind, str):
+                typed = {"type": JSON_TYPES[kind]}
             absent = column.null and f" Absent: {column.null}."
             unit = column.unit and f" Unit: {column.unit}."
             properties[name] = {**typed, "description": f"{column.sentence}{unit}{absent}"}
@@ -97,12 +99,7 @@ def json_schema(table: str, problem: Problem, columns: Collection[str]) -> dict[
         "description": f"One row is {TABLES[table].sentence}.",
         "type": "object",
         "properties": properties,
-        "additionalProperties": False,
     }
-
-
-def _enumeration(names: Sequence[str]) -> dict[str, Any]:
-    return {"type": "string", "enum": list(names)}
 
 
 def _columns(
