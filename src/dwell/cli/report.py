@@ -40,7 +40,7 @@ def report(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Also write the run's tables as an MCAP file for Foxglove, PlotJuggler and others.",
+            help="Also write its tables as an MCAP file for Foxglove, PlotJuggler and others.",
         ),
     ] = None,
     figures: Annotated[
