@@ -87,13 +87,13 @@ def test_a_run_without_jobs_says_so(tmp_path: Path) -> None:
 
 
 def test_runs_of_one_realisation_go_by_cycles(tmp_path: Path) -> None:
-    metas = [
-        small_run(tmp_path / f"{policy}-{seed}", policy=policy, seed=seed).meta
+    first, second, other = (
+        small_run(tmp_path / f"{policy}-{seed}", policy=policy, seed=seed)
         for policy, seed in (("dtp", 1), ("LOC", 1), ("dtp", 2))
-    ]
-    assert same_realisation(metas[0], metas[1])
-    assert not same_realisation(metas[0], metas[2])
-    assert not same_realisation({**metas[0], "kind": "live"}, metas[1])
+    )
+    assert same_realisation(first, second)
+    assert not same_realisation(first, other)
+    assert not same_realisation(dwell.Run({**first.meta, "kind": "live"}, {}), second)
     cell = RecordedCell(tmp_path / "dtp-1", "cycle")
     assert cell.described()["end"] == cell.described()["cycles"]
     assert cell.state(100.5)["cycle"] == 100

@@ -77,7 +77,7 @@ def _on_one_line(folder: Path, beside: Path | None) -> tuple[list[RecordedCell],
     if beside is None:
         return [one], ""
     other = RecordedCell(beside)
-    if same_realisation(one.meta, other.meta):
+    if same_realisation(one.run, other.run):
         line = "by number of the cycle: both runs met the same realisation"
         return [RecordedCell(folder, "cycle"), RecordedCell(beside, "cycle")], line
     return [one, other], "by seconds since the first release: the runs met different realisations"

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,9 +81,9 @@ class RecordedCell:
         return True
 
     @property
-    def meta(self) -> Mapping[str, Any]:
-        """What it is the record of."""
-        return self._contents.run.meta
+    def run(self) -> Run:
+        """The run as it was read last."""
+        return self._contents.run
 
     def described(self) -> Plain:
         """See `PagedCell`."""
@@ -103,16 +102,11 @@ class RecordedCell:
         return self._contents.jobs(begin, end)
 
 
-def same_realisation(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Whether two runs met the same draws, cycle by cycle, by what they are the records of."""
-    return all(meta.get("kind", "simulated") == "simulated" for meta in (one, other)) and all(
-        part(one) == part(other)
-        for part in (
-            lambda meta: meta.get("seed"),
-            lambda meta: meta.get("scenario"),
-            lambda meta: {**meta.get("problem", {}), "controller": None},
-        )
-    )
+def same_realisation(one: Run, other: Run) -> bool:
+    """Whether two runs met the same draws, cycle by cycle."""
+    simulated = all(run.meta.get("kind", "simulated") == "simulated" for run in (one, other))
+    drawn = [(run.meta.get("seed"), run.meta.get("scenario")) for run in (one, other)]
+    return simulated and drawn[0] == drawn[1] and one.problem.drawn == other.problem.drawn
 
 
 class _Contents:
