@@ -36,6 +36,7 @@ BENCHMARKS = {
     "order": ("live", "decision"),
     "moves": ("live", "moves"),
     "share": ("live", "share"),
+    "page-cost": ("page_cost", "measure"),
     "live-fleet": ("fleet_live", "measure"),
     "restart": ("restart", "measure"),
 }

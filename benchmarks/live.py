@@ -36,7 +36,7 @@ def _everywhere() -> None:
 
 
 @contextmanager
-def _cell(found: dict[str, Any], *, links: bool) -> Iterator[LightCell]:
+def cell_of(found: dict[str, Any], *, links: bool) -> Iterator[LightCell]:
     _everywhere()
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -55,7 +55,7 @@ def decision(quick: bool) -> Section:
     asked: list[tuple[int, str]] = []
     # Short windows: what is in none is recorded with the next.
     found = document("decision", period_ms=PERIOD_MS, delay_ms=DELAY_MS, window_cycles=3)
-    with _cell(found, links=True) as cell:
+    with cell_of(found, links=True) as cell:
         for number in range(count):
             target = ("SO", "LOC")[number % 2]
             time.sleep(draw.uniform(0.36, 0.40))
@@ -129,7 +129,7 @@ def _moved(seed: int) -> dict[str, float]:
     )
     cell_file["tasks"]["last"]["run"] = "benchmarks.live_cell:Counting"
     draw = random.Random(seed)
-    with _cell(cell_file, links=True) as cell:
+    with cell_of(cell_file, links=True) as cell:
         begin = cell.applied()[-1].cycle
         for number in range(MOVES):
             target = ("OTHER", "EDGE")[number % 2]
@@ -161,18 +161,18 @@ def share(quick: bool) -> Section:
     """CPU time of every kind of process of a cell at 25 Hz whose stages do nothing."""
     runs, seconds = (1, 8.0) if quick else (3, 10.0)
     found: dict[str, list[float]] = {}
-    with _cell(document("share", period_ms=PERIOD_MS), links=False) as cell:
+    with cell_of(document("share", period_ms=PERIOD_MS), links=False) as cell:
         time.sleep(3)
-        processes = _processes(cell)
+        processes = processes_of(cell)
         for _ in range(runs):
             begin = time.monotonic()
-            before = {who: _cpu_s(each) for who, each in processes.items()}
+            before = {who: cpu_s(each) for who, each in processes.items()}
             time.sleep(seconds)
             passed = time.monotonic() - begin
             kinds: dict[str, list[float]] = {}
             for who, each in processes.items():
                 kinds.setdefault(_kind(who, cell), []).append(
-                    100 * (_cpu_s(each) - before[who]) / passed
+                    100 * (cpu_s(each) - before[who]) / passed
                 )
             for kind, shares in kinds.items():
                 found.setdefault(kind, []).append(mean(shares))
@@ -185,12 +185,12 @@ def share(quick: bool) -> Section:
     )
 
 
-def _cpu_s(process: psutil.Process) -> float:
+def cpu_s(process: psutil.Process) -> float:
     times = process.cpu_times()
     return float(times.user + times.system)
 
 
-def _processes(cell: LightCell) -> dict[str, psutil.Process]:
+def processes_of(cell: LightCell) -> dict[str, psutil.Process]:
     found = {who: psutil.Process(pid) for who, pid in cell.pids().items()}
     for who, top in cell.processes.running.items():
         found[who] = psutil.Process(top.pid)

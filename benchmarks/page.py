@@ -33,7 +33,7 @@ def measure(quick: bool) -> Section:
     if CHROMIUM is None:
         return Section("the page of a recorded run", [], ["skipped: there is no Chromium here"])
     cycles = CYCLES // 10 if quick else CYCLES
-    with tempfile.TemporaryDirectory() as folder, _browser(CHROMIUM) as browser:
+    with tempfile.TemporaryDirectory() as folder, browser_of(CHROMIUM) as browser:
         long, played = Path(folder) / "long", Path(folder) / "played"
         misses = _recorded(long, cycles)
         _recorded(played, PLAYED_CYCLES // 10 if quick else PLAYED_CYCLES)
@@ -67,7 +67,7 @@ def _recorded(folder: Path, cycles: int) -> int:
 
 
 @contextmanager
-def _browser(path: str) -> Iterator[Browser]:
+def browser_of(path: str) -> Iterator[Browser]:
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(
             executable_path=path, args=["--no-sandbox", "--js-flags=--expose-gc"]

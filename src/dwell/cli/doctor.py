@@ -41,6 +41,7 @@ EXTRAS = {
     "dash": "dwell dash",
     "mcap": "dwell report --mcap, dwell dash --mcap",
     "dask": "dwell study --dask",
+    "dash": "dwell dash",
 }
 #: How many ports are looked at where no cell says which.
 DEFAULT_PORTS = 50

@@ -33,8 +33,8 @@ from dwell.live.wiring import Role
 from dwell.model import Problem
 from dwell.model.instants import NEVER_NS
 
-#: Cycles, windows and events that are kept.
-MOST_CYCLES, MOST_WINDOWS, MOST_EVENTS = 40_000, 4_000, 1_000
+#: Cycles with their jobs (2 to 3 kB each), windows and events that are kept.
+MOST_CYCLES, MOST_WINDOWS, MOST_EVENTS = 4_000, 4_000, 1_000
 #: Time between two questions to the controller, at least and at most.
 LEAST_ASK_S, MOST_ASK_S = 0.1, 0.5
 #: A cycle that nobody has told the end of is given up so long after its deadline.
@@ -168,12 +168,12 @@ class Observer:
     """
 
     def __init__(self, problem: Problem, environment: Mapping[str, str] | None = None) -> None:
-        self.problem = problem
+        self.problem, self._environment = problem, environment
         self.cycles: Feed[ObservedCycle] = Feed(MOST_CYCLES)
         self.windows: Feed[ObservedWindow] = Feed(MOST_WINDOWS)
         self.events: Feed[CellEvent] = Feed(MOST_EVENTS)
         self._client = OperatorClient(problem, environment)
-        self._lock, self._asking = threading.Lock(), threading.Lock()
+        self._lock = threading.Lock()
         self._stopped = threading.Event()
         relay, stamper = problem.relay_node, f"stamper@{problem.stamper_node}"
         who = f"{self._client.name}-hears"
@@ -227,8 +227,9 @@ class Observer:
         TrustError
             If the keys are those of somebody who may only look.
         """
-        with self._asking:
-            status = self._client.ask(what, about)
+        # A client of its own: no late answer to a question is taken for the answer to this.
+        with OperatorClient(self.problem, self._environment) as client:
+            status = client.ask(what, about)
         self._answer(status)
         return status
 
@@ -366,9 +367,7 @@ class Observer:
             self._look()
 
     def _look(self) -> None:
-        with self._asking:
-            status = self._client.look(patience_s=MOST_ASK_S)
-        self._answer(status)
+        self._answer(self._client.look(patience_s=MOST_ASK_S))
 
     def _answer(self, status: Mapping[str, Any]) -> None:
         """Take in how the cell is, and what has happened since the answer before."""

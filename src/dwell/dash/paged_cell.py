@@ -12,11 +12,15 @@ from typing import Any, Literal, Protocol, TypeAlias
 
 from dwell.display import placement_hues
 from dwell.model import Link, Problem, Trace
+from dwell.model.bounds import counted
 
 #: What a place on the time line counts.
 Unit: TypeAlias = Literal["s", "cycle"]
 #: Plain values, ready for JSON.
 Plain: TypeAlias = dict[str, Any]
+
+#: Cycles of which the jobs are told at a time.
+MOST_WITH_JOBS = 200
 
 
 class PagedCell(Protocol):
@@ -124,5 +128,5 @@ def health_by(problem: Problem, rates: list[float]) -> Mapping[str, str | None]:
     rate = sum(rates) / len(rates)
     return {
         "health": "degraded",
-        "headline": f"V_D is {rate:.0%} in the last {len(rates)} windows",
+        "headline": f"V_D is {rate:.0%} in the last {counted(len(rates), 'window')}",
     }

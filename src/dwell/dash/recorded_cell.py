@@ -10,7 +10,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.dash.paged_cell import Plain, Unit, cell_document, cycle_since, health_by, job_since
+from dwell.dash.paged_cell import (
+    MOST_WITH_JOBS,
+    Plain,
+    Unit,
+    cell_document,
+    cycle_since,
+    health_by,
+    job_since,
+)
 from dwell.dash.strip import Strip, binned_means, plain
 from dwell.errors import RunError
 from dwell.model.disturbed import disturbed
@@ -18,8 +26,8 @@ from dwell.model.instants import NEVER_NS
 from dwell.model.live import RECENT_WINDOWS
 from dwell.record import Run, TableArrays, open_run
 
-#: Events of a view at most, and rows of jobs.
-MOST_EVENTS, MOST_JOBS = 300, 6_000
+#: Events of a view at most.
+MOST_EVENTS = 300
 #: Cycles before a place among which the newest one in effect is looked for.
 LOOK_BACK = 4_000
 #: What is both estimated and seen of a window, and the columns that say what was seen.
@@ -120,7 +128,7 @@ class _Contents:
         cycles = run.arrays("cycles")
         self._release_ns = cycles["release_ns"].astype(np.int64)
         if not len(self._release_ns):
-            raise RunError("this run has no cycles yet")
+            raise RunError(f"{source}: this run has no cycles yet")
         latency_ns = cycles["latency_ns"].astype(np.float64)
         latency_ns[latency_ns >= NEVER_NS] = np.nan
         self._cycle = cycles["cycle"].astype(np.int64)
@@ -162,14 +170,16 @@ class _Contents:
         """Take in the decisions: those at a window's close, by window, and all of them."""
         self._decisions = table
         windows, reasons = table["window"].astype(np.int64), table.names("reason")
-        self._decided_at = windows
         self._reasons = reasons.to_list()
         self._moves_to = self._codes(table, "placement"), self._codes(table, "incumbent")
         at_close = ~reasons.equal("guard")
         # Of a window, the row of its decision; -1 where nothing was decided.
         self._row = np.full(len(self._window), -1)
+        # The place of its window; one that is missing has none.
         places = np.searchsorted(self._window, windows)
-        fits = at_close & (places < len(self._window))
+        known = np.isin(windows, self._window)
+        self._decided_at = np.where(known, places, -1)
+        fits = at_close & known
         self._row[places[fits]] = np.flatnonzero(fits)
         self._costs = {
             name: self._by_window(table[f"j_{name}"].astype(np.float64))
@@ -189,11 +199,10 @@ class _Contents:
         table = self._decisions
         migrated = table["migrated"].astype(bool)
         refused = self._texts("refused")
-        places = np.searchsorted(self._window, self._decided_at)
         target, source = self._moves_to
         for row in np.flatnonzero(migrated | np.array([bool(text) for text in refused], bool)):
-            place = int(places[row])
-            if place >= len(self._window):
+            place = int(self._decided_at[row])
+            if place < 0:
                 continue
             reason = self._reasons[row]
             # The guard's move is noted under the window that follows it.
@@ -216,9 +225,7 @@ class _Contents:
         """Return a column of texts of the decisions; empty where there is none."""
         if column not in self._decisions:
             return [""] * len(self._decided_at)
-        if "String" in str(self.run.decisions.schema[column]):
-            return [text or "" for text in self.run.decisions[column].to_list()]
-        return [""] * len(self._decided_at)
+        return [text or "" for text in self.run.decisions[column].to_list()]
 
     def _place(self, at_s: float) -> float:
         """Return the place on the time line of an instant, seconds since the first release."""
@@ -354,9 +361,10 @@ class _Contents:
         if rows.start >= rows.stop or not self.run.has_jobs:
             return {"origin_s": 0.0, "jobs": [], "cycles": [], "known": self.run.has_jobs}
         origin_ns = int(self._release_ns[rows.start])
+        rows = slice(rows.start, min(rows.stop, rows.start + MOST_WITH_JOBS))
         first, last = int(self._cycle[rows.start]), int(self._cycle[rows.stop - 1])
         table = self.run.jobs
-        mine = table.filter(table["cycle"].is_between(first, last)).head(MOST_JOBS)
+        mine = table.filter(table["cycle"].is_between(first, last))
         cycles = [
             cycle_since(
                 int(self._cycle[row]),
@@ -365,7 +373,7 @@ class _Contents:
                 origin_ns,
                 missed=bool(self.strip.missed[row]),
             )
-            for row in range(rows.start, min(rows.stop, rows.start + MOST_JOBS))
+            for row in range(rows.start, rows.stop)
         ]
         jobs = [job_since(job, origin_ns) for job in mine.iter_rows(named=True)]
         return {"origin_s": origin_ns / 1e9, "jobs": jobs, "cycles": cycles, "known": True}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import math
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager, suppress
@@ -11,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import cache, partial
 from http import HTTPStatus
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -24,6 +25,8 @@ from starlette.types import Receive, Scope, Send
 from dwell.dash.paged_cell import PagedCell, Plain
 from dwell.errors import DwellError
 
+_LOG = logging.getLogger(__name__)
+
 STATIC = Path(__file__).with_name("static")
 TYPES = {
     ".html": "text/html; charset=utf-8",
@@ -31,8 +34,8 @@ TYPES = {
     ".js": "text/javascript; charset=utf-8",
     ".svg": "image/svg+xml",
 }
-#: Time between two looks at the cells, and at those that are recorded.
-TICK_S, RECORDED_TICK_S = 0.1, 1.0
+#: Time between two looks at cells that run while somebody reads, and at all cells otherwise.
+TICK_S, IDLE_TICK_S = 0.1, 1.0
 #: Readers of events at a time, and how long one may take for one of them.
 MOST_READERS, READER_S = 32, 10.0
 #: A comment keeps a connection, and notices who is gone.
@@ -73,6 +76,7 @@ class Dash:
     _news: asyncio.Condition = field(default_factory=asyncio.Condition, repr=False)
     _tick: tuple[int, bytes] = field(default=(0, b""), repr=False)
     _readers: int = field(default=0, repr=False)
+    _over: bool = field(default=False, repr=False)
 
     def application(self) -> Starlette:
         """Return what a server serves; who may ask is not its business (`dwell.dash.gate`)."""
@@ -99,7 +103,7 @@ class Dash:
     async def _cells(self, _: Request) -> Response:
         described = [await run_in_threadpool(cell.described) for cell in self.cells]
         control = self.act is not None
-        return _json(
+        return JSONResponse(
             {
                 "cells": described,
                 "line": self.line,
@@ -112,15 +116,15 @@ class Dash:
         cell, begin, end = self._cell(request), *_places(request)
         bins = round(_number(request, "bins", 600.0))
         bins = min(max(bins, LEAST_BINS), MOST_BINS)
-        return _json(await run_in_threadpool(cell.view, begin, end, bins))
+        return JSONResponse(await run_in_threadpool(cell.view, begin, end, bins))
 
     async def _state(self, request: Request) -> Response:
         cell = self._cell(request)
-        return _json(await run_in_threadpool(cell.state, _number(request, "at")))
+        return JSONResponse(await run_in_threadpool(cell.state, _number(request, "at")))
 
     async def _jobs(self, request: Request) -> Response:
         cell, begin, end = self._cell(request), *_places(request)
-        return _json(await run_in_threadpool(cell.jobs, begin, end))
+        return JSONResponse(await run_in_threadpool(cell.jobs, begin, end))
 
     def _cell(self, request: Request) -> PagedCell:
         place = request.query_params.get("cell", "0")
@@ -153,7 +157,7 @@ class Dash:
         about = "" if key is None else await _about(request, key)
         status = await run_in_threadpool(self.act, what, about)
         shown = ("pinned", "drained", "placement", "moving_to")
-        return _json({name: status.get(name) for name in shown})
+        return JSONResponse({name: status.get(name) for name in shown})
 
     # ------------------------------------------------------------------------- what is new
 
@@ -169,16 +173,19 @@ class Dash:
 
     async def _look_on(self) -> None:
         """Tell all readers of events together what is new; nobody is waited for."""
-        every_s = TICK_S if any(cell.live for cell in self.cells) else RECORDED_TICK_S
+        live = any(cell.live for cell in self.cells)
         while True:
-            await asyncio.sleep(every_s)
-            if not self._readers:
+            await asyncio.sleep(TICK_S if live and self._readers else IDLE_TICK_S)
+            try:
+                news = await run_in_threadpool(self._new_states)
+                data = f"data: {json.dumps(news, allow_nan=False)}\n\n".encode()
+            except Exception:
+                # The next look may be better; a page without news says that it has none.
+                _LOG.exception("the page's cells cannot be looked at")
                 continue
-            news = await run_in_threadpool(self._new_states)
-            if news:
-                number, _ = self._tick
+            if news and self._readers:
                 async with self._news:
-                    self._tick = number + 1, f"data: {json.dumps(news)}\n\n".encode()
+                    self._tick = self._tick[0] + 1, data
                     self._news.notify_all()
 
     def _new_states(self) -> list[Plain]:
@@ -199,13 +206,21 @@ class Dash:
             )
         return _EventStream(self)
 
-    async def next_tick(self, number: int) -> tuple[int, bytes]:
-        """Return the newest tick after a number; a comment where there is none for a while."""
+    async def next_tick(self, number: int) -> tuple[int, bytes] | None:
+        """Return the newest tick after a number, or a comment after a while; None at the end."""
         async with self._news:
             with suppress(TimeoutError):
-                await asyncio.wait_for(self._news.wait_for(lambda: self._tick[0] > number), QUIET_S)
-                return self._tick
+                await asyncio.wait_for(
+                    self._news.wait_for(lambda: self._over or self._tick[0] > number), QUIET_S
+                )
+                return None if self._over else self._tick
         return number, b": quiet\n\n"
+
+    async def close(self) -> None:
+        """Let all readers of events go."""
+        async with self._news:
+            self._over = True
+            self._news.notify_all()
 
     @asynccontextmanager
     async def reading(self) -> AsyncIterator[None]:
@@ -238,11 +253,12 @@ class _EventStream(Response):
     async def _tell(self, send: Send) -> None:
         headers = [(b"content-type", b"text/event-stream")]
         await send({"type": "http.response.start", "status": 200, "headers": headers})
-        data, number = b"retry: 1000\n\n", 0
-        while True:
-            message = {"type": "http.response.body", "body": data, "more_body": True}
+        tick: tuple[int, bytes] | None = (0, b"retry: 1000\n\n")
+        while tick is not None:
+            message = {"type": "http.response.body", "body": tick[1], "more_body": True}
             await asyncio.wait_for(send(message), READER_S)
-            number, data = await self._dash.next_tick(number)
+            tick = await self._dash.next_tick(tick[0])
+        await send({"type": "http.response.body", "body": b""})
 
 
 async def _gone(receive: Receive) -> None:
@@ -266,13 +282,9 @@ async def _alive(_: Request) -> Response:
     return PlainTextResponse("alive\n")
 
 
-def _json(value: object) -> Response:
-    return JSONResponse(value)
-
-
 async def _refused(_: Request, error: Exception) -> Response:
-    assert isinstance(error, HTTPException)  # noqa: S101 (registered for that)
-    return JSONResponse({"error": error.detail}, error.status_code, error.headers)
+    refusal = cast("HTTPException", error)
+    return JSONResponse({"error": refusal.detail}, refusal.status_code, refusal.headers)
 
 
 async def _failed(_: Request, error: Exception) -> Response:

@@ -61,7 +61,7 @@ def serve(
         gate = Gate(dash.application(), listener.getsockname()[1], token or new_token())
         address = f"http://{LOOPBACK}:{gate.port}/?token={gate.token}"
         with _opened(address, say) if browser else nullcontext():
-            caught = asyncio.run(_served(gate, listener, lambda: print(address, flush=True)))
+            caught = asyncio.run(_served(gate, dash, listener, lambda: print(address, flush=True)))
     if caught == signal.SIGINT:
         raise KeyboardInterrupt
 
@@ -99,9 +99,11 @@ class _Server(uvicorn.Server):
         yield
 
 
-async def _served(gate: Gate, listener: socket.socket, ready: Callable[[], None]) -> int | None:
+async def _served(
+    gate: Gate, dash: Dash, listener: socket.socket, ready: Callable[[], None]
+) -> int | None:
     """Serve until a signal, and return it; `ready` is called once a signal ends it in order."""
-    logging.getLogger("uvicorn").setLevel(logging.CRITICAL)
+    logging.getLogger("uvicorn").setLevel(logging.ERROR)
     server = _Server(
         uvicorn.Config(
             gate,
@@ -116,9 +118,11 @@ async def _served(gate: Gate, listener: socket.socket, ready: Callable[[], None]
         )
     )
     caught: list[int] = []
+    closing: list[asyncio.Task[None]] = []
 
     def end(number: int) -> None:
         caught.append(number)
+        closing.append(loop.create_task(dash.close()))
         server.should_exit = True
 
     loop = asyncio.get_running_loop()

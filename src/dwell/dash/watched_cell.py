@@ -8,16 +8,23 @@ from typing import Any
 
 import numpy as np
 
-from dwell.dash.observer import MOST_CYCLES, ObservedCycle, ObservedWindow, Observer
-from dwell.dash.paged_cell import Plain, cell_document, cycle_since, finite, job_since
+from dwell.dash.observer import ObservedCycle, ObservedWindow, Observer
+from dwell.dash.paged_cell import (
+    MOST_WITH_JOBS,
+    Plain,
+    cell_document,
+    cycle_since,
+    finite,
+    job_since,
+)
 from dwell.dash.strip import Strip, binned_means
 
-#: Cycles at most whose jobs are told.
-MOST_WITH_JOBS = 400
+#: Cycles of the time line, which reaches farther back than the observer.
+MOST_CYCLES = 40_000
 #: Parts of a controller's status that the page shows as they are.
 SHOWN = (
     *("health", "headline", "mode", "fallback", "moving_to", "proving", "pinned", "drained"),
-    *("migrations", "guard_moves", "record", "complaints", "unproven", "bound_ms", "silent"),
+    *("migrations", "guard_moves", "unproven", "bound_ms"),
 )
 
 
@@ -167,7 +174,8 @@ class WatchedCell:
         }
 
     def refreshed(self) -> bool:
-        """See `PagedCell`."""
+        """See `PagedCell`; cycles are taken in meanwhile, before the observer lets go of them."""
+        self._take()
         observer = self.observer
         told = observer.cycles.upto, observer.windows.upto, observer.events.upto
         self._told, before = told, self._told

@@ -193,7 +193,8 @@ const ribbon = (root, page, cell) => {
     data = view;
     const stretches = view.ribbon.placement;
     const used = [...new Set(stretches)].map((code) => names[code]).filter(Boolean);
-    const changes = view.ribbon.exact ? `${Math.max(stretches.length - 1, 0)} changes` : "more changes than can be drawn";
+    const times = Math.max(stretches.length - 1, 0);
+    const changes = view.ribbon.exact ? `${times} change${times === 1 ? "" : "s"}` : "more changes than can be drawn";
     say(root.querySelector(".said"), `${used.join(", ") || "none"}; ${changes} in view`);
     plot.setData([view.bins.at, view.bins.high]);
     plot.root.setAttribute("role", "img");

@@ -258,8 +258,10 @@ class Page {
   take(cell, { state, described }) {
     if (described) {
       cell.describe(described);
+      const atEnd = this.view[1] >= this.span[1];
       this.span[1] = Math.max(this.span[1], described.end);
-      cell.load();
+      if (atEnd) this.setView(this.view[0], this.span[1]);
+      else cell.load();
       this.showPlace();
     }
     if (!state) return;
