@@ -18,6 +18,7 @@ from dwell.dash.metrics import CellMetrics
 from dwell.live.security import Security
 from dwell.live.trust.authority import Authority
 from tests.dash.stand_in import StandIn
+from tests.waiting import wait_until
 
 ROOT = Path(__file__).parents[2]
 OPENMETRICS = "application/openmetrics-text;version=1.0.0,text/plain;version=0.0.4;q=0.5,*/*;q=0.1"
@@ -71,13 +72,26 @@ def test_each_cycle_is_counted_once_however_often_somebody_asks(cell: StandIn) -
     assert f'latency_seconds_count{{cell="{cell.problem.name}"}} 6.0' in page.decode()
 
 
-def test_cycles_that_nobody_asked_for_in_time_are_counted_as_such() -> None:
+def test_cycles_that_it_was_too_slow_for_are_counted_as_such() -> None:
     cell = StandIn(most_cycles=10)
     for number in range(25):
         cell.cycle(number, 20)
     assert value(cell, "dwell_unread_cycles_total") == 15
     assert value(cell, "dwell_cycle_latency_seconds_count") == 10
     assert value(cell, "dwell_cycles_total", outcome="actuated") == 25
+
+
+def test_cycles_are_counted_though_nobody_asks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dwell.dash.metrics.EVERY_S", 0.001)
+    cell = StandIn(most_cycles=10)
+    with CellMetrics(cell.observer) as metrics:
+        for number in range(50):
+            cell.cycle(number, 20)
+            wait_until(lambda: metrics.counted == cell.cycles.upto)
+        page, _ = metrics.page(PLAIN)
+    name = f'{{cell="{cell.problem.name}"}}'
+    assert f"dwell_unread_cycles_total{name} 0.0" in page.decode()
+    assert f"dwell_cycle_latency_seconds_count{name} 50.0" in page.decode()
 
 
 def test_exemplars_name_run_and_cycle(cell: StandIn) -> None:

@@ -38,7 +38,6 @@ EXTRAS = {
     "sim": "dwell run, study, demo, validate",
     "report": "dwell report",
     "live": "dwell live, agent, controller, keys",
-    "dash": "dwell dash",
     "mcap": "dwell report --mcap, dwell dash --mcap",
     "dask": "dwell study --dask",
     "dash": "dwell dash",

@@ -18,6 +18,7 @@ from prometheus_client.registry import Collector
 
 from dwell.dash.observer import OUTCOMES, Observer
 from dwell.live.controlled_cell import MOVED_BY
+from dwell.live.failures import start_thread
 from dwell.live.health import Health
 from dwell.live.wiring import roles
 
@@ -26,6 +27,8 @@ BUCKETS_S = (
     *(0.001, 0.002, 0.005, 0.01, 0.015, 0.02, 0.025, 0.03, 0.04, 0.05, 0.075, 0.1, 0.15, 0.2),
     *(0.3, 0.5, 1.0, 2.0, 5.0),
 )
+#: Time between two looks at the cycles: the observer does not keep them for long.
+EVERY_S = 2.0
 #: What follows the name of a metric in its samples.
 SUFFIXES = {"counter": "_total", "gauge": "", "info": "_info"}
 
@@ -34,7 +37,15 @@ Samples: TypeAlias = Iterable[tuple[Mapping[str, str], float | None]]
 
 
 class CellMetrics(Collector):
-    """Collects the metrics of an observed cell whenever they are asked for."""
+    """Collects the metrics of an observed cell whenever they are asked for.
+
+    As a context manager it counts cycles meanwhile, however seldom it is asked.
+
+    Attributes
+    ----------
+    counted : int
+        Cycles that the observer has had, as far as they are counted here.
+    """
 
     def __init__(self, observer: Observer) -> None:
         self._observer, self._problem = observer, observer.problem
@@ -47,12 +58,20 @@ class CellMetrics(Collector):
             buckets=sorted({*BUCKETS_S, self._deadline_s}),
             registry=None,
         )
-        # How many cycles of the observer's have been counted there, and how many were too late.
-        self._upto = self._unread = 0
-        self._lock = threading.Lock()
+        self.counted = self._unread = 0
+        self._lock, self._stopped = threading.Lock(), threading.Event()
 
     def __repr__(self) -> str:
         return f"<CellMetrics of {self._problem.name}>"
+
+    def __enter__(self) -> CellMetrics:
+        """Begin to count."""
+        start_thread("metrics", self._keep_up)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Count no more."""
+        self._stopped.set()
 
     def page(self, accept: str) -> tuple[bytes, str]:
         """Return the metrics as Prometheus reads them, as text or OpenMetrics, and the page's type.
@@ -108,20 +127,28 @@ class CellMetrics(Collector):
         yield from self._told({} if health == "absent" else now.status)
         yield from self._certificates()
 
-    def _latencies(self) -> Iterator[Metric]:
+    def _keep_up(self) -> None:
+        while not self._stopped.wait(EVERY_S):
+            self._count()
+
+    def _count(self) -> None:
+        """Count the cycles that have been heard of since the last time."""
         with self._lock:
-            news = self._observer.cycles.since(self._upto)
-            self._upto, self._unread = news.upto, self._unread + news.dropped
+            news = self._observer.cycles.since(self.counted)
+            self.counted, self._unread = news.upto, self._unread + news.dropped
             for cycle in news.items:
                 if cycle.latency_ns is not None:
                     exemplar = {"run": str(cycle.run), "cycle": str(cycle.number)}
                     of_cell = self._latency.labels(self._problem.name)
                     of_cell.observe(cycle.latency_ns / 1e9, exemplar)
+
+    def _latencies(self) -> Iterator[Metric]:
+        self._count()
         yield from self._latency.collect()
         yield self._metric(
             "counter",
             "dwell_unread_cycles",
-            "Cycles that dwell_cycle_latency_seconds lacks, since nobody asked in time.",
+            "Cycles that dwell_cycle_latency_seconds lacks, since this process was too slow.",
             [({}, self._unread)],
         )
 

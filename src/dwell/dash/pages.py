@@ -123,7 +123,8 @@ def show_cell(
 
     with ExitStack() as stack:
         observer = stack.enter_context(Observer(load_without_traces(file), environment))
-        dash = Dash([WatchedCell(observer)], metrics=CellMetrics(observer).page)
+        metrics = stack.enter_context(CellMetrics(observer))
+        dash = Dash([WatchedCell(observer)], metrics=metrics.page)
         if control:
             _require_operator(observer)
             dash.act = _logged(observer, say)
