@@ -234,3 +234,13 @@ def test_a_run_that_is_written_is_shown_as_far_as_it_has_come(
             while b"data: " not in reader.recv(65_536):
                 pass
         assert not page.get("/cells")["cells"][0]["growing"]
+
+
+def test_readers_are_let_go_at_the_end(tmp_path: Path, run_folder: Path) -> None:
+    with serving(tmp_path, run_folder) as page:
+        reader = page.events()
+        assert b"200 OK" in reader.recv(1_024)
+    while reader.recv(1_024):
+        pass
+    reader.close()
+    assert page.said == ""

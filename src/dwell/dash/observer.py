@@ -14,10 +14,10 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 from dwell.dash.feed import Feed
 from dwell.errors import LiveError
@@ -140,6 +140,16 @@ class ObservedCell:
     missed: int
 
 
+class _SeenMove(NamedTuple):
+    """A change of placement, by the stamps."""
+
+    at_s: float
+    run: int
+    term: int
+    old: str
+    new: str
+
+
 class Observer:
     """Hears one cell; a context manager.
 
@@ -197,7 +207,8 @@ class Observer:
         self._missed = 0
         self._status: Mapping[str, Any] = {"health": ""}
         self._answered_s: float | None = None
-        self._moved: list[tuple[float, str, str]] = []
+        # Moves that no answer has told the reason of yet.
+        self._moves: deque[_SeenMove] = deque(maxlen=MOST_EVENTS)
 
     def __repr__(self) -> str:
         return f"<Observer of {self.problem.name}>"
@@ -307,7 +318,8 @@ class Observer:
         self._open[cycle.key] = cycle
         self._newest = cycle, time.monotonic_ns()
         if before is not None and cycle.placement != before.placement:
-            self._moved.append((cycle.at_ns / 1e9, before.placement, cycle.placement))
+            where = cycle.run, cycle.term, before.placement, cycle.placement
+            self._moves.append(_SeenMove(cycle.at_ns / 1e9, *where))
 
     def _begin_ns(self, stamp: Stamped, before: LiveCycle | None) -> int:
         """Return the first release of a run; that of a later run goes on with the time."""
@@ -393,13 +405,13 @@ class Observer:
             yield CellEvent(at_s, "health", f"{status['health']}{f': {why}' if why else ''}")
         if "mode" not in status:
             return
-        moved, self._moved = self._moved, []
         guarded = status["guard_moves"] > before.get("guard_moves", status["guard_moves"])
-        for move_s, old, new in moved:
+        course = status["run"] or 0, status["term"] or 0
+        while self._moves and (self._moves[0].run, self._moves[0].term) <= course:
+            move = self._moves.popleft()
             kind: EventKind = "guard" if guarded else "move"
-            yield CellEvent(
-                move_s, kind, f"{old} → {new}: {_why((status, before), new, guarded=guarded)}"
-            )
+            why = _why((status, before), move.new, guarded=guarded)
+            yield CellEvent(move.at_s, kind, f"{move.old} → {move.new}: {why}")
         if "mode" not in before:
             return
         if status["refused"] and status["refused"] != before["refused"]:
