@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from datetime import datetime
 from pathlib import Path
@@ -39,13 +40,16 @@ def show_run(
     RunError
         If a folder is no run, or damaged.
     """
-    from dwell.dash.server import Dash
-    from dwell.dash.serving import serve
-
     for one in (folder, beside):
         if one is not None:
             _require_run(one)
-    cells, line = _on_one_line(folder, beside)
+    with ThreadPoolExecutor(1) as reader:
+        reading = reader.submit(_on_one_line, folder, beside)
+        # Meanwhile: both take as long.
+        from dwell.dash.server import Dash
+        from dwell.dash.serving import serve
+
+        cells, line = reading.result()
     serve(Dash(cells, line), port, browser=browser, say=say, token=token)
 
 

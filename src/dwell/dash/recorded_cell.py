@@ -126,17 +126,17 @@ class _Contents:
         self.growing = bool(recovered) and not recovered.get("sealed", True)
         self._candidates = tuple(self.problem.candidates)
         cycles = run.arrays("cycles")
-        self._release_ns = cycles["release_ns"].astype(np.int64)
+        self._release_ns = cycles["release_ns"].astype(np.int64, copy=False)
         if not len(self._release_ns):
             raise RunError(f"{source}: this run has no cycles yet")
-        latency_ns = cycles["latency_ns"].astype(np.float64)
-        latency_ns[latency_ns >= NEVER_NS] = np.nan
-        self._cycle = cycles["cycle"].astype(np.int64)
+        latency_ms = cycles["latency_ns"] / 1e6
+        latency_ms[latency_ms >= NEVER_NS / 1e6] = np.nan
+        self._cycle = cycles["cycle"].astype(np.int64, copy=False)
         seconds = np.maximum.accumulate(self._release_ns) / 1e9
         self.strip = Strip(
             at=seconds if unit == "s" else self._cycle.astype(np.float64),
-            latency_ms=latency_ns / 1e6,
-            missed=cycles["missed"].astype(bool),
+            latency_ms=latency_ms,
+            missed=cycles["missed"].astype(bool, copy=False),
             placement=self._codes(cycles, "placement"),
             number=self._cycle,
         )

@@ -174,8 +174,12 @@ class Dash:
     async def _look_on(self) -> None:
         """Tell all readers of events together what is new; nobody is waited for."""
         live = any(cell.live for cell in self.cells)
+        clock = asyncio.get_running_loop().time
+        looked_s = clock()
         while True:
-            await asyncio.sleep(TICK_S if live and self._readers else IDLE_TICK_S)
+            every_s = TICK_S if live and self._readers else IDLE_TICK_S
+            await asyncio.sleep(max(looked_s + every_s - clock(), 0.0))
+            looked_s = max(looked_s + every_s, clock() - every_s)
             try:
                 news = await run_in_threadpool(self._new_states)
                 data = f"data: {json.dumps(news, allow_nan=False)}\n\n".encode()
@@ -194,7 +198,7 @@ class Dash:
         for place, cell in enumerate(self.cells):
             grew = cell.refreshed()
             if cell.live:
-                news.append({"cell": place, "grew": grew, "state": cell.state(math.inf)})
+                news.append({"cell": place, "grew": grew, "state": cell.state(0.0)})
             elif grew:
                 news.append({"cell": place, "grew": True, "described": cell.described()})
         return news

@@ -150,7 +150,11 @@ class WatchedCell:
             },
             "predicted": before and _estimate(before.said, window["placement"]),
             "used": window["utilisation"],
-            "decision": {"incumbent": window["placement"], "reason": window["reason"]},
+            "decision": {
+                "incumbent": window["placement"],
+                "placement": window["decided"],
+                "reason": window["reason"],
+            },
             "candidates": {name: _estimate(window, name) for name in window["estimates"]},
         }
 

@@ -648,6 +648,7 @@ class ControlledCell:
             "violation_rate": last.violation_rate(round(problem.pipeline.deadline_ms * 1e6)),
             "cost": cost,
             "reason": decision.reason,
+            "decided": decision.name,
             "estimates": {name: decision.costs.get(name) for name in problem.candidates},
             "predicted": {
                 name: {of: priced[f"est_{of}_{name}"] for of in ("l95_ms", "violation_rate")}

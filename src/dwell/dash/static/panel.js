@@ -89,6 +89,8 @@ const decision = (state) => {
     parts.push(`Last decision: ${where}, ${last.reason}: ${REASONS[last.reason] ?? "see the reasons in the documentation"}.`);
     if (last.delta_j !== null && last.delta_j !== undefined) parts.push(`ΔJ ${number(last.delta_j, 3)}.`);
   } else parts.push("No decision yet.");
+  if (state.pinned) parts.push(`Pinned to ${state.pinned}, whatever is decided.`);
+  if (state.drained?.length) parts.push(`Drained: ${state.drained.join(", ")}.`);
   if (state.fallback) parts.push("The guard has put it there.");
   if (proving) parts.push(`Proving ${proving.candidate}: ${proving.done} of ${proving.needed} probes.`);
   if (state.mode === "advise") parts.push("Mode: advise; nothing is ordered.");
@@ -101,7 +103,7 @@ export const facts = (root, cell, state) => {
   if (state.cycle !== null && state.cycle !== undefined) parts.push(`cycle ${count(state.cycle)}`);
   parts.push(`age of the command ${state.age_ms === null || state.age_ms === undefined ? "–" : `${number(state.age_ms, 0)} ms`}`);
   if (cell.live) {
-    parts.push(`${count(state.migrations ?? 0)} migrations, ${count(state.guard_moves ?? 0)} moves of the guard`);
+    parts.push(`migrations: ${count(state.migrations ?? 0)}, moves of the guard: ${count(state.guard_moves ?? 0)}`);
     parts.push(`answer of the controller ${ago(state.answer_age_ms)} old`);
     if (state.unproven) parts.push("clocks unproven");
     if (state.bound_ms !== null && state.bound_ms !== undefined) parts.push(`clocks within ${number(state.bound_ms, 1)} ms`);
