@@ -183,7 +183,7 @@ def test_the_doctor_and_completion_work_without_any_extra(
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)["findings"]
     extras = {one["name"]: one for one in found if one["part"] == "extras"}
-    assert set(extras) == {"sim", "report", "live", "dask"}
+    assert set(extras) == {"sim", "report", "live", "dash", "mcap", "dask"}
     assert not any(one["ok"] for one in extras.values())
     assert extras["live"]["remedy"] == "pip install 'dwell-placement[live]'"
     assert not [one for one in found if one["part"] == "runs here" and one["ok"]]

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
+
+import pytest
+from mcap.reader import make_reader
 
 import dwell
 from tests.cells.small import make_problem
 from tests.cli.small_cell import assert_refused, call, read_json
 
+OLD_RUNS = Path(__file__).parents[1] / "regression/data/old-runs"
 RECOVERED = {"sealed": False, "opened": 2, "torn_bytes": 17, "damaged_bytes": 0}
 
 
@@ -69,3 +75,48 @@ def test_a_page_that_cannot_be_written_is_a_failure(cell: Path) -> None:
     result = call("report", "kept", "--out", "small.yaml/report.html")
     assert result.exit_code == 1
     assert "error: " in result.stderr
+
+
+def test_report_writes_an_mcap_file_beside_the_page(cell: Path) -> None:
+    call("run", cell, "--windows", "12", "--out", "kept")
+    result = call("report", "kept", "--mcap", "new/run.mcap")
+    assert result.exit_code == 0
+    assert result.stdout == "report: kept/report.html\nmcap: new/run.mcap\n"
+    with Path("new/run.mcap").open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    assert {one.topic for one in summary.channels.values()} == {
+        *("/cycles", "/windows", "/decisions")
+    }
+    found = read_json(call("report", "kept", "--mcap", "run.mcap", "--json"))
+    assert found == {"report": "kept/report.html", "trace": None, "mcap": "run.mcap"}
+
+
+def test_without_its_package_no_mcap_file_and_no_page_is_written(
+    cell: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    call("run", cell, "--windows", "12", "--out", "kept")
+    monkeypatch.delitem(sys.modules, "dwell.record.mcap_file", raising=False)
+    monkeypatch.setitem(sys.modules, "mcap.writer", None)
+    refused = call("report", "kept", "--mcap", "run.mcap")
+    assert_refused(refused, "mcap is not installed; pip install 'dwell-placement[mcap]'", code=1)
+    assert not Path("run.mcap").exists()
+    assert not Path("kept/report.html").exists()
+
+
+def test_a_disk_that_is_full_leaves_no_half_mcap_file(cell: Path) -> None:
+    call("run", cell, "--windows", "12", "--out", "kept")
+    Path("run.mcap").write_text("older")
+    limited = "import resource as r; r.setrlimit(r.RLIMIT_FSIZE, (1 << 20,) * 2); "
+    command = "from dwell.cli import main; main('report kept --static --mcap run.mcap'.split())"
+    done = subprocess.run(
+        [sys.executable, "-c", limited + command], check=False, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (1, "error: run.mcap: File too large\n")
+    assert Path("run.mcap").read_text() == "older"
+    assert {path.name for path in Path.cwd().iterdir()} == {"small.yaml", "kept", "run.mcap"}
+
+
+def test_a_study_is_no_run_of_which_there_is_an_mcap_file() -> None:
+    study = OLD_RUNS / "study"
+    assert_refused(call("report", study, "--mcap", "x.mcap"), "is a study; name one of its runs")

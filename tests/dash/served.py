@@ -17,6 +17,7 @@ from urllib.parse import parse_qs, urlsplit
 
 from tests.cli.small_cell import environment
 
+ROOT = Path(__file__).parents[2]
 PATIENCE_S = 60.0
 
 
@@ -122,10 +123,17 @@ def dash(*arguments: str | Path, without: Sequence[str] = ()) -> list[str]:
 @contextmanager
 def serving(folder: Path, *arguments: str | Path, without: Sequence[str] = ()) -> Iterator[Served]:
     """Serve a page with `dwell dash`, at a free port; it has to end when it is told to."""
+    with started(folder, dash(*arguments, without=without)) as served:
+        yield served
+
+
+@contextmanager
+def started(folder: Path, words: Sequence[str]) -> Iterator[Served]:
+    """Start a process that serves a page; it has to end when it is told to."""
     err = folder / "dash.err"
     with err.open("wb") as log:
         process = subprocess.Popen(
-            dash(*arguments, without=without), stdout=subprocess.PIPE, stderr=log, env=environment()
+            words, cwd=ROOT, stdout=subprocess.PIPE, stderr=log, env=environment()
         )
     try:
         assert process.stdout is not None

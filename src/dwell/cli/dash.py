@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +13,8 @@ from dwell.cli.options import Insecure, Keys
 #: Where a page is served where nobody says.
 PORT = 8780
 CELL = Path("cell.yaml")
+#: At least 128 bits in base64; no sign that a header, a cookie or an address would change.
+TOKEN = re.compile(r"[A-Za-z0-9_-]{22,200}")
 
 
 def dash(
@@ -38,6 +41,20 @@ def dash(
             "--control", help="Let the page pin and drain; with keys, it takes an operator's."
         ),
     ] = False,
+    mcap: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Also record the live cell to an MCAP file for Foxglove, PlotJuggler and others.",
+        ),
+    ] = None,
+    token: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Where the page's token is kept, for Prometheus; made where there is none.",
+        ),
+    ] = None,
     keys: Keys = None,
     insecure: Insecure = False,
 ) -> None:
@@ -47,11 +64,14 @@ def dash(
     def say(line: str) -> None:
         typer.echo(line, err=True)
 
+    kept = None if token is None else _kept(token)
     where = shown or CELL
     if where.is_dir():
         if control:
             raise typer.BadParameter("--control: a recorded run cannot be acted on")
-        show_run(where, beside, port=port, browser=not no_browser, say=say)
+        if mcap is not None:
+            raise typer.BadParameter(f"--mcap: dwell report {where} --mcap {mcap} writes a run's")
+        show_run(where, beside, port=port, browser=not no_browser, say=say, token=kept)
         return
     if beside is not None:
         raise typer.BadParameter("--beside: a run stands beside a run, not beside a live cell")
@@ -60,4 +80,27 @@ def dash(
     from dwell.live.security import environment
 
     settings = environment(keys, insecure=insecure)
-    show_cell(where, settings, port=port, browser=not no_browser, control=control, say=say)
+    show_cell(
+        *(where, settings),
+        port=port,
+        browser=not no_browser,
+        control=control,
+        say=say,
+        mcap=mcap,
+        token=kept,
+    )
+
+
+def _kept(file: Path) -> str:
+    """Return the token in a file; a new one is made, and kept there, where there is none."""
+    from dwell.dash.gate import new_token
+    from dwell.files import write_whole
+
+    if not file.exists():
+        write_whole(file, new_token(), private=True)
+    token = file.read_text(encoding="utf-8").strip()
+    if file.stat().st_mode & 0o007:
+        raise typer.BadParameter(f"--token: everybody here can read {file}; chmod o-rwx {file}")
+    if not TOKEN.fullmatch(token):
+        raise typer.BadParameter(f"--token: {file} has no token: 22 to 200 letters, digits, - or _")
+    return token

@@ -38,6 +38,7 @@ EXTRAS = {
     "sim": "dwell run, study, demo, validate",
     "report": "dwell report",
     "live": "dwell live, agent, controller, keys",
+    "mcap": "dwell report --mcap, dwell dash --mcap",
     "dask": "dwell study --dask",
     "dash": "dwell dash",
 }

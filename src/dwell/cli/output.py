@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from dwell.files import write_whole
+from dwell.files import Content, write_whole
 
 if TYPE_CHECKING:
     from dwell.errors import Fault
@@ -77,12 +77,21 @@ def file_name(name: str, *, more: str = "") -> str:
     return re.sub(rf"[^\w.{more}-]", "_", name)
 
 
-def write_file(path: Path, text: str) -> None:
-    """Write a file that appears complete or not at all; an older one survives until then."""
+def write_file(path: Path, content: Content) -> None:
+    """Write a file that appears complete or not at all; an older one survives until then.
+
+    Raises
+    ------
+    OSError
+        If that fails; it names the file.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.is_dir():
         raise IsADirectoryError(None, "is a folder; name a file", str(path))
-    write_whole(path, text, durable=False)
+    try:
+        write_whole(path, content, durable=False)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from None
 
 
 def write_report(page: Page, path: Path | None, *, figures: Path | None, static: bool) -> None:

@@ -1,9 +1,10 @@
-"""`dwell report`: a run, a study or a campaign as a page; figures as files; jobs as a trace."""
+"""`dwell report`: a run, a study or a campaign as a page; figures as files; a run for viewers."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,6 +16,7 @@ from dwell.cli.output import print_json, working, write_file, write_report
 from dwell.errors import RunError
 
 if TYPE_CHECKING:
+    from dwell.files import Content
     from dwell.record import Run
 
 
@@ -32,6 +34,13 @@ def report(
         typer.Option(
             metavar="FILE",
             help="Also write every job as a trace for Perfetto; the run must have kept its jobs.",
+        ),
+    ] = None,
+    mcap: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Also write its tables as an MCAP file for Foxglove, PlotJuggler and others.",
         ),
     ] = None,
     figures: Annotated[
@@ -52,31 +61,39 @@ def report(
 
     page = out or folder / "report.html"
     for kind, is_one in (("campaign", is_campaign), ("study", is_study)):
-        if trace is not None and is_one(folder):
-            raise RunError(f"{folder} is a {kind}; name one of its runs for a trace")
+        for what, wanted in (("a trace", trace), ("an MCAP file", mcap)):
+            if wanted is not None and is_one(folder):
+                raise RunError(f"{folder} is a {kind}; name one of its runs for {what}")
     if is_campaign(folder):
         from dwell.cli.campaign import report_campaign
 
         report_campaign(folder, page, figures=figures, static=static, as_json=as_json)
         return
     extras: dict[str, Any] = {}
-    events = None
+    files: dict[Path, Content] = {}
     with working("writing the report"):
         if is_study(folder):
             from dwell.report.study_page import study_page
 
             document = study_page(open_study(folder))
         else:
-            from dwell.report import trace_events
             from dwell.report.run_page import run_page
 
             run = dwell.open_run(folder)
-            events = None if trace is None else trace_events(run)
             extras = {"trace": trace, **_recovered(run)}
+            if trace is not None:
+                from dwell.report import trace_events
+
+                files[trace] = json.dumps(trace_events(run))
+            if mcap is not None:
+                from dwell.record.mcap_file import write_mcap
+
+                files[mcap] = partial(write_mcap, run)
+                extras["mcap"] = mcap
             document = run_page(run)
         write_report(document, page, figures=figures, static=static)
-    if trace is not None:
-        write_file(trace, json.dumps(events))
+        for path, content in files.items():
+            write_file(path, content)
     if figures is not None:
         extras["figures"] = figures
     if as_json:
@@ -87,6 +104,8 @@ def report(
         typer.echo(f"note: {sentence}")
     if trace is not None:
         typer.echo(f"trace: {trace} (open it at https://ui.perfetto.dev)")
+    if mcap is not None:
+        typer.echo(f"mcap: {mcap}")
     if figures is not None:
         typer.echo(f"figures: {figures}")
 

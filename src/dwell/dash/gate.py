@@ -47,6 +47,11 @@ HEADERS = {
 }
 
 
+def new_token() -> str:
+    """Return a token that nobody guesses."""
+    return secrets.token_urlsafe(TOKEN_BYTES)
+
+
 @dataclass(frozen=True, slots=True)
 class Gate:
     """Lets through to an application whoever may pass; see the module.
@@ -61,7 +66,7 @@ class Gate:
 
     app: ASGIApp
     port: int
-    token: str = field(default_factory=lambda: secrets.token_urlsafe(TOKEN_BYTES), repr=False)
+    token: str = field(default_factory=new_token, repr=False)
 
     @property
     def cookie(self) -> str:

@@ -40,6 +40,9 @@ LEAST_ASK_S, MOST_ASK_S = 0.1, 0.5
 #: A cycle that nobody has told the end of is given up so long after its deadline.
 LATE_S = 1.0
 
+#: What may become of a cycle, as far as it can be heard.
+OUTCOMES = ("actuated", "not_applied", "behind", "stale", "replaced", "lost", "untold")
+
 EventKind: TypeAlias = Literal["move", "guard", "refused", "pin", "drain", "health"]
 
 
@@ -54,11 +57,11 @@ class ObservedCycle:
     release_ns : int
         Since the first release of the run.
     latency_ns : int or None
-        None where no sink has completed it.
+        None where no sink has completed it, or it is not known when.
     known : bool
-        False where it could not be heard what became of it; it is then not missed.
+        False where it could not be heard what became of it, or when; it is then not missed.
     outcome : str
-        ``actuated``, ``not_applied``, ``behind``, ``stale``, ``replaced``, ``lost`` or ``untold``.
+        One of `OUTCOMES`.
     jobs : tuple of mapping
         Rows of the table ``jobs`` (`dwell.model.table_columns`), its shadow's included; ``cycle``
         is its number.
@@ -344,7 +347,10 @@ class Observer:
         # Nothing came from the relay since: who knows.
         quiet_ns = time.monotonic_ns() - self._told_ns
         cycle.deaf = quiet_ns > round(LATE_S * 1e9)
-        missed, outcome = cycle.missed(self._deadline_ns), _outcome(cycle)
+        outcome, completed = _outcome(cycle), cycle.latency_ns < NEVER_NS
+        # Before the clocks are compared, nobody knows when it was completed.
+        known = not cycle.untold and (completed or outcome not in ("actuated", "behind"))
+        missed = known and cycle.missed(self._deadline_ns)
         jobs = tuple({**row, "cycle": cycle.number} for row in self._ledger.jobs(cycle))
         self.cycles.append(
             ObservedCycle(
@@ -353,9 +359,9 @@ class Observer:
                 term=cycle.term,
                 placement=cycle.placement,
                 release_ns=cycle.at_ns,
-                latency_ns=None if cycle.latency_ns >= NEVER_NS else cycle.latency_ns,
+                latency_ns=cycle.latency_ns if completed else None,
                 missed=missed,
-                known=not cycle.untold,
+                known=known,
                 outcome=outcome,
                 jobs=jobs,
             )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -23,7 +24,15 @@ Say: TypeAlias = Callable[[str], None]
 MOST_NAMED = 8
 
 
-def show_run(folder: Path, beside: Path | None, *, port: int, browser: bool, say: Say) -> None:
+def show_run(
+    folder: Path,
+    beside: Path | None,
+    *,
+    port: int,
+    browser: bool,
+    say: Say,
+    token: str | None = None,
+) -> None:
     """Show a recorded run until interrupted, or two on one time line.
 
     Raises
@@ -41,7 +50,7 @@ def show_run(folder: Path, beside: Path | None, *, port: int, browser: bool, say
         from dwell.dash.serving import serve
 
         cells, line = reading.result()
-    serve(Dash(cells, line), port, browser=browser, say=say)
+    serve(Dash(cells, line), port, browser=browser, say=say, token=token)
 
 
 def _require_run(folder: Path) -> None:
@@ -86,6 +95,8 @@ def show_cell(
     browser: bool,
     control: bool,
     say: Say,
+    mcap: Path | None = None,
+    token: str | None = None,
 ) -> None:
     """Show a live cell until interrupted.
 
@@ -95,24 +106,37 @@ def show_cell(
         With the variables of `dwell.live.security`.
     control : bool
         Whether the page may act.
+    mcap : Path, optional
+        File to record it to; there must be none.
+    token : str, optional
+        See `dwell.dash.serving.serve`.
 
     Raises
     ------
     TrustError
         If it may not with these keys, or without any.
+    OSError
+        If the file is there, or cannot be made.
     """
     from dwell.cellfile import load_without_traces
+    from dwell.dash.metrics import CellMetrics
     from dwell.dash.observer import Observer
     from dwell.dash.server import Dash
     from dwell.dash.serving import serve
     from dwell.dash.watched_cell import WatchedCell
 
-    with Observer(load_without_traces(file), environment) as observer:
-        dash = Dash([WatchedCell(observer)])
+    with ExitStack() as stack:
+        observer = stack.enter_context(Observer(load_without_traces(file), environment))
+        metrics = stack.enter_context(CellMetrics(observer))
+        dash = Dash([WatchedCell(observer)], metrics=metrics.page)
         if control:
             _require_operator(observer)
             dash.act = _logged(observer, say)
-        serve(dash, port, browser=browser, say=say)
+        if mcap is not None:
+            from dwell.dash.recorder import CellRecorder
+
+            stack.enter_context(CellRecorder(observer, mcap, say))
+        serve(dash, port, browser=browser, say=say, token=token)
 
 
 def _require_operator(observer: Observer) -> None:

@@ -64,12 +64,15 @@ class Dash:
         What carries out acts on the first cell; the page is read-only without.
     read_only : str
         Why it is.
+    metrics : callable, optional
+        From the header `Accept` to the page of the first cell's metrics, and its type.
     """
 
     cells: Sequence[PagedCell]
     line: str = ""
     act: Act | None = None
     read_only: str = "this page only looks; `dwell dash --control` lets it act"
+    metrics: Callable[[str], tuple[bytes, str]] | None = None
     _news: asyncio.Condition = field(default_factory=asyncio.Condition, repr=False)
     _tick: tuple[int, bytes] = field(default=(0, b""), repr=False)
     _readers: int = field(default=0, repr=False)
@@ -85,6 +88,7 @@ class Dash:
             Route("/state", self._state),
             Route("/jobs", self._jobs),
             Route("/events", self._events),
+            Route("/metrics", self._metrics),
             Route("/healthz", _alive),
             Route("/readyz", self._ready),
             *(Route(f"/{what}", partial(self._act, what), methods=["POST"]) for what in ACTS),
@@ -136,6 +140,13 @@ class Dash:
         well = bool(states) and all(state.get("health") == "ok" for state in states)
         status = HTTPStatus.OK if well else HTTPStatus.SERVICE_UNAVAILABLE
         return PlainTextResponse("ready\n" if well else "not ready\n", status)
+
+    async def _metrics(self, request: Request) -> Response:
+        if self.metrics is None:
+            raise HTTPException(HTTPStatus.NOT_FOUND, "a recorded run has no metrics")
+        accept = request.headers.get("accept", "")
+        page, content_type = await run_in_threadpool(self.metrics, accept)
+        return Response(page, headers={"content-type": content_type})
 
     # ------------------------------------------------------------------------- what acts
 

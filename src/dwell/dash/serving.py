@@ -21,7 +21,7 @@ from pathlib import Path
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from dwell.dash.gate import Gate
+from dwell.dash.gate import Gate, new_token
 from dwell.dash.server import Dash
 from dwell.errors import DwellError
 
@@ -32,7 +32,9 @@ MOST_CONNECTIONS, REQUEST_S = 512, 10.0
 GRACE_S = 1
 
 
-def serve(dash: Dash, port: int, *, browser: bool, say: Callable[[str], None]) -> None:
+def serve(
+    dash: Dash, port: int, *, browser: bool, say: Callable[[str], None], token: str | None = None
+) -> None:
     """Serve a page until this process is interrupted.
 
     Its address, with the token, is the only line on stdout.
@@ -45,6 +47,8 @@ def serve(dash: Dash, port: int, *, browser: bool, say: Callable[[str], None]) -
         Whether to open it in one.
     say : callable
         Prints a line for people.
+    token : str, optional
+        What the page is asked for with; a new one where left out.
 
     Raises
     ------
@@ -54,7 +58,7 @@ def serve(dash: Dash, port: int, *, browser: bool, say: Callable[[str], None]) -
         If that is what ended it.
     """
     with _listening(port) as listener:
-        gate = Gate(dash.application(), listener.getsockname()[1])
+        gate = Gate(dash.application(), listener.getsockname()[1], token or new_token())
         address = f"http://{LOOPBACK}:{gate.port}/?token={gate.token}"
         with _opened(address, say) if browser else nullcontext():
             caught = asyncio.run(_served(gate, dash, listener, lambda: print(address, flush=True)))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, TypeAlias
@@ -41,6 +42,9 @@ RESEND_NS = 40_000_000
 #: Stamps in a row that say that the cell has been moved, where no answer says so.
 CONFIRMATIONS = 3
 
+#: Why a cell is moved: the policy's reasons, the guard, a person's wish, an unknown order.
+MOVED_BY = ("migrate", "capped", "infeasible", "guard", "pinned", "drained", "ordered")
+
 Phase: TypeAlias = Literal["fork", "state", "order"]
 
 
@@ -70,6 +74,7 @@ class _Move:
     """
 
     name: str
+    reason: str
     since_ns: int
     phase: Phase
     forks: tuple[tuple[str, str], ...] = ()
@@ -123,11 +128,22 @@ class ControlledCell:
         self._setback = SetbackDetector()
         self._began_ns: int | None = None
         self._ask_ns = 0
-        self.guard_moves = self.migrations = 0
+        # How often the cell has been moved, by reason (see `MOVED_BY`).
+        self.moves = Counter(dict.fromkeys(MOVED_BY, 0))
         self._window: dict[str, Any] = {}
         self._window_ns = 0
         # Whether a window has closed that is not recorded.
         self._unwritten = False
+
+    @property
+    def guard_moves(self) -> int:
+        """How often the guard has moved the cell."""
+        return self.moves["guard"]
+
+    @property
+    def migrations(self) -> int:
+        """How often it has been moved by order."""
+        return self.moves.total() - self.guard_moves
 
     # ------------------------------------------------------------------------ hearing
 
@@ -288,15 +304,15 @@ class ControlledCell:
         self.refused = ""
         if move is not None and move.name == placement and not by_guard:
             self._move, self._unwritten = None, True
+            self.moves[move.reason] += 1
             if move.proposal is not None:
                 controller.commit(move.proposal)
         else:
             self._stay(f"the placement became {placement} meanwhile")
+            self.moves["guard" if by_guard else "ordered"] += 1
         if by_guard:
-            self.guard_moves += 1
             controller.adopt(placement, left=left)
         else:
-            self.migrations += 1
             if placement != course.placement:
                 # A person's choice, not the policy's.
                 controller.resume(placement)
@@ -452,7 +468,9 @@ class ControlledCell:
             if task.state_bytes and old[task.name] != new[task.name]
         )
         phase: Phase = "fork" if forks else "order"
-        self._move = _Move(name, now_ns, phase, forks, proposal=proposal)
+        wish = "pinned" if self.pinned else "drained"
+        reason = wish if proposal is None else proposal.decision.reason
+        self._move = _Move(name, reason, now_ns, phase, forks, proposal=proposal)
         self.refused = ""
         if self.windows is not None:
             self.windows.ordered(self.course.run, self.course.term)
@@ -723,6 +741,7 @@ class ControlledCell:
             "refused": self.refused or None,
             "migrations": self.migrations,
             "guard_moves": self.guard_moves,
+            "moves": dict(self.moves),
             "disbelieved": self.continuity.leaps,
             "window": {**self._window, "age_ms": age_ms} if self._window else {},
             **(self.windows.status() if self.windows is not None else {}),

@@ -1,14 +1,15 @@
 """The schema of a Run, of the columns that `dwell.model.table_columns` declares.
 
-`column_types` gives the types of a table's columns for one cell, `row_of` and `frame_of` bring
-values that go by the columns' names into their order, as a row of a journal or as a table. A new
-column is a declaration there and a value, of its name, where it is computed.
+`column_types` gives the types of a table's columns for one cell, `json_schema` what a row is as a
+JSON object; `row_of` and `frame_of` bring values that go by the columns' names into their order, as
+a row of a journal or as a table. A new column is a declaration there and a value, of its name,
+where it is computed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast, get_args
 
 from dwell.model import REASONS, Problem, Reason
 from dwell.model.instants import NEVER_NS
@@ -40,6 +41,14 @@ REASON_SENTENCES: Mapping[Reason, str] = {
     "guard": "the robot moved by itself",
 }
 
+#: Types of Polars' as JSON Schema calls them; names are an enumeration.
+JSON_TYPES: Mapping[str, str] = {
+    "Int64": "integer",
+    "Float64": "number",
+    "Boolean": "boolean",
+    "String": "string",
+}
+
 #: Types of a table's columns: a name of Polars', or the categories of an Enum.
 Types: TypeAlias = Mapping[str, str | Sequence[str]]
 #: Those of every table.
@@ -62,6 +71,35 @@ def column_types(table: str, problem: Problem, features: Collection[Feature] = (
         Features of the run.
     """
     return {name: kind for name, _, kind in _columns(table, problem, features)}
+
+
+def json_schema(table: str, problem: Problem, columns: Collection[str]) -> dict[str, Any]:
+    """Return the JSON Schema of a table's rows as objects.
+
+    A value that a row does not have is left out of its object, and so is an infinite one.
+
+    Parameters
+    ----------
+    table : str
+        One of `TABLES`.
+    columns : collection of str
+        Columns that there are; of those that are not declared nothing is said.
+    """
+    properties = {}
+    for name, column, kind in _columns(table, problem, get_args(Feature)):
+        if name in columns:
+            typed: dict[str, Any] = {"type": "string", "enum": kind}
+            if isinstance(kind, str):
+                typed = {"type": JSON_TYPES[kind]}
+            absent = column.null and f" Absent: {column.null}."
+            unit = column.unit and f" Unit: {column.unit}."
+            properties[name] = {**typed, "description": f"{column.sentence}{unit}{absent}"}
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "description": f"One row is {TABLES[table].sentence}.",
+        "type": "object",
+        "properties": properties,
+    }
 
 
 def _columns(

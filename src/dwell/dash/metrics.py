@@ -1,0 +1,253 @@
+"""Metrics: a live cell in numbers for Prometheus, by what an observer hears of it.
+
+Names and units follow Prometheus' conventions. Values of labels are names of the cell file, of its
+certificates and of the protocol, never text of a message. A series whose value nobody knows is
+absent, not 0.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable, Iterator, Mapping
+from datetime import UTC, datetime
+from typing import Any, Literal, TypeAlias, get_args
+
+from prometheus_client import Histogram, Metric
+from prometheus_client.exposition import choose_encoder
+from prometheus_client.registry import Collector
+
+from dwell.dash.observer import OUTCOMES, Observer
+from dwell.live.controlled_cell import MOVED_BY
+from dwell.live.failures import start_thread
+from dwell.live.health import Health
+from dwell.live.wiring import roles
+
+#: Upper bounds of the latencies that are counted together; the cell's deadline is one more.
+BUCKETS_S = (
+    *(0.001, 0.002, 0.005, 0.01, 0.015, 0.02, 0.025, 0.03, 0.04, 0.05, 0.075, 0.1, 0.15, 0.2),
+    *(0.3, 0.5, 1.0, 2.0, 5.0),
+)
+#: Time between two looks at the cycles: the observer does not keep them for long.
+EVERY_S = 2.0
+#: What follows the name of a metric in its samples.
+SUFFIXES = {"counter": "_total", "gauge": "", "info": "_info"}
+
+#: Labels beside the cell's, and the value; None where nobody knows it.
+Samples: TypeAlias = Iterable[tuple[Mapping[str, str], float | None]]
+
+
+class CellMetrics(Collector):
+    """Collects the metrics of an observed cell whenever they are asked for.
+
+    As a context manager it counts cycles meanwhile, however seldom it is asked.
+
+    Attributes
+    ----------
+    counted : int
+        Cycles that the observer has had, as far as they are counted here.
+    """
+
+    def __init__(self, observer: Observer) -> None:
+        self._observer, self._problem = observer, observer.problem
+        self._members = [role.who for role in roles(self._problem) if role.kind != "controller"]
+        self._deadline_s = round(self._problem.pipeline.deadline_ms * 1e6) / 1e9
+        self._latency = Histogram(
+            "dwell_cycle_latency_seconds",
+            "Time from the release of a cycle to the completion of its last sink.",
+            ["cell"],
+            buckets=sorted({*BUCKETS_S, self._deadline_s}),
+            registry=None,
+        )
+        self.counted = self._unread = 0
+        self._lock, self._stopped = threading.Lock(), threading.Event()
+
+    def __repr__(self) -> str:
+        return f"<CellMetrics of {self._problem.name}>"
+
+    def __enter__(self) -> CellMetrics:
+        """Begin to count."""
+        start_thread("metrics", self._keep_up)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Count no more."""
+        self._stopped.set()
+
+    def page(self, accept: str) -> tuple[bytes, str]:
+        """Return the metrics as Prometheus reads them, as text or OpenMetrics, and the page's type.
+
+        Parameters
+        ----------
+        accept : str
+            Header of the request.
+        """
+        encode, content_type = choose_encoder(accept)
+        return encode(self), content_type
+
+    def collect(self) -> Iterator[Metric]:
+        """Yield all metrics as they are now."""
+        now = self._observer.now()
+        health, problem = now.status["health"], self._problem
+        yield self._metric(
+            "gauge",
+            "dwell_health",
+            "1 of the health that the cell has, 0 of every other.",
+            (({"health": one}, health == one) for one in get_args(Health) if health),
+        )
+        yield self._metric(
+            "gauge", "dwell_deadline_seconds", "Deadline of a cycle.", [({}, self._deadline_s)]
+        )
+        placed: Mapping[str, str] = problem.candidates.get(now.placement, {})
+        yield self._metric(
+            "info",
+            "dwell_placement",
+            "Placement of the newest cycle.",
+            [({"placement": now.placement}, 1)] if placed else [],
+        )
+        yield self._metric(
+            "info",
+            "dwell_task_placement",
+            "Where a task runs under the placement of the newest cycle.",
+            (({"task": task, "node": node}, 1) for task, node in placed.items()),
+        )
+        yield self._metric(
+            "counter",
+            "dwell_cycles",
+            "Cycles since the observer began, by what became of them.",
+            (({"outcome": one}, now.cycles.get(one, 0)) for one in OUTCOMES if now.cycles),
+        )
+        yield self._metric(
+            "counter",
+            "dwell_missed_cycles",
+            "Cycles since the observer began that missed.",
+            [({}, now.missed)] if now.cycles else [],
+        )
+        yield from self._latencies()
+        # Of a controller that does not answer, nothing is known.
+        yield from self._told({} if health == "absent" else now.status)
+        yield from self._certificates()
+
+    def _keep_up(self) -> None:
+        while not self._stopped.wait(EVERY_S):
+            self._count()
+
+    def _count(self) -> None:
+        """Count the cycles that have been heard of since the last time."""
+        with self._lock:
+            news = self._observer.cycles.since(self.counted)
+            self.counted, self._unread = news.upto, self._unread + news.dropped
+            for cycle in news.items:
+                if cycle.latency_ns is not None:
+                    exemplar = {"run": str(cycle.run), "cycle": str(cycle.number)}
+                    of_cell = self._latency.labels(self._problem.name)
+                    of_cell.observe(cycle.latency_ns / 1e9, exemplar)
+
+    def _latencies(self) -> Iterator[Metric]:
+        self._count()
+        yield from self._latency.collect()
+        yield self._metric(
+            "counter",
+            "dwell_unread_cycles",
+            "Cycles that dwell_cycle_latency_seconds lacks, since this process was too slow.",
+            [({}, self._unread)],
+        )
+
+    def _told(self, status: Mapping[str, Any]) -> Iterator[Metric]:
+        """Yield what the controller's status tells."""
+        problem = self._problem
+        window, moves, heard = (status.get(name) or {} for name in ("window", "moves", "processes"))
+        yield self._metric(
+            "gauge",
+            "dwell_guard_fallback",
+            "Whether the cell is where its guard has put it.",
+            [({}, status.get("fallback"))],
+        )
+        yield self._metric(
+            "counter",
+            "dwell_migrations",
+            "Moves of the cell since the controller began, by reason; those of the guard among "
+            "them.",
+            (({"reason": one}, moves.get(one)) for one in MOVED_BY),
+        )
+        yield self._metric(
+            "counter", "dwell_windows", "Closed windows of the run.", [({}, status.get("windows"))]
+        )
+        yield self._metric(
+            "gauge",
+            "dwell_violation_ratio",
+            "Share of the cycles of the last window that missed.",
+            [({}, window.get("violation_rate"))],
+        )
+        estimates, used = window.get("estimates") or {}, window.get("utilisation") or {}
+        yield self._metric(
+            "gauge",
+            "dwell_estimated_cost",
+            "Cost J of a candidate as estimated at the close of the last window.",
+            (({"placement": name}, estimates.get(name)) for name in problem.candidates),
+        )
+        yield self._metric(
+            "gauge",
+            "dwell_utilisation_ratio",
+            "Utilisation of a resource in the last window, foreign work included.",
+            (
+                ({"node": one.node, "kind": one.kind or "cpu"}, used.get(name))
+                for name, one in problem.fabric.resources.items()
+            ),
+        )
+        bound_ms = status.get("bound_ms")
+        yield self._metric(
+            "gauge",
+            "dwell_clock_bound_seconds",
+            "Largest error of the latencies of the last window, by the clocks.",
+            [({}, None if bound_ms is None else bound_ms / 1e3)],
+        )
+        yield self._metric(
+            "gauge",
+            "dwell_window_unproven",
+            "Whether clocks or losses of messages leave the last window unproven.",
+            [({}, status.get("unproven"))],
+        )
+        yield self._metric(
+            "gauge",
+            "dwell_process_heard",
+            "Whether the controller hears a process of the cell.",
+            (({"process": who}, who in heard and heard[who]["heard"]) for who in self._members)
+            if status
+            else (),
+        )
+        yield self._metric(
+            "gauge",
+            "dwell_process_ready",
+            "Whether a process that is heard can do its work.",
+            (
+                ({"process": who}, heard[who]["ready"])
+                for who in self._members
+                if who in heard and heard[who]["heard"]
+            ),
+        )
+
+    def _certificates(self) -> Iterator[Metric]:
+        keyring = self._observer.security.keyring
+        subjects = {} if keyring is None else keyring.roster.subjects
+        yield self._metric(
+            "gauge",
+            "dwell_certificate_expiry_timestamp_seconds",
+            "Beginning of the day on which a certificate ends.",
+            (
+                (
+                    {"subject": subject.name},
+                    datetime.fromisoformat(subject.expires).replace(tzinfo=UTC).timestamp(),
+                )
+                for subject in subjects.values()
+            ),
+        )
+
+    def _metric(
+        self, kind: Literal["counter", "gauge", "info"], name: str, sentence: str, samples: Samples
+    ) -> Metric:
+        metric = Metric(name, sentence, kind)
+        for labels, value in samples:
+            if isinstance(value, int | float):
+                told = {"cell": self._problem.name, **labels}
+                metric.add_sample(f"{name}{SUFFIXES[kind]}", told, float(value))
+        return metric
