@@ -88,7 +88,7 @@ def simulate(problem: Problem, scenario: str, windows: int = 25) -> Played:
             release_ns=self.release_ns[first:boundary],
             close_ns=close_ns,
             open_ns=int(self.release_ns[first]),
-            core_ns=tables.closed[0, index] - tables.opened[0, index],
+            core_ns=(tables.closed[0, index] - tables.opened[0, index])[:3],
         )
         kept[0].windows.append(window)
         assert self.evidence is not None

@@ -397,11 +397,11 @@ def shares(case: Case, window: WindowResult, resource: str) -> tuple[float, floa
 
 
 def core_differences(case: Case, core_ns: NDArray[np.float64], result: Result) -> Iterator[str]:
-    """Compare what resources had done when windows began and ended: (2, windows, 3, resources)."""
+    """Compare what resources had done when windows began and ended: (2, windows, 4, resources)."""
     for k, window in enumerate(result.windows):
         for i, name in enumerate(case.problem.fabric.resources):
             for when, usage in enumerate((window.opened[name], window.closed[name])):
-                found = core_ns[when, k, :, i].tolist()
+                found = core_ns[when, k, :3, i].tolist()
                 expected = [float(value) for value in astuple(usage)]
                 # Rounded up to whole nanoseconds, work may take a little more time than it is.
                 if any(abs(a - b) > 1e-6 * b + 1 for a, b in zip(found, expected, strict=True)):
