@@ -555,9 +555,9 @@ def declared_of(problem: Problem, seed: int = SEED, shadow_fraction: float = 0.0
     question = Question.of(problem, "baseline", seed, DRAWN, shadow_fraction)
     known = _known.pop(question, None)
     if known is None:
-        short = _with_short_windows(problem)
+        short = _with_short_windows(question.problem)
         if question.shadow_fraction:
-            known = _with_shadows(short, declared_of(problem, seed), shadow_fraction)
+            known = _with_shadows(short, declared_of(question.problem, seed), shadow_fraction)
         else:
             known = _played_as_declared(short, seed)
     _known[question] = known

@@ -136,7 +136,9 @@ class Question:
         cycles: int | None,
         shadow_fraction: float = 0.0,
     ) -> Question:
-        """Ask for the prices of a problem (see `prices_of`)."""
+        """Ask for the prices of a problem (see `prices_of`), whose phase is nothing to it alone."""
+        if problem.pipeline.phase_ms:
+            problem = replace(problem, pipeline=replace(problem.pipeline, phase_ms=0.0))
         return cls(
             pipeline=problem.pipeline,
             fabric=problem.fabric,
