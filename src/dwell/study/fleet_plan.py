@@ -90,9 +90,9 @@ class FleetPlan:
 def phi_of(run: FleetRun) -> float:
     """Φ a cell of a run, by the means of what its windows showed after the warm-up."""
     own, shared = 0.0, 0.0
+    problems = {cell.name: cell.problem for cell in run.fleet.cells}
     for name, one in run.cells.items():
-        cell = next(cell for cell in run.fleet.cells if cell.name == name)
-        terms, windows = CellTerms(cell.problem, run.fleet.shared), one.arrays("windows")
+        terms, windows = CellTerms(problems[name], run.fleet.shared), one.arrays("windows")
         counts = ~windows["warmup"]
 
         def mean(column: str, windows: Any = windows, counts: Any = counts) -> float:
