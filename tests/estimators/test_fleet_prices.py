@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import islice
+from itertools import islice, product
 from pathlib import Path
 
 import numpy as np
@@ -55,7 +55,9 @@ def test_a_fleet_is_priced_as_the_simulator_plays_it() -> None:
         seen = cell_of(price, i).qos
         assert seen.l95_ms == pytest.approx(windows["seen_l95_ms"].mean(), rel=1e-12)
         assert seen.violation_rate == pytest.approx(windows["seen_violation_rate"].mean())
-        assert seen.utilisation["E"] == pytest.approx(windows["u_E"].mean())
+        assert seen.utilisation["R1"] == pytest.approx(windows["u_R1"].mean())
+    first = next(iter(run.cells.values())).windows[1:]
+    assert price.used == {"E": pytest.approx(first["u_E"].mean())}
 
 
 def test_phi_is_j_without_switching_and_the_shared_node_once() -> None:
@@ -68,8 +70,31 @@ def test_phi_is_j_without_switching_and_the_shared_node_once() -> None:
         robot = max(seen.utilisation["R1"], seen.utilisation["R2"])
         expected += seen.l95_ms / targets.latency_ms + weights.violations * seen.violation_rate
         expected += weights.robot * robot / targets.robot
-        expected += weights.edge * seen.utilisation["E"] / targets.edge / 2
+    expected += weights.edge * price.used["E"] / targets.edge
     assert price.phi == pytest.approx(expected)
+
+
+def test_phi_does_not_depend_on_what_was_played_before() -> None:
+    asked = list(product(("LOC", "SO", "HYB"), repeat=2))
+    one, other = (
+        priced(fleet_of(FleetEntry(CANONICAL, 2))),
+        priced(fleet_of(FleetEntry(CANONICAL, 2))),
+    )
+    forth = [one.price(placements) for placements in asked]
+    back = [other.price(placements) for placements in reversed(asked)]
+    assert [price.phi for price in forth] == [price.phi for price in reversed(back)]
+    qos = forth[0].qos(0)
+    assert qos is not None
+    assert qos.utilisation.keys() == CANONICAL.fabric.resources.keys()
+
+
+def test_presents_that_are_the_same_are_not_played_again() -> None:
+    prices = priced(fleet_of(FleetEntry(CANONICAL, 2)))
+    said = [Present(threads=FrozenDict({"E": 3.0})), Present(threads=FrozenDict({"R1": 1.0}))]
+    prices.begin(said)
+    before = prices.price(("SO", "LOC"))
+    prices.begin(list(said))
+    assert prices.price(("SO", "LOC")) is before
 
 
 def test_a_cell_that_meets_nobody_is_played_once_and_alike() -> None:

@@ -219,9 +219,9 @@ class FleetLedger:
                 return f"ledger: Φ would rise by {rises:.3g}"
             return f"ledger: Φ would fall by {-rises:.3g}, {self.owed(index, name):.3g} is owed"
         if self._has_caps:
-            for cell, one, other in zip(self.cells, before.cells, after.cells, strict=True):
-                caps = cell.problem.objective
-                if one and other and excess(one.qos, caps) <= 0 < excess(other.qos, caps):
+            for i, cell in enumerate(self.cells):
+                caps, one, other = cell.problem.objective, before.qos(i), after.qos(i)
+                if one and other and excess(one, caps) <= 0 < excess(other, caps):
                     return f"cap of {cell.name}"
         return None
 

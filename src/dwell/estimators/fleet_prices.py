@@ -8,7 +8,7 @@ that has nothing on a shared node meets no other, so that it is played once.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -65,7 +65,7 @@ class CellPrice:
     Parameters
     ----------
     qos : QoS
-        As a controller sees it; utilisation of shared nodes is that by all.
+        As a controller sees it, without the utilisation of shared nodes.
     cost : float
         J without switching, and without the utilisation of shared nodes.
     """
@@ -84,10 +84,13 @@ class FleetPrice:
         By cell; None for one that was left out.
     shared : float
         What the utilisation of shared nodes costs: α·U/U* of each, the mean over cells.
+    used : mapping of str to float
+        Utilisation of the shared nodes' resources by all, as the first cell sees it that is there.
     """
 
     cells: tuple[CellPrice | None, ...]
     shared: float
+    used: Mapping[str, float]
 
     def __repr__(self) -> str:
         return f"<FleetPrice: phi = {self.phi:.4g}>"
@@ -101,6 +104,13 @@ class FleetPrice:
     def phi(self) -> float:
         """Φ."""
         return sum(self.costs) + self.shared
+
+    def qos(self, index: int) -> QoS | None:
+        """What a cell came to, with the utilisation of shared nodes."""
+        cell = self.cells[index]
+        if cell is None:
+            return None
+        return replace(cell.qos, utilisation=FrozenDict({**cell.qos.utilisation, **self.used}))
 
 
 class FleetPrices:
@@ -153,36 +163,33 @@ class FleetPrices:
 
     def begin(self, presents: Sequence[Present]) -> None:
         """Begin with other presents, one a cell; of a shared node the middle of them holds."""
-        agreed = self._agreed(presents)
-        for i, (present, before) in enumerate(zip(agreed, self._presents, strict=True)):
-            if present is not before:
-                self._real[i] = realised(self.cells[i].problem, self._declared[i], present)
-                self._presents[i] = present
-                self._alone[i].clear()
-                self._known.clear()
-                self._first = None
+        given = zip(presents, self._presents, strict=True)
+        changed = [i for i, (present, before) in enumerate(given) if present is not before]
+        if not changed:
+            return
+        self._presents = list(presents)
+        # What befalls shared nodes is played with the first cell.
+        for i in dict.fromkeys((0, *changed)):
+            cell, declared = self.cells[i], self._declared[i]
+            self._real[i] = realised(cell.problem, declared, self._of(i))
+            self._alone[i].clear()
+        self._known.clear()
+        self._first = None
 
-    def _agreed(self, presents: Sequence[Present]) -> list[Present]:
-        """Presents of which the first one alone says something of shared nodes."""
-        agreed = []
-        for i, present in enumerate(presents):
-            threads, down = dict(present.threads), set(present.down)
-            for name in self.shared:
-                threads.pop(name, None)
-                down.discard(name)
-                if i == 0:
-                    said = sorted(one.threads.get(name, 0.0) for one in presents)
-                    if middle := said[len(said) // 2]:
-                        threads[name] = middle
-                    if any(name in one.down for one in presents):
-                        down.add(name)
-            same = threads == present.threads and down == present.down
-            agreed.append(
-                present
-                if same
-                else replace(present, threads=FrozenDict(threads), down=frozenset(down))
-            )
-        return agreed
+    def _of(self, index: int) -> Present:
+        """Present of a cell; of shared nodes that of the first one speaks, for all."""
+        present = self._presents[index]
+        threads, down = dict(present.threads), set(present.down)
+        for name in self.shared:
+            threads.pop(name, None)
+            down.discard(name)
+            if index == 0:
+                said = sorted(one.threads.get(name, 0.0) for one in self._presents)
+                if middle := said[len(said) // 2]:
+                    threads[name] = middle
+                if any(name in one.down for one in self._presents):
+                    down.add(name)
+        return replace(present, threads=FrozenDict(threads), down=frozenset(down))
 
     def price(self, placements: Placements) -> FleetPrice:
         """Play the fleet at some placements; what was played under these presents is known."""
@@ -192,27 +199,29 @@ class FleetPrices:
         return known
 
     def _price(self, placements: Placements) -> FleetPrice:
-        together = [name is not None and self._meets[i][name] for i, name in enumerate(placements)]
-        plays = [
-            name is not None and (together[i] or name not in self._alone[i])
-            for i, name in enumerate(placements)
-        ]
-        if any(plays):
-            arrays = self._played(placements, plays)
-        cells: list[CellPrice | None] = []
-        for i, name in enumerate(placements):
-            if name is None:
-                cells.append(None)
-            elif plays[i]:
-                found = self._price_of(arrays, i)
-                if not together[i]:
-                    self._alone[i][name] = found
-                cells.append(found)
-            else:
-                cells.append(self._alone[i][name])
-        return FleetPrice(tuple(cells), self._shared_cost(cells))
+        placed = {i: name for i, name in enumerate(placements) if name is not None}
+        there = [i for i, name in placed.items() if self._meets[i][name]]
+        new = [i for i, name in placed.items() if name not in self._alone[i]]
+        # The first that is on a shared node sees it; where nobody is, somebody looks.
+        watcher = min(there or placed)
+        plays = {watcher, *there, *new}
+        arrays = self._played(placements, plays)
+        found = {
+            i: self._price_of(arrays, i) if i in plays else self._alone[i][name]
+            for i, name in placed.items()
+        }
+        for i in plays.difference(there):
+            self._alone[i][placed[i]] = found[i]
+        used = {
+            name: share
+            for name, share in self._used(arrays, watcher).items()
+            if name in self._terms[watcher].of_shared
+        }
+        costs = [self._terms[i].shared_cost(used) for i in placed]
+        cells = tuple(map(found.get, range(len(placements))))
+        return FleetPrice(cells, sum(costs) / len(costs), used)
 
-    def _played(self, placements: Placements, plays: Sequence[bool]) -> Arrays:
+    def _played(self, placements: Placements, plays: Collection[int]) -> Arrays:
         if self._first is None:
             laid = zip((cell.problem for cell in self.cells), self._real, strict=True)
             self._first = lay_out(list(laid), shared=self.shared).copy()
@@ -227,7 +236,7 @@ class FleetPrices:
         clock = tables.clock[0]
         events = tables.events[: clock["n_events"]]
         kept = [
-            kind_of(key) != EventKind.RELEASE or plays[cell_of(key)]
+            kind_of(key) != EventKind.RELEASE or cell_of(key) in plays
             for key in events["key"].tolist()
         ]
         clock["n_events"] = sum(kept)
@@ -236,24 +245,32 @@ class FleetPrices:
         return arrays
 
     def _price_of(self, arrays: Arrays, i: int) -> CellPrice:
-        problem, tables, terms = self.cells[i].problem, arrays.tables, self._terms[i]
-        first, last = 1, self._windows[i]
-        seen = tables.seen[i, first:last]
-        shares = tables.shares[i, first:last, 0, : len(terms.resources)].mean(axis=0)
+        problem, terms = self.cells[i].problem, self._terms[i]
+        seen = arrays.tables.seen[i, 1 : self._windows[i]]
         l95_ms, missed = float(seen["l95_ms"].mean()), float(seen["missed"].mean())
         rate, uncut_ms = missed / problem.window_cycles, float(seen["uncut_ms"].mean())
-        used = FrozenDict(zip(terms.resources, shares.tolist(), strict=True))
+        shares = self._used(arrays, i).items()
+        used = FrozenDict((name, share) for name, share in shares if name not in terms.of_shared)
         qos = QoS(l95_ms, rate, used, max(uncut_ms, l95_ms))
         return CellPrice(qos, terms.cost(qos))
 
-    def _shared_cost(self, cells: Sequence[CellPrice | None]) -> float:
-        """What the utilisation of shared nodes costs: of each once, the mean over cells."""
-        met = [(self._terms[i], cell) for i, cell in enumerate(cells) if cell is not None]
-        return sum(terms.shared_cost(cell.qos) for terms, cell in met) / max(len(met), 1)
+    def _used(self, arrays: Arrays, i: int) -> dict[str, float]:
+        """Utilisation of every resource, by all, in the mean over a cell's windows."""
+        resources = self._terms[i].resources
+        shares = arrays.tables.shares[i, 1 : self._windows[i], 0, : len(resources)].mean(axis=0)
+        return dict(zip(resources, shares.tolist(), strict=True))
 
 
 class CellTerms:
-    """Terms of a cell's J: those of its own, and those of shared nodes."""
+    """Terms of a cell's J: those of its own, and those of shared nodes.
+
+    Attributes
+    ----------
+    resources : tuple of str
+        All of the cell's.
+    of_shared : set of str
+        Those of shared nodes.
+    """
 
     def __init__(self, problem: Problem, shared: Sequence[str]) -> None:
         self.resources = tuple(problem.fabric.resources)
@@ -267,10 +284,11 @@ class CellTerms:
         }
         self._capacity = {name: one.capacity for name, one in problem.fabric.resources.items()}
         node_of = {name: one.node for name, one in problem.fabric.resources.items()}
+        self.of_shared = {name for name, node in node_of.items() if node in shared}
         self._own, self._shared = [], []
         for tier in ("robot", "edge", "cloud"):
             names = getattr(nodes, tier)
-            self._own.append([name for name in names if node_of[name] not in shared])
+            self._own.append([name for name in names if name not in self.of_shared])
             # Of a shared node, its accelerators with it, the fullest counts.
             for node in shared:
                 here = [name for name in names if node_of[name] == node]
@@ -279,7 +297,7 @@ class CellTerms:
 
     def cost(self, qos: QoS) -> float:
         """J without switching and shared nodes."""
-        robot, edge, cloud = (self._most(names, qos) for names in self._own)
+        robot, edge, cloud = (_most(names, qos.utilisation) for names in self._own)
         rate, objective = qos.violation_rate, self._objective
         return float(price(qos.l95_ms, rate, robot, edge, cloud, 0.0, objective))
 
@@ -289,13 +307,14 @@ class CellTerms:
             name: factor / self._capacity[name] for factor, names in self._shared for name in names
         }
 
-    def shared_cost(self, qos: QoS) -> float:
+    def shared_cost(self, used: Mapping[str, float]) -> float:
         """What the utilisation of shared nodes would cost the cell."""
-        return sum(factor * self._most(names, qos) for factor, names in self._shared)
+        return sum(factor * _most(names, used) for factor, names in self._shared)
 
-    def _most(self, names: Sequence[str], qos: QoS) -> float:
-        """Utilisation of the fullest of some resources that are known."""
-        return max((qos.utilisation.get(name, 0.0) for name in names), default=0.0)
+
+def _most(names: Sequence[str], used: Mapping[str, float]) -> float:
+    """Utilisation of the fullest of some resources that are known."""
+    return max((used.get(name, 0.0) for name in names), default=0.0)
 
 
 def _windows_of(problem: Problem, cells: Sequence[PricedCell], cycles: int) -> int:

@@ -60,8 +60,8 @@ class FleetPlan:
     @property
     def cells(self) -> dict[str, QoS]:
         """What each cell comes to."""
-        priced = zip(self.placements, self.played.cells, strict=True)
-        return {name: cell.qos for name, cell in priced if cell is not None}
+        priced = map(self.played.qos, range(len(self.placements)))
+        return {name: qos for name, qos in zip(self.placements, priced, strict=True) if qos}
 
     def regret(self, run: FleetRun) -> float:
         """How far Φ of a run, by what its windows show, is above that of the plan: a share of it.
@@ -100,7 +100,7 @@ def phi_of(run: FleetRun) -> float:
 
         used = {name: mean(f"u_{name}") for name in terms.resources}
         qos = QoS(mean("seen_l95_ms"), mean("seen_violation_rate"), used)
-        own, shared = own + terms.cost(qos), shared + terms.shared_cost(qos)
+        own, shared = own + terms.cost(qos), shared + terms.shared_cost(used)
     count = len(run.cells)
     return (own + shared / count) / count
 
