@@ -2,8 +2,8 @@
 
 Makes the tables of docs/fleets.md: N canonical cells on one edge server, all of whose robots are
 stressed from window 20 on, under every rule and estimator, beside all fixed splits. J is the mean
-over cells of windows 30 to 59. `--table` compares the table of loads with long runs, `--return`
-takes the edge away for 8 s.
+over cells of windows 30 to 59. `--table` compares the table of loads with long runs, `--away` takes
+the edge away for 8 s, with guards, while all robots are stressed.
 """
 
 from __future__ import annotations
@@ -37,6 +37,8 @@ ESTIMATORS = "corrected", "scaling", "shadow"
 RULES = "ledger", "random", "most-gain-first", "none"
 SPLITS = "SO", "HYB"
 CHANGE, FIRST, LAST, WINDOWS = 20, 30, 59, 60
+#: Instant at which the edge goes, for how long, and the end of a run, seconds.
+GONE_S, AWAY_S, END_S = 60, 8, 120
 #: Cells for which the edge server of the canonical cell has its cores.
 CELLS_A_SERVER = 12
 
@@ -200,9 +202,13 @@ def compare_table(cells: int, seeds: Sequence[int], pool: ProcessPoolExecutor) -
                 weights.latency * one / targets.latency_ms + weights.violations * of
                 for one, of in ((l95_ms, rate), (run_l95_ms, run_rate))
             )
+            error = column.violation_error[size - 1]
+            j_error = weights.latency * column.l95_error_ms[size - 1] / targets.latency_ms
+            j_error += weights.violations * error
             yield (
-                f"| {name} | {size} | {j:.3f}, {run_j:.3f} ({100 * (j / run_j - 1):+.1f} %) | "
-                f"{100 * rate:.2f}, {100 * run_rate:.2f} ({100 * (rate - run_rate):+.2f}) |\n"
+                f"| {name} | {size} | {j:.3f} ± {j_error:.3f}, {run_j:.3f} "
+                f"({100 * (j / run_j - 1):+.1f} %) | {100 * rate:.2f} ± {100 * error:.2f}, "
+                f"{100 * run_rate:.2f} ({100 * (rate - run_rate):+.2f}) |\n"
             )
 
 
@@ -224,16 +230,68 @@ def long_run(cells: int, name: str, size: int, seed: int) -> tuple[float, float]
     return windows.select(pl.col("seen_l95_ms").mean(), pl.col("violation_rate").mean()).row(0)
 
 
+def away(cells: int, seeds: Sequence[int], pool: ProcessPoolExecutor) -> Iterator[str]:
+    """Yield what happens when the edge goes and comes back: means over seeds."""
+    back_s = GONE_S + AWAY_S
+    spans = [(GONE_S - 10, GONE_S), (GONE_S, back_s)]
+    spans += [(at, at + 10) for at in range(back_s, END_S - 9, 10)]
+    yield "| cell | figure | " + " | ".join(f"{a} to {b} s" for a, b in spans) + " |\n"
+    yield "|---" * (2 + len(spans)) + "|\n"
+    for what in ("canonical", "no tenants, fallback LOC"):
+        found = list(pool.map(partial(_gone, cells, spans, what != "canonical"), seeds))
+        for figure, of_seeds in zip(
+            ("V_D, %", "cells on E", "guard moves"), zip(*found, strict=True), strict=True
+        ):
+            means = " | ".join(f"{mean:.1f}" for mean in np.mean(of_seeds, axis=0))
+            yield f"| {what} | {figure} | {means} |\n"
+
+
+def _gone(
+    cells: int, spans: Sequence[tuple[int, int]], alone: bool, seed: int
+) -> tuple[list[float], list[float], list[float]]:
+    """V_D (%), cells on E and moves of guards by spans of time."""
+    stress = NodeDisturbance(node="R1", stress_threads=4)
+    fleet = fleet_of(
+        cells, [stress, NodeDisturbance(node="E", at_s=GONE_S, for_s=AWAY_S, down=True)]
+    )
+    (entry,) = fleet.entries
+    cell = entry.cell
+    if alone:
+        nodes = {**cell.fabric.nodes, "E": replace(cell.fabric.nodes["E"], bursts=None)}
+        cell = replace(
+            cell,
+            fabric=replace(cell.fabric, nodes=nodes),
+            controller=replace(cell.controller, fallbacks=("LOC",)),
+        )
+    fleet = replace(fleet, entries=(replace(entry, cell=cell),), coordination="ledger")
+    window_s = cell.window_cycles * cell.pipeline.period_ms / 1e3
+    run = simulate_fleet(
+        fleet, seed=seed, windows=round(END_S / window_s), estimator="corrected", guard=True
+    )
+    cycles = pl.concat([one.cycles for one in run.cells.values()])
+    cycles = cycles.with_columns(pl.col("release_ns") / 1e9)
+    moved = run.decisions.filter((pl.col("reason") == "guard") & pl.col("migrated"))
+    late, there, guards = [], [], []
+    for begin, end in spans:
+        mine = cycles.filter(pl.col("release_ns").is_between(begin, end, closed="left"))
+        late.append(100 * float(mine["missed"].to_numpy().mean()))
+        there.append(cells * float((mine["placement"] != "LOC").to_numpy().mean()))
+        at_s = (moved["window"] + 1) * window_s
+        guards.append(float(at_s.is_between(begin, end, closed="left").sum()))
+    return late, there, guards
+
+
 def main(arguments: Iterable[str] | None = None) -> None:
     """Print the tables that are asked for."""
     parser = argparse.ArgumentParser(prog=f"python -m benchmarks.{Path(__file__).stem}")
     parser.add_argument("--cells", type=int, default=12)
     parser.add_argument("--seeds", type=int, default=10)
-    parser.add_argument("--table", action="store_true")
+    parser.add_argument("--table", dest="what", action="store_const", const=compare_table)
+    parser.add_argument("--away", dest="what", action="store_const", const=away)
     asked = parser.parse_args(arguments if arguments is None else list(arguments))
     seeds = range(1, asked.seeds + 1)
     with ProcessPoolExecutor(2) as pool:
-        for text in (compare_table if asked.table else rules)(asked.cells, seeds, pool):
+        for text in (asked.what or rules)(asked.cells, seeds, pool):
             print(text, end="", flush=True)
 
 

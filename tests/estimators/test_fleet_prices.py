@@ -14,7 +14,7 @@ from dwell.estimators.fleet_prices import CellPrice, FleetPrice, FleetPrices, Pr
 from dwell.estimators.load_table import LoadTable, load_table
 from dwell.estimators.measured import Message, Site
 from dwell.estimators.presents import Playing, Present, realised
-from dwell.estimators.prices import SEED
+from dwell.estimators.prices import SEED, prices_of
 from dwell.kernels.advance import play
 from dwell.kernels.arrays import lay_out
 from dwell.model import FrozenDict, Problem
@@ -159,14 +159,19 @@ def test_a_table_has_a_level_for_every_cell_and_grows() -> None:
         PricedCell(c.name, p, c.streams) for c, p in zip(fleet.cells, phased(fleet, 1), strict=True)
     ]
     told: list[tuple[int, int]] = []
-    table = LoadTable(cells, ["E"], cycles=200, progress=lambda *done: told.append(done))
+    table = LoadTable(cells, ["E"], cycles=2_000, progress=lambda *done: told.append(done))
     assert set(table.columns) == {(0, "SO"), (0, "HYB")}
     assert told == [(i, 8) for i in range(1, 9)]
     for (_, name), column in table.columns.items():
         cores = table.work[0][name][1]
         assert column.level == pytest.approx(cores * np.arange(1, 5))
-        assert np.isinf(column.l95_error_ms[0])
-        assert np.isfinite(column.l95_error_ms[1:]).all()
+        assert (np.diff(column.l95_ms) > 0).all()
+        # A cell alone is as its price says; what more cells come to is known less well.
+        price = prices_of(cells[0].problem)[name]
+        assert column.l95_ms[0] == pytest.approx(price.l95_ms)
+        assert column.violation_rate[0] == pytest.approx(price.violation_rate)
+        assert column.l95_error_ms[0] == pytest.approx(price.l95_error_ms)
+        assert (column.l95_error_ms[1:] > price.l95_error_ms).all()
     assert load_table(cells, ["E"]) is load_table(list(cells), ("E",))
 
 

@@ -58,7 +58,7 @@ class PricedCell:
     scenario: str = "baseline"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class CellPrice:
     """What a cell came to among the others, in the mean over windows.
 
@@ -68,10 +68,13 @@ class CellPrice:
         As a controller sees it, without the utilisation of shared nodes.
     cost : float
         J without switching, and without the utilisation of shared nodes.
+    windows : float64 array, shape (windows, 2)
+        L95, milliseconds, and V_D of each.
     """
 
     qos: QoS
     cost: float
+    windows: Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,12 +250,13 @@ class FleetPrices:
     def _price_of(self, arrays: Arrays, i: int) -> CellPrice:
         problem, terms = self.cells[i].problem, self._terms[i]
         seen = arrays.tables.seen[i, 1 : self._windows[i]]
-        l95_ms, missed = float(seen["l95_ms"].mean()), float(seen["missed"].mean())
-        rate, uncut_ms = missed / problem.window_cycles, float(seen["uncut_ms"].mean())
+        windows = np.column_stack((seen["l95_ms"], seen["missed"] / problem.window_cycles))
+        l95_ms, rate = windows.mean(axis=0).tolist()
+        uncut_ms = float(seen["uncut_ms"].mean())
         shares = self._used(arrays, i).items()
         used = FrozenDict((name, share) for name, share in shares if name not in terms.of_shared)
         qos = QoS(l95_ms, rate, used, max(uncut_ms, l95_ms))
-        return CellPrice(qos, terms.cost(qos))
+        return CellPrice(qos, terms.cost(qos), windows)
 
     def _used(self, arrays: Arrays, i: int) -> dict[str, float]:
         """Utilisation of every resource, by all, in the mean over a cell's windows."""

@@ -2,8 +2,10 @@
 
 Of every kind of cell and every candidate that uses a shared node, one cell after another is played
 on it together, until all cells of the fleet are there: those of the kind first, the others beside
-them on what they have most work with. The table says what would be worth a look; Φ itself is
-played (see `dwell.estimators.fleet_prices`).
+them on what they have most work with. All levels are played on the same draws, and what a cell
+alone comes to is known well, so that this is a control variate: as much as windows show together
+with those of the cell alone is told from its price (DOI 10.1287/opre.30.5.961). The table says what
+would be worth a look; Φ itself is played (see `dwell.estimators.fleet_prices`).
 """
 
 from __future__ import annotations
@@ -22,8 +24,8 @@ from dwell.model.problem import Problem
 
 Floats: TypeAlias = NDArray[np.float64]
 
-#: Cycles of a cell that are played at each level.
-CYCLES = 3_000
+#: Cycles of all levels of a candidate together; fewest and most of a cell at each level.
+CYCLES, FEWEST, MOST = 1_000_000, 3_000, 15_000
 #: How many fleets are remembered.
 KEPT = 8
 
@@ -39,7 +41,7 @@ class LoadColumn:
     l95_ms, violation_rate : float64 array, shape (levels,)
         Mean over the cells of the kind.
     l95_error_ms, violation_error : float64 array, shape (levels,)
-        Their standard errors.
+        Their standard errors, by how windows differ.
     """
 
     level: Floats
@@ -77,12 +79,14 @@ class LoadTable:
         cells: Sequence[PricedCell],
         shared: Sequence[str],
         *,
-        cycles: int = CYCLES,
+        cycles: int | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> None:
         self.cells, self.shared = tuple(cells), tuple(shared)
         self.kinds = kinds_of(cells)
         self.work = tuple(_work(cell.problem, shared) for cell in cells)
+        if cycles is None:
+            cycles = min(max(2 * CYCLES // len(cells) ** 2, FEWEST), MOST)
         plays = FleetPrices(cells, shared, cycles * len(cells))
         asked = [(kind, name) for kind in dict.fromkeys(self.kinds) for name in self.work[kind]]
         self.columns: dict[tuple[int, str], LoadColumn] = {}
@@ -109,16 +113,34 @@ class LoadTable:
         others = [i for i, of in enumerate(self.kinds) if of != kind and self.work[i]]
         placements: list[str | None] = [None] * len(self.cells)
         asked, level = self.work[kind][name][0], 0.0
+        price, alone = prices_of(self.cells[kind].problem)[name], None
+        known = np.array([price.l95_ms, price.violation_rate])
+        known_error = np.array([price.l95_error_ms, price.violation_error])
         for i in mine + others:
             # The others ask for as much as they may.
             placed = name if i in mine else max(self.work[i], key=partial(self._asked, i))
             placements[i], (resource, work) = placed, self.work[i][placed]
             level += work if resource == asked else 0.0
             found = plays.price(tuple(placements)).cells
-            seen = [cell.qos for j in mine if (cell := found[j]) is not None]
-            l95_ms = np.array([qos.l95_ms for qos in seen])
-            rate = np.array([qos.violation_rate for qos in seen])
-            yield level, l95_ms.mean(), rate.mean(), _error(l95_ms), _error(rate)
+            windows = np.mean([cell.windows for j in mine if (cell := found[j])], axis=0)
+            alone = windows if alone is None else alone
+            (l95_ms, rate), (l95_error_ms, error) = _controlled(windows, alone, known, known_error)
+            yield level, l95_ms, rate, l95_error_ms, error
+
+
+def _controlled(
+    windows: Floats, alone: Floats, known: Floats, known_error: Floats
+) -> tuple[Floats, Floats]:
+    """Means over windows with their standard errors; those of the cell alone are known."""
+    count = len(windows)
+    if count < 3:
+        return windows.mean(axis=0), np.full(2, np.inf)
+    spread = alone - alone.mean(axis=0)
+    squares = (spread**2).sum(axis=0)
+    slope = np.divide((spread * windows).sum(axis=0), squares, where=squares > 0, out=0 * squares)
+    rest = windows - slope * alone
+    errors = np.hypot(rest.std(axis=0, ddof=2) / np.sqrt(count), slope * known_error)
+    return np.maximum(rest.mean(axis=0) + slope * known, 0.0), errors
 
 
 _known: dict[tuple[tuple[PricedCell, ...], tuple[str, ...]], LoadTable] = {}
@@ -161,10 +183,3 @@ def _work(problem: Problem, shared: Sequence[str]) -> Mapping[str, tuple[str, fl
             most = max(here, key=own.__getitem__)
             found[name] = most, own[most] * resources[most].capacity
     return found
-
-
-def _error(values: Floats) -> float:
-    """Standard error of the mean over cells; of a single one it is not known."""
-    if len(values) < 2:
-        return float("inf")
-    return float(values.std(ddof=1) / np.sqrt(len(values)))
