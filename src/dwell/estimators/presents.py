@@ -342,16 +342,11 @@ class Playing:
     def _fill_links(self, present: Present) -> None:
         """Set what links lose, and that measured delays are all that there is."""
         tables, links = self._first.tables, self.problem.fabric.links
-        lost: dict[str, list[float]] = {}
-        for part, values in present.demands.items():
-            if not isinstance(part, Message):
-                continue
-            lost.setdefault(part.link, []).append(float(np.isinf(values).mean()))
+        for part in present.demands:
             if part in self._hops:
                 layers = tables.layers[self._hops[part] :: len(self._hops)]  # shadows' come after
                 layers[layers != 0] = self._nothing_ns.ctypes.data
-        for link, shares in lost.items():
-            share = sum(shares) / len(shares)
+        for link, share in _lost(present).items():
             row = tables.links[list(links).index(link)]
             mine = slice(row["segment"], row["segment_end"])
             if links[link].retransmit_ms is None:
@@ -366,18 +361,29 @@ class Playing:
         rows = self._declared_changes
         if not present.threads and not present.down:
             return rows
-        names = list(self.problem.fabric.nodes)
-        others = [names.index(name) for name in {*present.threads, *present.down}]
-        pieces = [rows[~np.isin(rows["node"], others)]]
-        for number in others:
-            name = names[number]
-            mine = rows[rows["node"] == number]
-            threads = present.threads.get(name, 0.0)
-            pieces.append(with_threads(mine, threads, self._real.release_ns))
-            if name in present.down:
-                pieces[-1]["is_down"] = 1
-        changes = np.concatenate(pieces)
-        return np.ascontiguousarray(changes[np.argsort(changes["at_ns"], kind="stable")])
+        return _changed(rows, tuple(self.problem.fabric.nodes), present, self._real.release_ns)
+
+
+def _changed(rows: Rows, nodes: Sequence[str], present: Present, release_ns: Ints) -> Rows:
+    """Return changes of nodes with the foreign threads and the outages of a present."""
+    others = [i for i, name in enumerate(nodes) if name in present.threads or name in present.down]
+    pieces = [rows[~np.isin(rows["node"], others)]]
+    for i in others:
+        threads = present.threads.get(nodes[i], 0.0)
+        pieces.append(with_threads(rows[rows["node"] == i], threads, release_ns))
+        if nodes[i] in present.down:
+            pieces[-1]["is_down"] = 1
+    changes = np.concatenate(pieces)
+    return np.ascontiguousarray(changes[np.argsort(changes["at_ns"], kind="stable")])
+
+
+def _lost(present: Present) -> dict[str, float]:
+    """Share of the messages that each link loses of which a present knows something."""
+    lost: dict[str, list[float]] = {}
+    for part, values in present.demands.items():
+        if isinstance(part, Message):
+            lost.setdefault(part.link, []).append(float(np.isinf(values).mean()))
+    return {link: sum(shares) / len(shares) for link, shares in lost.items()}
 
 
 def with_threads(rows: Rows, threads: float, release_ns: Ints) -> Rows:
@@ -500,7 +506,6 @@ def realised(problem: Problem, real: Realisation, present: Present) -> Realisati
     places = np.arange(real.cycles)
     segments = LinkSegments.of(real.link_segments)
     state, rates = segments.table.copy(), segments.table_f.copy()
-    lost: dict[str, list[float]] = {}
     for part, values in present.demands.items():
         known: tuple[tuple[str, ...], ...] = real.sites
         times, stretched = exec_ns, 1.0
@@ -508,46 +513,29 @@ def realised(problem: Problem, real: Realisation, present: Present) -> Realisati
             stretched = _stretched(problem, part)
         else:
             known, times = real.hops, delay_ns
-            lost.setdefault(part.link, []).append(float(np.isinf(values).mean()))
             extra_ns[[real.hops[hop] == part for hop, _ in real.layers]] = 0
         demands = _drawn(values, stretched, places)
         if part in known and demands is not None:
             times[known.index(part)] = demands
-    for name, shares in lost.items():
-        share, mine = sum(shares) / len(shares), state[:, 1] == segments.links.index(name)
+    for name, share in _lost(present).items():
+        mine = state[:, 1] == segments.links.index(name)
         if problem.fabric.links[name].retransmit_ms is None:
             rates[mine, 1] = share
         else:
             rates[mine, 1] = 0.0
             state[mine, 2] = share >= 0.5
+    begins = [NodeChange(0, name, 0, False) for name in problem.fabric.nodes]
+    changes = NodeChanges.of([*begins, *real.node_changes])
+    rows = changes.table.view(row_types()["changes"]).reshape(len(changes))
+    rows = _changed(rows, changes.nodes, present, real.release_ns)
     return replace(
         real,
         exec_ns=exec_ns,
         delay_ns=delay_ns,
         extra_ns=extra_ns,
-        node_changes=_changed(problem, real, present),
+        node_changes=NodeChanges(changes.nodes, rows.view(np.int64).reshape(len(rows), 4)),
         link_segments=LinkSegments(segments.links, state, rates),
     )
-
-
-def _changed(problem: Problem, real: Realisation, present: Present) -> NodeChanges:
-    """Return the changes of nodes with the foreign threads and the outages of a present."""
-    names = tuple(problem.fabric.nodes)
-    begins = [NodeChange(0, name, 0, False) for name in names]
-    changes = NodeChanges.of([*begins, *real.node_changes])
-    kind = row_types()["changes"]
-    rows = np.ascontiguousarray(changes.table).view(kind).reshape(len(changes))
-    pieces = []
-    for number, name in enumerate(changes.nodes):
-        mine = with_threads(
-            rows[rows["node"] == number], present.threads.get(name, 0.0), real.release_ns
-        )
-        if name in present.down:
-            mine["is_down"] = 1
-        pieces.append(mine)
-    every = np.concatenate(pieces)
-    every = every[np.argsort(every["at_ns"], kind="stable")]
-    return NodeChanges(changes.nodes, every.view(np.int64).reshape(len(every), 4))
 
 
 def declared_of(problem: Problem, seed: int = SEED, shadow_fraction: float = 0.0) -> Declared:
