@@ -23,6 +23,7 @@ import dwell
 from benchmarks.canonical import CELL
 from dwell.control.coordination import Coordination, Verdict, Wish
 from dwell.control.ledger import FleetLedger, PricedCell, Seat
+from dwell.cost import cost_error, price
 from dwell.estimators.load_table import load_table
 from dwell.model import NodeDisturbance, Problem
 from dwell.model.fleet import Fleet, FleetEntry
@@ -188,10 +189,7 @@ def compare_table(cells: int, seeds: Sequence[int], pool: ProcessPoolExecutor) -
     ]
     table = load_table(specs, ["E"])
     yield "| candidate | cells | J: table, run | V_D, %: table, run |\n|---|---|---|---|\n"
-    weights, targets = (
-        fleet.entries[0].cell.objective.weights,
-        fleet.entries[0].cell.objective.targets,
-    )
+    objective = fleet.entries[0].cell.objective
     for name in SPLITS:
         column = table.columns[0, name]
         for size in range(1, cells + 1, max(cells // 12, 1)):
@@ -199,12 +197,11 @@ def compare_table(cells: int, seeds: Sequence[int], pool: ProcessPoolExecutor) -
             seen = list(pool.map(partial(long_run, cells, name, size), seeds))
             run_l95_ms, run_rate = np.mean(seen, axis=0)
             j, run_j = (
-                weights.latency * one / targets.latency_ms + weights.violations * of
+                price(one, of, 0.0, 0.0, 0.0, 0.0, objective)
                 for one, of in ((l95_ms, rate), (run_l95_ms, run_rate))
             )
-            error = column.violation_error[size - 1]
-            j_error = weights.latency * column.l95_error_ms[size - 1] / targets.latency_ms
-            j_error += weights.violations * error
+            error_ms, error = column.l95_error_ms[size - 1], column.violation_error[size - 1]
+            j_error = cost_error((error_ms, error), objective)
             yield (
                 f"| {name} | {size} | {j:.3f} ± {j_error:.3f}, {run_j:.3f} "
                 f"({100 * (j / run_j - 1):+.1f} %) | {100 * rate:.2f} ± {100 * error:.2f}, "

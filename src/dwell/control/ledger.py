@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.control.coordination import Coordination, Verdict, Wish
-from dwell.cost import excess, hamming
+from dwell.cost import excess, hamming, price
 from dwell.estimators.fleet_prices import CellTerms, FleetPrice, FleetPrices, PricedCell
 from dwell.estimators.load_table import LoadTable, load_table
 from dwell.estimators.presents import Present
@@ -295,9 +295,8 @@ class Loads:
         self._waits: dict[tuple[int, str], tuple[list[float], list[float]]] = {}
         for group, column in table.columns.items():
             objective = table.cells[group[0]].problem.objective
-            weights = objective.weights
-            j = weights.latency * column.l95_ms / objective.targets.latency_ms
-            j = j + weights.violations * column.violation_rate
+            l95_ms, rate, nothing = column.l95_ms, column.violation_rate, np.zeros(1)
+            j = price(l95_ms, rate, nothing, nothing, 0.0, 0.0, objective)
             self._waits[group] = column.level.tolist(), (j - j[0]).tolist()
         terms = [CellTerms(cell.problem, table.shared).of_one() for cell in table.cells]
         #: What a busy core, or place, of each shared resource costs the fleet.

@@ -279,25 +279,22 @@ class CellTerms:
     def __init__(self, problem: Problem, shared: Sequence[str]) -> None:
         self.resources = tuple(problem.fabric.resources)
         self._objective = objective = problem.objective
-        weights, targets = objective.weights, objective.targets
-        nodes = tier_nodes(objective)
-        factors = {
-            "robot": weights.robot / targets.robot,
-            "edge": weights.edge / targets.edge,
-            "cloud": (weights.cloud or 0.0) / (targets.cloud or 1.0),
-        }
+        # J is linear in U_r, U_e and U_c.
+        factors: list[float] = [
+            price(0.0, 0.0, robot, edge, cloud, 0.0, objective)
+            for robot, edge, cloud in np.eye(3).tolist()
+        ]
         self._capacity = {name: one.capacity for name, one in problem.fabric.resources.items()}
         node_of = {name: one.node for name, one in problem.fabric.resources.items()}
         self.of_shared = {name for name, node in node_of.items() if node in shared}
         self._own, self._shared = [], []
-        for tier in ("robot", "edge", "cloud"):
-            names = getattr(nodes, tier)
+        for factor, names in zip(factors, tier_nodes(objective), strict=True):
             self._own.append([name for name in names if name not in self.of_shared])
             # Of a shared node, its accelerators with it, the fullest counts.
             for node in shared:
                 here = [name for name in names if node_of[name] == node]
                 if here:
-                    self._shared.append((factors[tier], here))
+                    self._shared.append((factor, here))
 
     def cost(self, qos: QoS) -> float:
         """J without switching and shared nodes."""
