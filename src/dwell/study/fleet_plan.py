@@ -27,8 +27,8 @@ Floats: TypeAlias = NDArray[np.float64]
 
 #: Levels of the load of a shared resource: of the only one, of each of several.
 LEVELS, LEVELS_OF_SEVERAL = 400, 40
-#: Cycles of a cell that a plan is played for.
-CYCLES = 3_000
+#: Cycles that a plan is played for, of all cells together, and most of a cell.
+CYCLES, MOST = 1_000_000, 15_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +132,8 @@ def plan_fleet(
         for cell in cells
     ]
     best = best_placements(loads, alone)
-    played = FleetPrices(cells, fleet.shared, CYCLES * len(cells)).price(tuple(best))
+    cycles = min(CYCLES, MOST * len(cells))
+    played = FleetPrices(cells, fleet.shared, cycles).price(tuple(best))
     names = [cell.name for cell in cells]
     phi = sum(loads.costs(best, alone)) / len(cells)
     return FleetPlan(dict(zip(names, best, strict=True)), phi, played)
