@@ -104,7 +104,7 @@ class _FleetPage:
         most = max(row["moves"] for row in self.cells)
         yield Fact("moves", write_number(numbers["moves"], 0), f"at most {most} of a cell")
         if self.run.guard:
-            yield Fact("of guards", write_number(numbers["guard_moves"], 0))
+            yield Fact("moves of guards", write_number(numbers["guard_moves"], 0))
         for name, load in numbers["load"].items():
             yield Fact(f"U of {name}", percent(load["mean"]), f"at most {percent(load['most'])}")
 
@@ -274,6 +274,7 @@ class _FleetPage:
 
     def _about(self) -> Definitions:
         fleet = self.run.fleet
+        asks_a_ledger = fleet.coordination == "ledger"
         metas = [run.meta for run in self.run.cells.values()]
         entries = {
             "cells": ", ".join(
@@ -281,7 +282,8 @@ class _FleetPage:
             ),
             "shared": ", ".join(fleet.shared) or "nothing",
             "phases": PHASES.get(self._phases, "as listed"),
-            "coordination": f"{fleet.coordination}, objective {fleet.objective}",
+            "coordination": fleet.coordination
+            + (f", objective {fleet.objective}" if asks_a_ledger else ""),
             "policy": ", ".join(dict.fromkeys(str(meta.get("policy")) for meta in metas)),
             "estimator": ", ".join(dict.fromkeys(str(meta.get("estimator")) for meta in metas)),
             "deadline": ", ".join(
