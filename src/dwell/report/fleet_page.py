@@ -63,7 +63,7 @@ class _FleetPage:
         if not self.cells:
             raise SimulationError("no window is left after the warm-up; ask for more windows")
         self.names = [str(row["cell"]) for row in self.cells]
-        self.problems = {cell.name: cell.problem for cell in run.fleet.cells}
+        self.problems = run.fleet.problems
         candidates = dict.fromkeys(
             name for problem in self.problems.values() for name in problem.candidates
         )

@@ -164,56 +164,48 @@ def fleet_timeline(
     """
     import polars as pl
 
-    first = next(iter(run.cells.values()))
-    pipeline, cycles = first.problem.pipeline, first.problem.window_cycles
-    step_s = cycles * pipeline.period_ms / 1e3
+    problems = run.fleet.problems
+    length_s = {
+        name: one.window_cycles * one.pipeline.period_ms / 1e3 for name, one in problems.items()
+    }
+    first, *_ = run.cells
+    step_s = length_s[first]
     count = max(run.cells[name].windows.height for name in cells)
     each = 1 if count <= MOST_MARKS else math.ceil(count / MOST_BINS)
     placed, rates, moves = [], [], []
     for name in cells:
-        windows, problem = run.cells[name].windows, run.cells[name].problem
-        begin_s = begins_by_number(windows, problem.pipeline.period_ms)
-        length_s = problem.window_cycles * problem.pipeline.period_ms / 1e3
+        windows = run.cells[name].windows
+        begin_s = begins_by_number(windows, problems[name].pipeline.period_ms)
         frame = pl.DataFrame(
             {
                 "cell": [name] * windows.height,
                 "placement": windows["placement"].cast(pl.String),
                 "begin": begin_s,
-                "end": np.append(begin_s[1:], begin_s[-1:] + length_s),
+                "end": np.append(begin_s[1:], begin_s[-1:] + length_s[name]),
                 "v_d": windows["violation_rate"] * 100,
             }
         )
-        stays = frame.group_by(pl.col("placement").rle_id().alias("stay"), maintain_order=True)
-        placed.append(
-            stays.agg(
-                pl.col("cell", "placement", "begin").first(),
-                pl.col("end").last(),
-                pl.col("v_d").mean(),
-            )
-        )
+        placed.append(_stays(frame))
         # A window that follows a move begins a little later than others do.
         bins = ((pl.col("begin") / step_s).round() // each).alias("bin")
         rates.append(frame.group_by(bins).agg(pl.col("cell").first(), pl.col("v_d").mean()))
-        moved = _moves(windows, run.cells[name].decisions, begin_s, length_s)
+        moved = _moves(windows, run.cells[name].decisions, begin_s, length_s[name])
         moves.append(moved.with_columns(move=pl.format("{}: {}", pl.lit(name), "move")))
-    rate = pl.col("v_d")
-    spread = {"min": rate.min(), "mean": rate.mean(), "max": rate.max()}
-    by_bin = pl.concat(rates).sort("v_d", descending=True).group_by("bin", maintain_order=True)
     resources = [name[2:] for name in run.load.columns if name.startswith("u_")]
     load_s = (run.load["start_ns"] / 1e9 + step_s / 2).to_numpy()
     frames = {
-        "placed": pl.concat(placed).drop("stay"),
-        "rates": by_bin.agg(worst=pl.col("cell").first(), **spread)
-        .with_columns(time=(pl.col("bin") + 0.5) * each * step_s)
+        "placed": pl.concat(placed),
         # As long as all cells are there.
-        .filter(pl.col("time") < min(stay["end"][-1] for stay in placed))
-        .sort("bin"),
+        "rates": _spread(pl.concat(rates), each * step_s).filter(
+            pl.col("time") < min(stay["end"][-1] for stay in placed)
+        ),
         "nodes": _used(run.load, load_s, resources, each),
         "moves": pl.concat(moves),
     }
     end_s = float(str(frames["placed"]["end"].max()))
-    begin_s = begins_by_number(first.windows, pipeline.period_ms)
-    frames["spans"] = _spans(first.windows, disturbed, begin_s, step_s, end_s)
+    windows = run.cells[first].windows
+    begin_s = begins_by_number(windows, problems[first].pipeline.period_ms)
+    frames["spans"] = _spans(windows, disturbed, begin_s, step_s, end_s)
     panels: list[tuple[float, list[Spec]]] = [
         (rows_px(len(cells)), [_placed(cells, palette)]),
         (PANEL_PX, [*limit_rule("y", 100 * AIM, "5 %"), *_rates()]),
@@ -252,6 +244,26 @@ def _binned(frame: pl.DataFrame, each: int, by: Sequence[str] = ()) -> pl.DataFr
     ]
     bins = frame.with_columns(bin=(pl.col("window").rank("dense") - 1) // each)
     return bins.group_by("bin", *by, maintain_order=True).agg(*firsts, *quantiles).drop("bin")
+
+
+def _stays(frame: pl.DataFrame) -> pl.DataFrame:
+    """Return the stays of a cell at its placements, of a row a window."""
+    import polars as pl
+
+    stays = frame.group_by(pl.col("placement").rle_id().alias("stay"), maintain_order=True)
+    first = pl.col("cell", "placement", "begin").first()
+    return stays.agg(first, pl.col("end").last(), pl.col("v_d").mean()).drop("stay")
+
+
+def _spread(rates: pl.DataFrame, step_s: float) -> pl.DataFrame:
+    """Return mean and ends of V_D over cells, of a row a cell and stretch of time."""
+    import polars as pl
+
+    rate = pl.col("v_d")
+    spread = {"min": rate.min(), "mean": rate.mean(), "max": rate.max()}
+    by_bin = rates.sort("v_d", descending=True).group_by("bin", maintain_order=True)
+    found = by_bin.agg(worst=pl.col("cell").first(), **spread)
+    return found.with_columns(time=(pl.col("bin") + 0.5) * step_s).sort("bin")
 
 
 def resources_in(windows: pl.DataFrame, problem: Problem) -> tuple[str, ...]:

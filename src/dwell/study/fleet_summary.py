@@ -40,7 +40,7 @@ def summarise_fleet(run: FleetRun, judged: Fleet, labels: Mapping[str, str | int
     SimulationError
         If a run has no window after its warm-up.
     """
-    problems = {cell.name: cell.problem for cell in judged.cells}
+    problems = judged.problems
     found = {name: summarise(one, problems[name], labels) for name, one in run.cells.items()}
     rates = {name: float(one.row["violation_rate"]) for name, one in found.items()}
     worst = max(rates, key=lambda name: rates[name])
