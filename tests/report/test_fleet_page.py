@@ -16,6 +16,7 @@ from dwell.report.figure import printed_svg
 from dwell.report.figure_files import figure_files
 from dwell.report.fleet_page import fleet_page
 from dwell.report.page import Definitions, page_html
+from dwell.report.palette import Palette
 from dwell.report.timeline import MOST_BINS, MOST_MARKS
 from dwell.study.fleet_summary import refusals
 from tests.cells.fleets import fleet_of, one_job, within
@@ -134,7 +135,6 @@ def test_it_is_a_whole_page_that_links_to_those_of_cells(run: FleetRun) -> None:
     alone = Page(page_html(fleet_page(run), static=True))
     assert not alone.outside
     assert "script" not in alone.tags
-    assert fleet_page(run, sections=1).sections[0].blocks
 
 
 def test_its_figures_and_tables_are_files_too(run: FleetRun) -> None:
@@ -174,3 +174,13 @@ def test_without_a_window_after_the_warm_up_there_is_no_page() -> None:
     run = dwell.simulate_fleet(fleet_of((cell, 2)), seed=1, windows=5, policy="OFF")
     with pytest.raises(SimulationError, match="no window is left after the warm-up"):
         fleet_page(run)
+
+
+def test_a_placement_has_its_colour_whoever_else_is_used() -> None:
+    cell = one_job()
+    cell = replace(cell, candidates={**cell.candidates, "ELSEWHERE": cell.candidates["LOC"]})
+    fleet = fleet_of((replace(cell, candidates=dict(reversed(cell.candidates.items()))), 2))
+    page = fleet_page(dwell.simulate_fleet(fleet, seed=1, windows=12, policy="LOC"))
+    colour = Palette.of(fleet.entries[0].cell.candidates).placements["LOC"]
+    scale = figure_of(page, "time").spec()["vconcat"][1]["layer"][1]["encoding"]["color"]["scale"]
+    assert scale == {"domain": ["LOC"], "range": [colour]}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from dwell.errors import SimulationError
@@ -35,10 +34,8 @@ UNFOLDED = 24
 STAYS = "no move"
 
 
-def fleet_page(
-    run: FleetRun, *, links: Mapping[str, str] | None = None, sections: int | None = None
-) -> Page:
-    """Return what there is to show of a fleet's run; its first `sections` only.
+def fleet_page(run: FleetRun, *, links: Mapping[str, str] | None = None) -> Page:
+    """Return what there is to show of a fleet's run.
 
     Parameters
     ----------
@@ -50,14 +47,14 @@ def fleet_page(
     SimulationError
         If no window is after the warm-up.
     """
-    return _FleetPage(run, links or {}, sections).page()
+    return _FleetPage(run, links or {}).page()
 
 
 class _FleetPage:
     """Parts of a fleet's page, made from its runs."""
 
-    def __init__(self, run: FleetRun, links: Mapping[str, str], sections: int | None) -> None:
-        self.run, self.links, self.most = run, links, sections
+    def __init__(self, run: FleetRun, links: Mapping[str, str]) -> None:
+        self.run, self.links = run, links
         self.numbers = fleet_numbers(run)
         self.cells: list[dict[str, Any]] = self.numbers["cells"]
         if not self.cells:
@@ -69,7 +66,8 @@ class _FleetPage:
         )
         used = set(run.windows["placement"].cast(str))
         self.palette = Palette.of(candidates)
-        self.used = [name for name in candidates if name in used]
+        #: Colours of the candidates that any cell was on.
+        self.used = {name: hue for name, hue in self.palette.placements.items() if name in used}
 
     def page(self) -> Page:
         fleet = self.run.fleet
@@ -87,7 +85,7 @@ class _FleetPage:
                 )
             ),
             facts=list(self._facts()),
-            sections=list(islice(self._sections(), self.most)),
+            sections=list(self._sections()),
         )
 
     @property
@@ -125,7 +123,7 @@ class _FleetPage:
             self.run,
             self.names,
             slug="time",
-            palette=Palette.of(self.used),
+            colours=self.used,
             disturbed=self._disturbed(),
             caption=(
                 "A row is a cell, the worst first, in the colour of where it is. V_D: mean over "
@@ -220,9 +218,8 @@ class _FleetPage:
                 **{"from": pl.col("incumbent").cast(str)},
             )
         )  # fmt: skip
-        colours = {name: self.palette.placements[name] for name in self.used} | {STAYS: MUTED}
         seen = set(asked["to"])
-        colours = {name: colour for name, colour in colours.items() if name in seen}
+        colours = {to: hue for to, hue in {**self.used, STAYS: MUTED}.items() if to in seen}
         columns: Columns = [
             Text("round", "round"),
             Measure("at", "at", "s"),

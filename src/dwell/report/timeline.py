@@ -151,7 +151,7 @@ def fleet_timeline(
     cells: Sequence[str],
     *,
     slug: str,
-    palette: Palette,
+    colours: Mapping[str, str],
     disturbed: Iterable[Disturbed],
     caption: str,
 ) -> Figure:
@@ -161,6 +161,8 @@ def fleet_timeline(
     ----------
     cells : sequence of str
         In the order of the rows.
+    colours : mapping of str to str
+        Of the candidates that any cell was on.
     """
     import polars as pl
 
@@ -207,7 +209,7 @@ def fleet_timeline(
     begin_s = begins_by_number(windows, problems[first].pipeline.period_ms)
     frames["spans"] = _spans(windows, disturbed, begin_s, step_s, end_s)
     panels: list[tuple[float, list[Spec]]] = [
-        (rows_px(len(cells)), [_placed(cells, palette)]),
+        (rows_px(len(cells)), [_placed(cells, colours)]),
         (PANEL_PX, [*limit_rule("y", 100 * AIM, "5 %"), *_rates()]),
     ]
     if resources:
@@ -491,13 +493,13 @@ def _marks(
     return [*bars, *marks]
 
 
-def _placed(cells: Sequence[str], palette: Palette) -> Spec:
+def _placed(cells: Sequence[str], colours: Mapping[str, str]) -> Spec:
     """Return the stays of cells at their placements, a row a cell."""
     encoding = {
         "x": {"field": "begin"},
         "x2": {"field": "end"},
         "y": name_of("cell", sort=list(cells), axis={"labelOverlap": True}),
-        "color": coloured("placement", palette.placements, legend={"symbolType": "square"}),
+        "color": coloured("placement", colours, legend={"symbolType": "square"}),
         "tooltip": [
             *names("cell", "placement"),
             quantity("begin", "from (s)", format=".1f"),
