@@ -178,8 +178,8 @@ def test_without_a_window_after_the_warm_up_there_is_no_page() -> None:
 
 def test_a_placement_has_its_colour_whoever_else_is_used() -> None:
     cell = one_job()
-    cell = replace(cell, candidates={**cell.candidates, "ELSEWHERE": cell.candidates["LOC"]})
-    fleet = fleet_of((replace(cell, candidates=dict(reversed(cell.candidates.items()))), 2))
+    first = {"ELSEWHERE": cell.candidates["OFF"]}
+    fleet = fleet_of((replace(cell, candidates={**first, **cell.candidates}), 2))
     page = fleet_page(dwell.simulate_fleet(fleet, seed=1, windows=12, policy="LOC"))
     colour = Palette.of(fleet.entries[0].cell.candidates).placements["LOC"]
     scale = figure_of(page, "time").spec()["vconcat"][1]["layer"][1]["encoding"]["color"]["scale"]
