@@ -27,9 +27,9 @@ from dwell.cost import cost_error, price
 from dwell.estimators.load_table import load_table
 from dwell.model import NodeDisturbance, Problem
 from dwell.model.fleet import Fleet, FleetEntry
+from dwell.model.progress import Progress
 from dwell.record.fleet_run import FleetRun
 from dwell.sim import fleet as fleets
-from dwell.sim.engine import Progress
 from dwell.sim.fleet import phased, simulate_fleet
 from dwell.study.fleet_plan import best_placements
 from dwell.study.intervals import mean_interval

@@ -12,6 +12,7 @@ import pytest
 from mcap.reader import make_reader
 
 import dwell
+from tests.cells.fleets import fleet_of, one_job
 from tests.cells.small import make_problem
 from tests.cli.small_cell import assert_refused, call, read_json
 
@@ -120,3 +121,43 @@ def test_a_disk_that_is_full_leaves_no_half_mcap_file(cell: Path) -> None:
 def test_a_study_is_no_run_of_which_there_is_an_mcap_file() -> None:
     study = OLD_RUNS / "study"
     assert_refused(call("report", study, "--mcap", "x.mcap"), "is a study; name one of its runs")
+
+
+def fleet_in(folder: Path) -> Path:
+    """Save the runs of two cells that share an edge."""
+    return dwell.simulate_fleet(fleet_of((one_job(), 2)), windows=12, policy="OFF").save(folder)
+
+
+def test_a_fleet_has_a_page_that_leads_to_those_of_its_cells(tmp_path: Path) -> None:
+    folder = fleet_in(tmp_path / "hall")
+    page = folder / "report.html"
+    result = call("report", folder, "--static")
+    assert (result.exit_code, result.stdout) == (0, f"report: {page}\n")
+    assert "one-01/report.html" not in page.read_text()
+    found = read_json(call("report", folder, "--cells", "--static", "--json"))
+    names = ("one-01", "one-02")
+    assert found == {
+        "report": str(page),
+        "cells": {name: str(folder / name / "report.html") for name in names},
+    }
+    assert all((folder / name / "report.html").is_file() for name in names)
+    assert '<a href="one-01/report.html">' in page.read_text()
+    call("report", folder, "--out", tmp_path / "new/page.html", "--static")
+    assert '<a href="../hall/one-01/report.html">' in (tmp_path / "new/page.html").read_text()
+
+
+def test_what_a_fleet_has_none_of_is_refused(tmp_path: Path) -> None:
+    folder = fleet_in(tmp_path / "hall")
+    for option, what in (("--trace", "a trace"), ("--mcap", "an MCAP file")):
+        refused = call("report", folder, option, "x")
+        assert_refused(refused, f"hall is a fleet; name one of its runs for {what}")
+    refused = call("report", folder / "one-01", "--cells")
+    assert_refused(refused, "is a run, which has no cells; leave out --cells")
+
+
+def test_an_interrupted_fleet_says_how_many_runs_are_whole(tmp_path: Path) -> None:
+    folder = fleet_in(tmp_path / "hall")
+    (folder / "fleet.json").rename(folder / ".fleet.json.unfinished")
+    (folder / "one-02/run.json").unlink()
+    assert_refused(call("report", folder), "1 of 2 runs are whole")
+    assert not (folder / "report.html").exists()

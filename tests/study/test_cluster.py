@@ -9,9 +9,10 @@ from typing import Any
 
 import polars as pl
 import pytest
+from polars.testing import assert_frame_equal
 
 from dwell.errors import SimulationError
-from dwell.study import load_study, run_study
+from dwell.study import Study, StudyResult, load_study, run_study
 from dwell.study.cluster import spread_on_dask
 from tests.cli.small_cell import SMALL
 from tests.study.test_study import make_study
@@ -33,22 +34,46 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         yield cluster
 
 
-def test_a_cluster_ends_with_the_same_bytes(cluster: Any, tmp_path: Path) -> None:
-    study = make_study(references=True)
-    run_study(study, folder=tmp_path / "local", processes=1)
-    out = tmp_path / "cluster"
+def stop(done: int, _: int) -> None:
+    if done >= 4:
+        raise KeyboardInterrupt
 
-    def stop(done: int, _: int) -> None:
-        if done >= 4:
-            raise KeyboardInterrupt
 
+def stopped_and_resumed(study: Study, cluster: Any, out: Path) -> StudyResult:
+    """Do two items of a study on a cluster, and the others in a second attempt."""
     with pytest.raises(KeyboardInterrupt):
         run_study(study, folder=out, dask=cluster.scheduler_address, progress=stop)
     known = parts_in(out)
     assert len(known) == 2
-    run_study(study, folder=out, dask=cluster.scheduler_address)
+    result = run_study(study, folder=out, dask=cluster.scheduler_address)
     assert parts_in(out).items() >= known.items(), "a finished item was repeated"
-    assert_same_files(out, tmp_path / "local")
+    return result
+
+
+def test_a_cluster_ends_with_the_same_bytes(cluster: Any, tmp_path: Path) -> None:
+    study = make_study(references=True)
+    run_study(study, folder=tmp_path / "local", processes=1)
+    stopped_and_resumed(study, cluster, tmp_path / "cluster")
+    assert_same_files(tmp_path / "cluster", tmp_path / "local")
+
+
+def test_fleets_on_a_cluster_end_with_the_same_bytes(cluster: Any, tmp_path: Path) -> None:
+    (tmp_path / "small.yaml").write_text(SMALL)
+    (tmp_path / "pair.yaml").write_text(
+        "dwell-fleet: 1\nname: pair\nshared: [E]\ncells:\n"
+        "  - {cell: small.yaml, count: 2, scenario: stress}\n"
+    )
+    (tmp_path / "study.yaml").write_text(
+        "dwell-study: 1\nname: fleets\nfleet: pair.yaml\nscenarios: [stress]\nwindows: 8\n"
+        "seeds: 2\npolicies: {edge: OFF, dtp: dtp+profile}\n"
+        "parameters: {fleet.count: [1, 3], fleet.coordination: [none, ledger]}\n"
+    )
+    study = load_study(tmp_path / "study.yaml")
+    local = run_study(study, folder=tmp_path / "local", processes=2)
+    found = stopped_and_resumed(study, cluster, tmp_path / "cluster")
+    assert_same_files(tmp_path / "cluster", tmp_path / "local")
+    assert_frame_equal(found.runs, local.runs)
+    assert found.runs["cells"].to_list() == [1] * 8 + [3] * 8
 
 
 def test_workers_make_policies_and_estimators_of_the_users_own(

@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike, fspath
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.overrides import OpenCell, Override, check_apart, open_cell
@@ -37,6 +37,9 @@ SEEDS = tuple(range(1, 21))
 MAX_POINTS = 10_000
 
 Value: TypeAlias = float | int | str
+#: Values of parameters by their paths, and the paths that vary together.
+Grid: TypeAlias = "Mapping[str, list[Any]]"
+Axes: TypeAlias = "Sequence[tuple[str, ...]]"
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +109,15 @@ def read_study(path: str | PathLike[str], *, references: Collection[str] = ()) -
     return study
 
 
+class _Plays(NamedTuple):
+    """What a study plays, and cells whose windows are to be enough."""
+
+    points: tuple[DeclaredPoint, ...]
+    scenarios: tuple[str, ...]
+    policies: list[DeclaredPolicy]
+    cells: Sequence[Problem]
+
+
 @dataclass(frozen=True, slots=True)
 class _Reading:
     """One study file on its way from its entry to what it declares."""
@@ -123,7 +135,24 @@ class _Reading:
         grid = self._grid()
         axes = self._axes(grid)
         labels = self._labels()
-        policies = self._policies()
+        plays = self._plays(grid, axes, self._policies())
+        if plays is None:
+            return None
+        windows = WINDOWS if entry.windows is None else entry.windows
+        self._check_windows(windows, plays.cells)
+        return DeclaredStudy(
+            name=name,
+            points=plays.points,
+            labels=labels,
+            scenarios=plays.scenarios,
+            policies=tuple(plays.policies),
+            seeds=SEEDS if entry.seeds is None else entry.seeds,
+            windows=windows,
+            references=bool(entry.references),
+        )
+
+    def _plays(self, grid: Grid, axes: Axes, policies: list[DeclaredPolicy]) -> _Plays | None:
+        """Return what is played of the cell, or None where it cannot be read."""
         cell = self._cell()
         if cell is None:
             return None
@@ -134,30 +163,21 @@ class _Reading:
         for policy in policies:
             self._check_names(policy, cell.problem)
             self._check_settings(policy, [cell for _, cell in points] or [cell])
-        windows = WINDOWS if entry.windows is None else entry.windows
-        self._check_windows(windows, points)
-        return DeclaredStudy(
-            name=name,
-            points=tuple(DeclaredPoint(values, cell.problem) for values, cell in points),
-            labels=labels,
-            scenarios=scenarios,
-            policies=tuple(policies),
-            seeds=SEEDS if entry.seeds is None else entry.seeds,
-            windows=windows,
-            references=bool(entry.references),
-        )
+        cells = [cell.problem for _, cell in points]
+        made = tuple(DeclaredPoint(values, cell.problem) for values, cell in points)
+        return _Plays(made, scenarios, policies, cells)
 
     def _check_name(self, path: str, name: str) -> None:
         if message := bad_name(name):
             self.faults.add(path, message)
 
-    def _check_windows(self, windows: int, points: Sequence[tuple[object, OpenCell]]) -> None:
-        warmup = max((cell.problem.warmup_windows for _, cell in points), default=0)
+    def _check_windows(self, windows: int, cells: Sequence[Problem]) -> None:
+        warmup = max((cell.warmup_windows for cell in cells), default=0)
         if windows <= warmup:
             bound = f"more than the {warmup} windows of warm-up"
             self.faults.add("windows", f"{windows} is not allowed; it must be {bound}")
-        for _, cell in points:
-            self.faults.attempt("", cell.problem.cycles_of, windows)
+        for cell in cells:
+            self.faults.attempt("", cell.cycles_of, windows)
 
     # ------------------------------------------------------------------------------ cell
 
@@ -274,7 +294,7 @@ class _Reading:
         return labels
 
     def _points(
-        self, cell: OpenCell, grid: Mapping[str, list[Any]], axes: Sequence[tuple[str, ...]]
+        self, cell: OpenCell, grid: Grid, axes: Axes
     ) -> list[tuple[dict[str, Value], OpenCell]]:
         """Return every combination of the values of axes, and the cell with them."""
         steps = {path: self._steps("parameters", path, cell) for path in grid}
@@ -406,20 +426,13 @@ class _FleetReading(_Reading):
 
     __slots__ = ()
 
-    def study(self) -> DeclaredStudy | None:
-        """Return the study, or None beside at least one fault."""
-        entry = self.entry
-        name = entry.name or self.path.stem
-        self._check_name("name", name)
-        grid = self._grid()
-        axes = self._axes(grid)
-        labels = self._labels()
-        policies = self._policies()
+    def _plays(self, grid: Grid, axes: Axes, policies: list[DeclaredPolicy]) -> _Plays | None:
+        """Return what is played of the fleet, or None where it cannot be read."""
         fleet = self._fleet()
         if fleet is None:
             return None
         first = fleet.entries[0]
-        scenarios = tuple(entry.scenarios or (first.scenario,))
+        scenarios = tuple(self.entry.scenarios or (first.scenario,))
         for i, scenario in enumerate(scenarios):
             if scenario not in first.cell.scenarios:
                 hint = nearest(scenario, first.cell.scenarios)
@@ -427,25 +440,13 @@ class _FleetReading(_Reading):
                 self.faults.add(f"scenarios[{i}]", message)
         fleets = self._fleets(fleet, grid, axes)
         policies = [self._with_estimator(policy, first.cell) for policy in policies]
-        for cell in {one.cell.name: one.cell for one in fleet.entries}.values():
+        cells = [*{one.cell.name: one.cell for one in fleet.entries}.values()]
+        for cell in cells:
             for policy in policies:
                 self._check_names(policy, cell)
         self._check_policy_settings(policies, fleet)
-        windows = WINDOWS if entry.windows is None else entry.windows
-        warmup = max(one.cell.warmup_windows for one in fleet.entries)
-        if windows <= warmup:
-            bound = f"more than the {warmup} windows of warm-up"
-            self.faults.add("windows", f"{windows} is not allowed; it must be {bound}")
-        return DeclaredStudy(
-            name=name,
-            points=tuple(DeclaredPoint(values, first.cell, one) for values, one in fleets),
-            labels=labels,
-            scenarios=scenarios,
-            policies=tuple(policies),
-            seeds=SEEDS if entry.seeds is None else entry.seeds,
-            windows=windows,
-            references=False,
-        )
+        points = tuple(DeclaredPoint(values, first.cell, one) for values, one in fleets)
+        return _Plays(points, scenarios, policies, cells)
 
     def _fleet(self) -> Fleet | None:
         """Read the fleet as it is in its file."""
@@ -462,9 +463,7 @@ class _FleetReading(_Reading):
                 self.faults.add("fleet", line)
             return None
 
-    def _fleets(
-        self, fleet: Fleet, grid: Mapping[str, list[Any]], axes: Sequence[tuple[str, ...]]
-    ) -> list[tuple[dict[str, Value], Fleet]]:
+    def _fleets(self, fleet: Fleet, grid: Grid, axes: Axes) -> list[tuple[dict[str, Value], Fleet]]:
         """Return every combination of the values of axes, and the fleet with them."""
         for path, values in grid.items():
             place = f"parameters.{path}"

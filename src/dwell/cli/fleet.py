@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -105,6 +104,7 @@ def run(
     """Simulate the cells of a fleet together, save a run a cell, sum them up."""
     from dwell.record.fleet_run import describe_fleet, require_free_or_same
     from dwell.sim.fleet import phases_ms
+    from dwell.study.fleet_summary import fleet_numbers
 
     given = dwell.load_fleet(file)
     warn(file, warnings_of(given))
@@ -133,7 +133,7 @@ def run(
             err=True,
         )
         raise typer.Exit(ExitCode.INTERRUPTED) from None
-    summary = _summed_up(result)
+    summary = fleet_numbers(result)
     if as_json:
         print_json({**_head(result, windows), "run": folder, **summary})
     else:
@@ -293,73 +293,6 @@ def _head(result: FleetRun, windows: int) -> dict[str, Any]:
         "phases_ms": result.phases_ms,
         "guard": result.guard,
     }
-
-
-def _summed_up(result: FleetRun) -> dict[str, Any]:
-    """Return what a fleet comes to: its cells, the worst first, its shared nodes and its moves."""
-    import polars as pl
-
-    windows = result.windows.filter(~pl.col("warmup"))
-    means = windows.group_by("cell").agg(
-        pl.col("violation_rate", "seen_l95_ms", "cost").mean(),
-    )
-    moved = result.decisions.filter(pl.col("migrated"))
-    moves = dict(moved.group_by("cell").len().iter_rows())
-    by_guard = moved.filter(pl.col("reason") == "guard").height
-    cells = [
-        {
-            "cell": row["cell"],
-            "violation_rate": row["violation_rate"],
-            "l95_ms": _known(row["seen_l95_ms"]),
-            "cost": _known(row["cost"]),
-            "moves": moves.get(row["cell"], 0),
-        }
-        for row in means.sort("violation_rate", "cell", descending=[True, False]).to_dicts()
-    ]
-    load = {
-        name.removeprefix("u_"): {"mean": values.mean(), "most": values.max()}
-        for name, values in result.load.to_dict().items()
-        if name.startswith("u_") and len(values)
-    }
-    return {
-        "cells": cells,
-        "cost": _known(means["cost"].mean()),
-        "load": load,
-        "moves": moved.height,
-        "guard_moves": by_guard,
-        "refused": _refused(result),
-        "rounds": _rounds(result),
-    }
-
-
-def _refused(result: FleetRun) -> dict[str, int]:
-    """Return how many moves were refused, by who refused them: ``ledger``, ``cap``, ``chance``."""
-    if "refused" not in result.decisions.columns:
-        return {}
-    # ``SO: ledger: Φ would rise by 0.2``, ``SO: cap of canonical-07``
-    whys = result.decisions["refused"].drop_nulls().to_list()
-    return dict(Counter(why.partition(": ")[2].split()[0].rstrip(":") for why in whys))
-
-
-def _known(mean: object) -> float:
-    """Return a mean; NaN where the controller saw no window."""
-    return mean if isinstance(mean, float) else math.nan
-
-
-def _rounds(result: FleetRun) -> list[dict[str, Any]]:
-    """Return Φ before and after every round in which the ledger was asked."""
-    import polars as pl
-
-    decisions = result.decisions
-    if not {"round", "phi_before", "phi_after"} <= set(decisions.columns):
-        return []
-    asked = decisions.filter(pl.col("phi_before").is_not_null())
-    rounds = asked.group_by("round", maintain_order=True).agg(
-        pl.col("phi_before").first(),
-        pl.col("phi_after").last(),
-        pl.col("cell").filter(pl.col("migrated")).alias("moved"),
-    )
-    return rounds.sort("round").to_dicts()
 
 
 # --------------------------------------------------------------------------- on a terminal

@@ -6,7 +6,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,11 +17,10 @@ from dwell.files import Content, write_whole
 
 if TYPE_CHECKING:
     from dwell.errors import Fault
+    from dwell.model.progress import Progress
     from dwell.report.page import Page
 
 BLOCKS = "▁▂▃▄▅▆▇█"
-#: Takes how many are done, and of how many.
-Progress = Callable[[int, int], None]
 
 
 def aligned(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -1,29 +1,36 @@
-"""`dwell report`: a run, a study or a campaign as a page; figures as files; a run for viewers."""
+"""`dwell report`: runs, fleets, studies and campaigns as pages; figures; a run for viewers."""
 
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
+from urllib.parse import quote
 
 import typer
 
 import dwell
 from dwell.cli.options import Json
-from dwell.cli.output import print_json, working, write_file, write_report
+from dwell.cli.output import print_json, progress, working, write_file, write_report
 from dwell.errors import RunError
 
 if TYPE_CHECKING:
     from dwell.files import Content
     from dwell.record import Run
 
+#: A folder's own page.
+PAGE = "report.html"
+
 
 def report(
     folder: Annotated[
         Path,
-        typer.Argument(metavar="FOLDER", help="Of a saved run, of a study, or of a campaign."),
+        typer.Argument(
+            metavar="FOLDER", help="Of a saved run, of a fleet, of a study, or of a campaign."
+        ),
     ],
     out: Annotated[
         Path | None,
@@ -53,29 +60,43 @@ def report(
     static: Annotated[
         bool, typer.Option("--static", help="A page without scripts: nothing to hover or choose.")
     ] = False,
+    cells: Annotated[
+        bool, typer.Option("--cells", help="Of a fleet: also write the page of every cell.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
-    """Write the report of a run, a study or a campaign: one HTML file that needs nothing else."""
+    """Write the page of runs, fleets, studies, campaigns: one HTML file that needs nothing else."""
     from dwell.record.campaign_folder import is_campaign
+    from dwell.record.fleet_run import is_fleet
     from dwell.study.study_folder import is_study, open_study
 
-    page = out or folder / "report.html"
-    for kind, is_one in (("campaign", is_campaign), ("study", is_study)):
-        for what, wanted in (("a trace", trace), ("an MCAP file", mcap)):
-            if wanted is not None and is_one(folder):
-                raise RunError(f"{folder} is a {kind}; name one of its runs for {what}")
-    if is_campaign(folder):
+    page = out or folder / PAGE
+    kinds = {"campaign": is_campaign, "study": is_study, "fleet": is_fleet}
+    kind = next((kind for kind, is_one in kinds.items() if is_one(folder)), "run")
+    for what, wanted in (("a trace", trace), ("an MCAP file", mcap)):
+        if wanted is not None and kind != "run":
+            raise RunError(f"{folder} is a {kind}; name one of its runs for {what}")
+    if cells and kind != "fleet":
+        raise RunError(f"{folder} is a {kind}, which has no cells; leave out --cells")
+    if kind == "campaign":
         from dwell.cli.campaign import report_campaign
 
         report_campaign(folder, page, figures=figures, static=static, as_json=as_json)
         return
     extras: dict[str, Any] = {}
     files: dict[Path, Content] = {}
+    if cells:
+        extras["cells"] = _write_cells(folder, static=static)
     with working("writing the report"):
-        if is_study(folder):
+        if kind == "study":
             from dwell.report.study_page import study_page
 
             document = study_page(open_study(folder))
+        elif kind == "fleet":
+            from dwell.record import open_fleet
+            from dwell.report.fleet_page import fleet_page
+
+            document = fleet_page(open_fleet(folder), links=_links(folder, page))
         else:
             from dwell.report.run_page import run_page
 
@@ -108,6 +129,30 @@ def report(
         typer.echo(f"mcap: {mcap}")
     if figures is not None:
         typer.echo(f"figures: {figures}")
+    if cells:
+        typer.echo(f"of cells: {folder}/*/{PAGE}")
+
+
+def _write_cells(folder: Path, *, static: bool) -> dict[str, Path]:
+    """Write the page of every cell of a fleet beside its run; return them by the cells' names."""
+    from dwell.record import open_fleet
+    from dwell.report.run_page import run_page
+
+    pages: dict[str, Path] = {}
+    runs = open_fleet(folder).cells
+    with progress("writing the reports of cells") as shown:
+        for name, run in runs.items():
+            pages[name] = folder / name / PAGE
+            write_report(run_page(run), pages[name], figures=None, static=static)
+            if shown is not None:
+                shown(len(pages), len(runs))
+    return pages
+
+
+def _links(folder: Path, page: Path) -> dict[str, str]:
+    """Return where a page finds those of a fleet's cells that are there."""
+    known = folder.glob(f"*/{PAGE}")
+    return {one.parent.name: quote(os.path.relpath(one, page.parent)) for one in known}
 
 
 def _recovered(run: Run) -> dict[str, Any]:

@@ -19,13 +19,14 @@ from dwell.cli.options import (
     require_one_length,
     windows_of,
 )
-from dwell.cli.output import Progress, aligned, file_name, print_json, progress, warn, working
+from dwell.cli.output import aligned, file_name, print_json, progress, warn, working
 from dwell.errors import ExitCode
 from dwell.model.bounds import counted
 
 if TYPE_CHECKING:
     from dwell.errors import Fault
     from dwell.model import Problem
+    from dwell.model.progress import Progress
     from dwell.report.formatting import Measure
     from dwell.study import Study, StudyResult
 

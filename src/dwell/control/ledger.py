@@ -23,7 +23,7 @@ from __future__ import annotations
 import bisect
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -38,6 +38,7 @@ from dwell.estimators.prices import prices_of
 from dwell.estimators.protocol import CellEstimator
 from dwell.model import Caps, Decision, QoS
 from dwell.model.fleet import FleetObjective
+from dwell.model.progress import Progress
 
 __all__ = ["FleetLedger", "Loads", "PricedCell", "Seat"]
 
@@ -83,7 +84,7 @@ class FleetLedger:
         *,
         table: LoadTable | None = None,
         prices: FleetPrices | None = None,
-        progress: Callable[[int, int], None] | None = None,
+        progress: Progress | None = None,
     ) -> None:
         self.cells, self.shared, self.objective = tuple(cells), tuple(shared), objective
         problems = [cell.problem for cell in cells]

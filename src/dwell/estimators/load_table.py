@@ -10,7 +10,7 @@ would be worth a look; Φ itself is played (see `dwell.estimators.fleet_prices`)
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TypeAlias
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from dwell.estimators.fleet_prices import FleetPrices, PricedCell
 from dwell.estimators.prices import prices_of
 from dwell.model.problem import Problem
+from dwell.model.progress import Progress
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -80,7 +81,7 @@ class LoadTable:
         shared: Sequence[str],
         *,
         cycles: int | None = None,
-        progress: Callable[[int, int], None] | None = None,
+        progress: Progress | None = None,
     ) -> None:
         self.cells, self.shared = tuple(cells), tuple(shared)
         self.kinds = kinds_of(cells)
@@ -149,7 +150,7 @@ _known: dict[tuple[tuple[PricedCell, ...], tuple[str, ...]], LoadTable] = {}
 def load_table(
     cells: Sequence[PricedCell],
     shared: Sequence[str],
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> LoadTable:
     """Return the table of a fleet; what was asked before is not played again."""
     asked = tuple(cells), tuple(shared)
@@ -162,14 +163,9 @@ def load_table(
 
 def kinds_of(cells: Sequence[PricedCell]) -> tuple[int, ...]:
     """Return of every cell the first one of its kind: equal but for phase and name."""
-    firsts: dict[object, int] = {}
-    return tuple(firsts.setdefault(_kind(cell.problem), i) for i, cell in enumerate(cells))
-
-
-def _kind(problem: Problem) -> object:
-    pipeline = problem.pipeline
-    tasks, flows = tuple(pipeline.tasks.items()), pipeline.flows
-    return problem.name, pipeline.period_ms, pipeline.deadline_ms, tasks, flows, problem.candidates
+    firsts: dict[Problem, int] = {}
+    kinds = [cell.problem.at_phase(0.0) for cell in cells]
+    return tuple(firsts.setdefault(kind, i) for i, kind in enumerate(kinds))
 
 
 def _work(problem: Problem, shared: Sequence[str]) -> Mapping[str, tuple[str, float]]:

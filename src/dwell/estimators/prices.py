@@ -138,7 +138,7 @@ class Question:
     ) -> Question:
         """Ask for the prices of a problem (see `prices_of`), whose phase is nothing to it alone."""
         if problem.pipeline.phase_ms:
-            problem = replace(problem, pipeline=replace(problem.pipeline, phase_ms=0.0))
+            problem = problem.at_phase(0.0)
         return cls(
             pipeline=problem.pipeline,
             fabric=problem.fabric,

@@ -222,13 +222,18 @@ class CellArrays:
             )
         return self._tables
 
-    def logs(self) -> tuple[Rows, NDArray[np.int8]]:
-        """Every job's instants and outcome, shape (rows, cycles, tasks), where all are kept."""
+    def logs(self) -> tuple[Rows, NDArray[np.int8], Ints]:
+        """Every job's instants and outcome, and every message's arrival, where all are kept.
+
+        Shapes (rows, cycles, tasks) and (rows, cycles, flows); flows stand as `flow_rows` says, and
+        what did not arrive is -1.
+        """
         whole, part = self.whole.tables, self.part
-        own = slice(part.row, part.row + part.rows), slice(part.cycles), slice(part.tasks)
-        clock = whole.clock[0]
-        shape = -1, int(clock["n_cycles"]), int(clock["n_tasks"])
-        return whole.log.reshape(shape)[own], whole.log_outcome.reshape(shape)[own]
+        shape = len(whole.cells), int(whole.clock[0]["n_cycles"]), -1
+        own = slice(part.row, part.row + part.rows), slice(part.cycles)
+        tasks = *own, slice(part.tasks)
+        log, outcome = whole.log.reshape(shape), whole.log_outcome.reshape(shape)
+        return log[tasks], outcome[tasks], whole.log_arrived.reshape(shape)[own]
 
 
 def lay_out(

@@ -131,6 +131,11 @@ class Fleet:
                 cells.append(FleetCell(f"{entry.cell.name}-{copy:02}", copy, entry))
         return tuple(cells)
 
+    @property
+    def problems(self) -> dict[str, Problem]:
+        """What every cell is, by its name."""
+        return {cell.name: cell.problem for cell in self.cells}
+
     def changed(
         self,
         *,

@@ -214,6 +214,10 @@ class Problem(Displayed):
             self.servo,
         )
 
+    def at_phase(self, phase_ms: float) -> Problem:
+        """Return the problem with another offset of all its releases."""
+        return replace(self, pipeline=replace(self.pipeline, phase_ms=phase_ms))
+
     @property
     def initial(self) -> str:
         """Name of the candidate that a run starts with."""

@@ -208,12 +208,22 @@ def require_free_or_same(folder: Path, described: Mapping[str, Any]) -> None:
     """
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
-    file = next((folder / one for one in (FLEET, UNFINISHED) if (folder / one).is_file()), None)
+    file = _described_in(folder)
     if file is None:
         raise RunError(f"{folder} exists and is no fleet's; choose another folder")
     same = {"versions": None, "file": None}
     if {**_read(file), **same} != {**json.loads(json.dumps(described)), **same}:
         raise RunError(f"{folder} holds the runs of another fleet; choose another folder")
+
+
+def _described_in(folder: Path) -> Path | None:
+    """Return the file that says which fleet's folder it is; None where it is none."""
+    return next((folder / one for one in (FLEET, UNFINISHED) if (folder / one).is_file()), None)
+
+
+def is_fleet(path: str | os.PathLike[str]) -> bool:
+    """Whether a folder has a fleet's runs in it, all of them or some."""
+    return _described_in(Path(path)) is not None
 
 
 def open_fleet(path: str | os.PathLike[str]) -> FleetRun:
@@ -227,9 +237,8 @@ def open_fleet(path: str | os.PathLike[str]) -> FleetRun:
     folder = Path(path)
     if not folder.is_dir():
         raise RunError(f"{folder}: no such folder")
-    finished = (folder / FLEET).is_file()
-    file = folder / (FLEET if finished else UNFINISHED)
-    if not file.is_file():
+    file = _described_in(folder)
+    if file is None:
         raise RunError(f"{folder}: no fleet's folder (it has no {FLEET})")
     described = _read(file)
     version = described.get("schema_version")
@@ -249,7 +258,7 @@ def open_fleet(path: str | os.PathLike[str]) -> FleetRun:
             runs[name] = open_run(folder / name)
         except DwellError as error:
             faults.append(f"  {error}")
-    if faults or not finished:
+    if faults or file.name != FLEET:
         more = [f"  and {len(faults) - LISTED} more"] if len(faults) > LISTED else []
         whole = f"{folder}: {len(runs)} of {len(names)} runs are whole"
         remedy = "remove what is damaged, and the same command makes the others again"

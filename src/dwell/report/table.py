@@ -22,7 +22,7 @@ from dwell.study import Interval
 
 Row: TypeAlias = "Mapping[str, Any]"
 Columns: TypeAlias = "list[Text | Measure]"
-Kind: TypeAlias = Literal["text", "policy", "placement", "scenario", "word"]
+Kind: TypeAlias = Literal["text", "cell", "policy", "placement", "scenario", "word"]
 
 #: Width of sentences in text.
 PROSE = 100
@@ -51,9 +51,9 @@ class Text(NamedTuple):
         Key of the rows.
     name : str
         Heading.
-    kind : {"text", "policy", "placement", "scenario", "word"}
-        Names are written as they are everywhere and have their colour; words of verdicts are
-        marked (see `WORDS`).
+    kind : {"text", "cell", "policy", "placement", "scenario", "word"}
+        A cell's name stays on one line. Other names are written as they are everywhere and have
+        their colour; words of verdicts are marked (see `WORDS`).
     link : str
         Where a cell leads to, a format of the row: ``#window-{window}``.
     """
@@ -179,6 +179,8 @@ class Table:
                 colour, marker = (style.colour, style.marker) if style else (MUTED, CIRCLE)
                 shown = shown_contender(name)
                 return cell._replace(text=shown, kind="name", colour=colour, marker=marker)
+            case "cell":
+                return cell._replace(kind="cell")
             case _:
                 return cell if known else cell._replace(sort="")
 

@@ -1,4 +1,4 @@
-"""A run through time: what it showed window by window, where it was placed, what was disturbed."""
+"""Runs through time: what they showed by window, where they were placed, what was disturbed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dwell.report.charts import coloured, is_wide, layer, limit_rule, name_of, names, quantity
-from dwell.report.figure import Figure, Spec
+from dwell.report.figure import Draw, Figure, Spec
 from dwell.report.palette import BAD, INK, MUTED, SHADE, Palette
 from dwell.study import AIM
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from dwell.model import Problem
     from dwell.model.disturbed import Disturbed
+    from dwell.record import FleetRun
     from dwell.report.run_header import Tracking
 
 #: Marks of a panel at most, each a window; of longer runs there are fewer, each of several windows.
@@ -32,6 +33,8 @@ A_BIN = (
     "them had; of U, a line and bands. "
 )
 PANEL_PX, USE_PX = 86, 56
+#: Height of a cell's row, and of all of them at most.
+ROW_PX, ROWS_PX = 17, 640
 DASHES: tuple[list[int], ...] = ([], [6, 3], [2, 2], [6, 2, 2, 2])
 #: Scales that every panel has for itself.
 OWN = ("color", "strokeDash")
@@ -124,7 +127,7 @@ def run_timeline(
     aim, due = limit_rule("y", 100 * AIM, "5 %"), limit_rule("y", deadline_ms, "deadline")
     used = set(frame["placement"])
     colours = {name: colour for name, colour in palette.placements.items() if name in used}
-    panels: list[tuple[int, list[Spec]]] = [
+    panels: list[tuple[float, list[Spec]]] = [
         (PANEL_PX, [*aim, *_marks("v_d", "V_D (%)", colours, each)]),
         (PANEL_PX, [*due, *_marks("l95", L95, colours, each, log=wide)]),
         (PANEL_PX, [_others(palette), *_marks("j", "J", colours, each)]),
@@ -133,31 +136,86 @@ def run_timeline(
     if tracking is not None:
         panels.append((PANEL_PX, [*_marks("error", "tracking error (mm)", colours, each)]))
 
-    time: Spec = {"type": "quantitative", "scale": {"domain": [0, end_s], "nice": False}}
-    # On paper there is no caption.
-    across = "time (s)"
-    if each > 1:
-        across += f"; a mark: median, quartiles, extremes of {each} windows"
-    axes = [*[None] * (len(panels) - 1), {"title": across, "grid": False, "tickCount": 10}]
-
-    def draw(width: float) -> Spec:
-        drawn = [
-            {
-                "width": width - 90,
-                "height": height,
-                "encoding": {"x": {"field": "time", **time, "axis": axis}},
-                "layer": [SHADES, *layers, _migrations(frames["moves"].height)],
-            }
-            for (height, layers), axis in zip(panels, axes, strict=True)
-        ]
-        return {
-            "vconcat": [_named_spans(width - 90, time), *drawn],
-            "spacing": 8,
-            "resolve": {"scale": {"x": "shared", **dict.fromkeys(OWN, "independent")}},
-        }
-
+    draw = _over_time(panels, end_s, each, frames["moves"].height)
     mark = A_BIN if each > 1 else A_WINDOW if caption else ""
     return Figure(slug, title, frames, draw, f"{mark}{caption}".strip())
+
+
+def rows_px(cells: int) -> float:
+    """Return the height of a panel with a row a cell, pixels."""
+    return min(cells * ROW_PX, ROWS_PX)
+
+
+def fleet_timeline(
+    run: FleetRun,
+    cells: Sequence[str],
+    *,
+    slug: str,
+    colours: Mapping[str, str],
+    disturbed: Iterable[Disturbed],
+    caption: str,
+) -> Figure:
+    """Draw where the cells of a fleet are, their violation rates, and the load of shared nodes.
+
+    Parameters
+    ----------
+    cells : sequence of str
+        In the order of the rows.
+    colours : mapping of str to str
+        Of the candidates that any cell was on.
+    """
+    import polars as pl
+
+    problems = run.fleet.problems
+    length_s = {
+        name: one.window_cycles * one.pipeline.period_ms / 1e3 for name, one in problems.items()
+    }
+    first, *_ = run.cells
+    step_s = length_s[first]
+    count = max(run.cells[name].windows.height for name in cells)
+    each = 1 if count <= MOST_MARKS else math.ceil(count / MOST_BINS)
+    placed, rates, moves = [], [], []
+    for name in cells:
+        windows = run.cells[name].windows
+        begin_s = begins_by_number(windows, problems[name].pipeline.period_ms)
+        frame = pl.DataFrame(
+            {
+                "cell": [name] * windows.height,
+                "placement": windows["placement"].cast(pl.String),
+                "begin": begin_s,
+                "end": np.append(begin_s[1:], begin_s[-1:] + length_s[name]),
+                "v_d": windows["violation_rate"] * 100,
+            }
+        )
+        placed.append(_stays(frame))
+        # A window that follows a move begins a little later than others do.
+        bins = ((pl.col("begin") / step_s).round() // each).alias("bin")
+        rates.append(frame.group_by(bins).agg(pl.col("cell").first(), pl.col("v_d").mean()))
+        moved = _moves(windows, run.cells[name].decisions, begin_s, length_s[name])
+        moves.append(moved.with_columns(move=pl.format("{}: {}", pl.lit(name), "move")))
+    resources = [name[2:] for name in run.load.columns if name.startswith("u_")]
+    load_s = (run.load["start_ns"] / 1e9 + step_s / 2).to_numpy()
+    frames = {
+        "placed": pl.concat(placed),
+        # As long as all cells are there.
+        "rates": _spread(pl.concat(rates), each * step_s).filter(
+            pl.col("time") < min(stay["end"][-1] for stay in placed)
+        ),
+        "nodes": _used(run.load, load_s, resources, each),
+        "moves": pl.concat(moves),
+    }
+    end_s = float(str(frames["placed"]["end"].max()))
+    windows = run.cells[first].windows
+    begin_s = begins_by_number(windows, problems[first].pipeline.period_ms)
+    frames["spans"] = _spans(windows, disturbed, begin_s, step_s, end_s)
+    panels: list[tuple[float, list[Spec]]] = [
+        (rows_px(len(cells)), [_placed(cells, colours)]),
+        (PANEL_PX, [*limit_rule("y", 100 * AIM, "5 %"), *_rates()]),
+    ]
+    if resources:
+        panels.append((USE_PX, _use(resources, each)))
+    draw = _over_time(panels, end_s, each, frames["moves"].height)
+    return Figure(slug, "", frames, draw, caption)
 
 
 # -------------------------------------------------------------------------------------- data
@@ -188,6 +246,26 @@ def _binned(frame: pl.DataFrame, each: int, by: Sequence[str] = ()) -> pl.DataFr
     ]
     bins = frame.with_columns(bin=(pl.col("window").rank("dense") - 1) // each)
     return bins.group_by("bin", *by, maintain_order=True).agg(*firsts, *quantiles).drop("bin")
+
+
+def _stays(frame: pl.DataFrame) -> pl.DataFrame:
+    """Return the stays of a cell at its placements, of a row a window."""
+    import polars as pl
+
+    stays = frame.group_by(pl.col("placement").rle_id().alias("stay"), maintain_order=True)
+    first = pl.col("cell", "placement", "begin").first()
+    return stays.agg(first, pl.col("end").last(), pl.col("v_d").mean()).drop("stay")
+
+
+def _spread(rates: pl.DataFrame, step_s: float) -> pl.DataFrame:
+    """Return mean and ends of V_D over cells, of a row a cell and stretch of time."""
+    import polars as pl
+
+    rate = pl.col("v_d")
+    spread = {"min": rate.min(), "mean": rate.mean(), "max": rate.max()}
+    by_bin = rates.sort("v_d", descending=True).group_by("bin", maintain_order=True)
+    found = by_bin.agg(worst=pl.col("cell").first(), **spread)
+    return found.with_columns(time=(pl.col("bin") + 0.5) * step_s).sort("bin")
 
 
 def resources_in(windows: pl.DataFrame, problem: Problem) -> tuple[str, ...]:
@@ -308,6 +386,44 @@ def _spans(
 # ---------------------------------------------------------------------------------- drawings
 
 
+def _over_time(
+    panels: Sequence[tuple[float, list[Spec]]], end_s: float, each: int, moves: int
+) -> Draw:
+    """Draw panels below each other on one axis of time, with what went on and who moved.
+
+    Parameters
+    ----------
+    panels : sequence of (float, list of Spec)
+        Height, pixels, and layers.
+    each : int
+        Windows of a mark.
+    """
+    time: Spec = {"type": "quantitative", "scale": {"domain": [0, end_s], "nice": False}}
+    # On paper there is no caption.
+    across = "time (s)"
+    if each > 1:
+        across += f"; a mark: median, quartiles, extremes of {each} windows"
+    axes = [*[None] * (len(panels) - 1), {"title": across, "grid": False, "tickCount": 10}]
+
+    def draw(width: float) -> Spec:
+        drawn = [
+            {
+                "width": width - 90,
+                "height": height,
+                "encoding": {"x": {"field": "time", **time, "axis": axis}},
+                "layer": [SHADES, *layers, _migrations(moves)],
+            }
+            for (height, layers), axis in zip(panels, axes, strict=True)
+        ]
+        return {
+            "vconcat": [_named_spans(width - 90, time), *drawn],
+            "spacing": 8,
+            "resolve": {"scale": {"x": "shared", **dict.fromkeys(OWN, "independent")}},
+        }
+
+    return draw
+
+
 def _named_spans(width: float, time: Spec) -> Spec:
     """Return a row for everything that went on, with its name."""
     encoding = {
@@ -375,6 +491,36 @@ def _marks(
         for low, high, wide, opacity in (("min", "max", 0.6, 0.5), ("q1", "q3", 2.4, 0.5))
     ]
     return [*bars, *marks]
+
+
+def _placed(cells: Sequence[str], colours: Mapping[str, str]) -> Spec:
+    """Return the stays of cells at their placements, a row a cell."""
+    encoding = {
+        "x": {"field": "begin"},
+        "x2": {"field": "end"},
+        "y": name_of("cell", sort=list(cells), axis={"labelOverlap": True}),
+        "color": coloured("placement", colours, legend={"symbolType": "square"}),
+        "tooltip": [
+            *names("cell", "placement"),
+            quantity("begin", "from (s)", format=".1f"),
+            quantity("end", "to (s)", format=".1f"),
+            quantity("v_d", "V_D (%)"),
+        ],
+    }
+    return layer("rect", encoding, rows="placed", height={"band": 0.8})
+
+
+def _rates() -> list[Spec]:
+    """Return the mean over cells of V_D, and a band from the least to the most."""
+    about = [AT, *names("worst")]
+    about += [quantity(how, f"{how} (%)") for how in ("max", "mean", "min")]
+    up = {"y": quantity("mean", "V_D (%)", axis={"tickCount": 4})}
+    band = {"y": quantity("min", "V_D (%)"), "y2": {"field": "max"}}
+    return [
+        layer("area", band, rows="rates", color=MUTED, opacity=0.3),
+        layer("line", up, rows="rates", color=INK, strokeWidth=1.1),
+        layer("point", {**up, "tooltip": about}, rows="rates", filled=True, size=8, color=INK),
+    ]
 
 
 def _others(palette: Palette) -> Spec:

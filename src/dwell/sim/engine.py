@@ -5,7 +5,7 @@ from __future__ import annotations
 import bisect
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ from dwell.kernels.realisation import NodeChanges, Realisation
 from dwell.model import Problem
 from dwell.model.document import to_document
 from dwell.model.fabric import resources_of
+from dwell.model.progress import Progress
 from dwell.model.table_columns import require_apart
 from dwell.model.window_close import close_after_ns
 from dwell.record import Run
@@ -36,8 +37,6 @@ from dwell.sim.simulated_guard import SimulatedGuard
 from dwell.sim.tables import PlayedRealisation, make_tables
 from dwell.sim.versions import versions
 
-#: Told how much of how much is done.
-Progress: TypeAlias = Callable[[int, int], None]
 #: Columns of the kernel's table `seen`.
 SEEN = "first_cycle", "missed", "l95_ms", "uncut_ms"
 

@@ -15,9 +15,10 @@ from dwell.kernels.random_draws import draw, stream
 from dwell.kernels.realisation import NodeChanges, Realisation
 from dwell.model import NodeDisturbance, Problem, Scenario
 from dwell.model.fleet import Fleet, FleetCell, Phases
+from dwell.model.progress import Progress
 from dwell.record import Run
 from dwell.record.fleet_run import FleetRun
-from dwell.sim.engine import PlayedCell, Progress, meta_of, play_cells
+from dwell.sim.engine import PlayedCell, meta_of, play_cells
 from dwell.sim.shared_load import shared_load
 from dwell.sim.tables import PlayedRealisation, make_tables
 from dwell.sim.waiting import Waiting, waiting_of
@@ -129,8 +130,7 @@ def waiting_in_fleet(fleet: Fleet, *, seed: int, windows: int) -> Waiting:
 def phased(fleet: Fleet, seed: int) -> Iterator[Problem]:
     """Yield the problem of every cell, with its phase."""
     for cell, phase_ms in zip(fleet.cells, phases_ms(fleet, seed).values(), strict=True):
-        pipeline = replace(cell.problem.pipeline, phase_ms=phase_ms)
-        yield replace(cell.problem, pipeline=pipeline)
+        yield cell.problem.at_phase(phase_ms)
 
 
 def phases_ms(fleet: Fleet, seed: int) -> dict[str, float]:

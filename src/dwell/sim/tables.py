@@ -292,7 +292,7 @@ def _jobs(played: PlayedRealisation) -> pl.DataFrame:
     tasks = tuple(problem.pipeline.tasks)
     nodes = tuple(problem.fabric.nodes)
     cells = len(tables.cells)
-    log, outcome = played.arrays.logs()
+    log, outcome, _ = played.arrays.logs()
     # Sites of a shadow follow those of its cell in the same order.
     site_node = np.array([nodes.index(node) for _, node in played.realisation.sites] * cells)
     site = tables.site_of - played.arrays.part.site_0

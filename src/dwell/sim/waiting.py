@@ -32,10 +32,10 @@ def waiting_of(problem: Problem, real: Realisation, arrays: CellArrays) -> Waiti
     first, last = problem.warmup_windows * problem.window_cycles, real.cycles
     late_ns = tables.latency_ns[0, :last] > round(pipeline.deadline_ms * 1e6)
     cycles = first + np.flatnonzero(late_ns[first:])
-    log = arrays.logs()[0][0][cycles]
+    logs, _, arrivals = arrays.logs()
+    log, arrived = logs[0, cycles], arrivals[0, cycles][:, flow_rows(pipeline)]
     stamps = tables.stamps[0, cycles]
     names = [*pipeline.tasks]
-    arrived = _arrivals(problem, arrays)[cycles]
     waits = Waiting()
     for code, placement in enumerate(problem.candidates.values()):
         under = stamps == code
@@ -63,16 +63,6 @@ def waiting_of(problem: Problem, real: Realisation, arrays: CellArrays) -> Waiti
 
 def _sum(waited_ns: Ints, known: NDArray[np.bool_]) -> int:
     return int(waited_ns[known].clip(min=0).sum())
-
-
-def _arrivals(problem: Problem, arrays: CellArrays) -> Ints:
-    """Return when messages arrived, shape (cycles, flows); -1 where they did not."""
-    whole, part = arrays.whole.tables, arrays.part
-    clock = whole.clock[0]
-    shape = -1, int(clock["n_cycles"]), int(clock["n_flows"])
-    by_row = whole.log_arrived.reshape(shape)
-    arrived: Ints = by_row[part.row, : part.cycles, flow_rows(problem.pipeline)].T
-    return arrived
 
 
 def _unhindered(

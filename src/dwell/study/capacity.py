@@ -14,11 +14,12 @@ from typing import Any, Literal, NamedTuple
 from dwell.errors import Fault, ProblemError
 from dwell.model import evolve
 from dwell.model.fleet import PHASES, Fleet, FleetEntry, Phases
+from dwell.model.progress import Progress
 from dwell.sim.fleet import simulate_fleet, waiting_in_fleet
 from dwell.sim.static_fleet import StaticFleet
 from dwell.sim.waiting import Waiting
 from dwell.study.intervals import Interval, mean_interval
-from dwell.study.workers import Progress, available_processes, spread
+from dwell.study.workers import available_processes, spread
 
 #: Cycles that count, of a cell and seed, at least.
 CYCLES = 2_000

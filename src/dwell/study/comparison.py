@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 from dwell.model import Problem
+from dwell.model.progress import Progress
 from dwell.study.player import Example, Player
 from dwell.study.results import StudyRuns
 from dwell.study.runner import play_in_memory
 from dwell.study.software import versions
 from dwell.study.study import Contender, Point, Study
-from dwell.study.workers import Progress
 
 if TYPE_CHECKING:
     from dwell.policies import MinimalPolicy

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from dwell.errors import ProblemError, TraceError
 from dwell.model import Problem
+from dwell.model.progress import Progress
 from dwell.study.comparison import Comparison, compare
 from dwell.study.runner import StudyResult, run_study
 from dwell.study.study import Contender, load_study
-from dwell.study.workers import Progress
 
 if TYPE_CHECKING:
     import polars as pl

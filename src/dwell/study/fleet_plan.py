@@ -7,7 +7,7 @@ least and the work no more than it (a knapsack). With several it is a mixed-inte
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
@@ -19,6 +19,7 @@ from dwell.estimators.fleet_prices import CellTerms, FleetPrice, FleetPrices, Pr
 from dwell.estimators.load_table import load_table
 from dwell.estimators.prices import prices_of
 from dwell.model.fleet import Fleet
+from dwell.model.progress import Progress
 from dwell.model.qos import QoS
 from dwell.record import FleetRun
 from dwell.sim.fleet import phased
@@ -90,7 +91,7 @@ class FleetPlan:
 def phi_of(run: FleetRun) -> float:
     """Φ a cell of a run, by the means of what its windows showed after the warm-up."""
     own, shared = 0.0, 0.0
-    problems = {cell.name: cell.problem for cell in run.fleet.cells}
+    problems = run.fleet.problems
     for name, one in run.cells.items():
         terms, windows = CellTerms(problems[name], run.fleet.shared), one.arrays("windows")
         counts = ~windows["warmup"]
@@ -105,9 +106,7 @@ def phi_of(run: FleetRun) -> float:
     return (own + shared / count) / count
 
 
-def plan_fleet(
-    fleet: Fleet, *, seed: int = 1, progress: Callable[[int, int], None] | None = None
-) -> FleetPlan:
+def plan_fleet(fleet: Fleet, *, seed: int = 1, progress: Progress | None = None) -> FleetPlan:
     """Find where the cells of a fleet are best placed while their scenarios go on.
 
     Parameters
@@ -151,29 +150,36 @@ def best_placements(loads: Loads, alone: Sequence[Mapping[str, float]]) -> list[
         return _by_program(loads, alone)
     most = max(map(loads.most, loads.resources), default=0.0)
     levels = np.linspace(0.0, most, LEVELS + 1) if most else np.zeros(1)
-    found = (_at_level(loads, alone, levels, last) for last in range(len(levels)))
+    step = levels[1] if most else 1.0
+    units = [
+        {name: round(loads.work(i, name) / step) for name in costs} for i, costs in enumerate(alone)
+    ]
+    found = (
+        _at_level(loads, alone, units, last, load) for last, load in enumerate(levels.tolist())
+    )
     return min(
         (one for one in found if one is not None), key=lambda one: sum(loads.costs(one, alone))
     )
 
 
 def _at_level(
-    loads: Loads, alone: Sequence[Mapping[str, float]], levels: Floats, last: int
+    loads: Loads,
+    alone: Sequence[Mapping[str, float]],
+    units: Sequence[Mapping[str, int]],
+    last: int,
+    load: float,
 ) -> list[str] | None:
-    """Least sum of costs at a level of the load, with no more work than it; a knapsack."""
-    step = levels[1] if len(levels) > 1 else 1.0
+    """Least sum of costs at a load, with no more than `last` units of work; a knapsack."""
     #: By work that is asked so far, the least sum of the cells before.
     least = np.zeros(last + 1)
     chosen = []
     for i, costs in enumerate(alone):
         rows = []
         for name in costs:
-            work = loads.work(i, name)
-            units = round(work / step)
-            row = np.full(last + 1, np.inf)
-            if units <= last:
-                row[units:] = least[: last + 1 - units] + costs[name]
-                row[units:] += loads.wait(i, name, levels[last])
+            row, work = np.full(last + 1, np.inf), units[i][name]
+            if work <= last:
+                row[work:] = least[: last + 1 - work] + costs[name]
+                row[work:] += loads.wait(i, name, load)
             rows.append(row)
         chosen.append(np.argmin(rows, axis=0))
         least = np.min(rows, axis=0)
@@ -183,7 +189,7 @@ def _at_level(
     names = []
     for i in reversed(range(len(alone))):
         name = list(alone[i])[chosen[i][left]]
-        left -= round(loads.work(i, name) / step)
+        left -= units[i][name]
         names.append(name)
     return names[::-1]
 

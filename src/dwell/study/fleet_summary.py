@@ -1,9 +1,13 @@
-"""Summary of a fleet's run: the row of its worst cell, and what the others add to it."""
+"""Summary of a fleet's run: its numbers, and the row of a study that it is."""
 
 from __future__ import annotations
 
 import hashlib
+import math
+import re
+from collections import Counter
 from collections.abc import Mapping
+from typing import Any
 
 from dwell.model.fleet import Fleet
 from dwell.record import FleetRun
@@ -36,7 +40,7 @@ def summarise_fleet(run: FleetRun, judged: Fleet, labels: Mapping[str, str | int
     SimulationError
         If a run has no window after its warm-up.
     """
-    problems = {cell.name: cell.problem for cell in judged.cells}
+    problems = judged.problems
     found = {name: summarise(one, problems[name], labels) for name, one in run.cells.items()}
     rates = {name: float(one.row["violation_rate"]) for name, one in found.items()}
     worst = max(rates, key=lambda name: rates[name])
@@ -52,3 +56,83 @@ def summarise_fleet(run: FleetRun, judged: Fleet, labels: Mapping[str, str | int
         "mean_violation_rate": sum(rates.values()) / len(rates),
     }
     return Summary(row, found[worst].costs, found[worst].within)
+
+
+def fleet_numbers(run: FleetRun) -> dict[str, Any]:
+    """Return what a fleet comes to: its cells, the worst first, its shared nodes and its moves.
+
+    Returns
+    -------
+    dict
+        ``cells``: of each the means over its windows after the warm-up, and its moves; ``cost``,
+        the mean over cells; ``load`` by shared resource; ``moves``, ``guard_moves``; ``refused`` by
+        who refused; ``rounds`` (each with Φ before and after it, and who moved).
+    """
+    import polars as pl
+
+    windows = run.windows.filter(~pl.col("warmup"))
+    means = windows.group_by("cell").agg(
+        pl.col("violation_rate", "seen_l95_ms", "cost").mean(),
+    )
+    moved = run.decisions.filter(pl.col("migrated"))
+    moves = dict(moved.group_by("cell").len().iter_rows())
+    by_guard = moved.filter(pl.col("reason") == "guard").height
+    cells = [
+        {
+            "cell": row["cell"],
+            "violation_rate": row["violation_rate"],
+            "l95_ms": _known(row["seen_l95_ms"]),
+            "cost": _known(row["cost"]),
+            "moves": moves.get(row["cell"], 0),
+        }
+        for row in means.sort("violation_rate", "cell", descending=[True, False]).to_dicts()
+    ]
+    load = {
+        name.removeprefix("u_"): {"mean": values.mean(), "most": values.max()}
+        for name, values in run.load.to_dict().items()
+        if name.startswith("u_") and len(values)
+    }
+    refused = Counter[str]()
+    for (_, reason), count in refusals(run).items():
+        refused[re.split(r"\W", reason, maxsplit=1)[0]] += count
+    return {
+        "cells": cells,
+        "cost": _known(means["cost"].mean()),
+        "load": load,
+        "moves": moved.height,
+        "guard_moves": by_guard,
+        "refused": dict(refused),
+        "rounds": _rounds(run),
+    }
+
+
+def refusals(run: FleetRun) -> Counter[tuple[str, str]]:
+    """Return how many moves were refused, by the candidate and the reason without its amount."""
+    if "refused" not in run.decisions.columns:
+        return Counter()
+    return Counter(_refusal(text) for text in run.decisions["refused"].drop_nulls())
+
+
+def _refusal(text: str) -> tuple[str, str]:
+    # ``SO: ledger: Φ would fall by 0.02, 0.1 is owed``, ``SO: cap of canonical-07``
+    candidate, _, reason = text.partition(": ")
+    reason = re.sub(r"by \S+, \S+ is owed$", "by less than is owed", reason)
+    return candidate, re.sub(r"( by|:) [\d.e+-]+$", "", reason)
+
+
+def _known(mean: object) -> float:
+    """Return a mean; NaN where the controller saw no window."""
+    return mean if isinstance(mean, float) else math.nan
+
+
+def _rounds(run: FleetRun) -> list[dict[str, Any]]:
+    """Return Φ before and after every round in which the ledger was asked, and who moved."""
+    import polars as pl
+
+    asked = run.decisions.filter(pl.col("phi_before").is_not_null())
+    rounds = asked.group_by("round", maintain_order=True).agg(
+        pl.col("phi_before").first(),
+        pl.col("phi_after").last(),
+        pl.col("cell").filter(pl.col("migrated")).alias("moved"),
+    )
+    return rounds.sort("round").to_dicts()

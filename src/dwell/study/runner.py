@@ -17,13 +17,14 @@ import numpy as np
 
 from dwell.cellfile.work_folder import open_work_folder
 from dwell.errors import SimulationError
+from dwell.model.progress import Progress
 from dwell.study.player import Example, PlayedItem, Player
 from dwell.study.results import PARAMETER, StudyRuns
 from dwell.study.software import describe, versions
 from dwell.study.study import Item, Study
 from dwell.study.study_folder import PARTS, STUDY, TABLES, finished, read_parts, write_table
 from dwell.study.summary import latency_grid_ms
-from dwell.study.workers import Progress, available_processes, spread
+from dwell.study.workers import available_processes, spread
 
 if TYPE_CHECKING:
     import polars as pl

@@ -28,6 +28,7 @@ from dwell.display import Displayed
 from dwell.errors import DwellError, RunError
 from dwell.model import Problem
 from dwell.model.bounds import counted
+from dwell.model.progress import Progress
 from dwell.study.job_times import finished_jobs, job_times
 from dwell.study.judged_prediction import GroupJudge, Judged, Outcome, worst
 from dwell.study.measured_run import MeasuredRun, Simulated, Simulator, Unit, read_measured
@@ -35,7 +36,7 @@ from dwell.study.predicted_moves import predicted_moves
 from dwell.study.qos_sample import Piece, QosSample, piece_of
 from dwell.study.software import versions
 from dwell.study.sum_of_means import sum_of_means, sums_of_shares
-from dwell.study.workers import Progress, available_processes, spread
+from dwell.study.workers import available_processes, spread
 
 if TYPE_CHECKING:
     import polars as pl

@@ -17,14 +17,12 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from typing import TypeAlias, TypeVar, cast
+from typing import TypeVar, cast
 
 from dwell.errors import SimulationError
 
 Unit = TypeVar("Unit")
 Result = TypeVar("Result")
-#: Takes how much is done, and of how much.
-Progress: TypeAlias = Callable[[int, int], None]
 
 
 def available_processes() -> int:

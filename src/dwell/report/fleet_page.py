@@ -1,0 +1,355 @@
+"""The page of a fleet: every cell, the worst first, who was where, and what rounds changed."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from dwell.errors import SimulationError
+from dwell.model.bounds import counted
+from dwell.model.disturbed import Disturbed, disturbed
+from dwell.report.capacity_page import PHASES
+from dwell.report.charts import coloured, layer, name_of, names, quantity
+from dwell.report.figure import Figure, Spec
+from dwell.report.formatting import Measure, percent, write_ms, write_number
+from dwell.report.page import Definitions, Fact, Page, Section
+from dwell.report.palette import INK, MUTED, Palette
+from dwell.report.policy_blocks import COST, L95, RATE
+from dwell.report.table import MOST_ROWS, Columns, Table, Text
+from dwell.report.timeline import fleet_timeline, rows_px
+from dwell.study import AIM
+from dwell.study.fleet_summary import fleet_numbers, refusals
+
+if TYPE_CHECKING:
+    from dwell.record import FleetRun
+
+MOVES = Measure("moves", "moves", decimals=0)
+#: Room beside the panels of cells, and between them, pixels.
+BESIDE_PX, GAP_PX = 120, 18
+ROUNDS_PX = 190
+#: Cells whose table is open.
+UNFOLDED = 24
+#: Where a cell goes that stays.
+STAYS = "no move"
+
+
+def fleet_page(run: FleetRun, *, links: Mapping[str, str] | None = None) -> Page:
+    """Return what there is to show of a fleet's run.
+
+    Parameters
+    ----------
+    links : mapping of str to str, optional
+        Where the pages of cells are, by their names.
+
+    Raises
+    ------
+    SimulationError
+        If no window is after the warm-up.
+    """
+    return _FleetPage(run, links or {}).page()
+
+
+class _FleetPage:
+    """Parts of a fleet's page, made from its runs."""
+
+    def __init__(self, run: FleetRun, links: Mapping[str, str]) -> None:
+        self.run, self.links = run, links
+        self.numbers = fleet_numbers(run)
+        self.cells: list[dict[str, Any]] = self.numbers["cells"]
+        if not self.cells:
+            raise SimulationError("no window is left after the warm-up; ask for more windows")
+        self.names = [str(row["cell"]) for row in self.cells]
+        self.problems = run.fleet.problems
+        candidates = dict.fromkeys(
+            name for problem in self.problems.values() for name in problem.candidates
+        )
+        used = set(run.windows["placement"].cast(str))
+        self.palette = Palette.of(candidates)
+        #: Colours of the candidates that any cell was on.
+        self.used = {name: hue for name, hue in self.palette.placements.items() if name in used}
+
+    def page(self) -> Page:
+        fleet = self.run.fleet
+        windows = int(next(iter(self.run.cells.values())).meta["windows"])
+        return Page(
+            title=f"Fleet {fleet.name}",
+            subtitle=" · ".join(
+                (
+                    counted(len(self.cells), "cell"),
+                    f"sharing {', '.join(fleet.shared) or 'nothing'}",
+                    f"coordination: {fleet.coordination}",
+                    f"phases: {self._phases}",
+                    f"seed {self.run.seed}",
+                    f"{counted(windows, 'window')} of each",
+                )
+            ),
+            facts=list(self._facts()),
+            sections=list(self._sections()),
+        )
+
+    @property
+    def _phases(self) -> str:
+        phases = self.run.fleet.phases
+        return phases if isinstance(phases, str) else "listed"
+
+    def _facts(self) -> Iterator[Fact]:
+        worst, numbers = self.cells[0], self.numbers
+        over = sum(row["violation_rate"] > AIM for row in self.cells)
+        yield Fact("V_D of the worst cell", percent(worst["violation_rate"], 1), worst["cell"])
+        yield Fact("cells over 5 %", f"{over}", f"of {len(self.cells)}")
+        yield Fact("J", write_number(numbers["cost"], 2), "mean over cells")
+        most = max(row["moves"] for row in self.cells)
+        yield Fact("moves", write_number(numbers["moves"], 0), f"at most {most} of a cell")
+        if self.run.guard:
+            yield Fact("moves of guards", write_number(numbers["guard_moves"], 0))
+        for name, load in numbers["load"].items():
+            yield Fact(f"U of {name}", percent(load["mean"]), f"at most {percent(load['most'])}")
+
+    def _sections(self) -> Iterator[Section]:
+        yield Section("", [self._time()])
+        yield Section("Cells, the worst first", [self._drawn_cells()])
+        yield Section("Cells in numbers", [self._table()], folded=len(self.cells) > UNFOLDED)
+        if self.numbers["rounds"]:
+            yield Section("Rounds of the ledger", self._rounds())
+        if refused := refusals(self.run):
+            yield Section("Refused moves", [self._refused(refused)])
+        yield Section("What this is", [self._about()])
+
+    # ------------------------------------------------------------------------------ in time
+
+    def _time(self) -> Figure:
+        return fleet_timeline(
+            self.run,
+            self.names,
+            slug="time",
+            colours=self.used,
+            disturbed=self._disturbed(),
+            caption=(
+                "A row is a cell, the worst first, in the colour of where it is. V_D: mean over "
+                "cells, and from the least to the most. Dashed: the aim of 5 %. U: all load of a "
+                "shared node, foreign work included. Upright lines: moves; in colour, a guard's. "
+                "Shaded: warm-up and disturbances."
+            ),
+        )
+
+    def _disturbed(self) -> list[Disturbed]:
+        """Return what befell cells, and of how many where it was not all of them."""
+        count = Counter[Disturbed]()
+        for entry in self.run.fleet.entries:
+            for one in disturbed(entry.cell.scenario(entry.scenario), entry.cell.fabric):
+                count[one] += entry.count
+        of = len(self.cells)
+        return [
+            one if k == of else one._replace(what=f"{one.what} ({k} of {of} cells)")
+            for one, k in count.items()
+        ]
+
+    # -------------------------------------------------------------------------------- cells
+
+    def _drawn_cells(self) -> Figure:
+        import polars as pl
+
+        deadlines = {name: one.pipeline.deadline_ms for name, one in self.problems.items()}
+        # Cells of several files have several deadlines.
+        limits = {RATE: dict.fromkeys(deadlines, 100 * AIM), L95: deadlines, COST: {}}
+        rows = [
+            {
+                "cell": row["cell"],
+                "measure": measure.heading,
+                "value": row[measure.column] * measure.factor,
+                "limit": limits[measure].get(row["cell"]),
+            }
+            for measure in limits
+            for row in self.cells
+        ]
+        return Figure(
+            "cells",
+            "",
+            {"rows": pl.DataFrame(rows, infer_schema_length=None)},
+            lambda width: _dots(self.names, [one.heading for one in limits], width),
+            "Means over the windows after the warm-up. Dashed: the aim of 5 %, and the deadline.",
+        )
+
+    def _table(self) -> Table:
+        import polars as pl
+
+        counts = self.run.windows.filter(~pl.col("warmup")).group_by("cell", "placement").len()
+        at = {(cell, str(name)): count for cell, name, count in counts.rows()}
+        rows = []
+        for row in self.cells:
+            cell = row["cell"]
+            spent = {name: at.get((cell, name), 0) for name in self.used}
+            windows = sum(spent.values())
+            shares = {f"share {name}": count / windows for name, count in spent.items()}
+            rows.append({**row, **shares, "page": self.links.get(cell, "")})
+        columns: Columns = [
+            Text("cell", "cell", "cell", "{page}"),
+            RATE,
+            L95,
+            COST,
+            MOVES,
+            *(Measure(f"share {name}", name, "%", 100.0, 0) for name in self.used),
+        ]
+        caption = "L95 as seen at the windows’ closes. Last columns: share of windows by placement."
+        return Table("cell-table", "", columns, rows, caption=caption, palette=self.palette)
+
+    # ------------------------------------------------------------------------------- rounds
+
+    def _rounds(self) -> list[Figure | Table]:
+        import polars as pl
+
+        cycles = pl.DataFrame(
+            [
+                {"cell": name, "each": one.window_cycles, "period": one.pipeline.period_ms / 1e3}
+                for name, one in self.problems.items()
+            ]
+        )
+        closes = self.run.windows.join(cycles, on="cell").select(
+            "cell", "window", at=(pl.col("first_cycle") + pl.col("each")) * pl.col("period")
+        )
+        asked = (
+            self.run.decisions.filter(pl.col("phi_before").is_not_null())
+            .join(closes, on=["cell", "window"], how="left")
+            .sort("round")
+            .select(
+                "round",
+                "cell",
+                "at",
+                "phi_before",
+                "phi_after",
+                "migrated",
+                to=pl.when("migrated").then(pl.col("placement").cast(str)).otherwise(pl.lit(STAYS)),
+                **{"from": pl.col("incumbent").cast(str)},
+            )
+        )
+        seen = set(asked["to"])
+        colours = {to: hue for to, hue in {**self.used, STAYS: MUTED}.items() if to in seen}
+        columns: Columns = [
+            Text("round", "round"),
+            Measure("at", "at", "s"),
+            Text("cell", "cell", "cell"),
+            Text("from", "from", "placement"),
+            Text("to", "to", "placement"),
+            Measure("phi_before", "Φ before", decimals=3),
+            Measure("phi_after", "Φ after", decimals=3),
+            Measure("fall", "lower by", decimals=3),
+        ]
+        moved = asked.filter("migrated").with_columns(
+            fall=pl.col("phi_before") - pl.col("phi_after")
+        )
+        rows = moved.head(MOST_ROWS).to_dicts()
+        return [
+            Figure(
+                "rounds",
+                "Φ before and after every round",
+                {"rows": asked},
+                lambda width: _phi(colours, width),
+                "Played by the ledger at closes: the fleet as it was, and with the move that was "
+                "looked at. A point is Φ with the move, in the colour of where it leads.",
+            ),
+            Table(
+                "round-table",
+                f"Rounds that moved a cell ({len(rows)} of {asked['round'].n_unique()} played)",
+                columns,
+                rows,
+                palette=self.palette,
+            ),
+        ]
+
+    def _refused(self, refused: Counter[tuple[str, str]]) -> Table:
+        rows = [
+            {"to": to, "reason": reason, "count": count}
+            for (to, reason), count in refused.most_common()
+        ]
+        columns: Columns = [
+            Text("reason", "reason"),
+            Text("to", "to", "placement"),
+            Measure("count", "refusals", decimals=0),
+        ]
+        caption = (
+            "Moves that a policy had decided on and coordination did not allow, by its closes."
+        )
+        return Table("refused", "", columns, rows, caption=caption, palette=self.palette)
+
+    # -------------------------------------------------------------------------------- about
+
+    def _about(self) -> Definitions:
+        fleet = self.run.fleet
+        asks_a_ledger = fleet.coordination == "ledger"
+        metas = [run.meta for run in self.run.cells.values()]
+        entries = {
+            "cells": ", ".join(
+                f"{one.count} {one.cell.name} ({one.scenario})" for one in fleet.entries
+            ),
+            "shared": ", ".join(fleet.shared) or "nothing",
+            "phases": PHASES.get(self._phases, "as listed"),
+            "coordination": fleet.coordination
+            + (f", objective {fleet.objective}" if asks_a_ledger else ""),
+            "policy": ", ".join(dict.fromkeys(str(meta.get("policy")) for meta in metas)),
+            "estimator": ", ".join(dict.fromkeys(str(meta.get("estimator")) for meta in metas)),
+            "deadline": ", ".join(
+                dict.fromkeys(write_ms(one.pipeline.deadline_ms) for one in self.problems.values())
+            ),
+            "record": f"simulated, seed {self.run.seed}",
+            "versions": ", ".join(f"{k} {v}" for k, v in metas[0].get("versions", {}).items()),
+        }
+        return Definitions(entries)
+
+
+def _dots(cells: Sequence[str], headings: Sequence[str], width: float) -> Spec:
+    """Return the drawing of several measures of cells, a row a cell."""
+    where = {
+        "x": quantity("value", None, axis={"tickCount": 4}),
+        "y": name_of("cell", sort=list(cells), axis={"labelOverlap": True}),
+        "tooltip": [*names("cell", "measure"), *(quantity(one, one) for one in ("value", "limit"))],
+    }
+    limit = {**where, "x": quantity("limit", None)}
+    return {
+        "data": {"name": "rows"},
+        "facet": name_of("measure", sort=list(headings)),
+        "columns": len(headings),
+        "spacing": GAP_PX,
+        "resolve": {"scale": {"x": "independent"}},
+        "spec": {
+            "width": (width - BESIDE_PX) / len(headings) - GAP_PX,
+            "height": rows_px(len(cells)),
+            "layer": [
+                layer("tick", limit, color=INK, thickness=1, height={"band": 0.6}),
+                layer("point", where, filled=True, size=34, color=INK, opacity=1),
+            ],
+        },
+    }
+
+
+def _phi(colours: Mapping[str, str], width: float) -> Spec:
+    """Return the drawing of Φ by round."""
+    about = [
+        quantity("round", "round"),
+        *names("cell", "from", "to"),
+        quantity("at", "at (s)", format=".1f"),
+        quantity("phi_before", "Φ before"),
+        quantity("phi_after", "Φ after"),
+    ]
+    axis = {"tickMinStep": 1, "format": "d", "grid": False}
+    scale = {"nice": False, "padding": 8}
+    up = quantity("phi_before", "Φ", scale={"zero": False}, axis={"tickCount": 5})
+    return {
+        "width": width - 90,
+        "height": ROUNDS_PX,
+        "data": {"name": "rows"},
+        "encoding": {
+            "x": quantity("round", "round", scale=scale, axis=axis),
+            "color": coloured("to", colours),
+        },
+        "layer": [
+            layer("rule", {"y": up, "y2": {"field": "phi_after"}}, strokeWidth=1.3),
+            layer(
+                "point",
+                {"y": {**up, "field": "phi_after"}, "tooltip": about},
+                filled=True,
+                size=34,
+                opacity=1,
+            ),
+        ],
+    }
