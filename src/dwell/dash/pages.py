@@ -43,9 +43,7 @@ def show_run(
     for one in (folder, beside):
         if one is not None:
             _require_run(one)
-    _serve(
-        lambda: _on_one_line(folder, beside), port=port, browser=browser, say=say, token=token
-    )
+    _serve(lambda: _on_one_line(folder, beside), port=port, browser=browser, say=say, token=token)
 
 
 def show_fleet(

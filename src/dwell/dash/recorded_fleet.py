@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ MOST_BINS, LEAST_BINS = 8_000, 10
 #: Opened cells that are kept.
 MOST_OPEN = 16
 #: Columns of a cell's bins that the page draws.
-DRAWN = ("at", "low", "high", "lost")
+DRAWN = ("at", "high", "lost")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,19 +65,25 @@ class _Rounds:
 
     Parameters
     ----------
-    at, phi : float64 array, shape (n,)
-        When; and Φ from then on, as far as known.
+    at, before, after : float64 array, shape (n,)
+        When; Φ as it was, and as it came to be.
     number : int64 array, shape (n,)
         Of the round.
     """
 
     at: Floats
-    phi: Floats
+    before: Floats
+    after: Floats
     number: NDArray[np.int64]
 
-    def last(self, at: Floats) -> NDArray[np.intp]:
-        """Return which was the last before each of some places; -1 where none was."""
-        return np.searchsorted(self.at, at, "right") - 1
+    def last(self, at: float) -> int:
+        """Return which was the last before a place; -1 where none was."""
+        return int(np.searchsorted(self.at, at, "right")) - 1
+
+    def view(self, begin: float, end: float, bins: int, cells: int) -> Plain:
+        """Return Φ a cell between two places, before and after where the ledger was asked."""
+        phi = np.column_stack([self.before, self.after]).ravel() / cells
+        return binned_means(np.repeat(self.at, 2), {"phi": phi}, begin, end, bins)
 
 
 class RecordedFleet:
@@ -95,7 +102,9 @@ class RecordedFleet:
         run = self._run = open_fleet(folder, whole=False)
         self.name, self.count = run.fleet.name, len(run.fleet.cells)
         self._faults = list(run.faults)
-        self._members = sorted(self._whole(run), key=lambda one: (-np.nan_to_num(one.rate), one.place))
+        self._members = sorted(
+            self._whole(run), key=lambda one: (-np.nan_to_num(one.rate), one.place)
+        )
         if not self._members:
             raise RunError("\n".join([self._how_many(), *listed(self._faults)]))
         self.name, self.count = run.fleet.name, len(run.fleet.cells)
@@ -140,26 +149,27 @@ class RecordedFleet:
         return closes, {name.removeprefix("u_"): table[name].to_numpy() for name in names}
 
     def _over_time(self) -> dict[str, Floats]:
-        """Return what is drawn as lines: load, cells by placement, Φ a cell."""
+        """Return what is drawn as lines: load, cells by placement."""
         counts = np.zeros((len(self._placements), len(self._grid)))
         for one in self._members:
             codes = np.array([self._placements[name] for name in one.problem.candidates])
             rows = _held(one.windows, self._grid)
             counts[codes[one.windows.placement[rows]], np.arange(len(self._grid))] += 1
-        last = self._rounds.last(self._grid)
-        phi = np.append(self._rounds.phi / self.count, np.nan)
         return {
             **{f"u {name}": column for name, column in self._load.items()},
             **{f"on {name}": counts[i] for name, i in self._placements.items()},
-            "phi": phi[last],
         }
 
     def _all_events(self) -> Iterator[Plain]:
         """Yield what happened to the cells: their moves and refusals, and to how many what else."""
         happened: Counter[tuple[float, str]] = Counter()
         for one in self._members:
-            for event in one.windows.events():
-                yield {**event, "text": f"{one.name}: {event['text']}"}
+            for (_, text), events in groupby(
+                one.windows.events(), lambda one: (one["kind"], one["text"])
+            ):
+                first, *again = events
+                times = f" ({len(again) + 1} times)" if again else ""
+                yield {**first, "text": f"{one.name}: {text}{times}"}
             entry = self._run.fleet.cells[one.place].entry
             for event in disturbance_events(
                 one.problem.scenario(entry.scenario), one.problem, self._end
@@ -226,6 +236,7 @@ class RecordedFleet:
             "end": end,
             "cells": [self._cell_view(one, begin, end, each) for one in self._members],
             "windows": binned_means(self._grid, self._lines, begin, end, bins // 2),
+            "rounds": self._rounds.view(begin, end, bins // 2, self.count),
             **self._events.view(begin, end),
         }
 
@@ -246,8 +257,7 @@ class RecordedFleet:
         cells = [self._cell_state(one, at) for one in self._members]
         unwell = sum(cell["health"] != "ok" for cell in cells)
         k = int(np.searchsorted(self._grid, at, "right")) - 1
-        row = int(self._rounds.last(np.array(at)))
-        phi = None if row < 0 else float(self._rounds.phi[row]) / self.count
+        row = self._rounds.last(at)
         return {
             "at": at,
             "health": "degraded" if unwell else "ok",
@@ -257,7 +267,7 @@ class RecordedFleet:
                 name: None if k < 0 else plain(column[k : k + 1], 4)[0]
                 for name, column in self._load.items()
             },
-            "phi": phi,
+            "phi": None if row < 0 else float(self._rounds.after[row]) / self.count,
             "round": None if row < 0 else int(self._rounds.number[row]),
         }
 
@@ -302,18 +312,18 @@ def _held(windows: RecordedWindows, at: Any) -> NDArray[np.intp]:
 
 
 def _rounds(members: list[_Member]) -> _Rounds:
-    """Return Φ where the ledger was asked: before the move that it refused, after one it allowed."""
-    at, phi, number = [np.zeros(0)], [np.zeros(0)], [np.zeros(0, np.int64)]
+    """Return Φ where the ledger was asked; a move that it refused changes nothing."""
+    at, phi, number = [np.zeros(0)], [np.zeros((0, 2))], [np.zeros(0, np.int64)]
     for one in members:
         table = one.windows.decisions
         if "phi_before" not in table:
             continue
         before, after = (table[name].astype(np.float64) for name in ("phi_before", "phi_after"))
         asked = ~np.isnan(before) & (one.windows.window_of >= 0)
+        came = np.where(table["migrated"].astype(bool), after, before)
         at.append(one.windows.closes[one.windows.window_of[asked]])
-        phi.append(np.where(table["migrated"].astype(bool), after, before)[asked])
+        phi.append(np.column_stack([before, came])[asked])
         number.append(table["round"].astype(np.int64)[asked])
     order = np.argsort(np.concatenate(at), kind="stable")
-    return _Rounds(
-        np.concatenate(at)[order], np.concatenate(phi)[order], np.concatenate(number)[order]
-    )
+    before, came = np.concatenate(phi)[order].T
+    return _Rounds(np.concatenate(at)[order], before, came, np.concatenate(number)[order])

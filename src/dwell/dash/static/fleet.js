@@ -6,8 +6,9 @@ import * as panel from "./panel.js";
 import { get, latest } from "./server.js";
 
 const BINS = 400;
-/** Heights of a strip and of a lane below it; widths are shares of a thousand. */
-const STRIP = 46;
+/** Heights: of the marks of lost cycles, down to the foot of the strip below, of a lane; widths are shares of a thousand. */
+const MARKS = 7;
+const STRIP = 50;
 const LANE = 9;
 const WIDE = 1000;
 /** Names of cells that are told of one placement. */
@@ -47,20 +48,21 @@ class Small {
 
   set(view, [begin, end], top, placements) {
     const x = (at) => ((WIDE * (Math.min(Math.max(at, begin), end) - begin)) / (end - begin)).toFixed(1);
-    const y = (ms) => STRIP * (1 - Math.min(ms, top) / top);
-    const { at, low, high, lost } = view.bins;
+    const y = (ms) => STRIP - ((STRIP - MARKS) * Math.min(ms, top)) / top;
+    const { at, high, lost } = view.bins;
+    const due = y(this.cell.deadline_ms);
     const [within, over, gone] = [[], [], []];
     at.forEach((from, i) => {
-      if (lost[i]) gone.push(`M${x(from)} 0V6`);
-      if (high[i] === null) return;
-      const [upper, lower] = [y(high[i]), Math.max(y(low[i]), y(high[i]) + 2)];
-      const band = `M${x(from)} ${upper.toFixed(1)}H${x(at[i + 1] ?? end)}V${lower.toFixed(1)}H${x(from)}z`;
-      (high[i] > this.cell.deadline_ms ? over : within).push(band);
+      if (lost[i]) gone.push(`M${x(from)} 0V${MARKS - 2}`);
+      // L95 of a window is without end where it is that of a lost cycle.
+      const upper = lost[i] ? MARKS : y(high[i]);
+      const bar = (top, bottom) => `M${x(from)} ${top.toFixed(1)}H${x(at[i + 1] ?? end)}V${bottom.toFixed(1)}H${x(from)}z`;
+      within.push(bar(Math.max(upper, due), STRIP));
+      if (upper < due) over.push(bar(upper, due));
     });
     this.within.setAttribute("d", within.join(""));
     this.over.setAttribute("d", over.join(""));
     this.lost.setAttribute("d", gone.join(""));
-    const due = y(this.cell.deadline_ms);
     this.due.setAttribute("d", `M0 ${due.toFixed(1)}H${WIDE}`);
     this.deadline.style.setProperty("top", `${due - 7}px`);
     const stretches = this.lanes.map(() => []);
@@ -78,7 +80,7 @@ class Small {
     panel.health(this.root, state, false);
     const { window: seen, decision } = state;
     say(this.seen, seen ? `window ${seen.number}: L95 ${number(seen.seen.l95_ms, 1)} ms, V_D ${percent(seen.seen.violation_rate, 0)}` : "no window yet");
-    say(this.last, decision ? panel.decided_in_words(decision) : `${state.placement}; no decision yet`);
+    say(this.last, decision ? `decided: ${panel.decided_in_words(decision)}` : `${state.placement}; no decision yet`);
   }
 }
 
@@ -124,7 +126,7 @@ export class FleetView {
       [
         "phi",
         has_phi ? [{ key: "phi", label: "Φ a cell", hue: "--ink", dash: [] }] : [],
-        { scale: { range: (_, low, high) => (low === null ? [0, 1] : uPlot.rangeNum(Math.min(0, low), high, 0.1, false)) }, written: (value) => number(value, 1) },
+        { scale: { range: (_, low, high) => (low === null ? [0, 1] : uPlot.rangeNum(low, high, 0.1, false)) }, written: (value) => number(value, 1) },
         (state) => (state.round === null ? "–" : `${number(state.phi, 3)}, round ${count(state.round)}`),
       ],
     ];
@@ -133,7 +135,8 @@ export class FleetView {
       root.hidden = named.length === 0;
       if (root.hidden) return [];
       const chart = lines(root, this.page, 120, named, { ...how, last: true });
-      return [{ ...chart, show: (state) => chart.read((key) => value(state, key)) }];
+      const set = (view) => chart.set(name === "phi" ? { windows: view.rounds } : view);
+      return [{ set, show: (state) => chart.read((key) => value(state, key)) }];
     });
   }
 

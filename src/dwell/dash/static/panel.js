@@ -89,16 +89,16 @@ export const decided = (root, cell, page) => {
 
 /** What was decided, in a few words. */
 export const decided_in_words = ({ incumbent, placement, reason, refused }) => {
-  if (refused) return `✕ ${incumbent}, ${reason}; refused: ${refused}`;
   const moves = placement && placement !== incumbent;
-  return `${moves ? `${incumbent} → ${placement}` : incumbent}, ${reason}`;
+  return `${moves ? `${incumbent} → ${placement}` : incumbent}, ${reason}${refused ? `; ✕ refused: ${refused}` : ""}`;
 };
 
 const decision = (state) => {
   const { decision: last, proving } = state;
   const parts = [];
   if (last) {
-    parts.push(`Last decision: ${decided_in_words(last)}: ${REASONS[last.reason] ?? "see the reasons in the documentation"}.`);
+    parts.push(`Last decision: ${decided_in_words({ ...last, refused: null })}: ${REASONS[last.reason] ?? "see the reasons in the documentation"}.`);
+    if (last.refused) parts.push(`✕ Refused: ${last.refused}.`);
     if (last.delta_j !== null && last.delta_j !== undefined) parts.push(`ΔJ ${number(last.delta_j, 3)}.`);
   } else parts.push("No decision yet.");
   if (state.pinned) parts.push(`Pinned to ${state.pinned}, whatever is decided.`);
