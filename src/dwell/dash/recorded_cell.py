@@ -18,7 +18,7 @@ from dwell.dash.paged_cell import (
     cycle_since,
     job_since,
 )
-from dwell.dash.recorded_events import RecordedEvents, disturbance_events
+from dwell.dash.recorded_events import RecordedEvents, disturbance_events, disturbances_met
 from dwell.dash.recorded_windows import RecordedWindows, placement_codes
 from dwell.dash.strip import Floats, Strip, binned_means
 from dwell.errors import RunError
@@ -148,7 +148,8 @@ class _Contents:
     def _disturbances(self) -> Iterator[Plain]:
         """Yield what the scenario did."""
         end_s = float(self._release_ns[-1]) / 1e9
-        for event in disturbance_events(self.run.disturbances, self.problem, end_s):
+        met = disturbances_met(self.run, self.run.disturbances)
+        for event in disturbance_events(met, self.problem, end_s):
             yield {**event, "at": self._place(event["at"])}
 
     def _place(self, at_s: float) -> float:

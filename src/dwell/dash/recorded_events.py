@@ -9,9 +9,20 @@ import numpy as np
 from dwell.dash.paged_cell import Plain
 from dwell.model import Problem, Scenario
 from dwell.model.disturbed import disturbed
+from dwell.record import Run
 
 #: Events of a view at most.
 MOST_EVENTS = 300
+
+
+def disturbances_met(run: Run, planned: Scenario) -> Scenario:
+    """Return what a run met: what was planned, with its episodes as they were drawn."""
+    if all(item.episodes is None for item in planned):
+        return planned
+    # Loads the simulator, which draws.
+    from dwell.study.drawn_disturbances import disturbances_of
+
+    return disturbances_of(run)
 
 
 def disturbance_events(scenario: Scenario, problem: Problem, end_s: float) -> Iterator[Plain]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from dwell.dash.paged_cell import Plain
 from dwell.dash.recorded_cell import RecordedCell
-from dwell.dash.recorded_events import RecordedEvents, disturbance_events
+from dwell.dash.recorded_events import RecordedEvents, disturbance_events, disturbances_met
 from dwell.dash.recorded_windows import RecordedWindows
 from dwell.dash.strip import Floats, Strip, binned_means, plain
 from dwell.display import placement_hues
@@ -170,10 +170,9 @@ class RecordedFleet:
                 first, *again = events
                 times = f" ({len(again) + 1} times)" if again else ""
                 yield {**first, "text": f"{one.name}: {text}{times}"}
-            entry = self._run.fleet.cells[one.place].entry
-            for event in disturbance_events(
-                one.problem.scenario(entry.scenario), one.problem, self._end
-            ):
+            planned = one.problem.scenario(self._run.fleet.cells[one.place].entry.scenario)
+            met = disturbances_met(self._run.cells[one.name], planned)
+            for event in disturbance_events(met, one.problem, self._end):
                 happened[event["at"], event["text"]] += 1
         for (at, text), count in happened.items():
             who = "all cells" if count == len(self._members) else f"{count} of the cells"
