@@ -18,6 +18,7 @@ from tests.dash.served import Served, serving
 from tests.dash.test_serving import LIVE, ran
 
 MARKUP = "<img src=x onerror=window.pwned=1><script>window.pwned=1</script>"
+TAG = "<img src=x onerror=window.pwned=1>"
 READY = "document.querySelector('.small .seen')?.textContent"
 
 
@@ -244,18 +245,26 @@ def test_markup_in_the_names_of_a_fleet_is_only_text(
 ) -> None:
     folder = shutil.copytree(fleet_folder, tmp_path / "pack")
     shutil.rmtree(folder / "small-03")
-    file = folder / FLEET
-    described = json.loads(file.read_text())
-    described["cells"][2] = MARKUP
-    described["phases"][MARKUP] = 0.0
+    for name in ("01", "02"):
+        (folder / f"small-{name}").rename(folder / f"{TAG}-{name}")
+    described = json.loads((folder / FLEET).read_text())
+    described["cells"] = [f"{TAG}-{name}" for name in ("01", "02", "03")]
+    described["phases"] = dict.fromkeys(described["cells"], 0.0)
     described["fleet"]["name"] = MARKUP
-    file.write_text(json.dumps(described))
+    for entry in described["fleet"]["cells"]:
+        entry["cell"]["name"] = TAG
+    (folder / FLEET).write_text(json.dumps(described))
     with (
         serving(tmp_path, folder) as served,
         opened(browser, served.address, ready=READY) as shown,
     ):
         assert shown.locator(".fleet .name").first.inner_text() == MARKUP
         assert MARKUP in shown.title()
-        assert MARKUP in shown.locator(".notes").inner_text()
+        assert f"{TAG}-03" in shown.locator(".notes").inner_text()
+        assert shown.locator(".small h4 a").first.inner_text().startswith(TAG)
+        shown.locator(".small h4 a").first.click()
+        wait_for(shown, "document.querySelector('.latency .said')?.textContent")
+        assert shown.locator(".source").inner_text().startswith(TAG)
+        assert MARKUP in shown.locator("#back-to-fleet").inner_text()
         assert shown.evaluate("window.pwned") is None
         assert shown.locator("main img, main script").count() == 0
