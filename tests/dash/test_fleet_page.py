@@ -13,6 +13,7 @@ from playwright.sync_api import Browser, Page
 from dwell.record import FleetRun, open_fleet
 from dwell.record.fleet_run import LOAD, UNFINISHED
 from dwell.record.run import FLEET
+from tests.dash.browser import READY as CELL_READY
 from tests.dash.browser import chromium, in_browser, opened, settled, wait_for
 from tests.dash.served import Served, serving
 from tests.dash.test_serving import LIVE, ran
@@ -44,6 +45,12 @@ def browser() -> Iterator[Browser]:
 def shown(browser: Browser, served: Served) -> Iterator[Page]:
     with opened(browser, served.address, ready=READY) as made:
         yield made
+
+
+def wait_for_page(shown: Page, address: str, ready: str = CELL_READY) -> None:
+    """Wait until another page has come, and is drawn."""
+    shown.wait_for_url(address)
+    wait_for(shown, ready)
 
 
 # ------------------------------------------------------------------------------ what is served
@@ -178,7 +185,7 @@ def test_a_click_opens_a_cell_at_the_same_place_and_leads_back(shown: Page, runs
     shown.evaluate("window.page.moveTo(3)")
     name = shown.locator(".small h4 a").first.inner_text()
     shown.locator(".small").first.click()
-    wait_for(shown, "document.querySelector('.latency .said')?.textContent")
+    wait_for_page(shown, "**/cell/*")
     assert shown.evaluate("window.page.at") == 3
     assert shown.locator(".source").inner_text() == name
     assert f"of {runs.cells[name].cycles.height} cycles" in shown.locator(".facts").inner_text()
@@ -188,7 +195,7 @@ def test_a_click_opens_a_cell_at_the_same_place_and_leads_back(shown: Page, runs
     shown.reload()
     wait_for(shown, "window.page")
     shown.locator("#back-to-fleet a").click()
-    wait_for(shown, READY)
+    wait_for_page(shown, "**/", READY)
     assert shown.locator(".small").count() == 3
 
 
@@ -205,6 +212,7 @@ def test_a_fleet_plays_steps_and_zooms(shown: Page) -> None:
     begin, end = shown.evaluate("window.page.view")
     assert end - begin == pytest.approx(4, abs=0.1)
     assert shown.get_by_role("button", name="Cycles").is_hidden()
+    shown.keyboard.press("0")
     shown.locator(".events button", has_text="→").first.click()
     begin, end = shown.evaluate("window.page.view")
     assert end - begin == pytest.approx(0.6)
@@ -224,7 +232,7 @@ def test_a_cell_is_reached_by_keys_and_has_a_name_for_screen_readers(shown: Page
     while shown.evaluate("document.activeElement.textContent") != name:
         shown.keyboard.press("Tab")
     shown.keyboard.press("Enter")
-    wait_for(shown, "document.querySelector('.latency .said')?.textContent")
+    wait_for_page(shown, "**/cell/*")
     assert shown.locator(".source").inner_text() == name
 
 
@@ -263,7 +271,7 @@ def test_markup_in_the_names_of_a_fleet_is_only_text(
         assert f"{TAG}-03" in shown.locator(".notes").inner_text()
         assert shown.locator(".small h4 a").first.inner_text().startswith(TAG)
         shown.locator(".small h4 a").first.click()
-        wait_for(shown, "document.querySelector('.latency .said')?.textContent")
+        wait_for_page(shown, "**/cell/*")
         assert shown.locator(".source").inner_text().startswith(TAG)
         assert MARKUP in shown.locator("#back-to-fleet").inner_text()
         assert shown.evaluate("window.pwned") is None
