@@ -192,11 +192,10 @@ def test_a_click_opens_a_cell_at_the_same_place_and_leads_back(shown: Page, runs
     shown.keyboard.press("c")
     settled(shown)
     assert shown.locator(".gantt .job").count() > 0
-    shown.reload()
-    wait_for(shown, "window.page")
     shown.locator("#back-to-fleet a").click()
     wait_for_page(shown, "**/", READY)
     assert shown.locator(".small").count() == 3
+    assert shown.evaluate("window.page.at") == 3
 
 
 @in_browser

@@ -58,6 +58,12 @@ class _Member:
     rate: float
     strip: Strip
 
+    @property
+    def placed(self) -> list[str]:
+        """The placements that its windows have."""
+        names = list(self.problem.candidates)
+        return [names[code] for code in np.unique(self.windows.placement).tolist()]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rounds:
@@ -106,10 +112,12 @@ class RecordedFleet:
             self._whole(run), key=lambda one: (-np.nan_to_num(one.rate), one.place)
         )
         if not self._members:
-            raise RunError("\n".join([self._how_many(), *listed(self._faults)]))
-        self.name, self.count = run.fleet.name, len(run.fleet.cells)
+            raise RunError("\n".join([f"{folder}: {self._how_many()}", *listed(self._faults)]))
         candidates = dict.fromkeys(name for one in self._members for name in one.problem.candidates)
-        self._placements = {name: i for i, name in enumerate(candidates)}
+        used = {name for one in self._members for name in one.placed}
+        self._hues = placement_hues(candidates)
+        # Those where a cell ever is.
+        self._placements = {name: i for i, name in enumerate(n for n in candidates if n in used)}
         self._end = max(float(one.windows.closes[-1]) for one in self._members)
         self._rounds = _rounds(self._members)
         self._grid, self._load = self._shared_load()
@@ -152,13 +160,17 @@ class RecordedFleet:
         """Return what is drawn as lines: load, cells by placement."""
         counts = np.zeros((len(self._placements), len(self._grid)))
         for one in self._members:
-            codes = np.array([self._placements[name] for name in one.problem.candidates])
+            codes = self._codes(one)
             rows = _held(one.windows, self._grid)
             counts[codes[one.windows.placement[rows]], np.arange(len(self._grid))] += 1
         return {
             **{f"u {name}": column for name, column in self._load.items()},
             **{f"on {name}": counts[i] for name, i in self._placements.items()},
         }
+
+    def _codes(self, one: _Member) -> NDArray[np.int64]:
+        """Return the places of a cell's candidates among the placements; -1 of those not used."""
+        return np.array([self._placements.get(name, -1) for name in one.problem.candidates])
 
     def _all_events(self) -> Iterator[Plain]:
         """Yield what happened to the cells: their moves and refusals, and to how many what else."""
@@ -187,7 +199,6 @@ class RecordedFleet:
     def described(self) -> Plain:
         """Return what does not change: its cells, and where its time line begins and ends."""
         run, first = self._run, self._run.fleet.entries[0].cell
-        hues = placement_hues(self._placements)
         phases = run.fleet.phases
         return {
             "name": run.fleet.name,
@@ -206,7 +217,7 @@ class RecordedFleet:
                 "seed": str(run.seed),
             },
             "notes": list(self._notes()),
-            "placements": [{"name": name, "hue": hues[name]} for name in self._placements],
+            "placements": [{"name": name, "hue": self._hues[name]} for name in self._placements],
             "shared": list(self._load),
             "has_phi": bool(len(self._rounds.at)),
             "mean_rate": plain(np.array([np.mean([one.rate for one in self._members])]), 4)[0],
@@ -241,9 +252,8 @@ class RecordedFleet:
 
     def _cell_view(self, one: _Member, begin: float, end: float, bins: int) -> Plain:
         view = one.strip.view(begin, end, bins)
-        names = list(one.problem.candidates)
         ribbon = view["ribbon"]
-        ribbon["placement"] = [self._placements[names[code]] for code in ribbon["placement"]]
+        ribbon["placement"] = self._codes(one)[ribbon["placement"]].tolist()
         return {
             "windows": view["cycles"],
             "over": view["missed"],

@@ -31,7 +31,7 @@ class Small {
     this.deadline = make("span", { text: number(cell.deadline_ms, 0), class: "deadline" });
     const names = fleet.placements.map(({ name }) => make("span", { text: name, title: name }));
     this.link = make("a", { href: `/cell/${cell.place}`, text: cell.name });
-    this.link.addEventListener("click", () => this.link.setAttribute("href", `/cell/${cell.place}#${page.at}`));
+    page.lead(this.link);
     this.health = make("span", { class: "health" });
     this.seen = make("p", { class: "seen" });
     this.last = make("p", { class: "last" });

@@ -102,11 +102,19 @@ class Page {
     this.readEvents();
   }
 
-  /** Lead from a cell's page to that of its fleet, at the same place. */
+  /** Lead from a cell's page to that of its fleet. */
   leadBack({ name }) {
     const link = make("a", { href: "/", text: `◀ ${name}, the fleet` });
-    link.addEventListener("click", () => link.setAttribute("href", `/#${this.at}`));
+    this.lead(link);
     element("back-to-fleet").replaceChildren(link);
+  }
+
+  /** Have a link lead to the same place on another page, and the browser's way back to it here. */
+  lead(link) {
+    link.addEventListener("click", () => {
+      link.hash = String(this.at);
+      history.replaceState(null, "", `#${this.at}`);
+    });
   }
 
   get stale() {
