@@ -210,6 +210,7 @@ class RecordedFleet:
             "end": self._end,
             "period_ms": first.pipeline.period_ms,
             "window_cycles": first.window_cycles,
+            "count": self.count,
             "about": {
                 "coordination": run.fleet.coordination,
                 "objective": run.fleet.objective,

@@ -91,7 +91,7 @@ export class FleetView {
     document.getElementById("cells").append(this.root);
     this.part = (name) => this.root.querySelector(`.${name}`);
     this.part("name").textContent = fleet.name;
-    this.part("source").textContent = `fleet of ${count(fleet.cells.length)}`;
+    this.part("source").textContent = `fleet of ${count(fleet.count)}`;
     panel.describe(this.root, fleet);
     this.smalls = fleet.cells.map((cell) => new Small(cell, fleet, page));
     this.part("smalls").append(...this.smalls.map(({ root }) => root));
