@@ -13,6 +13,8 @@ from playwright.sync_api import Browser, Page, sync_playwright
 from tests.dash.served import until
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+#: True once a cell's page is drawn.
+READY = "document.querySelector('.latency .said')?.textContent"
 in_browser = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
 
 
@@ -30,9 +32,24 @@ def wait_for(page: Page, expression: str) -> None:
     until(lambda: page.evaluate(f"Boolean({expression})"))
 
 
+def settled(shown: Page) -> None:
+    """Wait until what was asked for is drawn."""
+    shown.wait_for_timeout(100)
+    shown.wait_for_load_state("networkidle")
+    shown.wait_for_timeout(50)
+
+
 @contextmanager
-def opened(browser: Browser, address: str, **settings: object) -> Iterator[Page]:
-    """Open an address; the page's console has to be silent, and it may ask its own host alone."""
+def opened(
+    browser: Browser, address: str, *, ready: str = READY, **settings: object
+) -> Iterator[Page]:
+    """Open an address; the page's console has to be silent, and it may ask its own host alone.
+
+    Parameters
+    ----------
+    ready : str
+        What is true once the page is drawn.
+    """
     context = browser.new_context(**{"viewport": {"width": 1280, "height": 1000}, **settings})  # type: ignore[arg-type]
     page = context.new_page()
     said: list[str] = []
@@ -41,7 +58,7 @@ def opened(browser: Browser, address: str, **settings: object) -> Iterator[Page]
     page.on("pageerror", lambda error: said.append(str(error)))
     page.on("request", lambda request: asked.add(urlsplit(request.url).netloc))
     page.goto(address)
-    wait_for(page, "document.querySelector('.latency .said')?.textContent")
+    wait_for(page, ready)
     yield page
     context.close()
     assert said == []

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.dash.recorded import small_run
+from tests.dash.recorded import small_fleet, small_run
 from tests.dash.served import Served, serving
 
 
@@ -16,6 +16,14 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of a run that kept its jobs."""
     folder = tmp_path_factory.mktemp("runs") / "run"
     small_run(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def fleet_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a fleet's runs that kept their jobs."""
+    folder = tmp_path_factory.mktemp("fleets") / "pack"
+    small_fleet(folder)
     return folder
 
 

@@ -1,11 +1,12 @@
-"""Runs of the small cell, in folders."""
+"""Runs of the small cell, and of a fleet of them, in folders."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import dwell
-from dwell.record import Journal, Run, column_types
+from dwell.model.fleet import Fleet, FleetEntry
+from dwell.record import FleetRun, Journal, Run, column_types
 from tests.cli.small_cell import SMALL
 
 
@@ -20,6 +21,19 @@ def small_run(
     run = dwell.simulate(
         problem, scenario="stress", policy=policy, seed=seed, windows=windows, jobs=jobs
     )
+    run.save(folder)
+    return run
+
+
+def small_fleet(folder: Path, *, cells: int = 3, windows: int = 40, jobs: bool = True) -> FleetRun:
+    """Simulate a fleet of small cells under stress, and save its runs."""
+    folder.parent.mkdir(exist_ok=True)
+    file = folder.parent / "small.yaml"
+    file.write_text(SMALL, encoding="utf-8")
+    problem = dwell.load(file)
+    entries = (FleetEntry(problem, cells - 1, scenario="stress"), FleetEntry(problem))
+    fleet = Fleet("pack", entries, ("E",), phases="even")
+    run = dwell.simulate_fleet(fleet, seed=1, windows=windows, jobs=jobs)
     run.save(folder)
     return run
 

@@ -12,7 +12,7 @@ import pytest
 from playwright.sync_api import Browser, Page
 
 import dwell
-from tests.dash.browser import chromium, in_browser, opened, wait_for
+from tests.dash.browser import chromium, in_browser, opened, settled, wait_for
 from tests.dash.recorded import small_run
 from tests.dash.served import Served, serving
 
@@ -36,13 +36,6 @@ def shown(browser: Browser, page: Served) -> Iterator[Page]:
 @pytest.fixture(scope="module")
 def run(run_folder: Path) -> dwell.Run:
     return dwell.open_run(run_folder)
-
-
-def settled(shown: Page) -> None:
-    """Wait until what was asked for is drawn."""
-    shown.wait_for_timeout(100)
-    shown.wait_for_load_state("networkidle")
-    shown.wait_for_timeout(50)
 
 
 def missed_in_view(shown: Page) -> list[int]:

@@ -112,6 +112,22 @@ def test_disturbances_stand_among_the_events(tmp_path: Path) -> None:
     assert at == [2.0, 5.0]
 
 
+def test_episodes_stand_among_the_events_as_they_were_drawn(tmp_path: Path) -> None:
+    run = small_run(tmp_path / "run")
+    document = run.meta
+    document["problem"]["scenarios"]["stress"][0]["episodes"] = {
+        "name": "rush",
+        "every_s": 2.0,
+        "for_s": 0.5,
+    }
+    dwell.Run(
+        document, {name: getattr(run, name) for name in ("cycles", "windows", "decisions")}
+    ).save(tmp_path / "run")
+    view = RecordedCell(tmp_path / "run").view(0.0, 20.0, 50)
+    at = [event["at"] for event in view["events"] if event["kind"] == "disturbance"]
+    assert at == [2.0, 2.5, 4.5, 5.0, 7.0, 7.5, 9.5, 10.0]
+
+
 def test_a_damaged_table_is_named(tmp_path: Path) -> None:
     small_run(tmp_path / "run")
     file = tmp_path / "run" / "windows.parquet"

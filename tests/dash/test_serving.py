@@ -73,15 +73,18 @@ def test_a_port_that_is_taken_is_told(run_folder: Path) -> None:
     assert "--port 0" in done.stderr
 
 
-def test_ctrl_c_ends_it(run_folder: Path) -> None:
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 0)])
+def test_a_signal_right_after_the_address_ends_it_in_order(
+    run_folder: Path, sent: signal.Signals, code: int
+) -> None:
     process = subprocess.Popen(
         dash(run_folder), stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment()
     )
     assert process.stdout is not None
     assert process.stdout.readline()
-    process.send_signal(signal.SIGINT)
+    process.send_signal(sent)
     _, said = process.communicate(timeout=60)
-    assert (process.returncode, said) == (130, b"")
+    assert (process.returncode, said) == (code, b"")
 
 
 # ------------------------------------------------------------------------------ the browser
@@ -160,10 +163,6 @@ def test_a_folder_of_runs_names_them(tmp_path: Path) -> None:
     assert code == 2
     assert "it holds one, two: name one of them" in said
     assert "--beside" in said
-    (tmp_path / "both" / "fleet.json").write_text("{}")
-    code, said = ran(tmp_path / "both")
-    assert code == 2
-    assert "a fleet" in said
 
 
 def test_what_is_no_run_is_told_so(tmp_path: Path) -> None:

@@ -40,6 +40,36 @@ def test_where_nobody_answers_it_says_so() -> None:
     assert (found["health"], found["headline"], found["answer_age_ms"]) == ("absent", words, None)
 
 
+def test_a_late_answer_to_another_wish_is_not_taken_for_an_answer() -> None:
+    problem = on_this_machine(dwell.load(EXAMPLE / "cell.yaml"))
+    keys = Keys(problem.name)
+    role = next(role for role in roles(problem) if role.kind == "controller")
+    server = ZenohTransport(wire(problem).entry(role.who))
+    pins: list[Ask] = []
+
+    def answer(sample: Arrival) -> None:
+        ask = decode(sample.payload, Ask)
+        if ask.what == "pin":
+            pins.append(ask)
+            return
+        # What was not answered before is answered now, and first.
+        for one in (*pins, ask):
+            refused = "late" if one.what == "pin" else ""
+            server.put(keys.answer(one.number), encode(Answer(one.number, refused, {})))
+
+    for key in (keys.ask(), keys.look()):
+        server.subscribe(key, answer)
+    try:
+        with OperatorClient(problem) as client:
+            client.ask("status", patience_s=10.0)
+            with pytest.raises(LiveError, match="answers"):
+                client.ask("pin", "SO", patience_s=0.2)
+            assert client.ask("unpin", patience_s=10.0) == {}
+    finally:
+        server.close()
+    assert pins
+
+
 def test_an_answer_is_shown_without_what_a_terminal_would_obey() -> None:
     """Without keys anybody may be the controller."""
     problem = on_this_machine(dwell.load(EXAMPLE / "cell.yaml"))

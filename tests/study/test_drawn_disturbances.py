@@ -8,6 +8,8 @@ import numpy as np
 
 import dwell
 from dwell.model import Constant, Episodes, Exponential, NodeDisturbance, Trace, TraceTable
+from dwell.model.fleet import Fleet, FleetEntry
+from dwell.sim.fleet import drawn, phased
 from dwell.study.drawn_disturbances import disturbances_of, drawn_disturbances
 from tests.cells.small import make_problem
 
@@ -27,6 +29,22 @@ def test_episodes_of_a_run_are_those_that_its_seed_draws() -> None:
     assert len(gusts) > 1
     assert {(one.for_s, one.episodes) for one in gusts} == {(1.0, None)}
     assert found != drawn_disturbances(problem, "windy", 5, 40)
+
+
+def test_cells_of_a_fleet_draw_their_own_episodes_and_the_first_those_of_shared_nodes() -> None:
+    scenarios = {"windy": (WIND, replace(WIND, node="E"))}
+    problem = replace(make_problem(), scenarios=scenarios)
+    fleet = Fleet("two", (FleetEntry(problem, 2, scenario="windy"),), ("E",), coordination="none")
+    runs = dwell.simulate_fleet(fleet, policy="LOC", seed=4, windows=40).cells
+    problems = dict(zip(runs, phased(fleet, 4), strict=True))
+    for name, realisation in drawn(fleet, problems, 4, 40).items():
+        changes = {(change.node, change.at_ns) for change in realisation.node_changes}
+        met = disturbances_of(runs[name])
+        begins = {
+            (one.node, round(one.at_s * 1e9)) for one in met if isinstance(one, NodeDisturbance)
+        }
+        assert begins
+        assert begins <= changes
 
 
 def test_what_was_played_is_believed() -> None:

@@ -1,4 +1,4 @@
-"""`dwell dash`: the page of a live cell, or of a recorded run."""
+"""`dwell dash`: the page of a live cell, of a recorded run, or of a fleet's runs."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ def dash(
     shown: Annotated[
         Path | None,
         typer.Argument(
-            metavar="CELL|RUN",
-            help="Cell file of a cell that runs, or the folder of a run; ./cell.yaml if not given.",
+            metavar="CELL|RUN|FLEET",
+            help="Cell file of a cell that runs, or the folder of a run, or of a fleet's runs; "
+            "./cell.yaml if not given.",
         ),
     ] = None,
     beside: Annotated[
@@ -58,8 +59,9 @@ def dash(
     keys: Keys = None,
     insecure: Insecure = False,
 ) -> None:
-    """Show a live cell, or a recorded run, on a page in the browser of this computer."""
-    from dwell.dash.pages import show_cell, show_run
+    """Show a live cell, or recorded runs, on a page in the browser of this computer."""
+    from dwell.dash.pages import show_cell, show_fleet, show_run
+    from dwell.record import is_fleet
 
     def say(line: str) -> None:
         typer.echo(line, err=True)
@@ -67,10 +69,20 @@ def dash(
     kept = None if token is None else _kept(token)
     where = shown or CELL
     if where.is_dir():
+        fleet = is_fleet(where)
         if control:
-            raise typer.BadParameter("--control: a recorded run cannot be acted on")
+            raise typer.BadParameter("--control: recorded runs cannot be acted on")
         if mcap is not None:
-            raise typer.BadParameter(f"--mcap: dwell report {where} --mcap {mcap} writes a run's")
+            run = where / "CELL" if fleet else where
+            raise typer.BadParameter(f"--mcap: dwell report {run} --mcap {mcap} writes a run's")
+        if fleet and beside is not None:
+            raise typer.BadParameter(
+                f"--beside: {where} is a fleet, which is shown alone; two of its runs can stand "
+                "beside each other"
+            )
+        if fleet:
+            show_fleet(where, port=port, browser=not no_browser, say=say, token=kept)
+            return
         show_run(where, beside, port=port, browser=not no_browser, say=say, token=kept)
         return
     if beside is not None:

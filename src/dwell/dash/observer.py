@@ -238,7 +238,7 @@ class Observer:
         TrustError
             If the keys are those of somebody who may only look.
         """
-        # A client of its own: no late answer to a question is taken for the answer to this.
+        # A client of its own: the other one is asking.
         with OperatorClient(self.problem, self._environment) as client:
             status = client.ask(what, about)
         self._answer(status)

@@ -1,4 +1,4 @@
-"""Pages: what `dwell dash` shows of a run, of two, or of a live cell."""
+"""Pages: what `dwell dash` shows of a run, of two, of a fleet's runs, or of a live cell."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from dwell.errors import DwellError, RunError, TrustError
 from dwell.live.log import printable
-from dwell.record import is_run
+from dwell.record import is_fleet, is_run
 
 if TYPE_CHECKING:
     from dwell.dash.observer import Observer
-    from dwell.dash.recorded_cell import RecordedCell
+    from dwell.dash.recorded_fleet import RecordedFleet
 
 #: Prints a line for people.
 Say: TypeAlias = Callable[[str], None]
@@ -43,21 +43,41 @@ def show_run(
     for one in (folder, beside):
         if one is not None:
             _require_run(one)
+    _serve(lambda: _on_one_line(folder, beside), port=port, browser=browser, say=say, token=token)
+
+
+def show_fleet(
+    folder: Path, *, port: int, browser: bool, say: Say, token: str | None = None
+) -> None:
+    """Show the recorded runs of a fleet until interrupted.
+
+    Raises
+    ------
+    RunError
+        If the folder is no fleet's, or no run in it is whole.
+    """
+    _serve(lambda: {"fleet": _fleet(folder)}, port=port, browser=browser, say=say, token=token)
+
+
+def _serve(
+    read: Callable[[], Mapping[str, Any]], *, port: int, browser: bool, say: Say, token: str | None
+) -> None:
+    """Serve what is read from a folder."""
     with ThreadPoolExecutor(1) as reader:
-        reading = reader.submit(_on_one_line, folder, beside)
+        reading = reader.submit(read)
         # Meanwhile: both take as long.
         from dwell.dash.server import Dash
         from dwell.dash.serving import serve
 
-        cells, line = reading.result()
-    serve(Dash(cells, line), port, browser=browser, say=say, token=token)
+        dash = Dash(**reading.result())
+    serve(dash, port, browser=browser, say=say, token=token)
 
 
 def _require_run(folder: Path) -> None:
     """Refuse a folder that is not one run, and name those in it."""
     if is_run(folder) or not folder.is_dir():
         return
-    if (folder / "fleet.json").is_file():
+    if is_fleet(folder):
         raise RunError(f"{folder}: a fleet; name the folder of one of its cells")
     runs = sorted(path.relative_to(folder).as_posix() for path in _runs_in(folder))
     if runs:
@@ -73,18 +93,26 @@ def _runs_in(folder: Path) -> list[Path]:
     return [path for path in (*folder.glob("*"), *folder.glob("runs/*")) if is_run(path)]
 
 
-def _on_one_line(folder: Path, beside: Path | None) -> tuple[list[RecordedCell], str]:
+def _fleet(folder: Path) -> RecordedFleet:
+    from dwell.dash.recorded_fleet import RecordedFleet
+
+    return RecordedFleet(folder)
+
+
+def _on_one_line(folder: Path, beside: Path | None) -> dict[str, Any]:
     """Return the runs, and what their time line counts: cycles where these are the same."""
     from dwell.dash.recorded_cell import RecordedCell, same_realisation
 
     one = RecordedCell(folder)
     if beside is None:
-        return [one], ""
+        return {"cells": [one]}
     other = RecordedCell(beside)
     if same_realisation(one.run, other.run):
+        cells = [RecordedCell(folder, "cycle"), RecordedCell(beside, "cycle")]
         line = "by number of the cycle: both runs met the same realisation"
-        return [RecordedCell(folder, "cycle"), RecordedCell(beside, "cycle")], line
-    return [one, other], "by seconds since the first release: the runs met different realisations"
+        return {"cells": cells, "line": line}
+    line = "by seconds since the first release: the runs met different realisations"
+    return {"cells": [one, other], "line": line}
 
 
 def show_cell(

@@ -6,13 +6,14 @@ import asyncio
 import json
 import logging
 import math
+import re
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache, partial
 from http import HTTPStatus
 from pathlib import Path
-from typing import Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -24,6 +25,9 @@ from starlette.types import Receive, Scope, Send
 
 from dwell.dash.paged_cell import PagedCell, Plain
 from dwell.errors import DwellError
+
+if TYPE_CHECKING:
+    from dwell.dash.recorded_fleet import RecordedFleet
 
 _LOG = logging.getLogger(__name__)
 
@@ -41,6 +45,8 @@ MOST_READERS, READER_S = 32, 10.0
 #: A comment keeps a connection, and notices who is gone.
 QUIET_S = 15.0
 MOST_BODY_BYTES = 4_096
+#: Number of a cell, as a request has it.
+PLACE = re.compile(r"[0-9]{1,6}")
 LEAST_BINS, MOST_BINS = 10, 1_500
 
 #: Name of an act, and what it is about, to the controller's status.
@@ -52,12 +58,14 @@ ACTS = {"pin": "candidate", "unpin": None, "drain": "node", "undrain": "node"}
 
 @dataclass(slots=True)
 class Dash:
-    """Cells on one page.
+    """Cells on one page, or a fleet whose cells have a page each.
 
     Parameters
     ----------
     cells : sequence of PagedCell
         On one time line.
+    fleet : RecordedFleet, optional
+        Shown instead of them.
     line : str
         What the time line counts where there are several, and why; empty for one.
     act : callable, optional
@@ -68,7 +76,8 @@ class Dash:
         From the header `Accept` to the page of the first cell's metrics, and its type.
     """
 
-    cells: Sequence[PagedCell]
+    cells: Sequence[PagedCell] = ()
+    fleet: RecordedFleet | None = None
     line: str = ""
     act: Act | None = None
     read_only: str = "this page only looks; `dwell dash --control` lets it act"
@@ -81,7 +90,7 @@ class Dash:
     def application(self) -> Starlette:
         """Return what a server serves; who may ask is not its business (`dwell.dash.gate`)."""
         routes = [
-            Route("/", partial(_file, "index.html")),
+            *(Route(path, partial(_file, "index.html")) for path in ("/", "/cell/{place:int}")),
             *(Route(f"/static/{name}", partial(_file, name)) for name in static_files()),
             Route("/cells", self._cells),
             Route("/view", self._view),
@@ -100,12 +109,21 @@ class Dash:
 
     # ---------------------------------------------------------------------- what is read
 
-    async def _cells(self, _: Request) -> Response:
-        described = [await run_in_threadpool(cell.described) for cell in self.cells]
+    async def _cells(self, request: Request) -> Response:
+        fleet = None
+        if self.fleet is None:
+            cells = self.cells
+        elif "cell" in request.query_params:
+            cells = [await self._cell(request)]
+            fleet = {"name": self.fleet.name}
+        else:
+            cells = []
+            fleet = await run_in_threadpool(self.fleet.described)
         control = self.act is not None
         return JSONResponse(
             {
-                "cells": described,
+                "cells": [await run_in_threadpool(cell.described) for cell in cells],
+                "fleet": fleet,
                 "line": self.line,
                 "control": control,
                 "read_only": None if control else self.read_only,
@@ -113,25 +131,33 @@ class Dash:
         )
 
     async def _view(self, request: Request) -> Response:
-        cell, begin, end = self._cell(request), *_places(request)
+        shown, begin, end = await self._shown(request), *_places(request)
         bins = round(_number(request, "bins", 600.0))
         bins = min(max(bins, LEAST_BINS), MOST_BINS)
-        return JSONResponse(await run_in_threadpool(cell.view, begin, end, bins))
+        return JSONResponse(await run_in_threadpool(shown.view, begin, end, bins))
 
     async def _state(self, request: Request) -> Response:
-        cell = self._cell(request)
-        return JSONResponse(await run_in_threadpool(cell.state, _number(request, "at")))
+        shown = await self._shown(request)
+        return JSONResponse(await run_in_threadpool(shown.state, _number(request, "at")))
 
     async def _jobs(self, request: Request) -> Response:
-        cell, begin, end = self._cell(request), *_places(request)
+        cell, begin, end = await self._cell(request), *_places(request)
         return JSONResponse(await run_in_threadpool(cell.jobs, begin, end))
 
-    def _cell(self, request: Request) -> PagedCell:
-        place = request.query_params.get("cell", "0")
-        cell = {str(i): cell for i, cell in enumerate(self.cells)}.get(place)
-        if cell is None:
-            raise HTTPException(HTTPStatus.NOT_FOUND, f"no cell {place[:20]!r}")
-        return cell
+    async def _shown(self, request: Request) -> PagedCell | RecordedFleet:
+        """Return the cell that a request names; the fleet where it names none."""
+        if self.fleet is not None and "cell" not in request.query_params:
+            return self.fleet
+        return await self._cell(request)
+
+    async def _cell(self, request: Request) -> PagedCell:
+        name = request.query_params.get("cell", "0")
+        place = int(name) if PLACE.fullmatch(name) else -1
+        if self.fleet is not None and 0 <= place < self.fleet.count:
+            return await run_in_threadpool(self.fleet.cell, place)
+        if self.fleet is None and 0 <= place < len(self.cells):
+            return self.cells[place]
+        raise HTTPException(HTTPStatus.NOT_FOUND, f"no cell {name[:20]!r}")
 
     async def _ready(self, _: Request) -> Response:
         """Whether a live cell is heard, and well; says nothing else of it."""

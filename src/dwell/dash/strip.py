@@ -97,22 +97,22 @@ class Strip:
                 "missed": _reduced(np.add, missed.astype(np.int64), starts).tolist(),
                 "lost": _reduced(np.add, lost.astype(np.int64), starts).tolist(),
             },
-            "ribbon": self._ribbon(rows, begin, end),
+            "ribbon": self._ribbon(rows, begin, end, bins),
         }
 
-    def _ribbon(self, rows: slice, begin: float, end: float) -> dict[str, Any]:
+    def _ribbon(self, rows: slice, begin: float, end: float, bins: int) -> dict[str, Any]:
         at, placement = self.at[rows], self.placement[rows]
         if not len(at):
             return {"begin": [], "end": [], "placement": [], "exact": True}
         changes = np.concatenate(([0], np.flatnonzero(np.diff(placement)) + 1))
-        exact = len(changes) <= MOST_STRETCHES
+        exact = len(changes) <= min(bins, MOST_STRETCHES)
         if exact:
             # The placement that comes first held before, too.
             first = begin if rows.start else at[0]
             begins = np.concatenate(([first], at[changes[1:]]))
             ends, codes = np.append(begins[1:], end), placement[changes]
         else:
-            starts = bin_starts(at, begin, end, RIBBON_BINS)
+            starts = bin_starts(at, begin, end, min(bins, RIBBON_BINS))
             bin_ends = np.append(at[starts[1:]], end)
             found = [
                 (at[starts][inside], bin_ends[inside], np.full(int(inside.sum()), code))

@@ -120,7 +120,9 @@ def _require_memory(problem: Problem, windows: int) -> None:
         )
 
 
-def drawn_scenario(problem: Problem, *, scenario: str, seed: int, windows: int) -> Scenario:
+def drawn_scenario(
+    problem: Problem, *, scenario: str, seed: int, windows: int, streams: str = ""
+) -> Scenario:
     """Return a scenario as a realisation has it (see `draw`): its drawn episodes as disturbances.
 
     Raises
@@ -130,7 +132,7 @@ def drawn_scenario(problem: Problem, *, scenario: str, seed: int, windows: int) 
     TraceError
         If the times of episodes are a trace that is too short or is not there.
     """
-    return Drawing(problem, scenario, seed=seed, windows=windows).episodes()
+    return Drawing(problem, scenario, seed=seed, windows=windows, streams=streams).episodes()
 
 
 def draw_changes(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import queue
 import time
 import uuid
@@ -44,6 +45,7 @@ class OperatorClient:
         self._controller = f"controller@{problem.controller_node}"
         self._keys = Keys(problem.name)
         self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
+        self._wishes = itertools.count(1)
         self._answered_s: float | None = None
         role = Role(self.name, problem.controller_node, "visitor")
         security = self._security = Security.of(problem, role, environment)
@@ -113,20 +115,35 @@ class OperatorClient:
 
     def _answer(self, what: str, about: str, patience_s: float) -> Answer | None:
         """Ask until there is an answer, or patience ends."""
-        ask = encode(Ask(self.name, what, about))
         # Who only looks may do so with the keys of an observer.
-        key = self._keys.look() if what == "status" else self._keys.ask()
+        if what == "status":
+            number, key = self.name, self._keys.look()
+        else:
+            # Each wish has a number of its own: no late answer to another is taken for its own.
+            number, key = f"{self.name}-{next(self._wishes)}", self._keys.ask()
+            self._transport.subscribe(self._keys.answer(number), self._heard)
+        ask = encode(Ask(number, what, about))
         # One question is sent several times; what was answered to the one before is old.
         while not self._answers.empty():
             self._answers.get()
         for _ in range(max(round(patience_s / RESEND_S), 1)):
             self._transport.put(key, ask)
+            answer = self._answer_to(number)
+            if answer is not None:
+                self._answered_s = time.monotonic()
+                return answer
+        return None
+
+    def _answer_to(self, number: str) -> Answer | None:
+        """Wait a while for an answer with a number."""
+        until_s = time.monotonic() + RESEND_S
+        while (left_s := until_s - time.monotonic()) > 0:
             try:
-                answer = self._answers.get(timeout=RESEND_S)
+                answer = self._answers.get(timeout=left_s)
             except queue.Empty:
-                continue
-            self._answered_s = time.monotonic()
-            return answer
+                break
+            if answer.number == number:
+                return answer
         return None
 
     def _absent(self) -> str:

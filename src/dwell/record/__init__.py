@@ -1,7 +1,7 @@
 """The Run: its schema, tables, open, save; the journal of one that is still going on."""
 
 from dwell.model.table_columns import Feature
-from dwell.record.fleet_run import FleetRun, open_fleet
+from dwell.record.fleet_run import FleetRun, is_fleet, open_fleet
 from dwell.record.journal import Journal
 from dwell.record.run import Run, is_run, open_run, require_free, seal_run
 from dwell.record.schema import (
@@ -37,6 +37,7 @@ __all__ = [
     "arrays_of",
     "column_types",
     "frame_of",
+    "is_fleet",
     "is_run",
     "open_fleet",
     "open_run",

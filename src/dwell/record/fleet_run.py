@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -50,6 +50,10 @@ class FleetRun:
         Whether guards acted.
     phases_ms : mapping of str to float
         Offset of every cell's releases.
+    faults : sequence of str
+        Why cells of the fleet are not among these.
+    finished : bool
+        Whether all was written.
     """
 
     def __init__(
@@ -61,9 +65,12 @@ class FleetRun:
         seed: int,
         guard: bool,
         phases_ms: Mapping[str, float],
+        faults: Sequence[str] = (),
+        finished: bool = True,
     ) -> None:
         self.fleet, self.cells, self._load = fleet, dict(cells), load
         self.seed, self.guard, self.phases_ms = seed, guard, dict(phases_ms)
+        self.faults, self.finished = tuple(faults), finished
 
     def __repr__(self) -> str:
         return f"<FleetRun of {self.fleet.name}: {len(self.cells)} cells, seed {self.seed}>"
@@ -226,8 +233,13 @@ def is_fleet(path: str | os.PathLike[str]) -> bool:
     return _described_in(Path(path)) is not None
 
 
-def open_fleet(path: str | os.PathLike[str]) -> FleetRun:
+def open_fleet(path: str | os.PathLike[str], *, whole: bool = True) -> FleetRun:
     """Open a fleet's folder; tables are read when first asked for.
+
+    Parameters
+    ----------
+    whole : bool
+        Whether all runs have to be there; else those that are not are among the faults.
 
     Raises
     ------
@@ -252,19 +264,37 @@ def open_fleet(path: str | os.PathLike[str]) -> FleetRun:
     except (KeyError, TypeError, ValueError) as error:
         why = "; ".join(str(error).splitlines()) if isinstance(error, ProblemError) else repr(error)
         raise RunError(f"{file}: cannot be read ({why})") from None
+    finished = file.name == FLEET
     runs, faults = {}, []
     for name in names:
         try:
             runs[name] = open_run(folder / name)
         except DwellError as error:
-            faults.append(f"  {error}")
-    if faults or file.name != FLEET:
-        more = [f"  and {len(faults) - LISTED} more"] if len(faults) > LISTED else []
-        whole = f"{folder}: {len(runs)} of {len(names)} runs are whole"
+            faults.append(str(error))
+    if not runs or (whole and (faults or not finished)):
         remedy = "remove what is damaged, and the same command makes the others again"
-        raise RunError("\n".join([f"{whole}; {remedy}", *faults[:LISTED], *more]))
+        told = f"{folder}: {how_many_are_whole(len(runs), len(names))}; {remedy}"
+        raise RunError("\n".join([told, *(f"  {fault}" for fault in listed(faults))]))
     load = read_table(folder / LOAD)
-    return FleetRun(fleet, runs, load, seed=seed, guard=guard, phases_ms=phases_ms)
+    return FleetRun(
+        *(fleet, runs, load),
+        seed=seed,
+        guard=guard,
+        phases_ms=phases_ms,
+        faults=faults,
+        finished=finished,
+    )
+
+
+def how_many_are_whole(count: int, of: int) -> str:
+    """Return how many runs of a fleet there are."""
+    return f"{count} of {of} runs are whole"
+
+
+def listed(faults: Sequence[str]) -> list[str]:
+    """Return the first of some faults, and how many more there are."""
+    more = [f"and {len(faults) - LISTED} more"] if len(faults) > LISTED else []
+    return [*faults[:LISTED], *more]
 
 
 def _read(file: Path) -> dict[str, Any]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -71,10 +72,10 @@ def simulate_fleet(
     for cell in fleet.cells:
         one = played[cell.name]
         meta = partial(
-            meta_of,
-            one.problem,
-            one.controller,
-            scenario=cell.entry.scenario,
+            _meta_of,
+            cell,
+            one,
+            fleet.shared,
             seed=seed,
             windows=windows,
             guard=guard,
@@ -83,6 +84,18 @@ def simulate_fleet(
     load = shared_load(played, fleet.shared)
     offsets = phases_ms(fleet, seed)
     return FleetRun(fleet, runs, load, seed=seed, guard=guard, phases_ms=offsets)
+
+
+def _meta_of(
+    cell: FleetCell,
+    played: PlayedRealisation,
+    shared: Sequence[str],
+    **settings: Any,
+) -> dict[str, Any]:
+    """Return what the record of a cell says; of a copy, also which streams its draws are of."""
+    meta = meta_of(played.problem, played.controller, scenario=cell.entry.scenario, **settings)
+    drawn = {"streams": cell.streams, "shared": list(shared)} if cell.streams else {}
+    return {**meta, **drawn}
 
 
 def play_fleet(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from dwell.errors import TraceError
-from dwell.model import Problem, Scenario
+from dwell.model import Disturbance, NodeDisturbance, Problem, Scenario
 from dwell.record import Run
 from dwell.sim import drawn_scenario
 
@@ -21,19 +23,48 @@ def disturbances_of(run: Run) -> Scenario:
     known = scenario in run.problem.scenarios and isinstance(seed, int)
     if played or not known or run.windows.is_empty():
         return run.disturbances
-    return drawn_disturbances(run.problem, str(scenario), int(str(seed)), run.windows.height)
+    return drawn_disturbances(
+        *(run.problem, str(scenario), int(str(seed)), run.windows.height),
+        streams=str(run.meta.get("streams", "")),
+        shared=run.meta.get("shared", ()),
+    )
 
 
-def drawn_disturbances(problem: Problem, scenario: str, seed: int, windows: int) -> Scenario:
+def drawn_disturbances(
+    problem: Problem,
+    scenario: str,
+    seed: int,
+    windows: int,
+    *,
+    streams: str = "",
+    shared: Sequence[str] = (),
+) -> Scenario:
     """Return a scenario's disturbances as they are drawn; without episodes that cannot be.
 
     Parameters
     ----------
     seed, windows : int
         The run's; episodes are drawn as far as it reaches.
+    streams : str
+        What the names of its streams begin with: those of a cell of a fleet.
+    shared : sequence of str
+        Nodes of which the first cell of a fleet draws what happens.
     """
+
+    def drawn(streams: str) -> Scenario:
+        return drawn_scenario(
+            problem, scenario=scenario, seed=seed, windows=windows, streams=streams
+        )
+
+    def is_shared(item: Disturbance) -> bool:
+        return isinstance(item, NodeDisturbance) and item.node in shared
+
     try:
-        return drawn_scenario(problem, scenario=scenario, seed=seed, windows=windows)
+        own = drawn(streams)
+        if not streams:
+            return own
+        alone = [item for item in own if not is_shared(item)]
+        return (*alone, *(item for item in drawn("") if is_shared(item)))
     except TraceError:
         # Their times are recorded ones, which a run does not have.
         return tuple(item for item in problem.scenario(scenario) if item.episodes is None)

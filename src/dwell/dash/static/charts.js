@@ -2,7 +2,7 @@
 
 import { colour, count, draw, make, number, percent, say } from "./dom.js";
 
-const DASHES = [[], [7, 3], [2, 2], [7, 2, 2, 2], [11, 3, 3, 3], [4, 4], [9, 2, 2, 2, 2, 2]];
+export const DASHES = [[], [7, 3], [2, 2], [7, 2, 2, 2], [11, 3, 3, 3], [4, 4], [9, 2, 2, 2, 2, 2]];
 /** Bins in which a miss is a cross; in more of them, a line. */
 const CROSSES = 120;
 const LEFT = 50;
@@ -204,7 +204,7 @@ const ribbon = (root, page, cell) => {
 };
 
 /** Lines of a value a window; a legend names them, by dashes too, with the values at the place. */
-const lines = (root, page, height, named, { scale, written, last }) => {
+export const lines = (root, page, height, named, { scale, written, last }) => {
   const series = named.map(({ hue, dash, width }) => ({
     stroke: () => (hue.startsWith("--") ? colour(hue) : hue),
     dash,

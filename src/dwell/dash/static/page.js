@@ -2,6 +2,7 @@
 
 import { charts } from "./charts.js";
 import { count, make, place, say } from "./dom.js";
+import { FleetView } from "./fleet.js";
 import { gantt } from "./gantt.js";
 import * as panel from "./panel.js";
 import { act, get, latest } from "./server.js";
@@ -34,10 +35,12 @@ class CellView {
 
   describe(cell) {
     this.cell = cell;
-    const about = Object.entries(cell.about).map(([name, value]) => `${name} ${value}`);
-    this.root.querySelector(".where-caption").textContent = about.join(" · ");
-    const notes = this.root.querySelector(".notes");
-    notes.replaceChildren(...cell.notes.map((text) => make("li", { text })));
+    panel.describe(this.root, cell);
+  }
+
+  /** Less than two cycles show nothing. */
+  get least() {
+    return 2 * (this.page.unit === "cycle" ? 1 : this.cell.period_ms / 1000);
   }
 
   async loadView() {
@@ -65,17 +68,23 @@ class CellView {
     panel.heard(this.root, state);
     this.charts.read(state);
   }
+
+  redraw() {
+    this.charts.redraw();
+  }
 }
 
 class Page {
-  constructor({ cells, line, control, read_only }) {
+  /** Show cells, or a fleet; a cell of a fleet is asked for by its number there. */
+  constructor({ cells: alone, fleet, line, control, read_only }, numbered, at) {
+    const cells = alone.length ? alone : [fleet];
     this.control = control;
     this.readOnly = read_only;
     this.unit = cells[0].unit;
     this.live = cells.some((cell) => cell.live);
     this.span = [Math.min(...cells.map((cell) => cell.begin)), Math.max(...cells.map((cell) => cell.end))];
     this.view = this.live ? [this.span[1] - FOLLOWED_S, this.span[1]] : [...this.span];
-    this.at = this.live ? this.span[1] : this.span[0];
+    this.at = this.live ? this.span[1] : (at ?? this.span[0]);
     this.playing = false;
     this.following = this.live;
     this.heardMs = performance.now();
@@ -83,12 +92,29 @@ class Page {
     document.title = `${cells.map((cell) => cell.name).join(" and ")} – Dwell`;
     element("about").textContent = [this.live ? "live" : "replay", line, this.live && !control ? "read-only" : ""].filter(Boolean).join(" · ");
     element("cells").classList.toggle("two", cells.length > 1);
-    this.cells = cells.map((cell, i) => new CellView(cell, i, this));
+    this.cells = alone.length ? cells.map((cell, i) => new CellView(cell, numbered ?? i, this)) : [new FleetView(fleet, this)];
+    element("cycles").hidden = !alone.length;
+    if (fleet && alone.length) this.leadBack(fleet);
     this.windowLength = (cell) => (this.unit === "cycle" ? cell.window_cycles : (cell.window_cycles * cell.period_ms) / 1000);
     this.listen();
     this.setView(...this.view);
     this.moveTo(this.at);
     this.readEvents();
+  }
+
+  /** Lead from a cell's page to that of its fleet. */
+  leadBack({ name }) {
+    const link = make("a", { href: "/", text: `◀ ${name}, the fleet` });
+    this.lead(link);
+    element("back-to-fleet").replaceChildren(link);
+  }
+
+  /** Have a link lead to the same place on another page, and the browser's way back to it here. */
+  lead(link) {
+    link.addEventListener("click", () => {
+      link.hash = String(this.at);
+      history.replaceState(null, "", `#${this.at}`);
+    });
   }
 
   get stale() {
@@ -99,7 +125,7 @@ class Page {
 
   setView(begin, end) {
     const [first, last] = this.span;
-    const least = 2 * (this.unit === "cycle" ? 1 : this.cells[0].cell.period_ms / 1000);
+    const { least } = this.cells[0];
     const length = Math.min(Math.max(end - begin, least), Math.max(last - first, least));
     const low = this.following ? end - length : Math.min(Math.max(begin, first), last - length);
     this.view = [low, low + length];
@@ -130,7 +156,7 @@ class Page {
     else if (this.at > end) this.setView(this.at - 0.1 * length, this.at + 0.9 * length);
     for (const cell of this.cells) {
       cell.loadState();
-      cell.charts.redraw();
+      cell.redraw();
     }
     this.showPlace();
   }
@@ -153,6 +179,7 @@ class Page {
   }
 
   toCycles() {
+    if (element("cycles").hidden) return;
     const each = this.unit === "cycle" ? 1 : this.cells[0].cell.period_ms / 1000;
     const at = this.live ? this.view[1] - 12 * each : this.at;
     this.follow(false);
@@ -235,7 +262,7 @@ class Page {
       keys[event.key]();
     });
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
-      for (const cell of this.cells) cell.charts.redraw();
+      for (const cell of this.cells) cell.redraw();
     });
   }
 
@@ -308,10 +335,14 @@ class Page {
 
 // A page that plays for hours asks a million times; the browser need not remember when.
 performance.setResourceTimingBufferSize(0);
+/** Where the page before this one was, and the number of the cell in a fleet. */
+const before = location.hash.length > 1 ? Number(location.hash.slice(1)) : NaN;
+const [, numbered] = location.pathname.match(/^\/cell\/(\d+)$/) ?? [];
 // The token is in the cookie by now: it need not stay in the address, nor in the history.
 history.replaceState(null, "", location.pathname);
 try {
-  window.page = new Page(await get("/cells"));
+  const found = await get("/cells", numbered === undefined ? {} : { cell: numbered });
+  window.page = new Page(found, numbered, Number.isFinite(before) ? before : null);
 } catch (error) {
   element("connection").classList.add("bad");
   say(element("connection"), `✕ ${error.message}`);

@@ -20,6 +20,13 @@ export const health = (root, state, stale) => {
   say(element, `${HEALTH[word] ?? "?"} ${word}${state.headline ? `: ${state.headline}` : ""}`);
 };
 
+/** Say what does not change of a cell, or of a fleet. */
+export const describe = (root, { about, notes }) => {
+  const parts = Object.entries(about).map(([name, value]) => `${name} ${value}`);
+  root.querySelector(".where-caption").textContent = parts.join(" · ");
+  root.querySelector(".notes").replaceChildren(...notes.map((text) => make("li", { text })));
+};
+
 const head = (words) =>
   make("thead", {}, make("tr", {}, ...words.map((text, i) => make("th", { scope: "col", text, class: i ? "num" : null }))));
 
@@ -80,13 +87,18 @@ export const decided = (root, cell, page) => {
   };
 };
 
+/** What was decided, in a few words. */
+export const decided_in_words = ({ incumbent, placement, reason, refused }) => {
+  const moves = placement && placement !== incumbent;
+  return `${moves ? `${incumbent} → ${placement}` : incumbent}, ${reason}${refused ? `; ✕ refused: ${refused}` : ""}`;
+};
+
 const decision = (state) => {
   const { decision: last, proving } = state;
   const parts = [];
   if (last) {
-    const moves = last.placement && last.placement !== last.incumbent;
-    const where = moves ? `${last.incumbent} → ${last.placement}` : `${last.incumbent}`;
-    parts.push(`Last decision: ${where}, ${last.reason}: ${REASONS[last.reason] ?? "see the reasons in the documentation"}.`);
+    parts.push(`Last decision: ${decided_in_words({ ...last, refused: null })}: ${REASONS[last.reason] ?? "see the reasons in the documentation"}.`);
+    if (last.refused) parts.push(`✕ Refused: ${last.refused}.`);
     if (last.delta_j !== null && last.delta_j !== undefined) parts.push(`ΔJ ${number(last.delta_j, 3)}.`);
   } else parts.push("No decision yet.");
   if (state.pinned) parts.push(`Pinned to ${state.pinned}, whatever is decided.`);

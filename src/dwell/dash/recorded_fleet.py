@@ -1,0 +1,339 @@
+"""RecordedFleet: a fleet's folder as the page sees it.
+
+It has the windows and the decisions of every cell, and the cycles of those cells alone that are
+opened. Places on its time line are seconds since the run's beginning.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.dash.paged_cell import Plain
+from dwell.dash.recorded_cell import RecordedCell
+from dwell.dash.recorded_events import RecordedEvents, disturbance_events, disturbances_met
+from dwell.dash.recorded_windows import RecordedWindows
+from dwell.dash.strip import Floats, Strip, binned_means, plain
+from dwell.display import placement_hues
+from dwell.errors import RunError
+from dwell.model import Problem
+from dwell.model.fleet import FleetCell
+from dwell.record import FleetRun, Run, open_fleet
+from dwell.record.fleet_run import how_many_are_whole, listed
+
+#: Bins of all cells together at most: some 90 bytes each.
+MOST_BINS, LEAST_BINS = 8_000, 10
+#: Opened cells that are kept.
+MOST_OPEN = 16
+#: Columns of a cell's bins that the page draws.
+DRAWN = ("at", "high", "lost")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Member:
+    """A cell whose run is whole.
+
+    Parameters
+    ----------
+    place : int
+        In the fleet's file.
+    rate : float
+        V_D after the warm-up; NaN where no window is.
+    strip : Strip
+        Of its windows: L95, and whether it is over the deadline.
+    """
+
+    place: int
+    name: str
+    problem: Problem
+    windows: RecordedWindows
+    rate: float
+    strip: Strip
+
+    @property
+    def placed(self) -> list[str]:
+        """The placements that its windows have."""
+        names = list(self.problem.candidates)
+        return [names[code] for code in np.unique(self.windows.placement).tolist()]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rounds:
+    """Φ of the fleet where the ledger was asked, in the order of the closes.
+
+    Parameters
+    ----------
+    at, before, after : float64 array, shape (n,)
+        When; Φ as it was, and as it came to be.
+    number : int64 array, shape (n,)
+        Of the round.
+    """
+
+    at: Floats
+    before: Floats
+    after: Floats
+    number: NDArray[np.int64]
+
+    def last(self, at: float) -> int:
+        """Return which was the last before a place; -1 where none was."""
+        return int(np.searchsorted(self.at, at, "right")) - 1
+
+    def view(self, begin: float, end: float, bins: int, cells: int) -> Plain:
+        """Return Φ a cell between two places, before and after where the ledger was asked."""
+        phi = np.column_stack([self.before, self.after]).ravel() / cells
+        return binned_means(np.repeat(self.at, 2), {"phi": phi}, begin, end, bins)
+
+
+class RecordedFleet:
+    """See the module.
+
+    Its cells stand worst first, by V_D after the warm-up.
+
+    Raises
+    ------
+    RunError
+        If the folder is no fleet's, or no run in it is whole.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        run = self._run = open_fleet(folder, whole=False)
+        self.name, self.count = run.fleet.name, len(run.fleet.cells)
+        self._faults = list(run.faults)
+        self._members = sorted(
+            self._whole(run), key=lambda one: (-np.nan_to_num(one.rate), one.place)
+        )
+        if not self._members:
+            raise RunError("\n".join([f"{folder}: {self._how_many()}", *listed(self._faults)]))
+        candidates = dict.fromkeys(name for one in self._members for name in one.problem.candidates)
+        used = {name for one in self._members for name in one.placed}
+        self._hues = placement_hues(candidates)
+        # Those where a cell ever is.
+        self._placements = {name: i for i, name in enumerate(n for n in candidates if n in used)}
+        self._end = max(float(one.windows.closes[-1]) for one in self._members)
+        self._rounds = _rounds(self._members)
+        self._grid, self._load = self._shared_load()
+        self._lines = self._over_time()
+        self._events = RecordedEvents(self._all_events())
+        self.cell = lru_cache(MOST_OPEN)(self._open)
+
+    def __repr__(self) -> str:
+        return f"<RecordedFleet of {str(self.folder)!r}>"
+
+    # --------------------------------------------------------------------- what is read
+
+    def _whole(self, run: FleetRun) -> Iterator[_Member]:
+        """Yield the cells whose windows and decisions can be read; why others cannot is a fault."""
+        for place, cell in enumerate(run.fleet.cells):
+            if cell.name not in run.cells:
+                continue
+            try:
+                yield _member(place, cell, run.cells[cell.name], run.phases_ms[cell.name])
+            except RunError as error:
+                self._faults.append(str(error))
+
+    def _how_many(self) -> str:
+        return how_many_are_whole(len(self._members), self.count)
+
+    def _shared_load(self) -> tuple[Floats, dict[str, Floats]]:
+        """Return the closes of the fleet's windows, and the load of shared nodes in them."""
+        try:
+            table = self._run.load
+        except RunError as error:
+            self._faults.append(str(error))
+            return self._members[0].windows.closes, {}
+        first = self._run.fleet.entries[0].cell
+        length_s = first.window_cycles * first.pipeline.period_ms / 1e3
+        closes = table["start_ns"].to_numpy() / 1e9 + length_s
+        names = [name for name in table.columns if name.startswith("u_")]
+        return closes, {name.removeprefix("u_"): table[name].to_numpy() for name in names}
+
+    def _over_time(self) -> dict[str, Floats]:
+        """Return what is drawn as lines: load, cells by placement."""
+        counts = np.zeros((len(self._placements), len(self._grid)))
+        for one in self._members:
+            codes = self._codes(one)
+            rows = _held(one.windows, self._grid)
+            counts[codes[one.windows.placement[rows]], np.arange(len(self._grid))] += 1
+        return {
+            **{f"u {name}": column for name, column in self._load.items()},
+            **{f"on {name}": counts[i] for name, i in self._placements.items()},
+        }
+
+    def _codes(self, one: _Member) -> NDArray[np.int64]:
+        """Return the places of a cell's candidates among the placements; -1 of those not used."""
+        return np.array([self._placements.get(name, -1) for name in one.problem.candidates])
+
+    def _all_events(self) -> Iterator[Plain]:
+        """Yield what happened to the cells: their moves and refusals, and to how many what else."""
+        happened: Counter[tuple[float, str]] = Counter()
+        for one in self._members:
+            for (_, text), events in groupby(
+                one.windows.events(), lambda one: (one["kind"], one["text"])
+            ):
+                first, *again = events
+                times = f" ({len(again) + 1} times)" if again else ""
+                yield {**first, "text": f"{one.name}: {text}{times}"}
+            planned = one.problem.scenario(self._run.fleet.cells[one.place].entry.scenario)
+            met = disturbances_met(self._run.cells[one.name], planned)
+            for event in disturbance_events(met, one.problem, self._end):
+                happened[event["at"], event["text"]] += 1
+        for (at, text), count in happened.items():
+            who = "all cells" if count == len(self._members) else f"{count} of the cells"
+            yield {"at": at, "kind": "disturbance", "text": f"{who}: {text}"}
+
+    def _open(self, place: int) -> RecordedCell:
+        """Return a cell by its place in the fleet's file, with its cycles."""
+        return RecordedCell(self.folder / self._run.fleet.cells[place].name)
+
+    # --------------------------------------------------------------------- what is shown
+
+    def described(self) -> Plain:
+        """Return what does not change: its cells, and where its time line begins and ends."""
+        run, first = self._run, self._run.fleet.entries[0].cell
+        phases = run.fleet.phases
+        return {
+            "name": run.fleet.name,
+            "source": self.folder.resolve().name,
+            "live": False,
+            "growing": False,
+            "unit": "s",
+            "begin": 0.0,
+            "end": self._end,
+            "period_ms": first.pipeline.period_ms,
+            "window_cycles": first.window_cycles,
+            "count": self.count,
+            "about": {
+                "coordination": run.fleet.coordination,
+                "objective": run.fleet.objective,
+                "phases": phases if isinstance(phases, str) else "listed",
+                "seed": str(run.seed),
+            },
+            "notes": list(self._notes()),
+            "placements": [{"name": name, "hue": self._hues[name]} for name in self._placements],
+            "shared": list(self._load),
+            "has_phi": bool(len(self._rounds.at)),
+            "mean_rate": plain(np.array([np.mean([one.rate for one in self._members])]), 4)[0],
+            "cells": [
+                {
+                    "place": one.place,
+                    "name": one.name,
+                    "deadline_ms": one.problem.pipeline.deadline_ms,
+                    "rate": plain(np.array([one.rate]), 4)[0],
+                }
+                for one in self._members
+            ],
+        }
+
+    def _notes(self) -> Iterator[str]:
+        if self._faults or not self._run.finished:
+            ended = "" if self._run.finished else "; writing the fleet was interrupted"
+            yield f"{self._how_many()}{ended}."
+        yield from listed(self._faults)
+
+    def view(self, begin: float, end: float, bins: int) -> Plain:
+        """Return what is drawn between two places; all cells together have `MOST_BINS` bins."""
+        each = max(min(bins, MOST_BINS // len(self._members)), LEAST_BINS)
+        return {
+            "begin": begin,
+            "end": end,
+            "cells": [self._cell_view(one, begin, end, each) for one in self._members],
+            "windows": binned_means(self._grid, self._lines, begin, end, bins // 2),
+            "rounds": self._rounds.view(begin, end, bins // 2, self.count),
+            **self._events.view(begin, end),
+        }
+
+    def _cell_view(self, one: _Member, begin: float, end: float, bins: int) -> Plain:
+        view = one.strip.view(begin, end, bins)
+        ribbon = view["ribbon"]
+        ribbon["placement"] = self._codes(one)[ribbon["placement"]].tolist()
+        return {
+            "windows": view["cycles"],
+            "over": view["missed"],
+            "bins": {name: view["bins"][name] for name in DRAWN},
+            "ribbon": ribbon,
+        }
+
+    def state(self, at: float) -> Plain:
+        """Return how the cells were at a place, and the load of the shared nodes."""
+        cells = [self._cell_state(one, at) for one in self._members]
+        unwell = sum(cell["health"] != "ok" for cell in cells)
+        k = int(np.searchsorted(self._grid, at, "right")) - 1
+        row = self._rounds.last(at)
+        return {
+            "at": at,
+            "health": "degraded" if unwell else "ok",
+            "headline": f"{unwell} of {len(cells)} cells" if unwell else None,
+            "cells": cells,
+            "used": {
+                name: None if k < 0 else plain(column[k : k + 1], 4)[0]
+                for name, column in self._load.items()
+            },
+            "phi": None if row < 0 else float(self._rounds.after[row]) / self.count,
+            "round": None if row < 0 else int(self._rounds.number[row]),
+        }
+
+    @staticmethod
+    def _cell_state(one: _Member, at: float) -> Plain:
+        k = one.windows.closed(at)
+        code = int(one.windows.placement[_held(one.windows, np.array(at))])
+        return {
+            "placement": list(one.problem.candidates)[code],
+            **one.windows.health(k),
+            **({} if k < 0 else one.windows.window(k)),
+        }
+
+
+def _member(place: int, cell: FleetCell, run: Run, phase_ms: float) -> _Member:
+    pipeline = cell.problem.pipeline
+
+    def opens(first: NDArray[np.int64]) -> Floats:
+        return (phase_ms + first.astype(np.float64) * pipeline.period_ms) / 1e3
+
+    length_s = cell.problem.window_cycles * pipeline.period_ms / 1e3
+    windows = RecordedWindows(run, cell.problem, opens, length_s)
+    if not len(windows.number):
+        raise RunError(f"{cell.name}: this run has no windows")
+    l95_ms = run.arrays("windows")["l95_ms"].astype(np.float64)
+    strip = Strip(
+        at=windows.opens,
+        latency_ms=np.where(np.isinf(l95_ms), np.nan, l95_ms),
+        missed=~(l95_ms <= pipeline.deadline_ms),
+        placement=windows.placement,
+        number=windows.number,
+    )
+    counted = windows.rates[windows.counts]
+    rate = float(counted.mean()) if len(counted) else np.nan
+    return _Member(place, cell.name, cell.problem, windows, rate, strip)
+
+
+def _held(windows: RecordedWindows, at: Any) -> NDArray[np.intp]:
+    """Return the window that each of some places is in; the first before it, the last after."""
+    rows: NDArray[np.intp] = np.searchsorted(windows.opens, at, "right") - 1
+    return np.maximum(rows, 0)
+
+
+def _rounds(members: list[_Member]) -> _Rounds:
+    """Return Φ where the ledger was asked; a move that it refused changes nothing."""
+    at, phi, number = [np.zeros(0)], [np.zeros((0, 2))], [np.zeros(0, np.int64)]
+    for one in members:
+        table = one.windows.decisions
+        if "phi_before" not in table:
+            continue
+        before, after = (table[name].astype(np.float64) for name in ("phi_before", "phi_after"))
+        asked = ~np.isnan(before) & (one.windows.window_of >= 0)
+        came = np.where(table["migrated"].astype(bool), after, before)
+        at.append(one.windows.closes[one.windows.window_of[asked]])
+        phi.append(np.column_stack([before, came])[asked])
+        number.append(table["round"].astype(np.int64)[asked])
+    order = np.argsort(np.concatenate(at), kind="stable")
+    before, came = np.concatenate(phi)[order].T
+    return _Rounds(np.concatenate(at)[order], before, came, np.concatenate(number)[order])

@@ -1,0 +1,201 @@
+"""RecordedWindows: windows and decisions of a recorded run, on a time line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.dash.paged_cell import Plain, health_by
+from dwell.dash.strip import Floats, plain
+from dwell.model import Problem
+from dwell.model.live import RECENT_WINDOWS
+from dwell.record import Names, Run, TableArrays
+
+#: What is both estimated and seen of a window, and the columns that say what was seen.
+SEEN = {"l95_ms": "seen_l95_ms", "violation_rate": "seen_violation_rate", "cost": "cost"}
+
+
+class RecordedWindows:
+    """See the module.
+
+    Parameters
+    ----------
+    opens : callable
+        From the numbers of their first cycles to where windows begin.
+    length : float
+        Of a window.
+
+    Attributes
+    ----------
+    number : int64 array, shape (n,)
+        Of the windows.
+    opens, closes : float64 array, shape (n,)
+        Where they begin and end.
+    rates : float64 array, shape (n,)
+        V_D, as it came to be.
+    counts : bool array, shape (n,)
+        Whether the window is after the warm-up.
+    placement : int32 array, shape (n,)
+        Places of their placements among the cell's candidates.
+    decisions : TableArrays
+        All of them.
+    window_of : integer array, shape (decisions,)
+        Place of each one's window; -1 where that is missing.
+    seen, used, costs : dict of str to float64 array, shape (n,)
+        What the close saw; utilisation by resource; J by candidate, NaN where none was known.
+    """
+
+    def __init__(
+        self,
+        run: Run,
+        problem: Problem,
+        opens: Callable[[NDArray[np.int64]], Floats],
+        length: float,
+    ) -> None:
+        self._run, self._problem = run, problem
+        self._candidates = tuple(problem.candidates)
+        windows = run.arrays("windows")
+        self.number = windows["window"].astype(np.int64)
+        self.opens = opens(windows["first_cycle"].astype(np.int64))
+        self.closes = self.opens + length
+        self.rates = windows["violation_rate"].astype(np.float64)
+        self.counts = ~windows["warmup"].astype(bool)
+        self.placement = placement_codes(windows.names("placement"), self._candidates)
+        self.seen = {name: windows[of].astype(np.float64) for name, of in SEEN.items()}
+        self.used = {
+            name: windows[f"u_{name}"].astype(np.float64)
+            for name in problem.fabric.resources
+            if f"u_{name}" in windows
+        }
+        self._decide(run.arrays("decisions"))
+
+    def __repr__(self) -> str:
+        return f"<RecordedWindows: {len(self.number)} of {self._problem.name}>"
+
+    def _decide(self, table: TableArrays) -> None:
+        """Take in the decisions: those at a window's close, by window, and all of them."""
+        self.decisions = table
+        windows, reasons = table["window"].astype(np.int64), table.names("reason")
+        self._reasons = reasons.to_list()
+        self._target = placement_codes(table.names("placement"), self._candidates)
+        self._incumbent = placement_codes(table.names("incumbent"), self._candidates)
+        self._refused = self._texts("refused")
+        at_close = ~reasons.equal("guard")
+        # Of a window, the row of its decision; -1 where nothing was decided.
+        self._row = np.full(len(self.number), -1)
+        # The place of its window; one that is missing has none.
+        places = np.searchsorted(self.number, windows)
+        known = np.isin(windows, self.number)
+        self.window_of = np.where(known, places, -1)
+        fits = at_close & known
+        self._row[places[fits]] = np.flatnonzero(fits)
+        self.costs = {
+            name: self._by_window(table[f"j_{name}"].astype(np.float64))
+            for name in self._candidates
+            if f"j_{name}" in table
+        }
+
+    def _by_window(self, column: Floats) -> Floats:
+        """Return a column of the decisions by window; NaN where nothing was decided."""
+        values = np.full(len(self._row), np.nan)
+        known = self._row >= 0
+        values[known] = column[self._row[known]]
+        return values
+
+    def _texts(self, column: str) -> Sequence[str]:
+        """Return a column of texts of the decisions; empty where there is none."""
+        if column not in self.decisions:
+            return [""] * len(self._reasons)
+        return [text or "" for text in self._run.decisions[column].to_list()]
+
+    def events(self) -> Iterator[Plain]:
+        """Yield moves and refusals."""
+        migrated = self.decisions["migrated"].astype(bool)
+        refused = np.array([bool(text) for text in self._refused], bool)
+        for row in np.flatnonzero(migrated | refused).tolist():
+            place = int(self.window_of[row])
+            if place < 0:
+                continue
+            reason = self._reasons[row]
+            # The guard's move is noted under the window that follows it.
+            at = float((self.opens if reason == "guard" else self.closes)[place])
+            names = [self._candidates[code[row]] for code in (self._incumbent, self._target)]
+            event = {"at": at, "window": int(self.number[place])}
+            if refused[row]:
+                yield {**event, "kind": "refused", "text": f"{reason}: {self._refused[row]}"}
+            else:
+                kind = "guard" if reason == "guard" else "move"
+                yield {**event, "kind": kind, "text": f"{names[0]} → {names[1]}: {reason}"}
+
+    def closed(self, at: float) -> int:
+        """Return which window was the last to close before a place; -1 where none was."""
+        return int(np.searchsorted(self.closes, at, "right")) - 1
+
+    def health(self, k: int) -> Plain:
+        """Return health and headline when the k-th window was the last to have closed."""
+        recent = self.rates[max(k + 1 - RECENT_WINDOWS, 0) : k + 1]
+        return dict(health_by(self._problem, recent.tolist()))
+
+    def window(self, k: int) -> Plain:
+        """Return the k-th window, and what was decided on it."""
+        row = int(self._row[k])
+        return {
+            "window": {
+                "number": int(self.number[k]),
+                "begin": float(self.opens[k]),
+                "end": float(self.closes[k]),
+                "placement": self._candidates[self.placement[k]],
+                "seen": {name: plain(self.seen[name][k : k + 1], 4)[0] for name in SEEN},
+            },
+            **({} if row < 0 else {"decision": self._decision(row)}),
+        }
+
+    def estimates(self, k: int) -> Plain:
+        """Return what was predicted of the k-th window, and what was estimated at its close."""
+        before, row = int(self._row[k - 1]) if k > 0 else -1, int(self._row[k])
+        placement = self._candidates[self.placement[k]]
+        names = () if row < 0 else self._candidates
+        return {
+            "predicted": None if before < 0 else self._estimate(before, placement),
+            "used": {name: plain(column[k : k + 1], 4)[0] for name, column in self.used.items()},
+            "candidates": {name: self._estimate(row, name) for name in names},
+        }
+
+    def _decision(self, row: int) -> Plain:
+        return {
+            "incumbent": self._candidates[self._incumbent[row]],
+            "placement": self._candidates[self._target[row]],
+            "reason": self._reasons[row],
+            "refused": self._refused[row] or None,
+            **self._numbers(row, "delta_j", "dwell"),
+        }
+
+    def _estimate(self, row: int, name: str) -> Plain:
+        """Return what a decision believed of a candidate: cost, L95, V_D, whether it is in caps."""
+        columns = (f"j_{name}", f"est_l95_ms_{name}", f"est_violation_rate_{name}")
+        values = self._numbers(row, *columns)
+        eligible = f"eligible_{name}"
+        within = bool(self.decisions[eligible][row]) if eligible in self.decisions else True
+        found = zip(("cost", "l95_ms", "violation_rate"), values.values(), strict=True)
+        return {**dict(found), "eligible": within}
+
+    def _numbers(self, row: int, *columns: str) -> Plain:
+        """Return values of a decision; None where there is none."""
+        table = self.decisions
+        return {
+            name: plain(table[name][row : row + 1].astype(np.float64), 4)[0]
+            if name in table
+            else None
+            for name in columns
+        }
+
+
+def placement_codes(names: Names, candidates: Sequence[str]) -> NDArray[np.int32]:
+    """Return names as places among candidates; -1 for one that is none of them."""
+    place = {name: i for i, name in enumerate(candidates)}
+    codes = np.array([place.get(name, -1) for name in names.known] or [-1], np.int32)
+    found: NDArray[Any] = codes[names.places] if len(names.places) else codes[:0]
+    return found
