@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from functools import cache
 from itertools import chain, permutations
 from pathlib import Path
 from typing import TypeAlias
@@ -108,7 +109,8 @@ def pytest_xdist_auto_num_workers() -> int:
     return cpus + (cpus + 1) // 2
 
 
-def below(file: Path, names: Sequence[str]) -> str:
+@cache
+def below(file: Path, names: tuple[str, ...]) -> str:
     """Return the name that a file is below, or nothing."""
     return next((name for name in names if file.is_relative_to(HERE / name)), "")
 
