@@ -56,7 +56,7 @@ TOGETHER = {
         "cli/test_live_secure.py",
         "cli/test_new.py",
         "dash/test_live_page.py",
-        "dash/test_live_recording.py",
+        "dash/test_live_page_with_keys.py",
         "live/test_security.py",
         "live/transport",
     ),

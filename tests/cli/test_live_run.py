@@ -179,14 +179,14 @@ def test_any_cell_with_stages_runs_and_its_observer_looks_on(tmp_path: Path) -> 
     text = re.sub(r"\bplanning\b", "plan it", (beside / "cell.yaml").read_text())
     (tmp_path / "cell.yaml").write_text(text.replace("name: light-follower", "name: S\u00fcd x"))
     document = to_document(dwell.load(tmp_path / "cell.yaml"))
-    delay = {"link": "R1->E", "both_ways": True, "at_s": 3, "for_s": 60, "add_delay_ms": 400}
+    delay = {"link": "R1->E", "both_ways": True, "at_s": 2, "for_s": 60, "add_delay_ms": 400}
     document["scenarios"] = {"calm": [], "far": [delay]}
     document["live"] = {**document.get("live", {}), "observer": "looking:Looking"}
     (tmp_path / "cell.yaml").write_text(yaml.safe_dump(document))
     stages = (beside / "stages.py").read_text().replace('"planning"', '"plan it"')
     (tmp_path / "stages.py").write_text(stages)
     (tmp_path / "looking.py").write_text(OBSERVER)
-    words = ["--scenario", "far", "--seconds", "12", "--policy", "SO", "--seed", "3"]
+    words = ["--scenario", "far", "--seconds", "8", "--policy", "SO", "--seed", "3"]
     done = subprocess.run(
         [*LIVE_RUN, str(tmp_path / "cell.yaml"), *words, "--out", str(tmp_path / "out"), "--json"],
         capture_output=True,
