@@ -496,7 +496,7 @@ class NodeState:
             return
         long = self.had >= self.in_time(LEAST_TURN_MS)
         behind = any(thread.received < self.turn.received for thread in self.waiting)
-        if (at_tick and long) or (now in self.wakes and behind):
+        if (at_tick and long) or (now in self.wakes[-2:] and behind):
             self.waiting.append(self.turn)
             self.end_turn()
 
@@ -625,6 +625,8 @@ class NodeState:
     def advance(self, now: int) -> None:
         """Let the time since the last change pass."""
         elapsed = now - self.since
+        if not elapsed:
+            return
         self.since = now
         running, rate = self.running, self.rate
         speeds = {cell: self.speed(cell) for cell in {job.cell for job in running}}
