@@ -6,9 +6,10 @@ themselves. `make test-all` does the same with what takes longest.
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import cache
 from itertools import chain, permutations
 from pathlib import Path
@@ -134,6 +135,17 @@ class InGroups(LoadScopeScheduling):  # type: ignore[misc]
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> InGroups:
     """Return who deals tests out where they run side by side."""
     return InGroups(config, log)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Keep the garbage collector from looking at thousands of tests, while they come and later."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()
+        gc.freeze()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
