@@ -43,6 +43,7 @@ ALONE: Chosen = {
     "cli/test_live_run.py": ("test_any_cell_with_stages_runs",),
     "live/test_real_faults.py": (),
     "test_package.py": ("test_a_robot_runs_and_moves_a_cell",),
+    "test_readme.py": ("[Live, on this machine]",),
     "testbed/chaos/test_fault_campaign.py": (),
     "testbed/chaos/test_strike.py": (),
     "testbed/test_execution.py": (),
@@ -88,17 +89,22 @@ EXHAUSTIVE: Chosen = {
     ),
     "test_compilers.py": (),
     "test_package.py": (),
+    "test_readme.py": ("test_commands_print_what_the_page_on_capacity_says",),
     "test_sanitizers.py": (),
     "testbed/chaos/test_fault_campaign.py": (),
     "testbed/chaos/test_strike.py": ("actuator", "clock", "process", "terminal"),
     "testbed/test_execution.py": (),
 }
 
+#: Marks of these.
+LISTED = {"alone": ALONE, "exhaustive": EXHAUSTIVE}
+
 #: Files whose tests share nothing, and take longest: any process has any of them.
 APART = (
     "reference/test_against.py",
     "reference/test_guarded.py",
     "live/test_protocol_model.py",
+    "live/test_seeded_faults.py",
     "reproduction/test_questions.py",
     "live/test_continuity.py",
 )
@@ -137,6 +143,14 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> InGroup
     return InGroups(config, log)
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Pass over files that have no test with a mark that is asked for."""
+    asked = config.option.markexpr.split(" and ")
+    lists = [tuple(chosen) for mark, chosen in LISTED.items() if mark in asked]
+    without = any(not below(collection_path, names) for names in lists)
+    return True if without and collection_path.suffix == ".py" else None
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Iterator[None]:
     """Keep the garbage collector from looking at thousands of tests, while they come and later."""
@@ -153,7 +167,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     longest = (*chain(*TOGETHER.values()), *APART)
     items.sort(key=lambda item: [*longest, ""].index(below(item.path, longest)))
     for item in items:
-        if among(item, ALONE):
-            item.add_marker(pytest.mark.alone)
-        if among(item, EXHAUSTIVE):
-            item.add_marker(pytest.mark.exhaustive)
+        for mark, chosen in LISTED.items():
+            if among(item, chosen):
+                item.add_marker(mark)
