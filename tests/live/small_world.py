@@ -136,8 +136,6 @@ class Passing(CellStage):
 class Counting(Passing):
     """A stage with a state: how many cycles it has seen."""
 
-    stateful = True
-
     def __init__(self, name: str) -> None:
         super().__init__(name)
         self.count = 0

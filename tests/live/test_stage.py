@@ -12,7 +12,7 @@ from dwell.live.stage import Message, load_actuator, load_function, load_stage
 HERE = "stages_of_test_stage"
 MODULE = """
 import functools
-from dwell.live.stage import Message
+from dwell.live.stage import CellStage, Message
 
 def double(inputs):
     return Message(2)
@@ -37,6 +37,12 @@ class Everything:
     def wait(self): self.called.append("wait")
     def snapshot(self): self.called.append("snapshot")
     def restore(self, state): self.called.append("restore")
+
+class Derived(CellStage):
+    def process(self, inputs): return Message(1)
+    def wait(self): pass
+    def snapshot(self): return b""
+    def restore(self, state): pass
 
 made = Bare()
 
@@ -79,6 +85,7 @@ def test_what_is_a_stage(name: str) -> None:
 
 def test_a_state_is_what_has_both_methods() -> None:
     assert load_stage(f"{HERE}:Kept", "x").stateful
+    assert load_stage(f"{HERE}:Derived", "x").stateful
     assert not load_stage(f"{HERE}:Bare", "x").stateful
 
 
@@ -96,6 +103,7 @@ def test_what_a_stage_need_not_have_has_a_default(name: str) -> None:
 def test_what_a_stage_has_is_called() -> None:
     stage = load_stage(f"{HERE}:Everything", "x")
     assert stage.has_frames
+    assert load_stage(f"{HERE}:Derived", "x").has_frames
     assert stage.inputs == {"a": dict}
     stage.start()
     stage.wait()

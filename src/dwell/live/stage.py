@@ -99,14 +99,19 @@ class CellStage(ABC):
     inputs : mapping of str to type
         By source task, the `msgspec.Struct` that arrives; without, structs arrive as dicts.
     stateful : bool
-        Whether its state moves with it.
+        Whether its state moves with it: it has `snapshot` of its own.
     has_frames : bool
-        Whether it can wait for a frame.
+        Whether it can wait for a frame: it has `wait` of its own.
     """
 
     inputs: Mapping[str, type] = {}
     stateful: bool = False
     has_frames: bool = False
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        cls.stateful = cls.snapshot is not CellStage.snapshot
+        cls.has_frames = cls.wait is not CellStage.wait
 
     @abstractmethod
     def process(self, inputs: Mapping[str, Message]) -> Message:
@@ -209,8 +214,8 @@ class _FunctionActuator(CellActuator):
 def _take(own: CellStage | CellActuator, given: object, members: Sequence[str]) -> None:
     """Have those of these members that a user's object has stand before the defaults."""
     for name in members:
-        if hasattr(given, name):
-            setattr(own, name, getattr(given, name))
+        if (member := getattr(given, name, None)) is not None:
+            setattr(own, name, member)
 
 
 def load_stage(name: str, where: str) -> CellStage:
