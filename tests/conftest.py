@@ -6,9 +6,11 @@ themselves. `make test-all` does the same with what takes longest.
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
+from functools import cache
 from itertools import chain, permutations
 from pathlib import Path
 from typing import TypeAlias
@@ -41,6 +43,7 @@ ALONE: Chosen = {
     "cli/test_live_run.py": ("test_any_cell_with_stages_runs",),
     "live/test_real_faults.py": (),
     "test_package.py": ("test_a_robot_runs_and_moves_a_cell",),
+    "test_readme.py": ("[Live, on this machine]",),
     "testbed/chaos/test_fault_campaign.py": (),
     "testbed/chaos/test_strike.py": (),
     "testbed/test_execution.py": (),
@@ -55,7 +58,7 @@ TOGETHER = {
         "cli/test_live_secure.py",
         "cli/test_new.py",
         "dash/test_live_page.py",
-        "dash/test_live_recording.py",
+        "dash/test_live_page_with_keys.py",
         "live/test_security.py",
         "live/transport",
     ),
@@ -86,17 +89,22 @@ EXHAUSTIVE: Chosen = {
     ),
     "test_compilers.py": (),
     "test_package.py": (),
+    "test_readme.py": ("test_commands_print_what_the_page_on_capacity_says",),
     "test_sanitizers.py": (),
     "testbed/chaos/test_fault_campaign.py": (),
     "testbed/chaos/test_strike.py": ("actuator", "clock", "process", "terminal"),
     "testbed/test_execution.py": (),
 }
 
+#: Marks of these.
+LISTED = {"alone": ALONE, "exhaustive": EXHAUSTIVE}
+
 #: Files whose tests share nothing, and take longest: any process has any of them.
 APART = (
     "reference/test_against.py",
     "reference/test_guarded.py",
     "live/test_protocol_model.py",
+    "live/test_seeded_faults.py",
     "reproduction/test_questions.py",
     "live/test_continuity.py",
 )
@@ -108,7 +116,8 @@ def pytest_xdist_auto_num_workers() -> int:
     return cpus + (cpus + 1) // 2
 
 
-def below(file: Path, names: Sequence[str]) -> str:
+@cache
+def below(file: Path, names: tuple[str, ...]) -> str:
     """Return the name that a file is below, or nothing."""
     return next((name for name in names if file.is_relative_to(HERE / name)), "")
 
@@ -134,12 +143,30 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> InGroup
     return InGroups(config, log)
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Pass over files that have no test with a mark that is asked for."""
+    asked = config.option.markexpr.split(" and ")
+    lists = [tuple(chosen) for mark, chosen in LISTED.items() if mark in asked]
+    without = any(not below(collection_path, names) for names in lists)
+    return True if without and collection_path.suffix == ".py" else None
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Keep the garbage collector from looking at thousands of tests, while they come and later."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()
+        gc.freeze()
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests that are listed here; what takes longest begins first."""
     longest = (*chain(*TOGETHER.values()), *APART)
     items.sort(key=lambda item: [*longest, ""].index(below(item.path, longest)))
     for item in items:
-        if among(item, ALONE):
-            item.add_marker(pytest.mark.alone)
-        if among(item, EXHAUSTIVE):
-            item.add_marker(pytest.mark.exhaustive)
+        for mark, chosen in LISTED.items():
+            if among(item, chosen):
+                item.add_marker(mark)

@@ -39,11 +39,7 @@ def without_numbers(printed: str) -> str:
 @pytest.mark.parametrize(
     "commands",
     [
-        pytest.param(
-            commands,
-            id=section.partition("\n")[0],
-            marks=[pytest.mark.alone] if any(LIVE in words for words, _ in commands) else [],
-        )
+        pytest.param(commands, id=section.partition("\n")[0])
         for section in SECTIONS
         if (commands := transcript(section))
     ],
@@ -54,7 +50,6 @@ def test_commands_print_what_the_readme_says(
     check(commands, tmp_path)
 
 
-@pytest.mark.exhaustive
 def test_commands_print_what_the_page_on_capacity_says(tmp_path: Path) -> None:
     page = ROOT / "docs" / "capacity.md"
     check(transcript(page.read_text(encoding="utf-8")), tmp_path)

@@ -9,7 +9,7 @@ import gc
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -212,6 +212,15 @@ def test_collections_are_counted() -> None:
     assert sum(time_runs(lambda: None, Settings(3, 0)).collections) == 0
 
 
+@pytest.fixture
+def _nothing_is_frozen() -> Iterator[None]:
+    """Have the collector look at what tests/conftest.py keeps from it."""
+    gc.unfreeze()
+    yield
+    gc.freeze()
+
+
+@pytest.mark.usefixtures("_nothing_is_frozen")
 def test_objects_from_before_are_not_looked_at() -> None:
     before = gc.get_freeze_count()
     mine: list[object] = [[]]
@@ -224,13 +233,10 @@ def test_objects_from_before_are_not_looked_at() -> None:
 
 def test_what_somebody_else_froze_stays_frozen() -> None:
     gc.freeze()
-    try:
-        count = gc.get_freeze_count()
-        with undisturbed_collector():
-            pass
-        assert gc.get_freeze_count() == count
-    finally:
-        gc.unfreeze()
+    count = gc.get_freeze_count()
+    with undisturbed_collector():
+        pass
+    assert gc.get_freeze_count() == count
 
 
 # --------------------------------------------------------------------------------------- pace

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -179,14 +180,14 @@ def test_any_cell_with_stages_runs_and_its_observer_looks_on(tmp_path: Path) -> 
     text = re.sub(r"\bplanning\b", "plan it", (beside / "cell.yaml").read_text())
     (tmp_path / "cell.yaml").write_text(text.replace("name: light-follower", "name: S\u00fcd x"))
     document = to_document(dwell.load(tmp_path / "cell.yaml"))
-    delay = {"link": "R1->E", "both_ways": True, "at_s": 3, "for_s": 60, "add_delay_ms": 400}
+    delay = {"link": "R1->E", "both_ways": True, "at_s": 2, "for_s": 60, "add_delay_ms": 400}
     document["scenarios"] = {"calm": [], "far": [delay]}
     document["live"] = {**document.get("live", {}), "observer": "looking:Looking"}
     (tmp_path / "cell.yaml").write_text(yaml.safe_dump(document))
     stages = (beside / "stages.py").read_text().replace('"planning"', '"plan it"')
     (tmp_path / "stages.py").write_text(stages)
     (tmp_path / "looking.py").write_text(OBSERVER)
-    words = ["--scenario", "far", "--seconds", "12", "--policy", "SO", "--seed", "3"]
+    words = ["--scenario", "far", "--seconds", "8", "--policy", "SO", "--seed", "3"]
     done = subprocess.run(
         [*LIVE_RUN, str(tmp_path / "cell.yaml"), *words, "--out", str(tmp_path / "out"), "--json"],
         capture_output=True,
@@ -223,14 +224,18 @@ for module in {hidden!r}:
 @TWO_CPUS
 @pytest.mark.parametrize("extra", ["live", "sim"])
 def test_it_needs_no_more_than_the_extra_live(extra: str, tmp_path: Path) -> None:
-    beside, site = CELL.parents[1] / "live", tmp_path / "site"
+    cell, site = tmp_path / "cell" / "cell.yaml", tmp_path / "site"
+    shutil.copytree(CELL.parents[1] / "live", cell.parent)
+    text = cell.read_text()
+    assert "at_s: 8, for_s: 10" in text
+    cell.write_text(text.replace("at_s: 8, for_s: 10", "at_s: 2, for_s: 2"))
     site.mkdir()
     hidden = [module for module, (_, of) in OPTIONAL.items() if of not in ("live", extra)]
     (site / "sitecustomize.py").write_text(BARE.format(hidden=hidden))
     path = os.pathsep.join((str(site), str(ROOT / "src")))
-    words = ["--scenario", "slow-link", "--seconds", "12", "--out", str(tmp_path / "out"), "--json"]
+    words = ["--scenario", "slow-link", "--seconds", "6", "--out", str(tmp_path / "out"), "--json"]
     done = subprocess.run(
-        [*LIVE_RUN, str(beside / "cell.yaml"), *words],
+        [*LIVE_RUN, str(cell), *words],
         env={**os.environ, "PYTHONPATH": path},
         capture_output=True,
         text=True,

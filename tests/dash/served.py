@@ -152,3 +152,14 @@ def until(holds: Callable[[], object]) -> None:
     while not holds():
         assert time.monotonic() < limit_s, "it has not come about"
         time.sleep(0.05)
+
+
+def state(page: Served) -> Mapping[str, Any]:
+    """Return what the page says of its cell."""
+    found: Mapping[str, Any] = page.get("/state?at=0")
+    return found
+
+
+def until_state(page: Served, holds: Callable[[Mapping[str, Any]], object]) -> None:
+    """Wait until something holds of the cell."""
+    until(lambda: holds(state(page)))

@@ -1,20 +1,21 @@
-"""A live cell on the page: real processes, heard from outside, and acted on."""
+"""A live cell on the page: real processes, heard from outside, acted on and recorded."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+import re
+import signal
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from dwell.dash.observer import Observer
 from dwell.dash.watched_cell import WatchedCell
-from tests.cli.live_cell import MOODY, RealCell, invoke
-from tests.cli.test_live_secure import SecureCell
+from tests.cli.live_cell import MOODY, RealCell
 from tests.dash.browser import chromium, in_browser, opened, wait_for
-from tests.dash.served import Served, serving, until
+from tests.dash.served import Served, serving, state, until, until_state
+from tests.record.test_mcap_file import metadata, read
 
 MARKUP = "<script>window.pwned=1</script><img src=x onerror=window.pwned=1>"
 
@@ -24,34 +25,47 @@ NO_CANDIDATES: tuple[object, ...] = (None, [], "LOC", {}, {"candidate": 1}, {"no
 
 
 @pytest.fixture(scope="module")
-def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RealCell]:
+def absent(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RealCell]:
+    """Return a cell that nobody may have begun yet."""
     made = RealCell(tmp_path_factory.mktemp("live"))
     made.module.write_text(MOODY.replace('"no light"', repr(MARKUP)))
     try:
-        made.begin()
         yield made
     finally:
         made.close()
 
 
 @pytest.fixture(scope="module")
-def acting(cell: RealCell) -> Iterator[Served]:
-    """Return a page that may act."""
-    with serving(cell.folder, cell.file, "--control") as served:
+def cell(absent: RealCell) -> RealCell:
+    if not absent.processes:
+        absent.begin()
+    return absent
+
+
+@pytest.fixture(scope="module")
+def early(absent: RealCell) -> Iterator[Served]:
+    """Return a page that may act, from before its cell begins."""
+    with serving(absent.folder, absent.file, "--control") as served:
         yield served
 
 
-def state(page: Served) -> Mapping[str, Any]:
-    found: Mapping[str, Any] = page.get("/state?at=0")
-    return found
+@pytest.fixture
+def acting(cell: RealCell, early: Served) -> Served:
+    """Return a page that may act on its cell."""
+    return early
 
 
 def events(page: Served) -> set[str]:
     return {event["text"] for event in page.get("/view?begin=0&end=1e6")["events"]}
 
 
-def until_state(page: Served, holds: Callable[[Mapping[str, Any]], object]) -> None:
-    until(lambda: holds(state(page)))
+def test_a_cell_that_nobody_controls_is_absent(absent: RealCell, early: Served) -> None:
+    found = state(early)
+    assert found["health"] == "absent"
+    assert "controller" in found["headline"]
+    assert early.ask("/readyz").status == 503
+    absent.begin()
+    until_state(early, lambda found: found["health"] == "ok" and found.get("window"))
 
 
 # ----------------------------------------------------------------------------- the observer
@@ -236,65 +250,35 @@ def test_without_control_it_only_looks(cell: RealCell) -> None:
         assert page.get("/cells")["read_only"]
 
 
-def test_a_cell_that_nobody_controls_is_absent(tmp_path: Path) -> None:
-    made = RealCell(tmp_path)
-    try:
-        with serving(tmp_path, made.file) as page:
-            found = state(page)
-            assert found["health"] == "absent"
-            assert "controller" in found["headline"]
-            assert page.ask("/readyz").status == 503
-            made.begin()
-            until_state(page, lambda found: found["health"] == "ok" and found.get("window"))
-    finally:
-        made.close()
+def test_a_live_cell_is_recorded_and_its_numbers_are_read(cell: RealCell, tmp_path: Path) -> None:
+    file, token = tmp_path / "cell.mcap", tmp_path / "kept" / "dwell.token"
+    token.parent.mkdir()
+    with serving(tmp_path, cell.file, "--mcap", file, "--token", token) as page:
+        assert token.stat().st_mode & 0o777 == 0o600
+        assert token.read_text() == page.token
 
+        def numbers() -> str:
+            return page.ask("/metrics", page.bearer).body.decode()
 
-# ---------------------------------------------------------------------------------- keys
-
-
-@pytest.fixture(scope="module")
-def secure(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SecureCell]:
-    made = SecureCell(tmp_path_factory.mktemp("secure"))
-    try:
-        made.begin()
-        yield made
-    finally:
-        made.close()
-
-
-def test_an_observer_sees_and_may_not_act(secure: SecureCell) -> None:
-    keys = secure.host / "watcher"
-    code, stdout, stderr = invoke(
-        *("dash", secure.file, "--control", "--keys", keys, "--port", "0", "--no-browser")
-    )
-    assert (code, stdout) == (2, "")
-    assert "observer" in stderr
-    with serving(secure.folder, secure.file, "--keys", keys) as page:
-        until_state(page, lambda found: found["health"] == "ok")
-        until(lambda: page.get("/view?begin=0&end=1e6")["cycles"] > 20)
-        assert page.act("pin", {"candidate": "SO"}).status == 403
-
-
-def test_an_operator_acts_by_name(secure: SecureCell) -> None:
-    with serving(
-        secure.folder, secure.file, "--control", "--keys", secure.host / "operator"
-    ) as page:
-        assert page.get("/cells")["cells"][0]["certificate"].startswith("operator.")
-        assert page.act("pin", {"candidate": "SO"}).status == 200
-        until_state(page, lambda found: found["placement"] == "SO")
-        assert page.act("unpin", {}).status == 200
-        assert "pin SO by operator." in page.said
-
-
-def test_without_keys_it_acts_on_this_computer_alone(tmp_path: Path) -> None:
-    made = RealCell(tmp_path)
-    text = made.file.read_text()
-    assert "address: 127.0.0.1" in text
-    made.file.write_text(text.replace("address: 127.0.0.1", "address: 10.255.0.9", 1))
-    words = ("dash", made.file, "--port", "0", "--no-browser")
-    for more in ((), ("--insecure", "--control")):
-        code, stdout, stderr = invoke(*words, *more)
-        assert code in {1, 2}
-        assert stdout == ""
-        assert "beyond this computer" in stderr
+        until(lambda: re.search(r'cycles_total\{.*outcome="actuated"\} \d\d\.0', numbers()))
+        until(lambda: 'placement="LOC"' in numbers() and "dwell_utilisation_ratio{" in numbers())
+        # Whoever watches may stand still: the cell goes on.
+        page.process.send_signal(signal.SIGSTOP)
+        try:
+            number = cell.until(lambda status: status["window"])["window"]["number"]
+            cell.until(lambda status: status["window"]["number"] >= number + 3)
+        finally:
+            page.process.send_signal(signal.SIGCONT)
+    found = metadata(file)
+    published, recorded, dropped = (int(found[n]) for n in ("published", "recorded", "dropped"))
+    assert published == recorded + dropped
+    assert f"{recorded} cycles and windows recorded + {dropped} dropped = {published}" in page.said
+    topics: dict[str, list[int]] = {}
+    for topic, at_ns, _ in read(file):
+        topics.setdefault(topic, []).append(at_ns)
+    assert topics.keys() == {"/cycles", "/windows", "/decisions", "/jobs"}
+    assert len(topics["/cycles"]) + len(topics["/windows"]) == recorded
+    # The same token the next time.
+    with serving(tmp_path, cell.file, "--token", token) as page:
+        assert page.token == token.read_text()
+        assert page.ask("/metrics", page.bearer).status == 200

@@ -34,7 +34,7 @@ from dwell.live.controlled_cell import Recorder
 from dwell.live.failures import described
 from dwell.live.recording import RunRecorder
 from dwell.live.run_rows import Rows
-from dwell.live.stage import Actuator, Message, Stage
+from dwell.live.stage import CellActuator, CellStage, Message
 from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import Role
 from dwell.model import Problem, QoS
@@ -173,7 +173,7 @@ class Touring:
         return self.names[self.place]
 
 
-class TellingStage:
+class TellingStage(CellStage):
     """A stage of the light cell: passes on what the source says of the cycle, and where it ran."""
 
     def __init__(self, role: Role, failing: set[str]) -> None:
@@ -195,7 +195,7 @@ class TellingStage:
         return Message(SAID.pack(cycle, released_ns, perception, planning))
 
 
-class SeeingActuator:
+class SeeingActuator(CellActuator):
     """The actuator: notes every call, on the true clock, as the chaos's witness does."""
 
     def __init__(self, world: FaultyWorld, who: str) -> None:
@@ -272,13 +272,13 @@ class FaultyWorld(World):
         self.wrong: list[str] = []
         self.network.taps.append(self._hear)
 
-    def stage_of(self, role: Role) -> Stage:
+    def stage_of(self, role: Role) -> CellStage:
         return TellingStage(role, self.failing)
 
     def exec_ns_of(self, role: Role) -> int:
         return round(self.exec_of[role.task][role.node] * MS)
 
-    def actuator_of(self, role: Role) -> Actuator:
+    def actuator_of(self, role: Role) -> CellActuator:
         return SeeingActuator(self, role.who)
 
     def recorder_of(self, controller: Controller) -> Recorder:

@@ -17,7 +17,7 @@ from dwell.live.recording import RunRecorder
 from dwell.live.role import RolePlace
 from dwell.live.run_rows import Resume, Rows, columns_of
 from dwell.live.sink import Sink
-from dwell.live.stage import Actuator, Message, Stage
+from dwell.live.stage import CellActuator, CellStage, Message
 from dwell.live.stamper import Stamper, StamperState
 from dwell.live.supervision import Supervisor
 from dwell.live.transport.transport import Arrival
@@ -104,7 +104,7 @@ class MemoryHighest:
 
 
 @dataclass
-class Arm:
+class Arm(CellActuator):
     """An actuator that remembers."""
 
     applied: list[tuple[int, float]] = field(default_factory=list)
@@ -122,7 +122,7 @@ class Arm:
     zero = hold
 
 
-class Passing:
+class Passing(CellStage):
     """A stage that passes on what it gets."""
 
     def __init__(self, name: str) -> None:
@@ -324,7 +324,7 @@ class World:
         self.roles[who] = made
         self.network.attach(end, made)
 
-    def stage_of(self, role: Role) -> Stage:
+    def stage_of(self, role: Role) -> CellStage:
         """Make the stage of a worker."""
         return self.stages.get(role.task, Passing)(role.task)
 
@@ -332,7 +332,7 @@ class World:
         """How long a job of a worker takes."""
         return round(self.exec_ms[role.task] * MS)
 
-    def actuator_of(self, role: Role) -> Actuator:
+    def actuator_of(self, role: Role) -> CellActuator:
         """Make the actuator of a sink."""
         return self.arms[role.task]
 

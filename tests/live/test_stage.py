@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 from dwell.errors import LiveError
-from dwell.live.stage import Message, Stateful, load_actuator, load_function, load_stage
+from dwell.live.stage import Message, load_actuator, load_function, load_stage
 
 HERE = "stages_of_test_stage"
 MODULE = """
 import functools
-from dwell.live.stage import Message
+from dwell.live.stage import CellStage, Message
 
 def double(inputs):
     return Message(2)
@@ -25,6 +25,22 @@ class Bare:
 
 class Kept(Bare):
     inputs = {"a": dict}
+    def snapshot(self): return b""
+    def restore(self, state): pass
+
+class Everything:
+    inputs = {"a": dict}
+    def __init__(self): self.called = []
+    def process(self, inputs): return Message(self.called)
+    def start(self): self.called.append("start")
+    def stop(self): self.called.append("stop")
+    def wait(self): self.called.append("wait")
+    def snapshot(self): self.called.append("snapshot")
+    def restore(self, state): self.called.append("restore")
+
+class Derived(CellStage):
+    def process(self, inputs): return Message(1)
+    def wait(self): pass
     def snapshot(self): return b""
     def restore(self, state): pass
 
@@ -68,8 +84,32 @@ def test_what_is_a_stage(name: str) -> None:
 
 
 def test_a_state_is_what_has_both_methods() -> None:
-    assert isinstance(load_stage(f"{HERE}:Kept", "x"), Stateful)
-    assert not isinstance(load_stage(f"{HERE}:Bare", "x"), Stateful)
+    assert load_stage(f"{HERE}:Kept", "x").stateful
+    assert load_stage(f"{HERE}:Derived", "x").stateful
+    assert not load_stage(f"{HERE}:Bare", "x").stateful
+
+
+@pytest.mark.parametrize("name", ["double", "Bare", "Kept"])
+def test_what_a_stage_need_not_have_has_a_default(name: str) -> None:
+    stage = load_stage(f"{HERE}:{name}", "x")
+    stage.start()
+    stage.stop()
+    assert not stage.has_frames
+    with pytest.raises(LiveError, match=r"no method wait\(\)"):
+        stage.wait()
+    assert stage.inputs == ({"a": dict} if name == "Kept" else {})
+
+
+def test_what_a_stage_has_is_called() -> None:
+    stage = load_stage(f"{HERE}:Everything", "x")
+    assert stage.has_frames
+    assert load_stage(f"{HERE}:Derived", "x").has_frames
+    assert stage.inputs == {"a": dict}
+    stage.start()
+    stage.wait()
+    stage.restore(stage.snapshot())
+    stage.stop()
+    assert stage.process({}).payload == ["start", "wait", "snapshot", "restore", "stop"]
 
 
 @pytest.mark.parametrize("name", ["double", "Arm"])
@@ -77,6 +117,8 @@ def test_what_is_an_actuator(name: str) -> None:
     actuator = load_actuator(f"{HERE}:{name}", "x")
     actuator.hold()
     actuator.zero()
+    actuator.stop()
+    assert actuator.inputs == {}
 
 
 def test_what_tells_a_utilisation() -> None:

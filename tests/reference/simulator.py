@@ -28,6 +28,7 @@ LAST_CHANGE = 900_000
 COMPLETION, ARRIVAL, START, REPEAT, DISTURBANCE, RESTART, STEP, CLOSE, GUARD, RELEASE = range(1, 11)
 # Cells: the jobs of a cycle itself, and those of its shadow.
 ITSELF, SHADOW = 0, 1
+ZERO, ONE = Fraction(0), Fraction(1)
 MASK = 2**64 - 1
 NEAR_NS = 1000
 STATE_TIMEOUT_MS = 200
@@ -334,7 +335,9 @@ class NodeState:
         self.stressed = 0
         self.period = self.quota = self.left = self.pool = self.slack = self.periods = 0
         self.tick = 0
-        self.contention = Fraction(node.contention)
+        # Core time that what runs receives of the time that it has a core.
+        self.pace = 1 - Fraction(node.contention)
+        self.background, self.interference = Fraction(node.background), Fraction(node.interference)
         if node.quota is not None:
             self.period = nanoseconds(node.quota.period_ms)
             self.count(node.quota)
@@ -368,19 +371,14 @@ class NodeState:
         """Follow what other nodes, of which these have foreign threads, leave of the cores."""
         given = self.node.contention_stressed
         shares = [share for name, share in given.items() if name in stressed]
-        contention = Fraction(max(shares, default=self.node.contention))
-        if self.node.quota is None or contention == self.contention:
+        pace = 1 - Fraction(max(shares, default=self.node.contention))
+        if self.node.quota is None or pace == self.pace:
             return
-        before, self.contention = self.pace, contention
+        before, self.pace = self.pace, pace
         self.left = round(self.left * before / self.pace)
         self.pool = round(self.pool * before / self.pace)
         self.count(self.node.quota)
         self.touched = True
-
-    @property
-    def pace(self) -> Fraction:
-        """Core time that what runs receives of the time that it has a core."""
-        return 1 - self.contention
 
     def in_time(self, ms: float) -> int:
         """How long a core has to be had for so much core time."""
@@ -496,7 +494,7 @@ class NodeState:
             return
         long = self.had >= self.in_time(LEAST_TURN_MS)
         behind = any(thread.received < self.turn.received for thread in self.waiting)
-        if (at_tick and long) or (now in self.wakes and behind):
+        if (at_tick and long) or (now in self.wakes[-2:] and behind):
             self.waiting.append(self.turn)
             self.end_turn()
 
@@ -575,13 +573,13 @@ class NodeState:
     @property
     def slowness(self) -> Fraction:
         """How many times as much core time jobs take."""
-        return Fraction(self.node.interference) if self.foreign else Fraction(1)
+        return self.interference if self.foreign else ONE
 
     @property
     def free_of_background(self) -> Fraction:
         """c'."""
         # Under a quota the background takes from the bucket, elsewhere from the cores.
-        return self.node.cores - (Fraction(0) if self.quota else Fraction(self.node.background))
+        return self.node.cores - (ZERO if self.quota else self.background)
 
     @property
     def share(self) -> Fraction:
@@ -611,27 +609,28 @@ class NodeState:
         """Part of its speed at which a job runs on the cores that it holds."""
         # The speed of a fair node is that of its threads, however many a job has.
         if self.node.scheduler == "fair":
-            return Fraction(1)
-        return min(Fraction(1), Fraction(self.node.cores, job.execution.threads))
+            return ONE
+        return min(ONE, Fraction(self.node.cores, job.execution.threads))
 
     @property
     def behind(self) -> Fraction:
         """Cores that the background has."""
-        background = Fraction(self.node.background)
         if self.down or self.quota:
-            return background * (not self.down)
-        return min(background, Fraction(self.node.cores - self.rate))
+            return ZERO if self.down else self.background
+        return min(self.background, Fraction(self.node.cores - self.rate))
 
     def advance(self, now: int) -> None:
         """Let the time since the last change pass."""
         elapsed = now - self.since
+        if not elapsed:
+            return
         self.since = now
         running, rate = self.running, self.rate
         speeds = {cell: self.speed(cell) for cell in {job.cell for job in running}}
         for job in running:
-            before = max(job.left, Fraction(0))
+            before = max(job.left, ZERO)
             job.left -= speeds[job.cell] * self.part(job) * elapsed
-            received = before - max(job.left, Fraction(0))
+            received = before - max(job.left, ZERO)
             self.work[job.cell] += job.execution.threads * received
             job.core += job.execution.threads * received * self.slowness
         for kind, jobs in self.served.items():

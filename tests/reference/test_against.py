@@ -106,22 +106,37 @@ class Fickle(Replay):
         return self  # it is not put back to what it was
 
 
-class Probe:
-    """An estimator that asks for shadow jobs and keeps everything it is given."""
+class Level:
+    """An estimator that expects the same of every candidate."""
+
+    names: tuple[str, ...] = ()
+
+    def start(self, problem: Problem) -> None:
+        """Get to know the candidates."""
+        self.names = tuple(problem.candidates)
+
+    def estimate(
+        self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
+    ) -> Mapping[str, QoS]:
+        """Expect what was observed."""
+        return dict.fromkeys(self.names, observed)
+
+
+class Probe(Level):
+    """One that asks for shadow jobs and keeps everything it is given."""
 
     def __init__(self, shadow_fraction: float) -> None:
         self.shadow_fraction = shadow_fraction
         self.evidence: list[Evidence] = []
         self.observed: list[QoS] = []
         self.own: list[Mapping[str, float]] = []
-        self.names: tuple[str, ...] = ()
 
     def __deepcopy__(self, memo: object) -> Probe:
         return self  # what the simulator's copy sees is what the test looks at
 
     def start(self, problem: Problem) -> None:
         """Forget everything."""
-        self.names = tuple(problem.candidates)
+        super().start(problem)
         self.evidence, self.observed, self.own = [], [], []
 
     def learn(self, evidence: Evidence) -> None:
@@ -131,10 +146,10 @@ class Probe:
     def estimate(
         self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
     ) -> Mapping[str, QoS]:
-        """Keep what was observed, and expect the same of every candidate."""
+        """Keep what was observed."""
         self.observed.append(observed)
         self.own.append(own)
-        return dict.fromkeys(self.names, observed)
+        return super().estimate(observed=observed, incumbent=incumbent, own=own)
 
 
 @dataclass(frozen=True)
@@ -225,7 +240,7 @@ def play(case: Case) -> Played:
         case.problem,
         case.real,
         policy=(Fickle if case.fickle else Replay)(script(case)),
-        estimator=probe,
+        estimator=probe or Level(),
         jobs=True,
         guard=case.guarded,
     )

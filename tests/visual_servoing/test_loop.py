@@ -118,7 +118,7 @@ def test_a_cell_file_can_name_all_of_it(tmp_path: Path, monkeypatch: pytest.Monk
         ("control", "control:Control"),
     ):
         stage = load_stage(f"examples.visual_servoing.servoing.{name}", task)
-        expected = getattr(stage, "inputs", {}).get(before)
+        expected = stage.inputs.get(before)
         kind, data = write_payload(message.payload)
         payload = read_payload(kind, bytes(data), expected)
         done = stage.process({before: Message(payload, 1, released_ns)})

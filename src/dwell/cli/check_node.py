@@ -13,7 +13,7 @@ from dwell.cli.output import aligned, print_json
 from dwell.errors import Fault, LiveError, TrustError, installing
 from dwell.live.lint import lint
 from dwell.live.security import Security, environment, exposed
-from dwell.live.stage import Stage, Stateful, load_actuator, load_stage
+from dwell.live.stage import CellStage, load_actuator, load_stage
 from dwell.live.wiring import PORTS_PER_ROLE, Role, Wiring, roles, wire
 from dwell.model import Problem
 from dwell.model.bounds import counted
@@ -108,25 +108,25 @@ def _stages(problem: Problem, node: str) -> Iterator[Fault]:
             continue
         yield from _inputs(problem, name, stage, where)
         frames = problem.live.release == "frames" and name == first
-        if frames and not callable(getattr(stage, "wait", None)):
+        if frames and not stage.has_frames:
             yield Fault(where, f"{task.run} has no method wait(), and live.release is frames")
         yield from _state(name, task.run, stage, task.state_bytes)
 
 
-def _inputs(problem: Problem, name: str, stage: Stage, where: str) -> Iterator[Fault]:
+def _inputs(problem: Problem, name: str, stage: CellStage, where: str) -> Iterator[Fault]:
     sources = {flow.source for flow in problem.pipeline.inputs(name)}
-    for source in getattr(stage, "inputs", {}):
+    for source in stage.inputs:
         if source not in sources:
             known = ", ".join(sorted(sources)) or "nothing"
             yield Fault(where, f"its `inputs` name {source!r}, but it gets {known}")
 
 
-def _state(name: str, run: str, stage: Stage, state_bytes: int) -> Iterator[Fault]:
+def _state(name: str, run: str, stage: CellStage, state_bytes: int) -> Iterator[Fault]:
     """Yield where the cell file and the stage disagree on whether there is a state to move."""
     where = f"tasks.{name}.state_bytes"
-    if state_bytes and not isinstance(stage, Stateful):
+    if state_bytes and not stage.stateful:
         yield Fault(where, f"{state_bytes}, but {run} has no methods snapshot() and restore()")
-    if not state_bytes and isinstance(stage, Stateful):
+    if not state_bytes and stage.stateful:
         yield Fault(where, f"0, but {run} has a state: say about how many bytes it takes")
 
 

@@ -207,25 +207,21 @@ def work(
     stage = worker.stage
     if begin is not None:
         begin()
-    start = getattr(stage, "start", None)
-    if start is not None:
-        start()
+    stage.start()
     with hosted.lock:
         worker.started = True
         worker.pulse.send(clock())
     if ready is not None:
         ready()
     if worker.triggers:
-        start_thread("frames", _frames, worker, hosted, getattr(stage, "wait", None), stopped)
+        start_thread("frames", _frames, worker, hosted, stopped)
     try:
         while not stopped.is_set():
             _drain(worker, hosted, note, clock)
             hosted.news.acquire(timeout=worker.rest_s(clock()))
     finally:
         hosted.stop()
-        stop = getattr(stage, "stop", None)
-        if stop is not None:
-            stop()
+        stage.stop()
 
 
 def _drain(
@@ -253,15 +249,11 @@ def _drain(
             note(None)
 
 
-def _frames(
-    worker: Worker, hosted: Hosted, wait: Callable[[], object] | None, stopped: threading.Event
-) -> None:
+def _frames(worker: Worker, hosted: Hosted, stopped: threading.Event) -> None:
     """Ask the stamper for a cycle whenever the source has a frame."""
     while not stopped.is_set():
         try:
-            if wait is None:
-                raise LiveError("no method wait(), though live.release is frames")
-            wait()
+            worker.stage.wait()
         except Exception as error:  # the user's code; a camera that fails shows in its beats
             with hosted.lock:
                 worker.no_frame(error)

@@ -19,7 +19,7 @@ from dwell.live.messages import Header
 from dwell.live.role import Pulse, RoleLogic, RolePlace
 from dwell.live.security import Security
 from dwell.live.sink import Rest, Sink
-from dwell.live.stage import Actuator, load_actuator, load_stage
+from dwell.live.stage import CellActuator, load_actuator, load_stage
 from dwell.live.stamper import Stamper
 from dwell.live.state_files import BookFile, HighestFile, InFlight, make_folder
 from dwell.live.transport.transport import Arrival
@@ -90,8 +90,7 @@ def _run(
         return True
     actuator = _actuator(problem, role.task)
     highest = HighestFile(folder / f"{role.who}.highest")
-    expected = getattr(actuator, "inputs", {}).get(role.task)
-    sink = Sink(place, role.task, actuator, highest, expected)
+    sink = Sink(place, role.task, actuator, highest)
     if group is not None:
         sink.group_clock = group.taken_ns
     hosted = _host(sink, place, stopped, clock)
@@ -125,7 +124,7 @@ def bring_to_rest(sink: Sink, patience_s: float = ENDING_S) -> bool:
     return rests
 
 
-def _actuator(problem: Problem, task: str) -> Actuator:
+def _actuator(problem: Problem, task: str) -> CellActuator:
     name = problem.live.actuators.get(task)
     if name is None:
         raise LiveError(

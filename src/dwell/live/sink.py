@@ -10,7 +10,7 @@ from dwell.live.control_group import UNKNOWN
 from dwell.live.messages import ACTUATED, NOT_APPLIED, STALE, Completion, Header
 from dwell.live.payloads import read_payload
 from dwell.live.role import Pulse, RolePlace
-from dwell.live.stage import Actuator, Message
+from dwell.live.stage import CellActuator, Message
 from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import longest_bytes
 
@@ -34,23 +34,17 @@ class Sink:
     """Lets each command through once, in order and fresh; tells the actuator when none comes.
 
     Nothing of the user's runs before the gate has decided and remembered.
-
-    Parameters
-    ----------
-    expected : type, optional
-        Struct that the actuator takes.
     """
 
     def __init__(
         self,
         place: RolePlace,
         task: str,
-        actuator: Actuator,
+        actuator: CellActuator,
         highest: Highest,
-        expected: type | None = None,
     ) -> None:
         self.place, self.task, self.actuator = place, task, actuator
-        self._highest, self._expected = highest, expected
+        self._highest = highest
         self.max_age_ns = round(place.problem.max_age_ms * 1e6)
         self.newest = highest.load()
         self.offsets = place.offsets()
@@ -116,7 +110,8 @@ class Sink:
         self._alarm_ns = self._alarm_ns or alarm_ns
         age_ms = self.age_ns(header, now_ns) / 1e6
         try:
-            command = read_payload(header.kind, payload, self._expected)
+            expected = self.actuator.inputs.get(self.task)
+            command = read_payload(header.kind, payload, expected)
             released_ns, _ = self.offsets.from_reference(self.place.node, stamp.released_ns)
             self.actuator.apply(Message(command, stamp.cycle, released_ns, age_ms))
         except Exception as error:  # the user's code
@@ -127,12 +122,9 @@ class Sink:
         return True
 
     def rest(self, how: Rest) -> bool:
-        """Tell the actuator to hold, or to stop; returns whether it did not raise.
-
-        An actuator need not have a method `stop`.
-        """
+        """Tell the actuator to hold, or to stop; returns whether it did not raise."""
         try:
-            getattr(self.actuator, how, lambda: None)()
+            getattr(self.actuator, how)()
         except (Exception, SystemExit) as error:  # the user's code
             self._restless = self._complain(f"{how}()", error)
             return False

@@ -6,7 +6,8 @@ import difflib
 import functools
 import importlib
 import inspect
-from collections.abc import Callable, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, cast, runtime_checkable
 
@@ -14,6 +15,8 @@ from dwell.errors import LiveError
 
 __all__ = [
     "Actuator",
+    "CellActuator",
+    "CellStage",
     "Message",
     "Stage",
     "Stateful",
@@ -46,11 +49,7 @@ class Message:
 
 
 class Stage(Protocol):
-    """A task's code. It may also have ``start()``, ``stop()`` and `Stateful`'s two methods.
-
-    An attribute ``inputs``, a mapping from source task to `msgspec.Struct` type, says what the
-    structs that arrive are.
-    """
+    """A task's code. It may also have what else `CellStage` has."""
 
     def process(self, inputs: Mapping[str, Message]) -> Message:
         """Turn a cycle's inputs, by the task they come from, into its output.
@@ -74,9 +73,8 @@ class Stateful(Protocol):
 
 
 class Actuator(Protocol):
-    """Applies commands; it is called behind the gate.
+    """Applies commands; it is called behind the gate. It may also have ``inputs`` and ``stop()``.
 
-    It may also have ``stop()``, which is called after `zero` where its process is told to end.
     What raises is called again (docs/deploy.md).
     """
 
@@ -93,27 +91,134 @@ class Actuator(Protocol):
         ...
 
 
-class _Function:
+class CellStage(ABC):
+    """A stage as a worker calls it: all that a user's need not have has a default.
+
+    Attributes
+    ----------
+    inputs : mapping of str to type
+        By source task, the `msgspec.Struct` that arrives; without, structs arrive as dicts.
+    stateful : bool
+        Whether its state moves with it: it has `snapshot` of its own.
+    has_frames : bool
+        Whether it can wait for a frame: it has `wait` of its own.
+    """
+
+    inputs: Mapping[str, type] = {}
+    stateful: bool = False
+    has_frames: bool = False
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        cls.stateful = cls.snapshot is not CellStage.snapshot
+        cls.has_frames = cls.wait is not CellStage.wait
+
+    @abstractmethod
+    def process(self, inputs: Mapping[str, Message]) -> Message:
+        """As `Stage.process`."""
+
+    def start(self) -> None:
+        """Get ready, before the first cycle."""
+        return
+
+    def stop(self) -> None:
+        """Let go of what it has, after the last cycle."""
+        return
+
+    def wait(self) -> object:
+        """Return when there is a new frame, which begins a cycle."""
+        raise LiveError("no method wait(), though live.release is frames")
+
+    def snapshot(self) -> bytes:
+        """As `Stateful.snapshot`."""
+        raise LiveError("no method snapshot()")
+
+    def restore(self, state: bytes) -> None:
+        """As `Stateful.restore`."""
+        raise LiveError("no method restore()")
+
+
+class CellActuator(ABC):
+    """An actuator as a sink calls it: all that a user's need not have has a default.
+
+    Attributes
+    ----------
+    inputs : mapping of str to type
+        By its task, the `msgspec.Struct` that commands are.
+    """
+
+    inputs: Mapping[str, type] = {}
+
+    @abstractmethod
+    def apply(self, command: Message) -> None:
+        """As `Actuator.apply`."""
+
+    def hold(self) -> None:
+        """As `Actuator.hold`."""
+        return
+
+    def zero(self) -> None:
+        """As `Actuator.zero`."""
+        return
+
+    def stop(self) -> None:
+        """Let go of what it has; called after `zero` where its process is told to end."""
+        return
+
+
+class _UserStage(CellStage):
+    """A user's stage, and what it does without."""
+
+    def __init__(self, given: Stage) -> None:
+        self._given = given
+        self.stateful = isinstance(given, Stateful)
+        self.has_frames = callable(getattr(given, "wait", None))
+        _take(self, given, ("inputs", "start", "stop", "wait", "snapshot", "restore"))
+
+    def process(self, inputs: Mapping[str, Message]) -> Message:
+        return self._given.process(inputs)
+
+
+class _FunctionStage(CellStage):
     """A stage that is one function."""
 
     def __init__(self, function: Callable[[Mapping[str, Message]], Message]) -> None:
-        self.process = function
-        self.inputs: Mapping[str, type] = getattr(function, "inputs", {})
+        self._function = function
+        _take(self, function, ("inputs",))
+
+    def process(self, inputs: Mapping[str, Message]) -> Message:
+        return self._function(inputs)
 
 
-class _Apply:
+class _UserActuator(CellActuator):
+    """A user's actuator, and what it does without."""
+
+    def __init__(self, given: Actuator) -> None:
+        self._given = given
+        _take(self, given, ("inputs", "hold", "zero", "stop"))
+
+    def apply(self, command: Message) -> None:
+        self._given.apply(command)
+
+
+class _FunctionActuator(CellActuator):
     """An actuator that is one function, and does nothing when commands stay out."""
 
     def __init__(self, function: Callable[[Message], None]) -> None:
-        self.apply = function
+        self._function = function
 
-    def hold(self) -> None:
-        """Do nothing."""
-
-    zero = hold
+    def apply(self, command: Message) -> None:
+        self._function(command)
 
 
-def load_stage(name: str, where: str) -> Stage:
+def _take(own: CellStage | CellActuator, given: object, members: Sequence[str]) -> None:
+    """Have those of these members that a user's object has stand before the defaults."""
+    for name in members:
+        if (member := getattr(given, name, None)) is not None:
+            setattr(own, name, member)
+
+
+def load_stage(name: str, where: str) -> CellStage:
     """Import a stage and make it.
 
     Parameters
@@ -129,23 +234,27 @@ def load_stage(name: str, where: str) -> Stage:
         If it is not there, cannot be imported or made, or is no stage.
     """
     found = _made(name, where)
+    if isinstance(found, CellStage):
+        return found
     if callable(getattr(found, "process", None)):
-        return cast("Stage", found)
+        return _UserStage(cast("Stage", found))
     if _is_function(found):
-        return _Function(cast("Callable[[Mapping[str, Message]], Message]", found))
+        return _FunctionStage(cast("Callable[[Mapping[str, Message]], Message]", found))
     raise LiveError(f"{where}: {name} is no stage: it has no method process(inputs)")
 
 
-def load_actuator(name: str, where: str) -> Actuator:
+def load_actuator(name: str, where: str) -> CellActuator:
     """Import an actuator and make it; see `load_stage`."""
     found = _made(name, where)
+    if isinstance(found, CellActuator):
+        return found
     if callable(getattr(found, "apply", None)):
         for method in ("hold", "zero"):
             if not callable(getattr(found, method, None)):
                 raise LiveError(f"{where}: {name} has no method {method}()")
-        return cast("Actuator", found)
+        return _UserActuator(cast("Actuator", found))
     if _is_function(found):
-        return _Apply(cast("Callable[[Message], None]", found))
+        return _FunctionActuator(cast("Callable[[Message], None]", found))
     raise LiveError(f"{where}: {name} is no actuator: it has no method apply(command)")
 
 

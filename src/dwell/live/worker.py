@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
@@ -26,7 +26,7 @@ from dwell.live.offsets import Offsets
 from dwell.live.payloads import read_payload, write_payload
 from dwell.live.role import Pulse, RolePlace
 from dwell.live.routing import STAMPER, Routes
-from dwell.live.stage import Message, Stage, Stateful
+from dwell.live.stage import CellStage, Message
 from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import SPARE, lane_of, longest_bytes
 from dwell.model.instants import EVIDENCE_NS, NEVER_NS
@@ -170,7 +170,7 @@ class Worker:
         self,
         place: RolePlace,
         task: str,
-        stage: Stage,
+        stage: CellStage,
         *,
         shadow: bool = False,
         stands_by: str = "",
@@ -195,7 +195,6 @@ class Worker:
         self.is_sink = not self._output_bytes
         self._depth = problem.pipeline.tasks[task].depth
         self._joins = {MAIN: _Joins(sources), SHADOW: _Joins(sources)}
-        self._expected: Mapping[str, type] = getattr(stage, "inputs", {})
         #: What is read at a job's start and after the stage was called; a stage that is said to use
         #: several threads is charged with all that its process does meanwhile.
         alone = problem.pipeline.tasks[task].on[place.node].threads == 1
@@ -206,7 +205,7 @@ class Worker:
         self._jobs: deque[Job] = deque()
         offset_ns = round(problem.pipeline.tasks[task].offset_ms * 1e6)
         self._source = _Source(place, self.offsets, offset_ns) if STAMPER in sources else None
-        self._stateful = isinstance(stage, Stateful) and not shadow
+        self._stateful = stage.stateful and not shadow
         self._asked: Snapshot | None = None
         #: The state that shall come here, and by its node what has come, with a number and without.
         self._awaited: Snapshot | None = None
@@ -402,7 +401,7 @@ class Worker:
 
     def _send_state(self, to: str, number: int) -> None:
         place, stage = self.place, self.stage
-        if not isinstance(stage, Stateful):
+        if not stage.stateful:
             return
         run, cycle = (max(part, 0) for part in self.state_at)
         try:
@@ -420,7 +419,7 @@ class Worker:
 
     def _take_over(self, state: State, data: bytes) -> str:
         """Restore a state; returns what went wrong, or nothing."""
-        if not isinstance(self.stage, Stateful):
+        if not self.stage.stateful:
             return f"{self.task} has no restore()"
         try:
             self.stage.restore(data)
@@ -539,7 +538,7 @@ class Worker:
         try:
             inputs = {
                 source: Message(
-                    read_payload(header.kind, payload, self._expected.get(source)),
+                    read_payload(header.kind, payload, self.stage.inputs.get(source)),
                     stamp.cycle,
                     released_ns,
                     (started_ns - released_ns) / 1e6,

@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from dwell.live.stage import Actuator, Message, load_actuator
+from dwell.live.stage import CellActuator, Message, load_actuator
 
 #: Variable with what the processes are told: ``observed`` (file), ``exec_ms`` (by task and node),
 #: ``actuators`` (by task, those that are called behind the witness), ``failing`` (file with the
@@ -104,21 +104,22 @@ class Control(_Timed):
         return bytes(message.payload)
 
 
-class Witness:
+class Witness(CellActuator):
     """The actuator: a record a call, appended in one write, so that no kill tears it.
 
     Parameters
     ----------
-    behind : Actuator, optional
+    behind : CellActuator, optional
         Called after the record has been written.
     """
 
-    def __init__(self, behind: Actuator | None = None) -> None:
+    def __init__(self, behind: CellActuator | None = None) -> None:
         told = json.loads(os.environ[TOLD])
         self._file = os.open(told["observed"], os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
         self._failing = Path(told["failing"])
         self._behind = behind
-        self.inputs = getattr(behind, "inputs", {})
+        if behind is not None:
+            self.inputs = behind.inputs
         self._write(START)
 
     def apply(self, command: Message) -> None:
@@ -146,7 +147,8 @@ class Witness:
 
     def stop(self) -> None:
         """Have what is behind it stop, where it can."""
-        getattr(self._behind, "stop", lambda: None)()
+        if self._behind is not None:
+            self._behind.stop()
 
     def _write(self, what: int, *about: int) -> None:
         perception, planning, cycle, said, released_ns = about or (0, 0, 0, 0, 0)
