@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Collection, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
@@ -334,7 +334,6 @@ class NodeState:
         self.stressed = 0
         self.period = self.quota = self.left = self.pool = self.slack = self.periods = 0
         self.tick = 0
-        self.contention = Fraction(node.contention)
         if node.quota is not None:
             self.period = nanoseconds(node.quota.period_ms)
             self.count(node.quota)
@@ -364,23 +363,10 @@ class NodeState:
         )
         self.slack = self.in_time(quota.slack_ms)
 
-    def contend(self, stressed: Collection[str]) -> None:
-        """Follow what other nodes, of which these have foreign threads, leave of the cores."""
-        given = self.node.contention_stressed
-        shares = [share for name, share in given.items() if name in stressed]
-        contention = Fraction(max(shares, default=self.node.contention))
-        if self.node.quota is None or contention == self.contention:
-            return
-        before, self.contention = self.pace, contention
-        self.left = round(self.left * before / self.pace)
-        self.pool = round(self.pool * before / self.pace)
-        self.count(self.node.quota)
-        self.touched = True
-
     @property
     def pace(self) -> Fraction:
         """Core time that what runs receives of the time that it has a core."""
-        return 1 - self.contention
+        return 1 - Fraction(self.node.contention)
 
     def in_time(self, ms: float) -> int:
         """How long a core has to be had for so much core time."""
@@ -1573,9 +1559,6 @@ class Simulation:
                 self.come_up(change.node)
                 if self.guard is not None and change.node == self.problem.stamper_node:
                     self.guard.restart()
-            up = {name for name, other in self.nodes.items() if other.foreign and not other.down}
-            for other in self.nodes.values():
-                other.contend(up)
 
         return happen
 
