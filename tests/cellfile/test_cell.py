@@ -186,6 +186,16 @@ def test_a_candidate_of_a_file_places_no_anchored_task(tmp_path: Path) -> None:
     assert to_document(from_document(placed))["candidates"] == {"LOC": {}}
 
 
+def test_a_key_that_has_gone_is_passed_over_in_records_alone(tmp_path: Path) -> None:
+    node = {"tier": "robot", "quota": {"cpu": 0.5, "period_ms": 4}}
+    old = {**node, "contention_stressed": {"E": 0.5}}
+    with pytest.raises(ProblemError, match=r"nodes\.n\.contention_stressed: .*delete the line"):
+        from_document({**LEAST, "nodes": {"n": old}})
+    plain, record = ({**LEAST, "nodes": {"n": one}} for one in (node, old))
+    assert from_record(record) == from_record(plain)
+    assert from_document(record, judged=False) == from_document(plain)
+
+
 def test_every_key_reaches_the_model() -> None:
     process = {"exponential": {"mean": 5}}
     problem = from_document(

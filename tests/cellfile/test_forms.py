@@ -77,36 +77,10 @@ VALUES: list[tuple[tuple[str | int, ...], object, str, tuple[str, ...]]] = [
     ),
     (("nodes", "R1", "background_hz"), 1e6, "nodes.R1.background_hz", ("from 0 to 100000",)),
     (
-        ("nodes", "R1"),
-        {"tier": "robot", "contention_stressed": {"E": 0.5}},
-        "nodes.R1.contention_stressed.E",
-        ("0.5", "no quota"),
-    ),
-    (
-        ("nodes", "R1"),
-        {
-            "tier": "robot",
-            "quota": {"cpu": 0.5, "period_ms": 4},
-            "contention_stressed": {"E9": 0.5},
-        },
-        "nodes.R1.contention_stressed.E9",
-        ("unknown node 'E9'",),
-    ),
-    (
-        ("nodes", "R1"),
-        {
-            "tier": "robot",
-            "quota": {"cpu": 0.5, "period_ms": 4},
-            "contention_stressed": {"R1": 0.5},
-        },
-        "nodes.R1.contention_stressed.R1",
-        ("the node itself",),
-    ),
-    (
         ("nodes", "R1", "contention_stressed"),
-        {"E": 0.95},
-        "nodes.R1.contention_stressed.E",
-        ("0.95", "from 0 to 0.9"),
+        {"E": 0.5},
+        "nodes.R1.contention_stressed",
+        ("'contention_stressed' has gone; delete the line",),
     ),
     (
         ("nodes", "R1", "bursts"),

@@ -253,7 +253,7 @@ class _Maker:
     def problem(self) -> Problem:
         rng, period = self.rng, self.period
         names = ("N0", "N1", "N2", "N3", "N4")[: rng.randint(1, 5)]
-        self.nodes = [self.node(name, names) for name in names]
+        self.nodes = [self.node(name) for name in names]
         if not self.whole_ms and rng.random() < 0.4:
             self.scales["scene"] = AR1(
                 mean=1, cv=rng.uniform(0.05, 0.3), rho=rng.uniform(-0.3, 0.9)
@@ -306,7 +306,7 @@ class _Maker:
             close_grace_ms=rng.choice([0.0, 0.0, self.duration(0, 1), self.duration(0, 6)]),
         )
 
-    def node(self, name: str, names: Sequence[str]) -> Node:
+    def node(self, name: str) -> Node:
         rng = self.rng
         tiers: list[Tier] = ["robot", "edge", "cloud"]
         tier = rng.choice(tiers)
@@ -316,7 +316,6 @@ class _Maker:
         turns = scheduler == "turns"
         quota = self.quota(turns)
         beside = rng.choice([None, 0.0, background / 2]) if quota is not None else None
-        stressed = {other: rng.choice([0.0, 0.25, 0.75]) for other in names if other != name}
         return Node(
             name,
             tier,
@@ -324,8 +323,7 @@ class _Maker:
             background_beside=beside,
             background_hz=rng.choice([0.0, 50.0, 700.0]) if turns else 0.0,
             interference=rng.choice([1.0, 1.0, 2.0]),
-            contention=rng.choice([0.0, 0.0, 0.5]) if quota is not None else 0.0,
-            contention_stressed=rng.choice([{}, stressed]) if quota is not None else {},
+            contention=rng.choice([0.0, 0.0, 0.25, 0.5, 0.75]) if quota is not None else 0.0,
             cores=1 if turns else cores,
             scheduler="fair" if scheduler == "turns" else scheduler,
             accelerators={"gpu": rng.randint(1, 2)} if rng.random() < 0.3 else {},

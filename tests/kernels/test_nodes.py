@@ -248,26 +248,6 @@ def test_a_period_that_begins_with_stress_and_a_job_is_a_stressed_one() -> None:
     assert run.cycles["latency_ns"][0] == 60.5 * MS
 
 
-def test_foreign_threads_of_a_node_on_the_same_cpu_take_more_of_it() -> None:
-    # R2 has all of its core, and in the second of four windows, while R1 is stressed, a quarter.
-    quota = Quota(0.4, 20.0)
-    problem = make_problem(
-        [
-            Node("R1", "robot", 1),
-            Node("R2", "robot", 1, quota=quota, contention_stressed={"R1": 0.75}),
-        ],
-        [Task("work", {"R2": Execution(Constant(10.0))})],
-        period_ms=100.0,
-        window_cycles=5,
-        scenario=[NodeDisturbance("R1", at_s=0.5, for_s=0.5, stress_threads=1)],
-    )
-    run = dwell.simulate(problem, scenario="disturbed", policy="LOC", seed=1, windows=4)
-    # Calm: 8 ms, 12 of waiting, 2. Stressed: 5 ms in every period, less than its quota.
-    assert run.cycles["latency_ns"].to_list() == [22 * MS] * 5 + [40 * MS] * 5 + [22 * MS] * 10
-    # It is the same work, whatever it took of the core's time.
-    assert run.windows["u_R2"].to_list() == pytest.approx([0.25] * 4)
-
-
 def test_threads_that_hand_a_job_on_wait_for_their_turns() -> None:
     # One core, nothing used up: a foreign thread, ticks every 4 ms.
     def played(before_ms: float, after_ms: float) -> tuple[list[float], list[float]]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Collection, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
@@ -366,19 +366,6 @@ class NodeState:
             for taken in (Fraction(beside), Fraction(node.background))
         )
         self.slack = self.in_time(quota.slack_ms)
-
-    def contend(self, stressed: Collection[str]) -> None:
-        """Follow what other nodes, of which these have foreign threads, leave of the cores."""
-        given = self.node.contention_stressed
-        shares = [share for name, share in given.items() if name in stressed]
-        pace = 1 - Fraction(max(shares, default=self.node.contention))
-        if self.node.quota is None or pace == self.pace:
-            return
-        before, self.pace = self.pace, pace
-        self.left = round(self.left * before / self.pace)
-        self.pool = round(self.pool * before / self.pace)
-        self.count(self.node.quota)
-        self.touched = True
 
     def in_time(self, ms: float) -> int:
         """How long a core has to be had for so much core time."""
@@ -1572,9 +1559,6 @@ class Simulation:
                 self.come_up(change.node)
                 if self.guard is not None and change.node == self.problem.stamper_node:
                     self.guard.restart()
-            up = {name for name, other in self.nodes.items() if other.foreign and not other.down}
-            for other in self.nodes.values():
-                other.contend(up)
 
         return happen
 

@@ -483,9 +483,8 @@ def test_own_jobs_run_as_without_shadows(schedulers: Sequence[Scheduler]) -> Non
 def without_shared_means(case: Case) -> Case:
     """Draw a case again without quotas, accelerators, bytes and order on links."""
     fabric, pipeline = case.problem.fabric, case.problem.pipeline
-    alone: dict[str, Any] = {"background_beside": None, "contention_stressed": {}}
     nodes = {
-        name: replace(node, quota=None, contention=0.0, **alone)
+        name: replace(node, quota=None, contention=0.0, background_beside=None)
         for name, node in fabric.nodes.items()
     }
     tasks = {

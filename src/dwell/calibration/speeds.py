@@ -160,10 +160,6 @@ def slowed(
             background=node.background * factor,
             background_beside=None if beside is None else beside * factor,
             contention=min(node.contention * factor, CONTENTION.high),
-            contention_stressed={
-                other: min(share * factor, CONTENTION.high)
-                for other, share in node.contention_stressed.items()
-            },
         )
     links = {
         name: replace(link, delay_ms=moved(link.delay_ms))

@@ -114,7 +114,7 @@ def from_document(
     ProblemError
         With every fault found.
     """
-    faults = Faults(source)
+    faults = Faults(source, is_record=not judged)
     return read_problem(document, faults, Path(folder), "cell", anchored=True, judged=judged)
 
 
@@ -139,7 +139,8 @@ def from_record(document: Mapping[str, object]) -> Problem:
     ProblemError
         With every fault found.
     """
-    return read_problem(document, Faults(), None, "cell", anchored=True, judged=False)
+    faults = Faults(is_record=True)
+    return read_problem(document, faults, None, "cell", anchored=True, judged=False)
 
 
 def read_problem(

@@ -18,10 +18,12 @@ class Faults:
     ----------
     source : str, optional
         Name of the document in messages.
+    is_record : bool
+        Whether an earlier version may have written it: keys that have gone are passed over.
     """
 
-    def __init__(self, source: str | None = None) -> None:
-        self.source = source
+    def __init__(self, source: str | None = None, *, is_record: bool = False) -> None:
+        self.source, self.is_record = source, is_record
         self.lines: dict[str, int] = {}
         # A mapping keeps their order and finds one again, however many an alias multiplies.
         self._faults: dict[Fault, type[ProblemError]] = {}

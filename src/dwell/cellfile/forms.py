@@ -448,6 +448,8 @@ class Shape(Form):
         Class of the model that its values are the arguments of.
     extra : mapping
         What its JSON Schema has besides.
+    gone : tuple of str
+        Keys of earlier versions.
     """
 
     title: str
@@ -455,6 +457,7 @@ class Shape(Form):
     keys: tuple[FormKey, ...]
     kind: Any = None
     extra: Mapping[str, Any] = field(default_factory=dict)
+    gone: tuple[str, ...] = ()
 
     @property
     def words(self) -> str:
@@ -473,8 +476,11 @@ class Shape(Form):
         names = self.names
         missing = [key.named for key in self.keys if key.is_required and key.named not in value]
         for name in value:
-            if name not in names:
-                here = beneath(path, name)
+            here = beneath(path, name)
+            if name in self.gone:
+                if not faults.is_record:
+                    faults.add(here, f"the key {name!r} has gone; delete the line")
+            elif name not in names:
                 if not faults.at(here):
                     faults.add(here, f"unknown key {name!r}; {nearest(name, names)}")
                 meant = closest(name, names, MISSPELT)
@@ -580,6 +586,7 @@ def shape_of(
     instead: Mapping[str, Form | FormKey] | None = None,
     further: tuple[FormKey, ...] = (),
     says: str = "",
+    gone: tuple[str, ...] = (),
 ) -> Shape:
     """Return the shape of a class of the model.
 
@@ -595,6 +602,8 @@ def shape_of(
         Keys that are no fields; they come last.
     says : str
         The first line of the class's docstring where empty.
+    gone : tuple of str
+        Keys of earlier versions.
     """
     keys = []
     for one in declared_fields(kind):
@@ -606,7 +615,7 @@ def shape_of(
         else:
             keys.append(key_of(one, given or form_of(one, forms)))
     first = (kind.__doc__ or "").partition("\n")[0]
-    return Shape(title or kind.__name__, says or first, (*keys, *further), kind)
+    return Shape(title or kind.__name__, says or first, (*keys, *further), kind, gone=gone)
 
 
 def entries_of(value: Any) -> Iterator[Entry]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,8 +31,6 @@ DRAWN_MS, LEAST_MS = 5.0, 1.4
 PARTS = 4
 #: Tables of a state that is in one piece begin at multiples of so many bytes.
 LINE = 64
-#: What a quota counts in time of its core (`_counted_ns`).
-COUNTED = "quota_ns", "stressed_ns", "slack_ns", "least_ns", "drawn_ns"
 
 
 class CellPart(NamedTuple):
@@ -346,20 +343,16 @@ class _Layout:
         return [first + row * stride for row in range(len(kept))]
 
     def _add_nodes(self, index: int, problem: Problem, real: Realisation) -> None:
-        new = []
         for name, node in problem.fabric.nodes.items():
             if name in self.shared and (0, name) in self.node_row:
                 self.node_row[index, name] = self.node_row[0, name]
                 continue
-            new.append(name)
             row = self.node_row[index, name] = len(self.rows["nodes"])
             servers = {"server_0": len(self.rows["servers"])}
             self.rows["nodes"].append({**servers, "n_servers": 1 + len(node.accelerators)})
             self._add_cpu(row, node, real.phases.get(name, Phase()))
             for kind, count in node.accelerators.items():
                 self._add_server(row, kind, Scheduler.FIFO, count)
-        for name in new:
-            self._add_paces(index, problem.fabric.nodes[name])
 
     def _add_cpu(self, row: int, node: Node, phase: Phase) -> None:
         """Add the CPU of a node, with its quota."""
@@ -378,7 +371,7 @@ class _Layout:
         if quota is None:
             return
         cpu["quota"] = len(self.rows["quotas"])
-        counted = dict(zip(COUNTED, _counted_ns(node, quota), strict=True))
+        counted = _counted_ns(node, quota)
         ticks = scheduler == Scheduler.TURNS
         pooled = counted["slack_ns"] or ticks
         new: dict[str, Any] = {
@@ -398,22 +391,6 @@ class _Layout:
                 "wakes_ns": 0 if hz else LAST_NS,
             }
         self.rows["quotas"].append(new)
-
-    def _add_paces(self, index: int, node: Node) -> None:
-        """Add how fast a node is while others on its CPUs have foreign threads."""
-        if node.quota is None or not node.contention_stressed:
-            return
-        others = {
-            self.server_row[self.node_row[index, other], None]: share
-            for other, share in node.contention_stressed.items()
-        }
-        server = self.server_row[self.node_row[index, node.name], None]
-        for other, share in ({-1: node.contention} | others).items():
-            of = replace(node, contention=share)
-            counted = zip(COUNTED, _counted_ns(of, node.quota), strict=True)
-            self.rows["paces"].append(
-                {"server": server, "other": other, "pace": of.pace, **dict(counted)}
-            )
 
     def _add_server(
         self, node: int, kind: str | None, scheduler: Scheduler, cores: int
@@ -858,10 +835,15 @@ def shadow_parts(pipeline: Pipeline, active: Placement, other: Placement) -> lis
     ]
 
 
-def _counted_ns(node: Node, quota: Quota) -> list[int]:
+def _counted_ns(node: Node, quota: Quota) -> dict[str, int]:
     """Quota without and with foreign threads, slack, least turn, and what is drawn at a time."""
-    budgets = (max(node.wall_ns(ms), 1) for ms in (node.budget_ms, node.stressed_budget_ms))
-    return [*budgets, *(node.wall_ns(ms) for ms in (quota.slack_ms, LEAST_MS, DRAWN_MS))]
+    return {
+        "quota_ns": max(node.wall_ns(node.budget_ms), 1),
+        "stressed_ns": max(node.wall_ns(node.stressed_budget_ms), 1),
+        "slack_ns": node.wall_ns(quota.slack_ms),
+        "least_ns": node.wall_ns(LEAST_MS),
+        "drawn_ns": node.wall_ns(DRAWN_MS),
+    }
 
 
 def _with_own_state(tables: Tables, first: Tables) -> tuple[NDArray[np.uint8], Tables]:

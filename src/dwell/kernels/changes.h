@@ -143,14 +143,6 @@ template <class S>
     turns = (server.is_down != 0) != (change.is_down != 0);
     change_server(s, server, change, turns, now);
   }
-  if (S::kQuotas) {
-    for (i64 i = 0; i < s.paces.size; ++i) {
-      const Pace& pace = s.paces[i];
-      if (pace.other >= 0 && s.servers[pace.other].node == change.node) {
-        repace(s, s.servers[pace.server], now);
-      }
-    }
-  }
   if (turns) turn_sites(s, change.node, change.is_down != 0, now);
   announce_change(s);
 }

@@ -1,4 +1,4 @@
-// Quotas of servers: when they are used up, renewed, and paced by what others take of the core.
+// Quotas of servers: when they are used up and renewed.
 #pragma once
 
 #include <cmath>
@@ -124,43 +124,6 @@ void look_at_quota(S& s, Server& server, i64 now) {
   quota.looks_ns = -1;
   tick(s, server, now);
   draw_quota(s, server, now);
-  mark(s, server);
-}
-
-// Sets what others leave of a server's core by which of them have foreign threads.
-//
-// What it counts is in time of the core: what is left of it is converted, to the nanosecond.
-template <class S>
-void repace(S& s, Server& server, i64 now) {
-  const i64 row = &server - s.servers.rows;
-  const Pace* pace = nullptr;
-  bool is_stressed = false;
-  for (i64 i = 0; i < s.paces.size; ++i) {
-    const Pace& other = s.paces[i];
-    if (other.server != row) continue;
-    if (other.other < 0) {  // comes first
-      pace = &other;
-    } else if (s.servers[other.other].stress > 0 && !s.servers[other.other].is_down) {
-      if (!is_stressed || other.pace < pace->pace) pace = &other;
-      is_stressed = true;
-    }
-  }
-  if (pace == nullptr || pace->pace == server.pace) return;
-  Quota& quota = s.quotas[server.quota];
-  tick(s, server, now);
-  renew_before_stress(s, server, now);
-  server.behind_ns += server.busy_ns * server.pace;
-  server.busy_ns = 0.0;
-  const f64 ratio = server.pace / pace->pace;
-  quota.left_ns = static_cast<i64>(std::rint(static_cast<f64>(quota.left_ns) * ratio));
-  quota.pool_ns = static_cast<i64>(std::rint(static_cast<f64>(quota.pool_ns) * ratio));
-  quota.quota_ns = pace->quota_ns;
-  quota.stressed_ns = pace->stressed_ns;
-  quota.slack_ns = pace->slack_ns;
-  quota.least_ns = pace->least_ns;
-  quota.drawn_ns = pace->drawn_ns;
-  server.pace = pace->pace;
-  set_speed(s, server);
   mark(s, server);
 }
 

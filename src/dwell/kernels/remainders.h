@@ -42,11 +42,6 @@ template <class S>
   if (has_quota(s, server) && !takes_turns(s, server)) refill(s, server, now);
   below.stress = server.stress;
   below.is_stopped = server.is_stopped;
-  if (below.pace != server.pace) {
-    below.behind_ns += below.busy_ns * below.pace;
-    below.busy_ns = 0.0;
-    below.pace = server.pace;
-  }
   if (below.scheduler == kFair) {
     below.spare = rest_of(s, server);
     set_speed(s, below);

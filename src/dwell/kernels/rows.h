@@ -110,13 +110,6 @@ using Times = const i64*;
   field(i64, least_ns) field(i64, drawn_ns)                                                      \
   field(i64, wakes_ns) field(i64, wakes) field(u64, wake_key) field(f64, wake_gap_ns)
 
-// What the quota of a server counts, and its pace, while the CPU of a node, server `other`, has
-// foreign threads; -1: while none has of those for which there are rows.
-#define DWELL_PACE(field)                                                                        \
-  field(i32, server) field(i32, other)                                                           \
-  field(i64, quota_ns) field(i64, stressed_ns) field(i64, slack_ns) field(i64, least_ns)         \
-  field(i64, drawn_ns) field(f64, pace)
-
 // Servers of a node: its CPU first.
 #define DWELL_NODE(field) field(i32, server_0) field(i32, n_servers)
 
@@ -197,7 +190,7 @@ using Times = const i64*;
 #define DWELL_ROWS(row)                                                                          \
   row(Clock, DWELL_CLOCK) row(Cell, DWELL_CELL) row(Task, DWELL_TASK) row(Flow, DWELL_FLOW)      \
   row(Site, DWELL_SITE) row(Server, DWELL_SERVER) row(Quota, DWELL_QUOTA)                        \
-  row(Pace, DWELL_PACE) row(Node, DWELL_NODE) row(Change, DWELL_CHANGE) row(Hop, DWELL_HOP)      \
+  row(Node, DWELL_NODE) row(Change, DWELL_CHANGE) row(Hop, DWELL_HOP)      \
   row(Link, DWELL_LINK) row(Segment, DWELL_SEGMENT) row(Rate, DWELL_RATE)                        \
   row(Event, DWELL_EVENT) row(Running, DWELL_RUNNING) row(Waiting, DWELL_WAITING)                \
   row(Job, DWELL_JOB) row(Slot, DWELL_SLOT) row(Log, DWELL_LOG) row(Seen, DWELL_SEEN)            \
@@ -223,7 +216,7 @@ DWELL_ROWS(DWELL_STRUCT)
   table(i32, outputs) table(i32, cell_servers) table(f64, capacity) table(Node, nodes)           \
   table(i32, site_of) table(i32, route) table(i64, back_ns) table(i8, shadow_parts)              \
   table(Hop, hops) table(Times, layers) table(Segment, segments) table(Rate, rates)              \
-  table(Change, changes) table(Pace, paces) table(f64, work) table(f64, switching)               \
+  table(Change, changes) table(f64, work) table(f64, switching)               \
   table(i8, tiers) table(i16, stamps)                                                            \
   table(Site, sites) table(Server, servers) table(Quota, quotas) table(Link, links)              \
   table(Event, events) table(i32, following) table(i32, days)                                    \

@@ -98,7 +98,6 @@ class Tables(NamedTuple):
     segments: Rows  # (segments,)
     rates: Rows  # (segments,)
     changes: Rows  # (changes,)
-    paces: Rows  # (paces,)
     work: Floats  # (candidates, resources) own work, or empty; as all below that a rule needs
     switching: Floats  # (candidates, candidates) share of tasks moved
     tiers: NDArray[np.int8]  # (resources,)

@@ -131,13 +131,6 @@ class Node:
         default=0.0,
         is_rare=True,
     )
-    contention_stressed: Mapping[str, float] = key(
-        "What `contention` is while another node, on the same CPUs, has foreign threads, as "
-        "`{R1: 0.4}`; of several the largest counts.",
-        CONTENTION,
-        default_factory=FrozenDict,
-        is_rare=True,
-    )
 
     def __post_init__(self) -> None:
         if self.bursts is not None and self.bursts.add_delay_ms != Constant(0.0):
@@ -154,11 +147,9 @@ class Node:
             ticks = self.quota is not None and self.quota.tick_ms > 0
             bound = "0 where there is no `quota` with `tick_ms`; elsewhere it is looked at any time"
             require(ticks, "background_hz", self.background_hz, bound)
-        stressed = self.contention_stressed.items()
-        shares = {f"contention_stressed.{name}": share for name, share in stressed}
-        for path, share in {"contention": self.contention, **shares}.items():
-            bound = "0 where there is no quota; elsewhere it is `background`"
-            require(self.quota is not None or share == 0.0, path, share, bound)
+        bound = "0 where there is no quota; elsewhere it is `background`"
+        has_quota = self.quota is not None
+        require(has_quota or self.contention == 0.0, "contention", self.contention, bound)
         if self.quota is not None and self.quota.tick_ms > 0:
             tick_ms, bound = self.quota.tick_ms, "0 where a node has several cores, or is not fair"
             require(self.cores == 1 and self.scheduler == "fair", "quota.tick_ms", tick_ms, bound)

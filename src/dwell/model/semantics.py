@@ -200,12 +200,6 @@ def bad_name(name: str) -> str:
 def _nodes(parts: CellParts) -> Iterator[Fault]:
     if not parts.nodes:
         yield Fault("nodes", "none is declared; a cell needs at least one node")
-    for name, node in parts.nodes.items():
-        for other in node.contention_stressed if node is not None else ():
-            here = f"nodes.{name}.contention_stressed.{other}"
-            yield from _unknown(here, "node", other, parts.nodes)
-            if other == name:
-                yield Fault(here, "is the node itself; its own foreign threads are no contention")
 
 
 def _links(parts: CellParts) -> Iterator[Fault]:

@@ -29,7 +29,6 @@ from dwell.testbed.node_loads import (
     backgrounds,
     beside_jobs,
     contentions,
-    contentions_stressed,
     interferences,
     wakes,
 )
@@ -45,7 +44,7 @@ ASKED = 20_000
 #: Least execution time written, ms: one of nothing is no execution time.
 LEAST_MS = 1e-3
 #: Findings on a node that a cell states of nodes with a quota alone.
-ONLY_WITH_QUOTA = ("background_beside", "contention", "contention_stressed")
+ONLY_WITH_QUOTA = ("background_beside", "contention")
 #: Windows that the check simulates of every run at most.
 CHECK_WINDOWS = 300
 
@@ -53,7 +52,6 @@ CHECK_WINDOWS = 300
 #: What is said of a node by each of its keys, where it is nothing else's.
 NODE_LINES = {
     "contention": "{node}: others have {value:.3g} of its CPUs while jobs run",
-    "contention_stressed": "{node}: and {value:.3g} while {other} is stressed",
     "background_hz": "{node}: something wakes {value:.4g} times a second",
     "interference": "{node}: stages take {value:.3g} times as long beside foreign threads",
 }
@@ -138,7 +136,6 @@ def calibrate(
             "interference": interferences(measured, costs, usual),
             "contention": contentions(measured),
             "background_hz": wakes(measured, problem),
-            "contention_stressed": contentions_stressed(measured, cpus),
         }
     )
     document = _document(cell, out)
@@ -464,9 +461,7 @@ def _lines(report: Mapping[str, Any]) -> list[str]:
         more = "" if beside is None else f", {beside:.3g} while jobs run"
         lines.append(f"{node}: background {value:.3g} cores{more}")
     for key, line in NODE_LINES.items():
-        for node, value in report[key].items():
-            values = value if isinstance(value, dict) else {"": value}
-            lines += [line.format(node=node, other=o, value=value) for o, value in values.items()]
+        lines += [line.format(node=node, value=value) for node, value in report[key].items()]
     for name, value in report["sensitivity"].items():
         lines.append(f"{name}: takes x^{value:.3g} times as long where a CPU is x times as slow")
     for row in report["check"]:

@@ -6,7 +6,7 @@ workers without jobs and the messaging that delays nothing) is its background.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -77,22 +77,6 @@ def contentions(measured: Sequence[Measured]) -> dict[str, float]:
         of = [one.outside[node] for one in calm if node in one.outside]
         if (taken := _cores(of)) is not None:
             result[node] = min(taken, CONTENTION.high)
-    return result
-
-
-def contentions_stressed(
-    measured: Sequence[Measured], cpus: Mapping[str, Collection[int]]
-) -> dict[str, dict[str, float]]:
-    """Contention of every node while another one on the same CPUs is stressed, by both."""
-    result: dict[str, dict[str, float]] = {}
-    for other in sorted({name for one in measured for name in one.disturbed.stressed}):
-        runs = [one for one in measured if one.disturbed.nodes == {other}]
-        for node in sorted({node for one in runs for node in one.outside} - {other}):
-            if set(cpus.get(node, ())).isdisjoint(cpus.get(other, ())):
-                continue
-            taken = _cores([one.outside[node] for one in runs if node in one.outside])
-            if taken is not None:
-                result.setdefault(node, {})[other] = min(taken, CONTENTION.high)
     return result
 
 
