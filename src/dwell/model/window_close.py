@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from decimal import Decimal
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -44,5 +44,5 @@ def window_close_ns(
 def close_after_ns(problem: Problem) -> tuple[int, int]:
     """Least times to a window's close: from its last release, and from the first beyond it."""
     # 28.6 ms are 28600000 ns, though their product in floating point may be a little less.
-    due_ns = math.floor(round(problem.pipeline.deadline_ms * 1e6, 3))
+    due_ns = int(Decimal(str(problem.pipeline.deadline_ms)).scaleb(6))
     return due_ns, round(problem.controller.close_grace_ms * 1e6)
