@@ -49,7 +49,7 @@ def test_a_fleet_is_priced_as_the_simulator_plays_it() -> None:
     entries = [FleetEntry(CANONICAL, 2, policy="SO"), FleetEntry(CANONICAL, 1, policy="HYB")]
     fleet = fleet_of(*entries)
     price = priced(fleet).price(("SO", "SO", "HYB"))
-    run = simulate_fleet(fleet, seed=SEED, windows=5)
+    run = simulate_fleet(fleet, seed=SEED, windows=9)
     for i, one in enumerate(run.cells.values()):
         windows = one.windows[1:]
         seen = cell_of(price, i).qos

@@ -32,8 +32,8 @@ Floats: TypeAlias = NDArray[np.float64]
 Placements: TypeAlias = tuple[str | None, ...]
 
 #: Cycles of all cells together that are played of a fleet, and fewest windows of a cell, the first
-#: of which settles queues.
-CYCLES, FEWEST = 10_000, 3
+#: of which settles queues: in less than half a minute there are too few bursts of others.
+CYCLES, FEWEST = 10_000, 9
 AS_DECLARED = Present()
 
 
