@@ -85,18 +85,21 @@ def report(
         return
     extras: dict[str, Any] = {}
     files: dict[Path, Content] = {}
-    if cells:
-        extras["cells"] = _write_cells(folder, static=static)
+    if kind == "fleet":
+        from dwell.record import open_fleet
+
+        fleet = open_fleet(folder)
+        if cells:
+            extras["cells"] = _write_cells(folder, fleet.cells, static=static)
     with working("writing the report"):
         if kind == "study":
             from dwell.report.study_page import study_page
 
             document = study_page(open_study(folder))
         elif kind == "fleet":
-            from dwell.record import open_fleet
             from dwell.report.fleet_page import fleet_page
 
-            document = fleet_page(open_fleet(folder), links=_links(folder, page))
+            document = fleet_page(fleet, links=_links(folder, page))
         else:
             from dwell.report.run_page import run_page
 
@@ -133,13 +136,11 @@ def report(
         typer.echo(f"of cells: {folder}/*/{PAGE}")
 
 
-def _write_cells(folder: Path, *, static: bool) -> dict[str, Path]:
+def _write_cells(folder: Path, runs: Mapping[str, Run], *, static: bool) -> dict[str, Path]:
     """Write the page of every cell of a fleet beside its run; return them by the cells' names."""
-    from dwell.record import open_fleet
     from dwell.report.run_page import run_page
 
     pages: dict[str, Path] = {}
-    runs = open_fleet(folder).cells
     with progress("writing the reports of cells") as shown:
         for name, run in runs.items():
             pages[name] = folder / name / PAGE

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.control.ledger import Loads
 from dwell.estimators.fleet_prices import CellTerms, FleetPrice, FleetPrices, PricedCell
@@ -23,8 +22,6 @@ from dwell.model.progress import Progress
 from dwell.model.qos import QoS
 from dwell.record import FleetRun
 from dwell.sim.fleet import phased
-
-Floats: TypeAlias = NDArray[np.float64]
 
 #: Levels of the load of a shared resource: of the only one, of each of several.
 LEVELS, LEVELS_OF_SEVERAL = 400, 40
