@@ -12,7 +12,7 @@ import heapq
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import count
 from math import inf
 from random import Random
@@ -175,7 +175,6 @@ class MemoryTransport:
         self, key: str, payload: bytes | memoryview, header: bytes = b"", *, lane: Lane = "control"
     ) -> None:
         """Send a message; returns at once, whatever the receivers do."""
-        require_key(key)
         if not self.closed:
             self._network.send(self, Arrival(key, bytes(payload), bytes(header)), lane)
 
@@ -406,12 +405,13 @@ class Network:
 
     def send(self, source: MemoryTransport, sample: Arrival, lane: Lane) -> None:
         """Send a message to everybody who subscribed to it, the sender left out."""
-        for tap in self.taps:
-            tap(sample)
         key = source.who, lane, sample.key
         audience = self._audiences.get(key)
         if audience is None:
+            require_key(sample.key)
             audience = self._audiences[key] = list(self._audience(*key))
+        for tap in self.taps:
+            tap(sample)
         for target, path in audience:
             self._forward(path, _Message(source, target, lane, sample))
 
@@ -446,7 +446,7 @@ class Network:
         """Apply every condition to a message and put what is left of it on the agenda."""
         if not self._rules:
             path.last_ns = max(self.now_ns + self.delay_ns, path.last_ns)
-            self.call_at(path.last_ns, lambda: self._arrive(message))
+            self.call_at(path.last_ns, partial(self._arrive, message))
             return
         random, copies, delay_ns, overtaken_ns = path.random, 1, self.delay_ns, 0
         for rule in self._rules:
@@ -479,7 +479,7 @@ class Network:
         else:
             path.last_ns = at_ns
         for _ in range(copies):
-            self.call_at(at_ns, lambda: self._arrive(message))
+            self.call_at(at_ns, partial(self._arrive, message))
 
     def _hold(self, path: _Path, message: _Message, waiting: int) -> None:
         path.held.append(message)
@@ -541,4 +541,4 @@ class _Drive:
     def _arrange(self, due_ns: int) -> None:
         if not self.end.closed:
             self.due_ns = due_ns
-            self.network.call_at(due_ns, lambda: self.wake(due_ns))
+            self.network.call_at(due_ns, partial(self.wake, due_ns))
