@@ -1,0 +1,12 @@
+from .cell_warnings import unplayed as unplayed
+from .cell_warnings import warnings_of as warnings_of
+from .corrected import Corrected as Corrected
+from .evidence import Evidence as Evidence
+from .evidence import Instants as Instants
+from .profile import Profile as Profile
+from .protocol import Estimator as Estimator
+from .protocol import Learner as Learner
+from .protocol import Support as Support
+from .registry import by_name as by_name
+from .scaling import Scaling as Scaling
+from .shadow import Shadow as Shadow

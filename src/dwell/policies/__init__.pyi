@@ -1,0 +1,12 @@
+from .atp import ATP as ATP
+from .atp_thresholds import ATPThresholds as ATPThresholds
+from .check import check_policy as check_policy
+from .cusum import Cusum as Cusum
+from .dtp import DTP as DTP
+from .latency_first import LatencyFirst as LatencyFirst
+from .parameters import parameters_of as parameters_of
+from .protocol import MinimalPolicy as MinimalPolicy
+from .protocol import Policy as Policy
+from .registry import by_name as by_name
+from .static import Static as Static
+from .work_function import WorkFunction as WorkFunction
