@@ -5,7 +5,6 @@ The decisions are those of `dwell.control.Controller`, the object that the simul
 
 from __future__ import annotations
 
-import math
 import time
 from collections import Counter
 from collections.abc import Iterable
@@ -32,7 +31,7 @@ from dwell.live.messages import (
     encode,
 )
 from dwell.live.role import REPEATED_NS, Pulse, RolePlace
-from dwell.live.run_rows import LiveWindow, Resume, Rows
+from dwell.live.run_rows import Resume, Rows
 from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import roles
 
@@ -583,7 +582,7 @@ class ControlledCell:
             self.controller.reject(proposal, why)
         elif target == course.placement:
             self.controller.commit(proposal)
-        self._window, self._window_ns = self._shown(last, proposal), now_ns
+        self._window, self._window_ns = last.shown(proposal, self.controller), now_ns
         if target != course.placement:
             self._begin(target, now_ns, proposal if target == wanted else None)
 
@@ -633,32 +632,6 @@ class ControlledCell:
         if self.pinned:
             return f"pinned to {self.pinned}"
         return f"{', '.join(sorted(self.drained))} drained" if self.drained else "not proven"
-
-    def _shown(self, last: LiveWindow, proposal: Proposal) -> dict[str, Any]:
-        """Return the last window as people look at it."""
-        decision, problem = proposal.decision, self.place.problem
-        l95_ms, _, cost = proposal.seen
-        used = last.used[0].tolist()
-        columns = self.controller.decision_columns[-len(proposal.priced) :]
-        priced = dict(zip(columns, proposal.priced, strict=True))
-        return {
-            "number": last.number,
-            "placement": last.cycles[0].placement,
-            "l95_ms": l95_ms,
-            "violation_rate": last.violation_rate(round(problem.pipeline.deadline_ms * 1e6)),
-            "cost": cost,
-            "reason": decision.reason,
-            "decided": decision.name,
-            "estimates": {name: decision.costs.get(name) for name in problem.candidates},
-            "predicted": {
-                name: {of: priced[f"est_{of}_{name}"] for of in ("l95_ms", "violation_rate")}
-                for name in problem.candidates
-            },
-            "utilisation": {
-                name: None if math.isnan(share) else share
-                for name, share in zip(self.controller.resources, used, strict=True)
-            },
-        }
 
     # -------------------------------------------------------------------------- people
 

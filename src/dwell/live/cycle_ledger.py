@@ -17,18 +17,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.control import Evidence, Instants
+from dwell.live.loads import NodeLoad
 from dwell.live.messages import ACTUATED, NOT_APPLIED, STALE, Completion, Hop, Stamp
 from dwell.live.offsets import UNBOUNDED_NS, Offsets
 from dwell.live.wiring import lane_of
 from dwell.model import Execution, Problem
+from dwell.model.fabric import accelerator_name
 from dwell.model.instants import NEVER_NS
 from dwell.record import Values
 
 Ints: TypeAlias = NDArray[np.int64]
+Floats: TypeAlias = NDArray[np.float64]
 
 UNKNOWN = -1
 #: Shadow completions remembered of one cycle.
 MAX_SHADOWS = 16
+#: Share of a window for which a hook has to have said how busy an accelerator was.
+HOOKED_SHARE = 0.5
 #: Outcomes of what came to its end before a sink.
 SHADOW, REPLACED = "shadow", "replaced"
 
@@ -194,6 +199,11 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
         return self.latency_ns > min(deadline_ns, age_ns)
 
 
+def told(cycles: Sequence[LiveCycle]) -> Sequence[LiveCycle]:
+    """Return the cycles of a window whose end is known; all where there are none."""
+    return [cycle for cycle in cycles if not cycle.untold] or cycles
+
+
 class Ledger:
     """Puts what messages say of cycles on the stamper's clock, and adds it up."""
 
@@ -202,6 +212,9 @@ class Ledger:
         self.sinks = frozenset(name for name in pipeline.tasks if not pipeline.outputs(name))
         self._pipeline, self._candidates, self._offsets = pipeline, problem.candidates, offsets
         self._stamper_node = problem.stamper_node
+        self._nodes, self._resources = problem.fabric.nodes, problem.fabric.resources
+        #: By node.
+        self.loads = {node: NodeLoad() for node in self._nodes}
         self._tasks = {name: column for column, name in enumerate(pipeline.tasks)}
         self._flows = {(f.source, f.target): column for column, f in enumerate(pipeline.flows)}
         self._codes = {name: code for code, name in enumerate(problem.candidates)}
@@ -352,6 +365,37 @@ class Ledger:
         return compute_ns, cycle.latency_ns - compute_ns - network_ns, network_ns
 
     # --------------------------------------------------------------------------- jobs
+
+    def core_ns(self, cycles: Sequence[LiveCycle], close_ns: int) -> Floats:
+        """Core-nanoseconds of every resource in a window, shape (3, resources).
+
+        A node's own work is what its jobs took, where any tell: what their processes take beside
+        that, messages and beats, is in no candidate's own work, and would be missing from the
+        estimates of all. Accelerators are as busy as a hook says, where their node has one kind of
+        them; elsewhere as busy as the cell's jobs keep them. NaN where none of these is known.
+        """
+        jobs_ns = self.spent_ns(cycles)
+        by_jobs = self.accelerator_ns(cycles) if len(self._resources) > len(self.loads) else {}
+        used = np.zeros((3, len(self._resources)))
+        hooked: dict[str, float] = {}
+        for column, (node, load) in enumerate(self.loads.items()):
+            begin_ns, end_ns = self.span_ns(node, cycles[0], close_ns)
+            *counted_ns, busy_ns, told_ns = load.at(end_ns) - load.at(begin_ns)
+            used[:, column] = counted_ns
+            if jobs_ns:
+                used[1, column] = jobs_ns[node]
+            load.forget(begin_ns)
+            kinds = self._nodes[node].accelerators.items()
+            if len(kinds) == 1 and told_ns >= HOOKED_SHARE * (end_ns - begin_ns):
+                ((kind, count),) = kinds
+                busy = count * (close_ns - cycles[0].at_ns) * busy_ns / told_ns
+                hooked[accelerator_name(node, kind)] = busy
+        for column, name in enumerate(self._resources):
+            if column >= len(self.loads):
+                own_ns, shadow_ns = by_jobs.get(name, (0.0, 0.0))
+                busy_ns = hooked.get(name, own_ns + shadow_ns)
+                used[:, column] = busy_ns, own_ns, shadow_ns
+        return used
 
     def spent_ns(self, cycles: Sequence[LiveCycle]) -> Counter[str]:
         """CPU time that the jobs of some cycles took, by node; of those that told it.

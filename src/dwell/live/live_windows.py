@@ -21,24 +21,20 @@ from functools import partial
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.control import ClosedWindow, Controller
 from dwell.errors import LiveError
-from dwell.live.cycle_ledger import Ledger, LiveCycle
-from dwell.live.loads import NodeLoad, ProcessLoads
+from dwell.live.cycle_ledger import Ledger, LiveCycle, told
+from dwell.live.loads import ProcessLoads
 from dwell.live.messages import Completion, Load, Stamp, Stamped
 from dwell.live.offsets import UNBOUNDED_NS, Offsets
-from dwell.live.run_rows import LiveWindow, Resume, RunRows, sends_shadows, told
+from dwell.live.run_rows import LiveWindow, Resume, RunRows, sends_shadows
 from dwell.live.symptoms import Symptoms
 from dwell.model import Problem
-from dwell.model.fabric import accelerator_name
 from dwell.model.window_close import window_close_ns
 
 #: A window whose latencies may be off by more than this share of D is marked unproven.
 PROVEN_SHARE = 0.2
-#: Share of a window for which a hook has to have said how busy an accelerator was.
-HOOKED_SHARE = 0.5
 #: Numbers between two cycles were cycles if they had this share of a period each.
 NEAR_PERIOD = (0.75, 1.25)
 #: Where the stamper's clock and the controller's disagree by this much on the time since the last
@@ -82,7 +78,6 @@ class LiveWindows:
         self.ignored = 0
         self._ledger = Ledger(problem, offsets)
         self._symptoms = Symptoms(problem, self._ledger)
-        self._loads = {node: NodeLoad() for node in problem.fabric.nodes}
         self._processes = ProcessLoads()
         self._keeps_jobs = resume.jobs
         self._size = problem.window_cycles
@@ -163,8 +158,8 @@ class LiveWindows:
 
     def loaded(self, load: Load) -> None:
         """A node's agent has read its counters."""
-        if load.node in self._loads:
-            self._loads[load.node].report(load)
+        if load.node in self._ledger.loads:
+            self._ledger.loads[load.node].report(load)
             if self._keeps_jobs:
                 self._processes.report(load.node, load.at_ns, load.processes)
         else:
@@ -374,7 +369,7 @@ class LiveWindows:
             release_ns=np.array([cycle.at_ns for cycle in known], np.int64),
             close_ns=close_ns,
             open_ns=int(release_ns[0]),
-            core_ns=self._core_ns(cycles, close_ns),
+            core_ns=self._ledger.core_ns(cycles, close_ns),
             evidence=partial(self._ledger.evidence, cycles, release_ns, close_ns, shadows=shadows),
         )
         bound_ns = max(cycle.bound_ns for cycle in cycles)
@@ -409,38 +404,6 @@ class LiveWindows:
                 del self._by_key[old.key]
         del self._line[:count]
         self._beginning = None
-
-    def _core_ns(self, cycles: list[LiveCycle], close_ns: int) -> NDArray[np.float64]:
-        """Core-nanoseconds of every resource in a window, shape (3, resources).
-
-        A node's own work is what its jobs took, where any tell: what their processes take beside
-        that, messages and beats, is in no candidate's own work, and would be missing from the
-        estimates of all. Accelerators are as busy as a hook says, where their node has one kind of
-        them; elsewhere as busy as the cell's jobs keep them. NaN where none of these is known.
-        """
-        jobs_ns = self._ledger.spent_ns(cycles)
-        used = np.zeros((3, len(self._controller.resources)))
-        hooked: dict[str, float] = {}
-        for column, (node, load) in enumerate(self._loads.items()):
-            begin_ns, end_ns = self._ledger.span_ns(node, cycles[0], close_ns)
-            *counted_ns, busy_ns, told_ns = load.at(end_ns) - load.at(begin_ns)
-            used[:, column] = counted_ns
-            if jobs_ns:
-                used[1, column] = jobs_ns[node]
-            load.forget(begin_ns)
-            kinds = self.problem.fabric.nodes[node].accelerators.items()
-            if len(kinds) == 1 and told_ns >= HOOKED_SHARE * (end_ns - begin_ns):
-                ((kind, count),) = kinds
-                busy = count * (close_ns - cycles[0].at_ns) * busy_ns / told_ns
-                hooked[accelerator_name(node, kind)] = busy
-        if len(used[0]) > len(self._loads):
-            by_jobs = self._ledger.accelerator_ns(cycles)
-            for column, name in enumerate(self._controller.resources):
-                if column >= len(self._loads):
-                    own_ns, shadow_ns = by_jobs.get(name, (0.0, 0.0))
-                    busy_ns = hooked.get(name, own_ns + shadow_ns)
-                    used[:, column] = busy_ns, own_ns, shadow_ns
-        return used
 
     def symptoms(self, now_ns: int) -> dict[str, object]:
         """Return what the cycles say of the cell's health, as plain values (see `Symptoms`)."""

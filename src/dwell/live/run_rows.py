@@ -12,13 +12,13 @@ import math
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.control import Controller, final_l95_ms
-from dwell.live.cycle_ledger import Ledger, LiveCycle
+from dwell.control import Controller, Proposal, final_l95_ms
+from dwell.live.cycle_ledger import Ledger, LiveCycle, told
 from dwell.live.loads import ProcessLoads
 from dwell.live.messages import NOT_APPLIED
 from dwell.live.offsets import UNBOUNDED_NS
@@ -82,15 +82,35 @@ class LiveWindow:
     closed_unix_ns: int | None
     seen: tuple[float | None, ...] = (None, None, None)
 
+    def shown(self, proposal: Proposal, controller: Controller) -> dict[str, Any]:
+        """Return the window, and what was proposed on it, as people look at it."""
+        decision, names = proposal.decision, controller.problem.candidates
+        l95_ms, violation_rate, cost = proposal.seen
+        columns = controller.decision_columns[-len(proposal.priced) :]
+        priced = dict(zip(columns, proposal.priced, strict=True))
+        return {
+            "number": self.number,
+            "placement": self.cycles[0].placement,
+            "l95_ms": l95_ms,
+            "violation_rate": violation_rate,
+            "cost": cost,
+            "reason": decision.reason,
+            "decided": decision.name,
+            "estimates": {name: decision.costs.get(name) for name in names},
+            "predicted": {
+                name: {of: priced[f"est_{of}_{name}"] for of in ("l95_ms", "violation_rate")}
+                for name in names
+            },
+            "utilisation": {
+                name: _known(share)
+                for name, share in zip(controller.resources, self.used[0].tolist(), strict=True)
+            },
+        }
+
     def violation_rate(self, deadline_ns: int) -> float:
         """V_D: share of its cycles that missed, of those whose end is known."""
         known = told(self.cycles)
         return sum(cycle.missed(deadline_ns) for cycle in known) / len(known)
-
-
-def told(cycles: Sequence[LiveCycle]) -> Sequence[LiveCycle]:
-    """Return the cycles of a window whose end is known; all where there are none."""
-    return [cycle for cycle in cycles if not cycle.untold] or cycles
 
 
 def sends_shadows(controller: Controller) -> bool:
