@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -104,7 +104,9 @@ def report(
             from dwell.report.run_page import run_page
 
             run = dwell.open_run(folder)
-            extras = {"trace": trace, **_recovered(run)}
+            extras["trace"] = trace
+            if lost := run.losses:
+                extras |= {"recovered": run.meta["recovered"], "lost": lost}
             if trace is not None:
                 from dwell.report import trace_events
 
@@ -154,37 +156,3 @@ def _links(folder: Path, page: Path) -> dict[str, str]:
     """Return where a page finds those of a fleet's cells that are there."""
     known = folder.glob(f"*/{PAGE}")
     return {one.parent.name: quote(os.path.relpath(one, page.parent)) for one in known}
-
-
-def _recovered(run: Run) -> dict[str, Any]:
-    """Return what a run that was killed or damaged has lost; nothing of others."""
-    recovered = run.meta.get("recovered", {})
-    lost = list(_losses(recovered))
-    return {"recovered": recovered, "lost": lost} if lost else {}
-
-
-def _losses(recovered: Mapping[str, Any]) -> Iterator[str]:
-    """Yield sentences on what is not in a run because something was killed or damaged."""
-    from dwell.report.formatting import listed
-
-    opened = int(recovered.get("opened", 1))
-    if opened > 1:
-        yield f"The controller was started {opened} times while the run went on."
-    lost = [
-        text
-        for name, text in (
-            ("torn_bytes", "{} bytes at the journal's end were torn by a kill"),
-            ("damaged_bytes", "{} bytes within the journal were damaged"),
-        )
-        if recovered.get(name)
-        for text in [text.format(recovered[name])]
-    ]
-    if lost:
-        yield f"{listed(lost)}; what they said is not here."
-    if recovered.get("missing_windows"):
-        yield f"Windows missing from the run: {recovered['missing_windows']}."
-    if recovered and not recovered.get("sealed", True):
-        yield (
-            "The run was not closed: it goes on, or its controller was killed. This is what its "
-            "journal holds; what came after its last window is not here."
-        )

@@ -19,7 +19,7 @@ from dwell.cli.options import (
     require_one_length,
     windows_of,
 )
-from dwell.cli.output import aligned, file_name, print_json, progress, warn, working
+from dwell.cli.output import file_name, print_json, progress, warn, working
 from dwell.errors import ExitCode
 from dwell.model.bounds import counted
 
@@ -141,53 +141,34 @@ def _interruptible(folder: Path, study: Study) -> Iterator[Progress]:
 
 
 def _measures(study: Study) -> list[Measure]:
-    from dwell.report.formatting import Measure
+    """Return what the terminal shows."""
+    from dwell.report.policy_blocks import COST, MIGRATIONS, RATE, REGRET
 
-    measures = [
-        Measure("violation_rate", "V_D", "%", 100.0),
-        Measure("cost", "J", decimals=2),
-        Measure("migrations", "migrations"),
-    ]
-    return measures + [Measure("regret", "regret", "%", 100.0)] * bool(study.references)
+    return [RATE, COST, MIGRATIONS, *([REGRET] if study.references else [])]
 
 
 def _text(result: StudyResult) -> str:
-    """Return the tables of a study as text: one a point and scenario, as many as a screen takes."""
+    """Return a table a point and scenario."""
     from dwell.report.formatting import few_seeds, shown_policy, shown_scenario
-    from dwell.study.over_seeds import over_seeds
+    from dwell.report.table import Table, Text, table_text
+    from dwell.study import over_seeds
 
     study = result.study
     measures = _measures(study)
     groups = len(study.points) * len(study.scenarios)
-    keys = (*result.parameters, "scenario")
     # Intervals take time: only of what is shown.
     some = result.runs.head(SHOWN * len(study.policies) * len(study.seeds))
-    lines = []
-    for labels, runs in some.group_by(keys, maintain_order=True):
-        *values, scenario = labels
-        at = ", ".join(
-            f"{name} = {value}" for name, value in zip(study.parameters, values, strict=True)
-        )
-        table = over_seeds(runs, ("policy",), [measure.column for measure in measures])
-        rows = [
-            [shown_policy(row["policy"]), *(_written(row, measure) for measure in measures)]
-            for row in table.to_dicts()
-        ]
-        title = shown_scenario(str(scenario))
-        lines += [f"{title} ({at})" if at else title]
-        lines += [aligned(["", *(measure.heading for measure in measures)], rows), ""]
+    keys = (*result.parameters, "scenario", "policy")
+    rows = over_seeds(some, keys, [measure.column for measure in measures]).to_dicts()
+    for row in rows:
+        point = zip(study.parameters, result.parameters, strict=True)
+        at = ", ".join(f"{name} = {row[column]}" for name, column in point)
+        title = shown_scenario(row["scenario"])
+        row |= {"policy": shown_policy(row["policy"]), "group": f"{title} ({at})" if at else title}
+    lines = [table_text(Table("", "", [Text("policy", ""), *measures], rows, Text("group", "")))]
     seeds = len(study.seeds)
     means = f"Mean over {seeds} seeds, with its 95 % interval" if seeds > 1 else "One seed"
     lines.append(f"{means}{few_seeds(seeds) or '.'}")
     if groups > SHOWN:
         lines.append(f"{SHOWN} of {groups} tables are shown; runs.parquet has all runs.")
     return "\n".join(lines)
-
-
-def _written(row: dict[str, Any], measure: Measure) -> str:
-    from dwell.report.formatting import write_interval
-    from dwell.study import Interval
-
-    ends = (row[f"{measure.column}{end}"] for end in ("", "_low", "_high"))
-    known = Interval(*(float("nan") if end is None else end for end in ends))
-    return str(write_interval(known, measure))

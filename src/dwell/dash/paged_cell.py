@@ -103,15 +103,6 @@ def cycle_since(
     }
 
 
-def finite(value: Any) -> Any:
-    """Return plain values of which the numbers that are not finite are None: JSON has no others."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {name: finite(one) for name, one in value.items()}
-    return [finite(one) for one in value] if isinstance(value, list | tuple) else value
-
-
 def _link(link: Link) -> str:
     """Return delay and rate of a link, as written beside it."""
     delay = "as recorded" if isinstance(link.delay_ms, Trace) else None

@@ -117,8 +117,7 @@ class _Contents:
 
     def __init__(self, run: Run, unit: Unit, source: str) -> None:
         self.run, self.unit, self.source, self.problem = run, unit, source, run.problem
-        recovered = run.meta.get("recovered", {})
-        self.growing = bool(recovered) and not recovered.get("sealed", True)
+        self.growing = run.unfinished
         self._candidates = tuple(self.problem.candidates)
         cycles = run.arrays("cycles")
         self._release_ns = cycles["release_ns"].astype(np.int64, copy=False)
@@ -181,16 +180,8 @@ class _Contents:
             "missed": int(self.strip.missed.sum()),
             "windows": len(self.windows.number),
             "has_jobs": self.run.has_jobs,
-            "notes": list(self._notes()),
+            "notes": self.run.losses,
         }
-
-    def _notes(self) -> Iterator[str]:
-        recovered = self.run.meta.get("recovered", {})
-        if self.growing:
-            yield "This run was not closed: it goes on, or its controller was killed."
-        for name in ("torn_bytes", "damaged_bytes", "missing_cycles", "missing_windows"):
-            if recovered.get(name):
-                yield f"{name.replace('_', ' ').capitalize()}: {recovered[name]}."
 
     def view(self, begin: float, end: float, bins: int) -> Plain:
         windows = self.windows

@@ -9,15 +9,9 @@ from typing import Any
 import numpy as np
 
 from dwell.dash.observer import ObservedCycle, ObservedWindow, Observer
-from dwell.dash.paged_cell import (
-    MOST_WITH_JOBS,
-    Plain,
-    cell_document,
-    cycle_since,
-    finite,
-    job_since,
-)
+from dwell.dash.paged_cell import MOST_WITH_JOBS, Plain, cell_document, cycle_since, job_since
 from dwell.dash.strip import Floats, Strip, binned_means
+from dwell.record.json_documents import json_ready
 
 #: Cycles of the time line, which reaches farther back than the observer.
 MOST_CYCLES = 40_000
@@ -133,7 +127,7 @@ class WatchedCell:
             "processes": _processes(status),
             **(self._window_state(window) if window else {}),
         }
-        return {name: finite(value) for name, value in state.items()}
+        return dict(json_ready(state))
 
     def _window_state(self, window: Mapping[str, Any]) -> Plain:
         length_s = self.problem.window_cycles * self.problem.pipeline.period_ms / 1e3

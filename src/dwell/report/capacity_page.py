@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from dwell.report.charts import BOUNDED, Limit, layer, limit_rule, quantity
+from dwell.report.charts import BOUNDED, Limit, disc, layer, limit_rule, quantity
 from dwell.report.figure import Draw, Figure, Spec
 from dwell.report.formatting import Measure
 from dwell.report.page import Definitions, Fact, Page, Section
@@ -103,16 +103,9 @@ def _drawing(limit: Limit, sizes: int) -> Draw:
             "x": quantity("robots", "robots", scale={"nice": False, "padding": 8}, axis=axis),
             "y": quantity("mean", RATE.heading, scale={"domainMin": 0}),
         }
-        tip = [
-            quantity(name, title, format=".4~g")
-            for name, title in (
-                ("robots", "robots"),
-                ("mean", RATE.heading),
-                ("low", "from"),
-                ("high", "to"),
-            )
-        ]
-        ends = {"y": {"field": "low"}, "y2": {"field": "high"}}
+        shown = {"robots": "robots", "mean": RATE.heading, "low": "from", "high": "to"}
+        tip = [quantity(name, title, format=".4~g") for name, title in shown.items()]
+        ends = {"y": "low", "y2": "high"}
         return {
             "width": width - 80,
             "height": HEIGHT * min(1.0, width / 400),
@@ -124,9 +117,7 @@ def _drawing(limit: Limit, sizes: int) -> Draw:
                     "layer": [
                         layer("line", {}, color=MUTED, strokeWidth=1),
                         layer("rule", ends, where=[BOUNDED], color=INK, strokeWidth=1.5),
-                        layer(
-                            "point", {"tooltip": tip}, filled=True, size=36, color=INK, opacity=1
-                        ),
+                        disc({"tooltip": tip}, 36, color=INK),
                     ],
                 },
             ],

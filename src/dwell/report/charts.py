@@ -80,8 +80,9 @@ def layer(
 
     Parameters
     ----------
-    encoding : mapping of str to Spec
-        Encoding of this layer alone; what layers share stands in their group.
+    encoding : mapping of str to Spec or str
+        Encoding of this layer alone, a text for a bare field; what layers share stands in their
+        group.
     rows : str
         Name of its data, where these are not the chart's.
     where : sequence of str
@@ -89,12 +90,21 @@ def layer(
     **style : Any
         Properties of the mark.
     """
-    drawn: Spec = {"mark": {"type": mark, **style}, "encoding": dict(encoding)}
+    fields = {
+        channel: {"field": one} if isinstance(one, str) else one
+        for channel, one in encoding.items()
+    }
+    drawn: Spec = {"mark": {"type": mark, **style}, "encoding": fields}
     if rows:
         drawn["data"] = {"name": rows}
     if where:
         drawn["transform"] = [{"filter": test} for test in where]
     return drawn
+
+
+def disc(encoding: Mapping[str, Any], size: float, **more: Any) -> Spec:
+    """Return a layer of filled points; further arguments as `layer` has them."""
+    return layer("point", encoding, **{"filled": True, "size": size, "opacity": 1, **more})
 
 
 def styled(styles: Mapping[str, Style], width: float = 0.0) -> dict[str, Spec]:
@@ -175,22 +185,15 @@ def intervals(
     }
     about = names("policy", "scenario")
     seed = {
-        "x": {"field": "value"},
+        "x": "value",
         "opacity": {"condition": {"test": "seed === datum.seed", "value": 1}, "value": 0.22},
         "tooltip": [*about, quantity("seed", "seed"), quantity("value", measure.heading)],
     }
     mean = {"shape": colours["shape"], "tooltip": [*about, *_mean_and_ends(measure)]}
     marks = [
         layer("tick", seed, where=[CHOSEN, "isValid(datum.value)"], thickness=1.2, size=9),
-        layer(
-            "rule",
-            {"x": {"field": "low"}, "x2": {"field": "high"}},
-            where=[CHOSEN, BOUNDED],
-            strokeWidth=2,
-        ),
-        layer(
-            "point", mean, where=[CHOSEN, "isValid(datum.mean)"], filled=True, size=55, opacity=1
-        ),
+        layer("rule", {"x": "low", "x2": "high"}, where=[CHOSEN, BOUNDED], strokeWidth=2),
+        disc(mean, 55, where=[CHOSEN, "isValid(datum.mean)"]),
     ]
     layers = [*limit_rule("x", *limit), {"encoding": shared, "layer": marks}]
     return _panels(frame, list(styles), lambda _: layers, seeds=True)
@@ -340,19 +343,11 @@ def curves(
 
     def layers(width: float) -> list[Spec]:
         look = styled(styles, width)
-        ends = {"y": {"field": "low"}, "y2": {"field": "high"}}
         point = {**_of(look, "shape"), "tooltip": about}
         marks = [
-            layer("rule", ends, where=[CHOSEN, BOUNDED], strokeWidth=1.3),
+            layer("rule", {"y": "low", "y2": "high"}, where=[CHOSEN, BOUNDED], strokeWidth=1.3),
             layer("line", _of(look, "strokeDash"), where=[CHOSEN], strokeWidth=1.3),
-            layer(
-                "point",
-                point,
-                where=[CHOSEN, "isValid(datum.mean)"],
-                filled=True,
-                size=40,
-                opacity=1,
-            ),
+            disc(point, 40, where=[CHOSEN, "isValid(datum.mean)"]),
         ]
         shared = {"x": across, "y": up, **_of(look, "color")}
         return [*limit_rule("y", *limit), {"encoding": shared, "layer": marks}]

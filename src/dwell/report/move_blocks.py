@@ -6,15 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from dwell.report.charts import (
-    NO_LIMIT,
-    Limit,
-    coloured,
-    layer,
-    limit_rule,
-    names,
-    quantity,
-)
+from dwell.report.charts import NO_LIMIT, Limit, coloured, disc, layer, limit_rule, names, quantity
 from dwell.report.figure import Figure, Spec
 from dwell.report.formatting import Measure
 from dwell.report.palette import MUTED, Palette
@@ -117,7 +109,7 @@ def _scatter(
     bars = [
         layer(
             "rule",
-            {axis: {"field": f"{when}_low"}, f"{axis}2": {"field": f"{when}_high"}},
+            {axis: f"{when}_low", f"{axis}2": f"{when}_high"},
             where=[f"isValid(datum.{when}_{error})"],
             strokeWidth=1.3,
             opacity=0.6,
@@ -133,7 +125,7 @@ def _scatter(
             *ends,
         ],
         "encoding": {"x": across, "y": up, "color": colour},
-        "layer": [*bars, layer("point", {"tooltip": about}, filled=True, size=26, opacity=0.9)],
+        "layer": [*bars, disc({"tooltip": about}, 26, opacity=0.9)],
     }
     both = {"x": {**across, "field": "at"}, "y": {**up, "field": "at"}}
     diagonal = {

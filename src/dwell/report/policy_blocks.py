@@ -35,13 +35,15 @@ if TYPE_CHECKING:
 RATE = Measure("violation_rate", "V_D", "%", 100.0)
 L95 = Measure("l95_ms", "L95", "ms")
 COST = Measure("cost", "J", decimals=2)
+MIGRATIONS = Measure("migrations", "migrations")
+REGRET = Measure("regret", "regret", "%", 100.0)
 MEASURES = (
     RATE,
     L95,
     COST,
     Measure("u_robot", "U_r", "%", 100.0),
     Measure("u_edge", "U_e", "%", 100.0),
-    Measure("migrations", "migrations"),
+    MIGRATIONS,
 )
 MORE = (
     Measure("p95_ms", "P95 of all cycles", "ms", ends=True),

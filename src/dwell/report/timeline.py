@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dwell.report.charts import coloured, is_wide, layer, limit_rule, name_of, names, quantity
+from dwell.report.charts import coloured, disc, is_wide, layer, limit_rule, name_of, names, quantity
 from dwell.report.figure import Draw, Figure, Spec
 from dwell.report.palette import BAD, INK, MUTED, SHADE, Palette
 from dwell.study import AIM
@@ -45,8 +45,8 @@ AT = quantity("time", "at (s)", format=".1f")
 SHADES = layer(
     "rect",
     {
-        "x": {"field": "begin"},
-        "x2": {"field": "end"},
+        "x": "begin",
+        "x2": "end",
         "opacity": {"condition": {"test": f"datum.what === '{WARMUP}'", "value": 0.5}, "value": 1},
     },
     rows="spans",
@@ -428,7 +428,7 @@ def _named_spans(width: float, time: Spec) -> Spec:
     """Return a row for everything that went on, with its name."""
     encoding = {
         "x": {"field": "begin", **time, "axis": None},
-        "x2": {"field": "end"},
+        "x2": "end",
         "y": name_of("what", sort=None, axis={"domain": False, "ticks": False}),
         "tooltip": [
             *names("what"),
@@ -473,7 +473,7 @@ def _marks(
     }
     # On paper many stand side by side.
     size = 18 if each == 1 else 8
-    marks = [layer("point", point, rows="windows", filled=True, size=size, opacity=0.9)]
+    marks = [disc(point, size, rows="windows", opacity=0.9)]
     if each == 1:
         return marks
     bars = [
@@ -481,7 +481,7 @@ def _marks(
             "rule",
             {
                 "y": quantity(f"{field}_{low}", title, scale=scale, axis={"tickCount": 4}),
-                "y2": {"field": f"{field}_{high}"},
+                "y2": f"{field}_{high}",
                 "color": colour,
             },
             rows="windows",
@@ -496,8 +496,8 @@ def _marks(
 def _placed(cells: Sequence[str], colours: Mapping[str, str]) -> Spec:
     """Return the stays of cells at their placements, a row a cell."""
     encoding = {
-        "x": {"field": "begin"},
-        "x2": {"field": "end"},
+        "x": "begin",
+        "x2": "end",
         "y": name_of("cell", sort=list(cells), axis={"labelOverlap": True}),
         "color": coloured("placement", colours, legend={"symbolType": "square"}),
         "tooltip": [
@@ -515,7 +515,7 @@ def _rates() -> list[Spec]:
     about = [AT, *names("worst")]
     about += [quantity(how, f"{how} (%)") for how in ("max", "mean", "min")]
     up = {"y": quantity("mean", "V_D (%)", axis={"tickCount": 4})}
-    band = {"y": quantity("min", "V_D (%)"), "y2": {"field": "max"}}
+    band = {"y": quantity("min", "V_D (%)"), "y2": "max"}
     return [
         layer("area", band, rows="rates", color=MUTED, opacity=0.3),
         layer("line", up, rows="rates", color=INK, strokeWidth=1.1),
@@ -553,7 +553,7 @@ def _use(resources: Sequence[str], each: int) -> list[Spec]:
     bands = [
         layer(
             "area",
-            {"y": up(low), "y2": {"field": f"used{high}"}, "color": colour},
+            {"y": up(low), "y2": f"used{high}", "color": colour},
             rows="nodes",
             opacity=opacity,
         )
