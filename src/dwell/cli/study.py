@@ -142,7 +142,7 @@ def _interruptible(folder: Path, study: Study) -> Iterator[Progress]:
 
 def _measures(study: Study) -> list[Measure]:
     """Return what the terminal shows."""
-    from dwell.report.policy_blocks import COST, MIGRATIONS, RATE, REGRET
+    from dwell.report.formatting import COST, MIGRATIONS, RATE, REGRET
 
     return [RATE, COST, MIGRATIONS, *([REGRET] if study.references else [])]
 

@@ -10,11 +10,11 @@ from dwell.model.bounds import counted
 from dwell.model.disturbed import disturbed
 from dwell.report.charts import curves
 from dwell.report.figure import Figure
-from dwell.report.formatting import Measure, few_seeds, shown_policy, shown_scenario
+from dwell.report.formatting import COST, RATE, Measure, few_seeds, shown_policy, shown_scenario
 from dwell.report.method import numbered
 from dwell.report.page import Page, Section, page_html
 from dwell.report.palette import Palette
-from dwell.report.policy_blocks import COST, RATE, THE_AIM, PolicyBlocks, named, scaled
+from dwell.report.policy_blocks import THE_AIM, PolicyBlocks, named, scaled
 from dwell.report.table import Columns, Table, Text, table_text, wrapped
 from dwell.report.timeline import begins_by_number, resources_in, run_timeline
 from dwell.study import Comparison, StudyResult, paper_predictions

@@ -12,10 +12,9 @@ from dwell.model.disturbed import Disturbed, disturbed
 from dwell.report.capacity_page import PHASES
 from dwell.report.charts import coloured, disc, layer, name_of, names, quantity
 from dwell.report.figure import Figure, Spec
-from dwell.report.formatting import Measure, percent, write_ms, write_number
+from dwell.report.formatting import COST, L95, RATE, Measure, percent, write_ms, write_number
 from dwell.report.page import Definitions, Fact, Page, Section
 from dwell.report.palette import INK, MUTED, Palette
-from dwell.report.policy_blocks import COST, L95, RATE
 from dwell.report.table import MOST_ROWS, Columns, Table, Text
 from dwell.report.timeline import fleet_timeline, rows_px
 from dwell.study import AIM

@@ -20,7 +20,16 @@ from dwell.report.charts import (
     stacked,
 )
 from dwell.report.figure import Figure
-from dwell.report.formatting import Measure, shown_contender, shown_policy, shown_scenario
+from dwell.report.formatting import (
+    COST,
+    L95,
+    MIGRATIONS,
+    RATE,
+    Measure,
+    shown_contender,
+    shown_policy,
+    shown_scenario,
+)
 from dwell.report.method import method_blocks
 from dwell.report.page import Block, Definitions
 from dwell.report.palette import Palette
@@ -32,11 +41,6 @@ if TYPE_CHECKING:
 
     from dwell.study import StudyRuns
 
-RATE = Measure("violation_rate", "V_D", "%", 100.0)
-L95 = Measure("l95_ms", "L95", "ms")
-COST = Measure("cost", "J", decimals=2)
-MIGRATIONS = Measure("migrations", "migrations")
-REGRET = Measure("regret", "regret", "%", 100.0)
 MEASURES = (
     RATE,
     L95,

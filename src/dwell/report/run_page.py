@@ -31,6 +31,9 @@ from dwell.report.charts import (
 )
 from dwell.report.figure import Figure
 from dwell.report.formatting import (
+    COST,
+    FINAL_L95,
+    RATE,
     Measure,
     percent,
     shown_policy,
@@ -41,8 +44,7 @@ from dwell.report.formatting import (
 from dwell.report.move_blocks import move_blocks
 from dwell.report.page import Definitions, Fact, Page, Section, page_html
 from dwell.report.palette import BAD, Palette
-from dwell.report.phases import phase_rows
-from dwell.report.policy_blocks import COST, L95, RATE
+from dwell.report.phases import phase_rows, phase_table
 from dwell.report.run_header import RunHeader
 from dwell.report.table import MOST_ROWS, Columns, Table, Text
 from dwell.report.timeline import begins_by_number, resources_in, run_timeline
@@ -54,8 +56,6 @@ if TYPE_CHECKING:
 
     from dwell.record import Run
 
-#: Of the latencies that cycles had in the end.
-FINAL_L95 = L95._replace(name="L95 final")
 WORST = 10
 #: Share of a deadline that clocks may be off by, where a window's latencies are proven.
 PROVEN_SHARE = 0.2
@@ -190,40 +190,8 @@ class _RunPage:
 
     def _phases(self) -> Iterator[Table]:
         rows = phase_rows(self.run, self.header)
-        if len(rows) < 2:
-            return
-        used = {name for row in rows for name in row.shares}
-        names = [name for name in self.palette.placements if name in used]
-        columns: Columns = [
-            Text("name", "phase"),
-            Measure("begin_s", "from", "s", decimals=0),
-            Measure("end_s", "to", "s", decimals=0),
-            RATE,
-            FINAL_L95,
-            Measure("lost", "lost", decimals=0),
-            *(Measure(f"share {name}", name, "%", 100.0, 0) for name in names),
-            Measure("migrations", "migrations", decimals=0),
-            Measure("guard_moves", "by the guard", decimals=0),
-        ]
-        if self.header.tracking is not None:
-            columns += [
-                Measure("rms_mm", "error", "mm", decimals=2),
-                Measure("rms_px", "error", "px"),
-            ]
-        shown = [
-            {**row._asdict(), **{f"share {name}": row.shares.get(name, 0.0) for name in names}}
-            for row in rows
-        ]
-        yield Table(
-            "phases",
-            "By phase",
-            columns,
-            shown,
-            caption=(
-                "All cycles by when they were released, the warm-up included. Lost: cycles that "
-                "never finished."
-            ),
-        )
+        if len(rows) > 1:
+            yield phase_table(rows, self.palette)
 
     # -------------------------------------------------------------------------- worst windows
 

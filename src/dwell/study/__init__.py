@@ -84,47 +84,25 @@ __all__ = [
 ]
 
 _HOME = {
-    "AIM": "dwell.study.comparison",
-    "SAME_RUN": "dwell.study.family",
-    "UNTOLD": "dwell.study.family",
-    "Capacity": "dwell.study.capacity",
-    "CapacityPoint": "dwell.study.capacity",
-    "Comparison": "dwell.study.comparison",
-    "Contender": "dwell.study.study",
-    "Example": "dwell.study.player",
-    "Family": "dwell.study.family",
-    "Hindsight": "dwell.study.hindsight",
-    "Interval": "dwell.study.intervals",
-    "Limiting": "dwell.study.capacity",
-    "PairedDifference": "dwell.study.pairs",
-    "PairedMedian": "dwell.study.pairs",
-    "Point": "dwell.study.study",
-    "Study": "dwell.study.study",
-    "StudyResult": "dwell.study.runner",
-    "StudyRuns": "dwell.study.results",
-    "Validation": "dwell.study.validation",
-    "canonical_demo": "dwell.study.demo",
-    "capacity_of": "dwell.study.capacity",
-    "compare": "dwell.study.comparison",
-    "keeps": "dwell.study.kept_bounds",
-    "load_study": "dwell.study.study",
-    "longest_run": "dwell.study.demo",
-    "mean_interval": "dwell.study.intervals",
-    "median_interval": "dwell.study.intervals",
-    "open_study": "dwell.study.study_folder",
-    "paired_difference": "dwell.study.pairs",
-    "paired_median": "dwell.study.pairs",
-    "paper_predictions": "dwell.study.predictions",
-    "real_demo": "dwell.study.demo",
-    "run_study": "dwell.study.runner",
-    "same_run": "dwell.study.family",
-    "share_interval": "dwell.study.intervals",
-    "stored_deadlines": "dwell.study.demo",
-    "tenants_demo": "dwell.study.demo",
-    "under": "dwell.study.intervals",
-    "untold": "dwell.study.family",
-    "validate": "dwell.study.validation",
-    "what_ifs": "dwell.study.capacity",
+    name: module
+    for module, names in {
+        "comparison": ("AIM", "Comparison", "compare"),
+        "family": ("SAME_RUN", "UNTOLD", "Family", "same_run", "untold"),
+        "capacity": ("Capacity", "CapacityPoint", "Limiting", "capacity_of", "what_ifs"),
+        "study": ("Contender", "Point", "Study", "load_study"),
+        "player": ("Example",),
+        "hindsight": ("Hindsight",),
+        "intervals": ("Interval", "mean_interval", "median_interval", "share_interval", "under"),
+        "pairs": ("PairedDifference", "PairedMedian", "paired_difference", "paired_median"),
+        "runner": ("StudyResult", "run_study"),
+        "results": ("StudyRuns",),
+        "validation": ("Validation", "validate"),
+        "demo": ("canonical_demo", "longest_run", "real_demo", "stored_deadlines", "tenants_demo"),
+        "kept_bounds": ("keeps",),
+        "study_folder": ("open_study",),
+        "predictions": ("paper_predictions",),
+    }.items()
+    for name in names
 }
 
 
@@ -132,7 +110,7 @@ def __getattr__(name: str) -> Any:
     """Import what is asked for: a worker plays, and needs no statistics (PEP 562)."""
     if name not in _HOME:
         raise AttributeError(f"module 'dwell.study' has no attribute {name!r}")
-    return getattr(import_module(_HOME[name]), name)
+    return getattr(import_module(f"dwell.study.{_HOME[name]}"), name)
 
 
 def __dir__() -> list[str]:
