@@ -18,6 +18,8 @@ from dwell.cli.options import (
     Seed,
     TestbedName,
     Windows,
+    file_option,
+    folder_option,
     seconds_of_runs,
 )
 from dwell.cli.output import file_name, print_json, working, write_report
@@ -56,16 +58,14 @@ def campaign(
     seconds: Seconds = None,
     seed: Seed = 1,
     out: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="Of the campaign; campaigns/CELL if not given."),
+        Path | None, folder_option("Of the campaign; campaigns/CELL if not given.")
     ] = None,
     name: TestbedName = "campaign",
     minutes: Annotated[
         float | None, typer.Option(min=0, help="Begin no run that would end after these.")
     ] = None,
     inventory: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Real hosts (YAML), instead of this machine's testbed."),
+        Path | None, file_option("Real hosts (YAML), instead of this machine's testbed.")
     ] = None,
     report: Annotated[
         bool, typer.Option("--report", help="Measure nothing: report on what is there.")

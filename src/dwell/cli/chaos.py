@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from dwell.cli.options import Json, Seed
+from dwell.cli.options import Json, Seed, folder_option
 from dwell.cli.output import json_text, print_json, write_file
 from dwell.errors import ExitCode
 from dwell.live.log import say
@@ -30,8 +30,7 @@ def chaos(
         int | None, typer.Option(min=1, help="Nothing but this fault of the timeline.")
     ] = None,
     out: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="Where logs, runs and what was seen go, to be kept."),
+        Path | None, folder_option("Where logs, runs and what was seen go, to be kept.")
     ] = None,
     hosts: Annotated[
         bool,

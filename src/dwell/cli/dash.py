@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dwell.cli.options import Insecure, Keys
+from dwell.cli.options import Insecure, Keys, file_option
 
 if TYPE_CHECKING:
     from dwell.dash.server import Dash
@@ -48,17 +48,13 @@ def dash(
     ] = False,
     mcap: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Also record the live cell to an MCAP file for Foxglove, PlotJuggler and others.",
+        file_option(
+            "Also record the live cell to an MCAP file for Foxglove, PlotJuggler and others."
         ),
     ] = None,
     token: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Where the page's token is kept, for Prometheus; made where there is none.",
-        ),
+        file_option("Where the page's token is kept, for Prometheus; made where there is none."),
     ] = None,
     keys: Keys = None,
     insecure: Insecure = False,

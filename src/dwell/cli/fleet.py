@@ -11,7 +11,7 @@ import typer
 
 import dwell
 from dwell.cli.completion import estimators, policies
-from dwell.cli.options import Json, Processes, Seed
+from dwell.cli.options import Json, Processes, Seed, file_option, folder_option
 from dwell.cli.output import (
     aligned,
     block,
@@ -94,9 +94,8 @@ def run(
     jobs: Annotated[bool, typer.Option("--jobs", help="Keep every job's instants.")] = False,
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Where to save the runs; runs/FLEET-POLICY-COORDINATION-PHASES-SEED if not given.",
+        folder_option(
+            "Where to save the runs; runs/FLEET-POLICY-COORDINATION-PHASES-SEED if not given."
         ),
     ] = None,
     as_json: Json = False,
@@ -190,14 +189,12 @@ def capacity(
     processes: Processes = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Page to write; capacity/FLEET-POLICY-PHASES.html if not given, none with --json.",
+        file_option(
+            "Page to write; capacity/FLEET-POLICY-PHASES.html if not given, none with --json."
         ),
     ] = None,
     figures: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="Also write the curve for a paper: PDF, SVG, CSV."),
+        Path | None, folder_option("Also write the curve for a paper: PDF, SVG, CSV.")
     ] = None,
     as_json: Json = False,
 ) -> None:

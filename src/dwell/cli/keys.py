@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dwell.cli.options import Json
+from dwell.cli.options import Json, folder_option
 from dwell.cli.output import aligned, print_json
 
 if TYPE_CHECKING:
@@ -29,9 +29,7 @@ keys = typer.Typer(
 @keys.command()
 def init(
     cell: Annotated[Path, typer.Argument(metavar="CELL", help="Cell file.")],
-    out: Annotated[
-        Path, typer.Option(metavar="FOLDER", help="Where the authority and all keyrings go.")
-    ],
+    out: Annotated[Path, folder_option("Where the authority and all keyrings go.")],
     days: Days = 365,
     as_json: Json = False,
 ) -> None:

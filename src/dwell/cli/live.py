@@ -24,6 +24,8 @@ from dwell.cli.options import (
     Node,
     Policy,
     Seed,
+    file_option,
+    folder_option,
     require_held,
 )
 from dwell.cli.output import json_text, print_json
@@ -60,10 +62,7 @@ def agent(
     node: Node,
     cell: CellOption,
     state: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER", help="Where processes keep their files; by default below ~/.local."
-        ),
+        Path | None, folder_option("Where processes keep their files; by default below ~/.local.")
     ] = None,
     cpus: Cpus = None,
     cpus_of: Annotated[
@@ -109,12 +108,8 @@ def agent(
 
 
 def controller(
-    cell: Annotated[
-        list[Path], typer.Option("--cell", metavar="FILE", help="Cell file; may be repeated.")
-    ],
-    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where the runs' folders go.")] = Path(
-        "runs"
-    ),
+    cell: Annotated[list[Path], file_option("Cell file; may be repeated.", "--cell")],
+    out: Annotated[Path, folder_option("Where the runs' folders go.")] = Path("runs"),
     policy: Policy = None,
     name: Annotated[
         str | None, typer.Option(help="Of this controller; its process id if not given.")
@@ -289,10 +284,7 @@ def run(
     seed: Seed = 1,
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Where logs, the run and its report go; live-out/CELL if not given.",
-        ),
+        folder_option("Where logs, the run and its report go; live-out/CELL if not given."),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -313,11 +305,7 @@ def run(
 
 Root = Annotated[
     Path | None,
-    typer.Option(
-        "--state",
-        metavar="FOLDER",
-        help="Has a folder for each cell; by default below ~/.local.",
-    ),
+    folder_option("Has a folder for each cell; by default below ~/.local.", "--state"),
 ]
 
 
@@ -333,9 +321,7 @@ def up(
         ),
     ] = None,
     policy: Policy = None,
-    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where the runs' folders go.")] = Path(
-        "runs"
-    ),
+    out: Annotated[Path, folder_option("Where the runs' folders go.")] = Path("runs"),
     state: Root = None,
     keys: Keys = None,
     insecure: Insecure = False,
@@ -388,8 +374,7 @@ def log(
         bool, typer.Option("--follow", "-f", help="Go on with what is added, until interrupted.")
     ] = False,
     cell: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Its cell's file, where there are several cells."),
+        Path | None, file_option("Its cell's file, where there are several cells.")
     ] = None,
     state: Root = None,
 ) -> None:
@@ -405,9 +390,9 @@ def log(
 def units(
     cell: CellArgument,
     node: Node,
-    out: Annotated[
-        Path, typer.Option(metavar="FOLDER", help="Where the units go; made where it is missing.")
-    ] = Path("units"),
+    out: Annotated[Path, folder_option("Where the units go; made where it is missing.")] = Path(
+        "units"
+    ),
     user: Annotated[
         str | None, typer.Option(help="User of the services; this one if not given.")
     ] = None,

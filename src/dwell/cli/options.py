@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -49,6 +49,16 @@ def _require(bound: Bound, value: float | None) -> None:
     if value is not None and not bound.holds(value):
         shown = value if isinstance(value, int) else f"{value:g}"
         raise typer.BadParameter(f"{shown} is not allowed; it must be {bound}")
+
+
+def folder_option(sentence: str, *names: str) -> Any:
+    """Return an option that takes a folder, under the parameter's name or others."""
+    return typer.Option(*names, metavar="FOLDER", help=sentence)
+
+
+def file_option(sentence: str, *names: str) -> Any:
+    """Return an option that takes a file, under the parameter's name or others."""
+    return typer.Option(*names, metavar="FILE", help=sentence)
 
 
 CellArgument = Annotated[Path, typer.Argument(metavar="CELL", help="Cell file (YAML).")]

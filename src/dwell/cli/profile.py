@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dwell.cli.options import Json, Samples, Warmup
+from dwell.cli.options import Json, Samples, Warmup, file_option
 from dwell.cli.output import aligned, file_name, print_json
 from dwell.errors import ProfileError
 from dwell.live.log import say
@@ -25,7 +25,7 @@ PORT = 7411
 
 profile = typer.Typer(no_args_is_help=True)
 
-Out = Annotated[Path | None, typer.Option(metavar="FILE", help="Parquet file to write.")]
+Out = Annotated[Path | None, file_option("Parquet file to write.")]
 Period = Annotated[
     float | None,
     typer.Option(metavar="MS", help="Begin one every so often; one after another if not given."),
@@ -96,7 +96,7 @@ def measure(
 @profile.command()
 def merge(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Profiles.")],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="Parquet file to write.")],
+    out: Annotated[Path, file_option("Parquet file to write.")],
     as_json: Json = False,
 ) -> None:
     """Put the profiles of several nodes and links into one file."""

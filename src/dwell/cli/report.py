@@ -13,7 +13,7 @@ from urllib.parse import quote
 import typer
 
 import dwell
-from dwell.cli.options import Json
+from dwell.cli.options import Json, file_option, folder_option
 from dwell.cli.output import print_json, progress, working, write_file, write_report
 from dwell.errors import RunError
 
@@ -32,30 +32,20 @@ def report(
             metavar="FOLDER", help="Of a saved run, of a fleet, of a study, or of a campaign."
         ),
     ],
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Page to write [default: FOLDER/report.html]."),
-    ] = None,
+    out: Annotated[Path | None, file_option("Page to write [default: FOLDER/report.html].")] = None,
     trace: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Also write every job as a trace for Perfetto; the run must have kept its jobs.",
+        file_option(
+            "Also write every job as a trace for Perfetto; the run must have kept its jobs."
         ),
     ] = None,
     mcap: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Also write its tables as an MCAP file for Foxglove, PlotJuggler and others.",
-        ),
+        file_option("Also write its tables as an MCAP file for Foxglove, PlotJuggler and others."),
     ] = None,
     figures: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Also write figures and tables for a paper: PDF, SVG, LaTeX, CSV.",
-        ),
+        folder_option("Also write figures and tables for a paper: PDF, SVG, LaTeX, CSV."),
     ] = None,
     static: Annotated[
         bool, typer.Option("--static", help="A page without scripts: nothing to hover or choose.")

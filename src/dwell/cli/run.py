@@ -22,6 +22,7 @@ from dwell.cli.options import (
     Seed,
     Traces,
     Windows,
+    folder_option,
     require_one_length,
     windows_of,
 )
@@ -48,10 +49,9 @@ def run(
     seconds: Seconds = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Where to save the run; runs/CELL-SCENARIO-POLICY-SEED, and what --set says, if "
-            "not given.",
+        folder_option(
+            "Where to save the run; runs/CELL-SCENARIO-POLICY-SEED, and what --set says, if "
+            "not given."
         ),
     ] = None,
     traces: Traces = None,

@@ -15,6 +15,7 @@ from dwell.cli.options import (
     Processes,
     Seconds,
     Windows,
+    folder_option,
     require_few,
     require_one_length,
     windows_of,
@@ -40,10 +41,7 @@ def study(
         typer.Argument(metavar="FILE", help="Study file (YAML)."),
     ],
     out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER", help="Where parts and tables go; studies/NAME if not given."
-        ),
+        Path | None, folder_option("Where parts and tables go; studies/NAME if not given.")
     ] = None,
     processes: Processes = None,
     dask: Annotated[

@@ -19,6 +19,8 @@ from dwell.cli.options import (
     Seed,
     TestbedName,
     Windows,
+    file_option,
+    folder_option,
     require_one_length,
     seconds_of_runs,
 )
@@ -41,11 +43,7 @@ def run(
     seconds: Seconds = None,
     seed: Seed = 1,
     out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Where logs and the run go; below testbed-out if not given.",
-        ),
+        Path | None, folder_option("Where logs and the run go; below testbed-out if not given.")
     ] = None,
     name: TestbedName = "bed",
     jobs: Annotated[bool, typer.Option("--jobs", help="Keep every job of the run.")] = False,
@@ -152,7 +150,7 @@ testbed.command()(campaign)
 @testbed.command()
 def calibrate(
     cell: CellArgument,
-    out: Annotated[Path, typer.Option(metavar="FILE", help="Cell file to write.")],
+    out: Annotated[Path, file_option("Cell file to write.")],
     runs: Annotated[
         list[Path] | None,
         typer.Argument(

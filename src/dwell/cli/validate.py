@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import dwell
-from dwell.cli.options import Json, Processes, Traces, require_few
+from dwell.cli.options import Json, Processes, Traces, file_option, folder_option, require_few
 from dwell.cli.output import json_text, print_json, progress, write_file
 from dwell.errors import RunError
 
@@ -24,12 +24,9 @@ def validate(
     runs: Annotated[
         list[Path], typer.Argument(metavar="RUN...", help="Folders of runs that were measured.")
     ],
-    cell: Annotated[Path, typer.Option(metavar="FILE", help="Calibrated cell file (YAML).")],
+    cell: Annotated[Path, file_option("Calibrated cell file (YAML).")],
     out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER", help="Where page and table go; validations/CELL if not given."
-        ),
+        Path | None, folder_option("Where page and table go; validations/CELL if not given.")
     ] = None,
     seeds: Annotated[
         int,

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.dash.paged_cell import Plain
+from dwell.dash.paged_cell import NO_WINDOW, UNMEASURED, Plain
 from dwell.dash.recorded_cell import RecordedCell
 from dwell.dash.recorded_events import RecordedEvents, disturbance_events, disturbances_met
 from dwell.dash.recorded_windows import RecordedWindows
@@ -265,13 +265,17 @@ class RecordedFleet:
     def state(self, at: float) -> Plain:
         """Return how the cells were at a place, and the load of the shared nodes."""
         cells = [self._cell_state(one, at) for one in self._members]
-        unwell = sum(cell["health"] != "ok" for cell in cells)
+        unwell = sum(cell["health"] == "degraded" for cell in cells)
+        health = "degraded" if unwell else "ok"
+        headline = f"{unwell} of {len(cells)} cells" if unwell else None
+        if all(cell["health"] == UNMEASURED for cell in cells):
+            health, headline = UNMEASURED, NO_WINDOW
         k = int(np.searchsorted(self._grid, at, "right")) - 1
         row = self._rounds.last(at)
         return {
             "at": at,
-            "health": "degraded" if unwell else "ok",
-            "headline": f"{unwell} of {len(cells)} cells" if unwell else None,
+            "health": health,
+            "headline": headline,
             "cells": cells,
             "used": {
                 name: None if k < 0 else plain(column[k : k + 1], 4)[0]

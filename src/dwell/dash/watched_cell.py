@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from dwell.dash.observer import ObservedCycle, ObservedWindow, Observer
-from dwell.dash.paged_cell import MOST_WITH_JOBS, Plain, cell_document, cycle_since, job_since
+from dwell.dash.paged_cell import MOST_WITH_JOBS, Plain, TimedCycle, cell_document, jobs_document
 from dwell.dash.strip import Floats, Strip, binned_means
 from dwell.record.json_documents import json_ready
 
@@ -31,7 +31,7 @@ class WatchedCell:
         self.observer, self.problem = observer, observer.problem
         self._taking = threading.Lock()
         self._codes = {name: code for code, name in enumerate(self.problem.candidates)}
-        self._strip, self._cycles_upto = Strip.empty(), 0
+        self._strip, self._cycles_upto = self._strip_of(()), 0
         self._windows: list[ObservedWindow] = []
         self._windows_upto = -1
         # When the windows closed, and their values: what is drawn as lines.
@@ -155,22 +155,17 @@ class WatchedCell:
 
     def jobs(self, begin: float, end: float) -> Plain:
         """See `PagedCell`."""
-        cycles = self.observer.cycles.since(0).items
-        mine = [one for one in cycles if begin <= one.release_ns / 1e9 < end][-MOST_WITH_JOBS:]
-        if not mine:
-            return {"origin_s": 0.0, "jobs": [], "cycles": [], "known": True}
-        origin_ns = min(one.release_ns for one in mine)
-        return {
-            "origin_s": origin_ns / 1e9,
-            "jobs": [job_since(job, origin_ns) for one in mine for job in one.jobs],
-            "cycles": [
-                cycle_since(
-                    *(one.number, one.release_ns, one.latency_ns, origin_ns), missed=one.missed
-                )
-                for one in mine
-            ],
-            "known": True,
-        }
+        heard = self.observer.cycles.since(0).items
+        mine = [one for one in heard if begin <= one.release_ns / 1e9 < end][-MOST_WITH_JOBS:]
+        cycles = [
+            TimedCycle(
+                *(one.number, one.release_ns),
+                None if one.latency_ns is None else one.latency_ns / 1e6,
+                one.missed,
+            )
+            for one in mine
+        ]
+        return jobs_document(cycles, (job for one in mine for job in one.jobs))
 
     def refreshed(self) -> bool:
         """See `PagedCell`; cycles are taken in meanwhile, before the observer lets go of them."""

@@ -75,16 +75,10 @@ PHASES = {
 def _figure(found: Capacity) -> Figure:
     import polars as pl
 
-    rows = [
-        {
-            "robots": point.robots,
-            "mean": point.violation_rate.value * 100,
-            "low": point.violation_rate.low * 100,
-            "high": point.violation_rate.high * 100,
-        }
-        for point in found.curve
-    ]
-    frame = pl.DataFrame(rows).with_columns(pl.col("low", "high").fill_nan(None))
+    rows = [(point.robots, *point.violation_rate) for point in found.curve]
+    ends = ("mean", "low", "high")
+    frame = pl.DataFrame(rows, schema=["robots", *ends], orient="row")
+    frame = frame.with_columns(pl.col(ends).fill_nan(None) * 100)
     limit = Limit(found.bound * 100, f"limit: {found.bound * 100:.3g} %")
     return Figure(
         slug="capacity",
