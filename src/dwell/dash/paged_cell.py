@@ -32,23 +32,18 @@ class PagedCell(Protocol):
 
     def described(self) -> Plain:
         """Return what does not change, and where its time line begins and ends."""
-        ...
 
     def view(self, begin: float, end: float, bins: int) -> Plain:
         """Return what is drawn between two places, in so many bins at most."""
-        ...
 
     def state(self, at: float) -> Plain:
         """Return how the cell was at a place; a cell that runs, how it is."""
-        ...
 
     def jobs(self, begin: float, end: float) -> Plain:
         """Return the jobs of the cycles between two places, as far as they are known."""
-        ...
 
     def refreshed(self) -> bool:
         """Whether there is more of it than at the last call."""
-        ...
 
 
 def cell_document(problem: Problem) -> Plain:

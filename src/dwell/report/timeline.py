@@ -64,11 +64,9 @@ def run_timeline(
     windows: pl.DataFrame,
     decisions: pl.DataFrame,
     begin_s: NDArray[np.float64],
+    problem: Problem,
     *,
     slug: str,
-    palette: Palette,
-    resources: Sequence[str],
-    deadline_ms: float,
     disturbed: Iterable[Disturbed] = (),
     tracking: Tracking | None = None,
     links: Mapping[int, str] | None = None,
@@ -84,10 +82,6 @@ def run_timeline(
     ----------
     begin_s : float64 array, shape (windows,)
         When each window began, seconds.
-    resources : sequence of str
-        Whose utilisation is drawn (see `resources_in`).
-    palette : Palette
-        Colours of the candidates.
     disturbed : iterable of Disturbed
         Disturbances, cut at the ends of the run.
     links : mapping of int to str, optional
@@ -99,7 +93,8 @@ def run_timeline(
 
     length_s = float(np.median(np.diff(begin_s))) if len(begin_s) > 1 else 1.0
     end_s = float(begin_s[-1]) + length_s
-    candidates = tuple(palette.placements)
+    deadline_ms, resources = problem.pipeline.deadline_ms, resources_in(windows, problem)
+    placements = Palette.of(problem.candidates).placements
     each = 1 if windows.height <= MOST_MARKS else math.ceil(windows.height / MOST_BINS)
     frame = pl.DataFrame(
         {
@@ -118,7 +113,7 @@ def run_timeline(
         frame = frame.with_columns(error=pl.Series(errors, dtype=pl.Float64))
     frames = {
         "windows": _binned(frame, each),
-        "estimates": _estimates(windows, decisions, begin_s + length_s, candidates, each),
+        "estimates": _estimates(windows, decisions, begin_s + length_s, [*placements], each),
         "moves": _moves(windows, decisions, begin_s, length_s),
         "spans": _spans(windows, disturbed, begin_s, length_s, end_s),
         "nodes": _used(windows, begin_s + length_s / 2, resources, each),
@@ -126,11 +121,11 @@ def run_timeline(
     wide = is_wide([*frame["l95"].drop_nulls().drop_nans(), deadline_ms])
     aim, due = limit_rule("y", 100 * AIM, "5 %"), limit_rule("y", deadline_ms, "deadline")
     used = set(frame["placement"])
-    colours = {name: colour for name, colour in palette.placements.items() if name in used}
+    colours = {name: colour for name, colour in placements.items() if name in used}
     panels: list[tuple[float, list[Spec]]] = [
         (PANEL_PX, [*aim, *_marks("v_d", "V_D (%)", colours, each)]),
         (PANEL_PX, [*due, *_marks("l95", L95, colours, each, log=wide)]),
-        (PANEL_PX, [_others(palette), *_marks("j", "J", colours, each)]),
+        (PANEL_PX, [_others(placements), *_marks("j", "J", colours, each)]),
         (USE_PX, _use(resources, each)),
     ]
     if tracking is not None:
@@ -523,10 +518,10 @@ def _rates() -> list[Spec]:
     ]
 
 
-def _others(palette: Palette) -> Spec:
+def _others(colours: Mapping[str, str]) -> Spec:
     encoding = {
         "y": quantity("j", "J", scale={"zero": False}, axis={"tickCount": 4}),
-        "color": coloured("placement", palette.placements, legend=None),
+        "color": coloured("placement", colours, legend=None),
     }
     return layer("line", encoding, rows="estimates", strokeWidth=1, opacity=0.75)
 
