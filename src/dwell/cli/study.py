@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import chain, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -25,8 +26,6 @@ from dwell.errors import ExitCode
 from dwell.model.bounds import counted
 
 if TYPE_CHECKING:
-    from dwell.errors import Fault
-    from dwell.model import Problem
     from dwell.model.progress import Progress
     from dwell.report.formatting import Measure
     from dwell.study import Study, StudyResult
@@ -76,6 +75,7 @@ def study(
             "`dwell study paper` is now `make paper`, in the folder of Dwell's sources "
             "(reproduction/README.md)"
         )
+    from dwell.estimators import unplayed
     from dwell.study import load_study, run_study
 
     require_one_length(windows, seconds)
@@ -86,16 +86,12 @@ def study(
         windows = windows_of(seconds, *(point.problem for point in plan.points))
     if windows is not None:
         plan = replace(plan, windows=windows)
-    warn(file, {one: None for each in plan.points for one in _unplayed(plan, each.problem)})
+    played = product(plan.points, plan.scenarios)
+    late = (unplayed(point.problem, one, plan.windows) for point, one in played)
+    warn(file, dict.fromkeys(chain.from_iterable(late)))
     folder = out or Path("studies", file_name(plan.name))
     with _interruptible(folder, plan) as shown:
-        result = run_study(
-            plan,
-            folder=folder,
-            processes=processes,
-            dask=dask,
-            progress=shown,
-        )
+        result = run_study(plan, folder=folder, processes=processes, dask=dask, progress=shown)
     if as_json:
         with working("intervals"):
             table = result.table([measure.column for measure in _measures(plan)]).to_dicts()
@@ -105,14 +101,6 @@ def study(
     with working("intervals"):
         text = _text(result)
     typer.echo(f"{text}\n\ntables: {folder}")
-
-
-def _unplayed(study: Study, problem: Problem) -> Iterator[Fault]:
-    """Yield the scenarios of which nothing is played at a point."""
-    from dwell.estimators import unplayed
-
-    for scenario in study.scenarios:
-        yield from unplayed(problem, scenario, study.windows)
 
 
 @contextmanager

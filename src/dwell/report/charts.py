@@ -142,6 +142,26 @@ def limit_rule(axis: str, limit: float, name: str, **style: Any) -> list[Spec]:
     return [{"data": {"values": [{}]}, **rule}]
 
 
+def square(
+    side: float, across: Spec, up: Spec, limit: Limit, beneath: Spec, marks: Mapping[str, Any]
+) -> Spec:
+    """Return a square panel of the same quantity on both axes.
+
+    Parameters
+    ----------
+    limit : Limit
+        Of both axes.
+    beneath : Spec
+        Layer below the marks, with its data.
+    marks : mapping of str to object
+        A group of layers over the chart's rows, without the two encodings.
+    """
+    rules = [rule for axis in ("x", "y") for rule in limit_rule(axis, *limit)]
+    encoding = {"x": across, "y": up, **marks["encoding"]}
+    group = {"data": {"name": "rows"}, **marks, "encoding": encoding}
+    return {"width": side, "height": side, "layer": [beneath, *rules, group]}
+
+
 def is_wide(values: Sequence[float]) -> bool:
     """Whether numbers are so far apart that an axis has to be logarithmic."""
     known = [value for value in values if math.isfinite(value) and value > 0]
@@ -336,7 +356,9 @@ def curves(
     axis = {"values": values, "labelOverlap": True, "labelAngle": 0, "grid": numeric}
     across: Spec = {**at, "axis": axis, "sort": None}
     if numeric:
-        scale = "log" if min(values) > 0 and is_wide(values) else "linear"
+        # Values at even distances, as numbers of robots are, stand at even distances.
+        wide = min(values) > 0 and is_wide(values) and np.ptp(np.diff(values)) > 0
+        scale = "log" if wide else "linear"
         across |= {"scale": {"type": scale, "zero": False}, "axis": {**axis, "format": ".6~g"}}
     up = quantity("mean", measure.heading, axis={"tickCount": 5})
     about = [*names("policy"), at, *_mean_and_ends(measure)]

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from dwell.report.charts import NO_LIMIT, Limit, coloured, disc, layer, limit_rule, names, quantity
+from dwell.report.charts import NO_LIMIT, Limit, coloured, disc, layer, names, quantity, square
 from dwell.report.figure import Figure, Spec
 from dwell.report.formatting import Measure
 from dwell.report.palette import MUTED, Palette
@@ -119,12 +119,11 @@ def _scatter(
     ]
     colour = coloured("to", colours, legend={"symbolOpacity": 1})
     moves = {
-        "data": {"name": "rows"},
         "transform": [
             {"filter": f"isValid(datum.predicted_{column}) && isValid(datum.seen_{column})"},
             *ends,
         ],
-        "encoding": {"x": across, "y": up, "color": colour},
+        "encoding": {"color": colour},
         "layer": [*bars, disc({"tooltip": about}, 26, opacity=0.9)],
     }
     both = {"x": {**across, "field": "at"}, "y": {**up, "field": "at"}}
@@ -132,9 +131,8 @@ def _scatter(
         "data": {"values": [{"at": low}, {"at": high}]},
         **layer("line", both, color=MUTED, strokeWidth=1),
     }
-    rules = [rule for axis in ("x", "y") for rule in limit_rule(axis, *limit)]
-    inside = rules if low <= limit.value <= high else []
-    return {"width": side, "height": side, "layer": [diagonal, *inside, moves]}
+    inside = limit if low <= limit.value <= high else NO_LIMIT
+    return square(side, across, up, inside, diagonal, moves)
 
 
 def _range(frame: pl.DataFrame, column: str, error: str) -> tuple[float, float]:

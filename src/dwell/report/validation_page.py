@@ -18,10 +18,10 @@ from dwell.report.charts import (
     coloured,
     cumulative,
     layer,
-    limit_rule,
     name_of,
     names,
     quantity,
+    square,
     stacked,
 )
 from dwell.report.figure import Figure, Spec
@@ -312,14 +312,12 @@ def _scatter(
         layer("point", {"shape": name_of("scenario"), "tooltip": about}, size=45, strokeWidth=1.6),
     ]
     groups = {
-        "data": {"name": "rows"},
         "transform": [{"filter": f"datum.goal === '{goal}'"}],
-        "encoding": {"x": across, "y": up, "color": coloured("policy", policies)},
+        "encoding": {"color": coloured("policy", policies)},
         "layer": marks,
     }
     shade = {"data": {"values": band}, **layer("area", allowed, color=SHADE, clip=True)}
-    rules = [*limit_rule("x", *limit), *limit_rule("y", *limit)]
-    return {"width": size, "height": size, "layer": [shade, *rules, groups]}
+    return square(size, across, up, limit, shade, groups)
 
 
 def _panel(group: Group) -> str:
