@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dwell.cli.options import Insecure, Keys, file_option
+from dwell.cli.options import Insecure, Keys, argument, flag, option
 
 if TYPE_CHECKING:
     from dwell.dash.server import Dash
@@ -24,37 +24,32 @@ TOKEN = re.compile(r"[A-Za-z0-9_-]{22,200}")
 def dash(
     shown: Annotated[
         Path | None,
-        typer.Argument(
-            metavar="CELL|RUN|FLEET",
-            help="Cell file of a cell that runs, or the folder of a run, or of a fleet's runs; "
+        argument(
+            "CELL|RUN|FLEET",
+            "Cell file of a cell that runs, or the folder of a run, or of a fleet's runs; "
             "./cell.yaml if not given.",
         ),
     ] = None,
     beside: Annotated[
-        Path | None,
-        typer.Option(metavar="RUN", help="Another run, to be shown on the same time line."),
+        Path | None, option("RUN", "Another run, to be shown on the same time line.")
     ] = None,
-    port: Annotated[
-        int, typer.Option(min=0, max=65_535, metavar="P", help="Of loopback; 0 takes a free one.")
-    ] = PORT,
+    port: Annotated[int, option("P", "Of loopback; 0 takes a free one.", min=0, max=65_535)] = PORT,
     no_browser: Annotated[
-        bool, typer.Option("--no-browser", help="Print the address only, and open no browser.")
+        bool, flag("--no-browser", "Print the address only, and open no browser.")
     ] = False,
     control: Annotated[
-        bool,
-        typer.Option(
-            "--control", help="Let the page pin and drain; with keys, it takes an operator's."
-        ),
+        bool, flag("--control", "Let the page pin and drain; with keys, it takes an operator's.")
     ] = False,
     mcap: Annotated[
         Path | None,
-        file_option(
-            "Also record the live cell to an MCAP file for Foxglove, PlotJuggler and others."
+        option(
+            "FILE",
+            "Also record the live cell to an MCAP file for Foxglove, PlotJuggler and others.",
         ),
     ] = None,
     token: Annotated[
         Path | None,
-        file_option("Where the page's token is kept, for Prometheus; made where there is none."),
+        option("FILE", "Where the page's token is kept, for Prometheus; made where there is none."),
     ] = None,
     keys: Keys = None,
     insecure: Insecure = False,

@@ -14,7 +14,7 @@ from dwell.cli.options import (
     Processes,
     Seconds,
     Windows,
-    folder_option,
+    option,
     require_few,
     require_one_length,
     windows_of,
@@ -31,17 +31,16 @@ if TYPE_CHECKING:
 
 def demo(
     real: Annotated[
-        Path | None, folder_option("Replay the measurements in this folder instead.")
+        Path | None, option("FOLDER", "Replay the measurements in this folder instead.")
     ] = None,
     seeds: Annotated[
-        int,
-        typer.Option(min=1, metavar="N", callback=require_few, help="Seeds 1 to N of every run."),
+        int, option("N", "Seeds 1 to N of every run.", min=1, callback=require_few)
     ] = 20,
     windows: Windows = None,
     seconds: Seconds = None,
-    out: Annotated[Path, folder_option("Where report.html goes.")] = Path("demo-out"),
+    out: Annotated[Path, option("FOLDER", "Where report.html goes.")] = Path("demo-out"),
     examples: Annotated[
-        Path | None, folder_option("Where the example cells are, if not found.")
+        Path | None, option("FOLDER", "Where the example cells are, if not found.")
     ] = None,
     processes: Processes = None,
     as_json: Json = False,

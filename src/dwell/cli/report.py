@@ -13,7 +13,7 @@ from urllib.parse import quote
 import typer
 
 import dwell
-from dwell.cli.options import Json, file_option, folder_option
+from dwell.cli.options import Json, argument, flag, option
 from dwell.cli.output import print_json, progress, working, write_file, write_report
 from dwell.errors import RunError
 
@@ -27,31 +27,32 @@ PAGE = "report.html"
 
 def report(
     folder: Annotated[
-        Path,
-        typer.Argument(
-            metavar="FOLDER", help="Of a saved run, of a fleet, of a study, or of a campaign."
-        ),
+        Path, argument("FOLDER", "Of a saved run, of a fleet, of a study, or of a campaign.")
     ],
-    out: Annotated[Path | None, file_option("Page to write [default: FOLDER/report.html].")] = None,
+    out: Annotated[
+        Path | None, option("FILE", "Page to write [default: FOLDER/report.html].")
+    ] = None,
     trace: Annotated[
         Path | None,
-        file_option(
-            "Also write every job as a trace for Perfetto; the run must have kept its jobs."
+        option(
+            "FILE", "Also write every job as a trace for Perfetto; the run must have kept its jobs."
         ),
     ] = None,
     mcap: Annotated[
         Path | None,
-        file_option("Also write its tables as an MCAP file for Foxglove, PlotJuggler and others."),
+        option(
+            "FILE", "Also write its tables as an MCAP file for Foxglove, PlotJuggler and others."
+        ),
     ] = None,
     figures: Annotated[
         Path | None,
-        folder_option("Also write figures and tables for a paper: PDF, SVG, LaTeX, CSV."),
+        option("FOLDER", "Also write figures and tables for a paper: PDF, SVG, LaTeX, CSV."),
     ] = None,
     static: Annotated[
-        bool, typer.Option("--static", help="A page without scripts: nothing to hover or choose.")
+        bool, flag("--static", "A page without scripts: nothing to hover or choose.")
     ] = False,
     cells: Annotated[
-        bool, typer.Option("--cells", help="Of a fleet: also write the page of every cell.")
+        bool, flag("--cells", "Of a fleet: also write the page of every cell.")
     ] = False,
     as_json: Json = False,
 ) -> None:

@@ -16,7 +16,8 @@ from dwell.cli.options import (
     Processes,
     Seconds,
     Windows,
-    folder_option,
+    argument,
+    option,
     require_few,
     require_one_length,
     windows_of,
@@ -35,25 +36,18 @@ SHOWN = 40
 
 
 def study(
-    file: Annotated[
-        Path,
-        typer.Argument(metavar="FILE", help="Study file (YAML)."),
-    ],
+    file: Annotated[Path, argument("FILE", "Study file (YAML).")],
     out: Annotated[
-        Path | None, folder_option("Where parts and tables go; studies/NAME if not given.")
+        Path | None, option("FOLDER", "Where parts and tables go; studies/NAME if not given.")
     ] = None,
     processes: Processes = None,
     dask: Annotated[
-        str | None,
-        typer.Option(metavar="ADDRESS", help="Scheduler of a Dask cluster that does the work."),
+        str | None, option("ADDRESS", "Scheduler of a Dask cluster that does the work.")
     ] = None,
     seeds: Annotated[
         int | None,
-        typer.Option(
-            min=1,
-            metavar="N",
-            callback=require_few,
-            help="Seeds 1 to N of every run; the file's if not given.",
+        option(
+            "N", "Seeds 1 to N of every run; the file's if not given.", min=1, callback=require_few
         ),
     ] = None,
     windows: Windows = None,
