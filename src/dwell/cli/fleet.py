@@ -101,11 +101,8 @@ def run(
     from dwell.sim.fleet import phases_ms
     from dwell.study.fleet_summary import fleet_numbers
 
-    given = dwell.load_fleet(file)
-    warn(file, warnings_of(given))
-    played = given.changed(
-        policy=policy, estimator=estimator, coordination=coordination, phases=read_phases(phases)
-    )
+    changes = {"policy": policy, "estimator": estimator, "coordination": coordination}
+    played = _read(file, phases, **changes)
     how = played.phases if isinstance(played.phases, str) else "listed"
     named = [one for one in (policy, estimator) if one is not None]
     folder = out or default_folder(played.name, *named, played.coordination, how, str(seed))
@@ -144,9 +141,7 @@ def plan(file: FleetArgument, seed: Seed = 1, phases: Phases = None, as_json: Js
     """
     from dwell.study.fleet_plan import plan_fleet
 
-    given = dwell.load_fleet(file)
-    warn(file, warnings_of(given))
-    planned = given.changed(phases=read_phases(phases))
+    planned = _read(file, phases)
     with progress(f"playing loads of {counted(len(planned.cells), 'cell')}") as shown:
         found = plan_fleet(planned, seed=seed, progress=shown)
     if as_json:
@@ -198,9 +193,7 @@ def capacity(
 
     if not 0 < limit < 1:
         raise typer.BadParameter(f"--limit: {limit:g} is not allowed; it must be between 0 and 1")
-    given = dwell.load_fleet(file)
-    warn(file, warnings_of(given))
-    asked = given.changed(policy=policy, phases=read_phases(phases))
+    asked = _read(file, phases, policy=policy)
     settings: dict[str, Any] = {"limit": limit, "most": most, "processes": processes}
     with progress(f"playing up to {most} robots") as shown:
         found = capacity_of(asked, **settings, progress=shown)
@@ -264,10 +257,12 @@ def read_phases(text: str | None) -> str | tuple[float, ...] | None:
         return text
 
 
-def warnings_of(of: Fleet) -> Iterator[Fault]:
-    """Yield what is allowed in a fleet and seldom meant."""
-    for name in of.unused():
-        yield Fault(f"shared.{name}", "no candidate of any cell uses this node")
+def _read(file: Path, phases: str | None, **changes: str | None) -> Fleet:
+    """Read a fleet, warn of what it has for nothing, and change it as the options say."""
+    fleet = dwell.load_fleet(file)
+    unused = "no candidate of any cell uses this node"
+    warn(file, (Fault(f"shared.{name}", unused) for name in fleet.unused()))
+    return fleet.changed(phases=read_phases(phases), **changes)
 
 
 def _head(result: FleetRun, windows: int) -> dict[str, Any]:

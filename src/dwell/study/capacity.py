@@ -116,14 +116,10 @@ class Capacity:
     def as_json(self) -> dict[str, Any]:
         """Return it as plain values."""
         limits = self.limits
+        names = ("robots", "at_least", "interval", "limit", "limit_on", "phases", "policy")
         return {
-            "robots": self.robots,
-            "at_least": self.at_least,
+            **{name: getattr(self, name) for name in names},
             "interval": list(self.interval),
-            "limit": self.limit,
-            "limit_on": self.limit_on,
-            "phases": self.phases,
-            "policy": self.policy,
             "reason": self.reason or None,
             "limits": None if limits is None else {limits.kind: limits.name, "share": limits.share},
             "curve": [
