@@ -29,6 +29,8 @@ WIDE = 30.0
 #: Least width of a panel, room beside panels of named rows and of numbers, and between, pixels.
 PANEL_PX, NAMES_PX, AXIS_PX, GAP_PX = 170, 150, 60, 16
 ROW_PX = 17
+#: Values of a parameter that have grid lines, at most.
+MOST_LINES = 20
 #: Width of a legend's symbol with what is beside it, and of a letter.
 SYMBOL_PX, LETTER_PX = 34, 6.2
 #: Share of cycles below which a distribution is not drawn.
@@ -353,7 +355,8 @@ def curves(
     numeric = frame["at"].dtype.is_numeric()
     values = frame["at"].unique(maintain_order=True).to_list()
     at = {"field": "at", "type": "quantitative" if numeric else "ordinal", "title": heading}
-    axis = {"values": values, "labelOverlap": True, "labelAngle": 0, "grid": numeric}
+    axis = {"values": values, "labelOverlap": True, "labelSeparation": 4, "labelAngle": 0}
+    axis["grid"] = numeric and len(values) <= MOST_LINES
     across: Spec = {**at, "axis": axis, "sort": None}
     if numeric:
         # Values at even distances, as numbers of robots are, stand at even distances.
