@@ -173,7 +173,7 @@ def windows_of(seconds: float, *problems: Problem) -> int:
     """
     from dwell.model.instants import require_length
 
-    each_s = sorted({one.window_cycles * one.pipeline.period_ms / 1e3 for one in problems})
+    each_s = sorted({one.window_ms / 1e3 for one in problems})
     if len(each_s) > 1:
         lengths = ", ".join(f"{window_s:g}" for window_s in each_s)
         raise typer.BadParameter(

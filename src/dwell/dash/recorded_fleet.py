@@ -151,8 +151,7 @@ class RecordedFleet:
             self._faults.append(str(error))
             return self._members[0].windows.closes, {}
         first = self._run.fleet.entries[0].cell
-        length_s = first.window_cycles * first.pipeline.period_ms / 1e3
-        closes = table["start_ns"].to_numpy() / 1e9 + length_s
+        closes = table["start_ns"].to_numpy() / 1e9 + first.window_ms / 1e3
         names = [name for name in table.columns if name.startswith("u_")]
         return closes, {name.removeprefix("u_"): table[name].to_numpy() for name in names}
 
@@ -302,8 +301,7 @@ def _member(place: int, cell: FleetCell, run: Run, phase_ms: float) -> _Member:
     def opens(first: NDArray[np.int64]) -> Floats:
         return (phase_ms + first.astype(np.float64) * pipeline.period_ms) / 1e3
 
-    length_s = cell.problem.window_cycles * pipeline.period_ms / 1e3
-    windows = RecordedWindows(run, cell.problem, opens, length_s)
+    windows = RecordedWindows(run, cell.problem, opens, cell.problem.window_ms / 1e3)
     if not len(windows.number):
         raise RunError(f"{cell.name}: this run has no windows")
     l95_ms = run.arrays("windows")["l95_ms"].astype(np.float64)

@@ -130,7 +130,6 @@ class WatchedCell:
         return dict(json_ready(state))
 
     def _window_state(self, window: Mapping[str, Any]) -> Plain:
-        length_s = self.problem.window_cycles * self.problem.pipeline.period_ms / 1e3
         seen = {name: window[name] for name in ("l95_ms", "violation_rate", "cost")}
         ends = {one.number: one for one in self._windows[-3:]}
         known, before = ends.get(window["number"]), ends.get(window["number"] - 1)
@@ -138,7 +137,7 @@ class WatchedCell:
         return {
             "window": {
                 "number": window["number"],
-                "begin": end_s - length_s,
+                "begin": end_s - self.problem.window_ms / 1e3,
                 "end": end_s,
                 "placement": window["placement"],
                 "seen": seen,

@@ -45,7 +45,7 @@ def method_blocks(
 def cell_definitions(problem: Problem) -> dict[str, str]:
     """Return what a cell is, and what its controller does, by headings."""
     pipeline, controller = problem.pipeline, problem.controller
-    span_s = problem.window_cycles * pipeline.period_ms / 1e3
+    span_s = problem.window_ms / 1e3
     nodes = problem.fabric.nodes.values()
     return {
         "cell": problem.name,

@@ -370,7 +370,7 @@ class _RunPage:
 
     def _migrations(self, moves: pl.DataFrame) -> Table:
         cost = dict(self.run.windows.select("window", "cost").rows())
-        length_s = self.header.window_cycles * self.header.period_ms / 1e3
+        length_s = self.header.problem.window_ms / 1e3
         rows = []
         for move in moves.head(MOST_ROWS).iter_rows(named=True):
             window, target, reason = move["window"], move["placement"], str(move["reason"])

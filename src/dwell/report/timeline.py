@@ -162,9 +162,7 @@ def fleet_timeline(
     import polars as pl
 
     problems = run.fleet.problems
-    length_s = {
-        name: one.window_cycles * one.pipeline.period_ms / 1e3 for name, one in problems.items()
-    }
+    length_s = {name: one.window_ms / 1e3 for name, one in problems.items()}
     first, *_ = run.cells
     step_s = length_s[first]
     count = max(run.cells[name].windows.height for name in cells)
