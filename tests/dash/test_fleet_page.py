@@ -20,7 +20,7 @@ from tests.dash.test_serving import LIVE, ran
 
 MARKUP = "<img src=x onerror=window.pwned=1><script>window.pwned=1</script>"
 TAG = "<img src=x onerror=window.pwned=1>"
-READY = "document.querySelector('.small .seen')?.textContent"
+READY = "document.querySelector('.small .last')?.textContent"
 
 
 @pytest.fixture(scope="module")

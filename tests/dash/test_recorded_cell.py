@@ -66,6 +66,7 @@ def test_a_cell_that_misses_is_degraded(cell: RecordedCell) -> None:
     ends = cell.described()["end"]
     words = {cell.state(at * ends / 40)["health"] for at in range(41)}
     assert "degraded" in words
+    assert cell.state(0.0)["health"] == "unmeasured"
 
 
 def test_jobs_are_those_of_the_cycles_in_view(cell: RecordedCell, run: dwell.Run) -> None:

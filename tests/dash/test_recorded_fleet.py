@@ -68,6 +68,8 @@ def test_a_state_has_where_all_are_and_the_load_of_the_shared_node(
     assert (state["health"] == "degraded") == bool(unwell)
     before = fleet.state(0.0)
     assert before["used"] == {"E": None}
+    assert (before["health"], before["headline"]) == ("unmeasured", "no window has closed yet")
+    assert {cell["health"] for cell in before["cells"]} == {"unmeasured"}
     json.dumps([before, state], allow_nan=False)
 
 

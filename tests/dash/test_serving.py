@@ -227,7 +227,7 @@ def test_a_run_that_is_written_is_shown_as_far_as_it_has_come(
     with serving(tmp_path, tmp_path / "run") as page:
         (cell,) = page.get("/cells")["cells"]
         assert 0 < cell["cycles"] <= 400
-        assert any("Torn bytes" in note for note in cell["notes"])
+        assert any("were torn by a kill" in note for note in cell["notes"])
         seal_run(tmp_path / "run")
         with page.events() as reader:
             while b"data: " not in reader.recv(65_536):

@@ -90,4 +90,4 @@ def test_cycles_that_come_late_stand_where_they_were_released() -> None:
 
     joined = strip([1.0, 2.0, 4.0]).followed_by(strip([3.0, 5.0]), most=4)
     assert joined.at.tolist() == [2.0, 3.0, 4.0, 5.0]
-    assert len(Strip.empty().followed_by(joined, most=2).at) == 2
+    assert len(strip([]).followed_by(joined, most=2).at) == 2

@@ -12,7 +12,8 @@ import pytest
 import dwell
 from dwell.report import comparison_text
 from dwell.report.comparison_page import comparison_page
-from dwell.report.policy_blocks import RATE, PolicyBlocks, scaled
+from dwell.report.formatting import RATE
+from dwell.report.policy_blocks import PolicyBlocks, scaled
 from dwell.study import compare, over_seeds
 from tests.cells.examples import EXAMPLES
 from tests.cells.small import SEEDS, make_comparison

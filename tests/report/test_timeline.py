@@ -12,7 +12,6 @@ import pytest
 import dwell
 from dwell.model.disturbed import Disturbed
 from dwell.report.figure import Figure, printed_svg, svg
-from dwell.report.palette import Palette
 from dwell.report.timeline import (
     MOST_BINS,
     MOST_MARKS,
@@ -32,10 +31,8 @@ def timeline(run: dwell.Run, **more: object) -> Figure:
         run.windows,
         run.decisions,
         begins_by_number(run.windows, PROBLEM.pipeline.period_ms),
+        PROBLEM,
         slug="time",
-        palette=Palette.of(tuple(PROBLEM.candidates)),
-        resources=tuple(PROBLEM.fabric.resources),
-        deadline_ms=PROBLEM.pipeline.deadline_ms,
         **more,  # type: ignore[arg-type]
     )
 

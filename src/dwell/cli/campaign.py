@@ -18,6 +18,8 @@ from dwell.cli.options import (
     Seed,
     TestbedName,
     Windows,
+    flag,
+    option,
     seconds_of_runs,
 )
 from dwell.cli.output import file_name, print_json, working, write_report
@@ -36,17 +38,13 @@ def campaign(
     cell: CellArgument,
     scenarios: Annotated[
         str | None,
-        typer.Option(
-            metavar="NAME,NAME",
-            help="The paper's four if not given.",
-            autocompletion=several_scenarios,
-        ),
+        option("NAME,NAME", "The paper's four if not given.", autocompletion=several_scenarios),
     ] = None,
     policies: Annotated[
         str | None,
-        typer.Option(
-            metavar="NAME,NAME",
-            help="Policies, candidates, or policies with an estimator, as cusum+corrected; all "
+        option(
+            "NAME,NAME",
+            "Policies, candidates, or policies with an estimator, as cusum+corrected; all "
             "candidates, atp, dtp and cusum+corrected if not given.",
             autocompletion=several_policies,
         ),
@@ -56,20 +54,16 @@ def campaign(
     seconds: Seconds = None,
     seed: Seed = 1,
     out: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="Of the campaign; campaigns/CELL if not given."),
+        Path | None, option("FOLDER", "Of the campaign; campaigns/CELL if not given.")
     ] = None,
     name: TestbedName = "campaign",
     minutes: Annotated[
         float | None, typer.Option(min=0, help="Begin no run that would end after these.")
     ] = None,
     inventory: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Real hosts (YAML), instead of this machine's testbed."),
+        Path | None, option("FILE", "Real hosts (YAML), instead of this machine's testbed.")
     ] = None,
-    report: Annotated[
-        bool, typer.Option("--report", help="Measure nothing: report on what is there.")
-    ] = False,
+    report: Annotated[bool, flag("--report", "Measure nothing: report on what is there.")] = False,
     as_json: Json = False,
 ) -> None:
     """Measure every policy in every scenario again and again, in random order, and report.

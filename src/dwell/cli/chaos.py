@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from dwell.cli.options import Json, Seed
+from dwell.cli.options import Json, Seed, argument, flag, option
 from dwell.cli.output import json_text, print_json, write_file
 from dwell.errors import ExitCode
 from dwell.live.log import say
@@ -20,8 +20,7 @@ MARK = ".dwell-chaos"
 
 def chaos(
     cell: Annotated[
-        Path | None,
-        typer.Argument(metavar="[CELL]", help="Cell file; a light cell if not given."),
+        Path | None, argument("[CELL]", "Cell file; a light cell if not given.")
     ] = None,
     minutes: Annotated[float | None, typer.Option(min=0.1, help="No fault begins later.")] = None,
     faults: Annotated[int | None, typer.Option(min=1, help="How many.")] = None,
@@ -30,12 +29,10 @@ def chaos(
         int | None, typer.Option(min=1, help="Nothing but this fault of the timeline.")
     ] = None,
     out: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="Where logs, runs and what was seen go, to be kept."),
+        Path | None, option("FOLDER", "Where logs, runs and what was seen go, to be kept.")
     ] = None,
     hosts: Annotated[
-        bool,
-        typer.Option("--hosts", help="Every node on a host of its own of a testbed; needs root."),
+        bool, flag("--hosts", "Every node on a host of its own of a testbed; needs root.")
     ] = False,
     as_json: Json = False,
 ) -> None:

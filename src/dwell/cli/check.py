@@ -16,7 +16,6 @@ from dwell.errors import ExitCode, Fault, PolicyError, ProblemError
 from dwell.model.bounds import counted
 
 if TYPE_CHECKING:
-    from dwell.estimators import Profile
     from dwell.estimators.prices import Price
     from dwell.model import Problem
 
@@ -54,11 +53,12 @@ def check(
         return
     if faults := tuple(_class_faults(problem)):
         _refuse(faults, "\n".join(f"{cell}: {fault}" for fault in faults), as_json=as_json)
-    from dwell.estimators import Profile
+    from dwell.estimators import Profile, warnings_of
     from dwell.estimators.prices import prices_of
+    from dwell.live.lint import lint
 
     prices = prices_of(problem, scenario)
-    warnings = tuple(_warnings(problem, Profile(problem)))
+    warnings = (*warnings_of(problem, Profile(problem)), *lint(problem))
     if as_json:
         rows = [_fault(warning) for warning in warnings]
         contents = {"valid": True, **_contents(problem), "priced_under": scenario}
@@ -95,15 +95,6 @@ def _class_faults(problem: Problem) -> Iterator[Fault]:
             make_estimator(settings.estimator, problem)
     except ProblemError as error:
         yield Fault("controller.estimator", str(error))
-
-
-def _warnings(problem: Problem, profile: Profile) -> Iterator[Fault]:
-    """Yield what is allowed in a cell but seldom meant."""
-    from dwell.estimators import warnings_of
-    from dwell.live.lint import lint
-
-    yield from warnings_of(problem, profile)
-    yield from lint(problem)
 
 
 def _fault(fault: Fault) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from dwell.cli.fleet import fleet
 from dwell.cli.keys import keys
 from dwell.cli.live import agent, controller, live
 from dwell.cli.new import new
-from dwell.cli.options import Json, Keys, respelt
+from dwell.cli.options import Json, Keys, argument, respelt
 from dwell.cli.profile import profile
 from dwell.cli.report import report
 from dwell.cli.run import run
@@ -85,8 +85,7 @@ def options(
 
 def doctor(
     cell: Annotated[
-        Path | None,
-        typer.Argument(metavar="CELL", help="Cell file whose ports, quotas and keys to look at."),
+        Path | None, argument("CELL", "Cell file whose ports, quotas and keys to look at.")
     ] = None,
     keys: Keys = None,
     as_json: Json = False,

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import re
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dwell.cli.options import Insecure, Keys
+from dwell.cli.options import Insecure, Keys, argument, flag, option
+
+if TYPE_CHECKING:
+    from dwell.dash.server import Dash
 
 #: Where a page is served where nobody says.
 PORT = 8780
@@ -20,51 +24,40 @@ TOKEN = re.compile(r"[A-Za-z0-9_-]{22,200}")
 def dash(
     shown: Annotated[
         Path | None,
-        typer.Argument(
-            metavar="CELL|RUN|FLEET",
-            help="Cell file of a cell that runs, or the folder of a run, or of a fleet's runs; "
+        argument(
+            "CELL|RUN|FLEET",
+            "Cell file of a cell that runs, or the folder of a run, or of a fleet's runs; "
             "./cell.yaml if not given.",
         ),
     ] = None,
     beside: Annotated[
-        Path | None,
-        typer.Option(metavar="RUN", help="Another run, to be shown on the same time line."),
+        Path | None, option("RUN", "Another run, to be shown on the same time line.")
     ] = None,
-    port: Annotated[
-        int, typer.Option(min=0, max=65_535, metavar="P", help="Of loopback; 0 takes a free one.")
-    ] = PORT,
+    port: Annotated[int, option("P", "Of loopback; 0 takes a free one.", min=0, max=65_535)] = PORT,
     no_browser: Annotated[
-        bool, typer.Option("--no-browser", help="Print the address only, and open no browser.")
+        bool, flag("--no-browser", "Print the address only, and open no browser.")
     ] = False,
     control: Annotated[
-        bool,
-        typer.Option(
-            "--control", help="Let the page pin and drain; with keys, it takes an operator's."
-        ),
+        bool, flag("--control", "Let the page pin and drain; with keys, it takes an operator's.")
     ] = False,
     mcap: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Also record the live cell to an MCAP file for Foxglove, PlotJuggler and others.",
+        option(
+            "FILE",
+            "Also record the live cell to an MCAP file for Foxglove, PlotJuggler and others.",
         ),
     ] = None,
     token: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Where the page's token is kept, for Prometheus; made where there is none.",
-        ),
+        option("FILE", "Where the page's token is kept, for Prometheus; made where there is none."),
     ] = None,
     keys: Keys = None,
     insecure: Insecure = False,
 ) -> None:
     """Show a live cell, or recorded runs, on a page in the browser of this computer."""
-    from dwell.dash.pages import show_cell, show_fleet, show_run
+    from dwell.dash.pages import live_page, recorded_page
+    from dwell.live.log import say
     from dwell.record import is_fleet
-
-    def say(line: str) -> None:
-        typer.echo(line, err=True)
 
     kept = None if token is None else _kept(token)
     where = shown or CELL
@@ -80,27 +73,19 @@ def dash(
                 f"--beside: {where} is a fleet, which is shown alone; two of its runs can stand "
                 "beside each other"
             )
-        if fleet:
-            show_fleet(where, port=port, browser=not no_browser, say=say, token=kept)
-            return
-        show_run(where, beside, port=port, browser=not no_browser, say=say, token=kept)
-        return
-    if beside is not None:
+        page: AbstractContextManager[Dash] = nullcontext(recorded_page(where, beside))
+    elif beside is not None:
         raise typer.BadParameter("--beside: a run stands beside a run, not beside a live cell")
-    if shown is None and not where.is_file():
+    elif shown is None and not where.is_file():
         raise typer.BadParameter("there is no cell.yaml here; name a cell file, or a run's folder")
-    from dwell.live.security import environment
+    else:
+        from dwell.live.security import environment
 
-    settings = environment(keys, insecure=insecure)
-    show_cell(
-        *(where, settings),
-        port=port,
-        browser=not no_browser,
-        control=control,
-        say=say,
-        mcap=mcap,
-        token=kept,
-    )
+        page = live_page(where, environment(keys, insecure=insecure), control=control, mcap=mcap)
+    from dwell.dash.serving import serve
+
+    with page as served:
+        serve(served, port, browser=not no_browser, say=say, token=kept)
 
 
 def _kept(file: Path) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,6 +14,7 @@ from dwell.cli.options import (
     Processes,
     Seconds,
     Windows,
+    option,
     require_few,
     require_one_length,
     windows_of,
@@ -30,21 +31,16 @@ if TYPE_CHECKING:
 
 def demo(
     real: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="Replay the measurements in this folder instead."),
+        Path | None, option("FOLDER", "Replay the measurements in this folder instead.")
     ] = None,
     seeds: Annotated[
-        int,
-        typer.Option(min=1, metavar="N", callback=require_few, help="Seeds 1 to N of every run."),
+        int, option("N", "Seeds 1 to N of every run.", min=1, callback=require_few)
     ] = 20,
     windows: Windows = None,
     seconds: Seconds = None,
-    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where report.html goes.")] = Path(
-        "demo-out"
-    ),
+    out: Annotated[Path, option("FOLDER", "Where report.html goes.")] = Path("demo-out"),
     examples: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="Where the example cells are, if not found."),
+        Path | None, option("FOLDER", "Where the example cells are, if not found.")
     ] = None,
     processes: Processes = None,
     as_json: Json = False,
@@ -64,23 +60,17 @@ def demo(
         windows = windows_of(seconds, *(dwell.load(folder / name, traces=real) for name in cells))
     windows = windows or WINDOWS
     with progress("simulating") as shown:
+        plan: dict[str, Any] = {"seeds": seeds, "windows": windows}
+        plan |= {"processes": processes, "progress": shown}
         comparisons: Sequence[Comparison]
         tenants: StudyResult | None = None
         deadlines: pl.DataFrame | None = None
         if real is None:
             deadlines = stored_deadlines(folder)
-            comparisons = [
-                canonical_demo(
-                    folder, seeds=seeds, windows=windows, processes=processes, progress=shown
-                )
-            ]
-            tenants = tenants_demo(
-                folder, seeds=seeds, windows=windows, processes=processes, progress=shown
-            )
+            comparisons = [canonical_demo(folder, **plan)]
+            tenants = tenants_demo(folder, **plan)
         else:
-            comparisons = real_demo(
-                folder, real, seeds=seeds, windows=windows, processes=processes, progress=shown
-            )
+            comparisons = real_demo(folder, real, **plan)
     page = out / "report.html"
     if not as_json:
         for comparison in comparisons:

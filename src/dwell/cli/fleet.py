@@ -11,7 +11,7 @@ import typer
 
 import dwell
 from dwell.cli.completion import estimators, policies
-from dwell.cli.options import Json, Processes, Seed
+from dwell.cli.options import Json, Processes, Seed, argument, flag, option
 from dwell.cli.output import (
     aligned,
     block,
@@ -42,36 +42,35 @@ fleet = typer.Typer(
     help="Play cells that share nodes, and find out how many of them there may be.",
 )
 
-FleetArgument = Annotated[Path, typer.Argument(metavar="FILE", help="Fleet file (YAML).")]
+FleetArgument = Annotated[Path, argument("FILE", "Fleet file (YAML).")]
 Policy = Annotated[
     str | None,
-    typer.Option(
-        metavar="NAME",
-        help="Policy of every cell, as dtp or cusum+corrected, or a candidate's name for the "
+    option(
+        "NAME",
+        "Policy of every cell, as dtp or cusum+corrected, or a candidate's name for the "
         "placement that never moves; what the file says if not given.",
         autocompletion=policies,
     ),
 ]
 Estimator = Annotated[
     str | None,
-    typer.Option(
-        metavar="NAME",
-        help="Estimator of every cell; what the file says if not given.",
+    option(
+        "NAME",
+        "Estimator of every cell; what the file says if not given.",
         autocompletion=estimators,
     ),
 ]
 Coordination = Annotated[
     str | None,
-    typer.Option(
-        metavar="NAME",
-        help="What a move is asked for: none, random or ledger; what the file says if not given.",
+    option(
+        "NAME", "What a move is asked for: none, random or ledger; what the file says if not given."
     ),
 ]
 Phases = Annotated[
     str | None,
-    typer.Option(
-        metavar="HOW",
-        help="When each cell begins: sync, even, random, or so many ms with commas between; what "
+    option(
+        "HOW",
+        "When each cell begins: sync, even, random, or so many ms with commas between; what "
         "the file says if not given.",
     ),
 ]
@@ -81,22 +80,18 @@ Phases = Annotated[
 def run(
     file: FleetArgument,
     seed: Seed = 1,
-    windows: Annotated[
-        int, typer.Option(min=1, metavar="N", help="Length in windows, the warm-up included.")
-    ] = 100,
+    windows: Annotated[int, option("N", "Length in windows, the warm-up included.", min=1)] = 100,
     policy: Policy = None,
     estimator: Estimator = None,
     coordination: Coordination = None,
     phases: Phases = None,
-    guard: Annotated[
-        bool, typer.Option("--guard", help="Let the robots' guards move to a fallback.")
-    ] = False,
-    jobs: Annotated[bool, typer.Option("--jobs", help="Keep every job's instants.")] = False,
+    guard: Annotated[bool, flag("--guard", "Let the robots' guards move to a fallback.")] = False,
+    jobs: Annotated[bool, flag("--jobs", "Keep every job's instants.")] = False,
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Where to save the runs; runs/FLEET-POLICY-COORDINATION-PHASES-SEED if not given.",
+        option(
+            "FOLDER",
+            "Where to save the runs; runs/FLEET-POLICY-COORDINATION-PHASES-SEED if not given.",
         ),
     ] = None,
     as_json: Json = False,
@@ -106,11 +101,8 @@ def run(
     from dwell.sim.fleet import phases_ms
     from dwell.study.fleet_summary import fleet_numbers
 
-    given = dwell.load_fleet(file)
-    warn(file, warnings_of(given))
-    played = given.changed(
-        policy=policy, estimator=estimator, coordination=coordination, phases=read_phases(phases)
-    )
+    changes = {"policy": policy, "estimator": estimator, "coordination": coordination}
+    played = _read(file, phases, **changes)
     how = played.phases if isinstance(played.phases, str) else "listed"
     named = [one for one in (policy, estimator) if one is not None]
     folder = out or default_folder(played.name, *named, played.coordination, how, str(seed))
@@ -149,9 +141,7 @@ def plan(file: FleetArgument, seed: Seed = 1, phases: Phases = None, as_json: Js
     """
     from dwell.study.fleet_plan import plan_fleet
 
-    given = dwell.load_fleet(file)
-    warn(file, warnings_of(given))
-    planned = given.changed(phases=read_phases(phases))
+    planned = _read(file, phases)
     with progress(f"playing loads of {counted(len(planned.cells), 'cell')}") as shown:
         found = plan_fleet(planned, seed=seed, progress=shown)
     if as_json:
@@ -164,40 +154,33 @@ def plan(file: FleetArgument, seed: Seed = 1, phases: Phases = None, as_json: Js
 @fleet.command()
 def capacity(
     file: FleetArgument,
-    limit: Annotated[
-        float,
-        typer.Option(metavar="SHARE", help="V_D that the worst cell may have at most."),
-    ] = 0.05,
+    limit: Annotated[float, option("SHARE", "V_D that the worst cell may have at most.")] = 0.05,
     policy: Policy = None,
     phases: Annotated[
         str | None,
-        typer.Option(
-            metavar="HOW",
-            help="When each cell begins: sync, even or random; what the file says if not given.",
+        option(
+            "HOW", "When each cell begins: sync, even or random; what the file says if not given."
         ),
     ] = None,
-    most: Annotated[
-        int, typer.Option(min=1, max=1000, metavar="N", help="Robots beyond are not asked for.")
-    ] = 128,
+    most: Annotated[int, option("N", "Robots beyond are not asked for.", min=1, max=1000)] = 128,
     what_if: Annotated[
         bool,
-        typer.Option(
+        flag(
             "--what-if",
-            help="Also with a core more on a shared node, with phases evenly spread, and on every "
+            "Also with a core more on a shared node, with phases evenly spread, and on every "
             "other placement that uses a shared node.",
         ),
     ] = False,
     processes: Processes = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Page to write; capacity/FLEET-POLICY-PHASES.html if not given, none with --json.",
+        option(
+            "FILE",
+            "Page to write; capacity/FLEET-POLICY-PHASES.html if not given, none with --json.",
         ),
     ] = None,
     figures: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="Also write the curve for a paper: PDF, SVG, CSV."),
+        Path | None, option("FOLDER", "Also write the curve for a paper: PDF, SVG, CSV.")
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -210,9 +193,7 @@ def capacity(
 
     if not 0 < limit < 1:
         raise typer.BadParameter(f"--limit: {limit:g} is not allowed; it must be between 0 and 1")
-    given = dwell.load_fleet(file)
-    warn(file, warnings_of(given))
-    asked = given.changed(policy=policy, phases=read_phases(phases))
+    asked = _read(file, phases, policy=policy)
     settings: dict[str, Any] = {"limit": limit, "most": most, "processes": processes}
     with progress(f"playing up to {most} robots") as shown:
         found = capacity_of(asked, **settings, progress=shown)
@@ -276,10 +257,12 @@ def read_phases(text: str | None) -> str | tuple[float, ...] | None:
         return text
 
 
-def warnings_of(of: Fleet) -> Iterator[Fault]:
-    """Yield what is allowed in a fleet and seldom meant."""
-    for name in of.unused():
-        yield Fault(f"shared.{name}", "no candidate of any cell uses this node")
+def _read(file: Path, phases: str | None, **changes: str | None) -> Fleet:
+    """Read a fleet, warn of what it has for nothing, and change it as the options say."""
+    fleet = dwell.load_fleet(file)
+    unused = "no candidate of any cell uses this node"
+    warn(file, (Fault(f"shared.{name}", unused) for name in fleet.unused()))
+    return fleet.changed(phases=read_phases(phases), **changes)
 
 
 def _head(result: FleetRun, windows: int) -> dict[str, Any]:

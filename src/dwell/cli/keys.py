@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dwell.cli.options import Json
+from dwell.cli.options import Json, argument, option
 from dwell.cli.output import aligned, print_json
 
 if TYPE_CHECKING:
     from dwell.live.trust.roster import Roster
     from dwell.model import Problem
 
-Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the authority.")]
-Name = Annotated[str, typer.Argument(metavar="NAME", help="Node of the cell, or another subject.")]
+Folder = Annotated[Path, argument("FOLDER", "Folder of the authority.")]
+Name = Annotated[str, argument("NAME", "Node of the cell, or another subject.")]
 Days = Annotated[int, typer.Option(help="How long certificates hold.")]
 
 keys = typer.Typer(
@@ -28,10 +28,8 @@ keys = typer.Typer(
 
 @keys.command()
 def init(
-    cell: Annotated[Path, typer.Argument(metavar="CELL", help="Cell file.")],
-    out: Annotated[
-        Path, typer.Option(metavar="FOLDER", help="Where the authority and all keyrings go.")
-    ],
+    cell: Annotated[Path, argument("CELL", "Cell file.")],
+    out: Annotated[Path, option("FOLDER", "Where the authority and all keyrings go.")],
     days: Days = 365,
     as_json: Json = False,
 ) -> None:
@@ -71,8 +69,7 @@ def issue(
         typer.Option(help="node, controller, operator or observer; the one it had if not given."),
     ] = None,
     address: Annotated[
-        list[str] | None,
-        typer.Option(metavar="HOST", help="Where it is reached; may be repeated."),
+        list[str] | None, option("HOST", "Where it is reached; may be repeated.")
     ] = None,
     days: Days = 365,
     as_json: Json = False,
@@ -97,9 +94,7 @@ def revoke(folder: Folder, name: Name, as_json: Json = False) -> None:
 
 @keys.command()
 def show(
-    folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="Folder of an authority, or a keyring.")
-    ],
+    folder: Annotated[Path, argument("FOLDER", "Folder of an authority, or a keyring.")],
     as_json: Json = False,
 ) -> None:
     """List the subjects, with what they may do and until when."""

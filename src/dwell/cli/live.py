@@ -24,6 +24,9 @@ from dwell.cli.options import (
     Node,
     Policy,
     Seed,
+    argument,
+    flag,
+    option,
     require_held,
 )
 from dwell.cli.output import json_text, print_json
@@ -38,14 +41,10 @@ if TYPE_CHECKING:
 WATCH_S = 1.0
 
 Cpus = Annotated[
-    str | None,
-    typer.Option(metavar="LIST", help="CPUs to use, as 0,2-3; those of this process if not given."),
+    str | None, option("LIST", "CPUs to use, as 0,2-3; those of this process if not given.")
 ]
 
-Owner = Annotated[
-    int | None,
-    typer.Option(metavar="PID", hidden=True, help="Process that this one ends with."),
-]
+Owner = Annotated[int | None, option("PID", "Process that this one ends with.", hidden=True)]
 
 NodeArgument = Annotated[str, typer.Argument(metavar="NODE", autocompletion=nodes)]
 
@@ -61,29 +60,24 @@ def agent(
     cell: CellOption,
     state: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FOLDER", help="Where processes keep their files; by default below ~/.local."
-        ),
+        option("FOLDER", "Where processes keep their files; by default below ~/.local."),
     ] = None,
     cpus: Cpus = None,
     cpus_of: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="PROCESS=LIST", help="CPUs of some processes, as perception@*=2-3; may repeat."
-        ),
+        option("PROCESS=LIST", "CPUs of some processes, as perception@*=2-3; may repeat."),
     ] = None,
     realtime: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="PROCESS=PRIORITY",
-            help="Real-time priority (SCHED_FIFO) of some processes, as sink.*=20; may repeat.",
+        option(
+            "PROCESS=PRIORITY",
+            "Real-time priority (SCHED_FIFO) of some processes, as sink.*=20; may repeat.",
         ),
     ] = None,
     accelerator: Annotated[
         str | None,
-        typer.Option(
-            metavar="MODULE:FUNCTION",
-            help="Returns the utilisation of the node's accelerator, from 0 to 1.",
+        option(
+            "MODULE:FUNCTION", "Returns the utilisation of the node's accelerator, from 0 to 1."
         ),
     ] = None,
     keys: Keys = None,
@@ -109,12 +103,8 @@ def agent(
 
 
 def controller(
-    cell: Annotated[
-        list[Path], typer.Option("--cell", metavar="FILE", help="Cell file; may be repeated.")
-    ],
-    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where the runs' folders go.")] = Path(
-        "runs"
-    ),
+    cell: Annotated[list[Path], option("FILE", "Cell file; may be repeated.", "--cell")],
+    out: Annotated[Path, option("FOLDER", "Where the runs' folders go.")] = Path("runs"),
     policy: Policy = None,
     name: Annotated[
         str | None, typer.Option(help="Of this controller; its process id if not given.")
@@ -162,12 +152,9 @@ def _bad_parameters() -> Iterator[None]:
 @live.command()
 def status(
     cell: CellOption,
-    check: Annotated[
-        bool, typer.Option("--check", help="Exit with 1 unless the cell's health is ok.")
-    ] = False,
+    check: Annotated[bool, flag("--check", "Exit with 1 unless the cell's health is ok.")] = False,
     watch: Annotated[
-        bool,
-        typer.Option("--watch", help="Look again every second; with --json, a line each time."),
+        bool, flag("--watch", "Look again every second; with --json, a line each time.")
     ] = False,
     keys: Keys = None,
     insecure: Insecure = False,
@@ -269,19 +256,19 @@ def run(
     cell: CellArgument,
     scenario: Annotated[
         str | None,
-        typer.Option(
-            metavar="NAME",
-            help="One of the cell's scenarios; its first that disturbs something if not given.",
+        option(
+            "NAME",
+            "One of the cell's scenarios; its first that disturbs something if not given.",
             autocompletion=scenarios,
         ),
     ] = None,
     seconds: Annotated[
         float | None,
-        typer.Option(
+        option(
+            "S",
+            "Length, the warm-up included; as the scenario asks for.",
             min=5,
-            metavar="S",
             callback=require_held,
-            help="Length, the warm-up included; as the scenario asks for.",
         ),
     ] = None,
     policy: Policy = None,
@@ -289,10 +276,7 @@ def run(
     seed: Seed = 1,
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Where logs, the run and its report go; live-out/CELL if not given.",
-        ),
+        option("FOLDER", "Where logs, the run and its report go; live-out/CELL if not given."),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -313,11 +297,7 @@ def run(
 
 Root = Annotated[
     Path | None,
-    typer.Option(
-        "--state",
-        metavar="FOLDER",
-        help="Has a folder for each cell; by default below ~/.local.",
-    ),
+    option("FOLDER", "Has a folder for each cell; by default below ~/.local.", "--state"),
 ]
 
 
@@ -333,9 +313,7 @@ def up(
         ),
     ] = None,
     policy: Policy = None,
-    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where the runs' folders go.")] = Path(
-        "runs"
-    ),
+    out: Annotated[Path, option("FOLDER", "Where the runs' folders go.")] = Path("runs"),
     state: Root = None,
     keys: Keys = None,
     insecure: Insecure = False,
@@ -378,18 +356,13 @@ def down(cell: CellArgument, state: Root = None) -> None:
 def log(
     process: Annotated[
         str,
-        typer.Argument(
-            metavar="PROCESS",
-            help="As agent@R1, controller@E, perception@E.",
-            autocompletion=processes,
-        ),
+        argument("PROCESS", "As agent@R1, controller@E, perception@E.", autocompletion=processes),
     ],
     follow: Annotated[
         bool, typer.Option("--follow", "-f", help="Go on with what is added, until interrupted.")
     ] = False,
     cell: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Its cell's file, where there are several cells."),
+        Path | None, option("FILE", "Its cell's file, where there are several cells.")
     ] = None,
     state: Root = None,
 ) -> None:
@@ -405,9 +378,9 @@ def log(
 def units(
     cell: CellArgument,
     node: Node,
-    out: Annotated[
-        Path, typer.Option(metavar="FOLDER", help="Where the units go; made where it is missing.")
-    ] = Path("units"),
+    out: Annotated[Path, option("FOLDER", "Where the units go; made where it is missing.")] = Path(
+        "units"
+    ),
     user: Annotated[
         str | None, typer.Option(help="User of the services; this one if not given.")
     ] = None,

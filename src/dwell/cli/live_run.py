@@ -14,7 +14,7 @@ import typer
 
 import dwell
 from dwell.cli.live_view import CellState, View, live_view
-from dwell.cli.output import aligned, print_json, working, write_file
+from dwell.cli.output import print_json, working, write_file
 from dwell.errors import ExitCode, LiveError, installing, not_installed
 from dwell.live.stage_modules import require_stages
 from dwell.model import Problem, Scenario
@@ -23,9 +23,11 @@ from dwell.model.disturbed import Disturbed, disturbed
 from dwell.record import Run, open_run, seal_run
 from dwell.record.journal import note_in_journal, read_plain_journal
 from dwell.report import run_html
-from dwell.report.formatting import listed, percent, write_ms
-from dwell.report.phases import PhaseRow, phase_rows
+from dwell.report.formatting import listed
+from dwell.report.palette import Palette
+from dwell.report.phases import PhaseRow, phase_rows, phase_table
 from dwell.report.run_header import RunHeader
+from dwell.report.table import table_text
 from dwell.testbed.cell_observer import CellObserver, load_observer
 from dwell.testbed.loopback import Loopback, on_this_machine
 from dwell.testbed.playing import (
@@ -103,7 +105,7 @@ def run_live(
         outcome = _told(seal_run(folder, warnings=crowded(run, problem)), out, reported=reported)
     else:
         outcome = _counted(played, folder)
-    _print(outcome, folder, interrupted=interrupted, as_json=as_json)
+    _print(outcome, folder, problem.candidates, interrupted=interrupted, as_json=as_json)
     if interrupted:
         raise typer.Exit(ExitCode.INTERRUPTED)
 
@@ -275,7 +277,14 @@ def _counted(played: _ObservedRun, folder: Path) -> _Outcome:
     return replace(outcome, instead=instead)
 
 
-def _print(outcome: _Outcome, folder: Path, *, interrupted: bool, as_json: bool) -> None:
+def _print(
+    outcome: _Outcome,
+    folder: Path,
+    candidates: Iterable[str],
+    *,
+    interrupted: bool,
+    as_json: bool,
+) -> None:
     warnings = outcome.meta.get("warnings", [])
     if as_json:
         print_json(
@@ -303,33 +312,8 @@ def _print(outcome: _Outcome, folder: Path, *, interrupted: bool, as_json: bool)
         f"{outcome.guard_moves} by the guard\n"
     )
     if outcome.phases:
-        typer.echo(f"{_phase_table(outcome.phases)}\n")
+        typer.echo(table_text(phase_table(outcome.phases, Palette.of(candidates))))
     for warning in warnings:
         typer.echo(f"warning: {warning}", err=True)
     typer.echo(f"run: {folder}")
     typer.echo(f"report: {outcome.report}" if outcome.report else outcome.instead)
-
-
-def _phase_table(phases: Sequence[PhaseRow]) -> str:
-    head = ("phase", "from", "to", "V_D", "L95", "lost", "moves", "guard", "error", "", "placed")
-    rows = [
-        (
-            row.name,
-            f"{row.begin_s:.0f} s",
-            f"{row.end_s:.0f} s",
-            f"{100 * row.violation_rate:.1f} %",
-            write_ms(row.l95_ms),
-            str(row.lost),
-            str(row.migrations),
-            str(row.guard_moves),
-            _known(row.rms_mm, "mm", 2),
-            _known(row.rms_px, "px", 1),
-            listed(f"{name} {percent(share)}" for name, share in row.shares.items()),
-        )
-        for row in phases
-    ]
-    return aligned(head, rows)
-
-
-def _known(value: float, unit: str, digits: int) -> str:
-    return f"{value:.{digits}f} {unit}" if math.isfinite(value) else "-"

@@ -83,7 +83,6 @@ class View(Protocol):
 
     def show(self, state: CellState) -> None:
         """Show how it is now."""
-        ...
 
 
 @contextmanager

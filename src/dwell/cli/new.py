@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from dwell.cli.examples import find_examples
+from dwell.cli.options import argument
 from dwell.cli.schema import SCHEMA_FILE, schema_text
 from dwell.errors import ProblemError
 
@@ -58,7 +59,7 @@ STAGES_HEAD = {
 
 
 def new(
-    folder: Annotated[Path, typer.Argument(metavar="NAME", help="Folder to make.")],
+    folder: Annotated[Path, argument("NAME", "Folder to make.")],
     origin: Annotated[
         Origin, typer.Option("--from", help="Example to begin as: simulated, or live.")
     ] = Origin.CANONICAL,

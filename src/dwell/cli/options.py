@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -51,25 +51,36 @@ def _require(bound: Bound, value: float | None) -> None:
         raise typer.BadParameter(f"{shown} is not allowed; it must be {bound}")
 
 
-CellArgument = Annotated[Path, typer.Argument(metavar="CELL", help="Cell file (YAML).")]
-CellOption = Annotated[Path, typer.Option("--cell", metavar="FILE", help="Cell file (YAML).")]
+def option(metavar: str, sentence: str, *names: str, **more: Any) -> Any:
+    """Return an option that takes a value, under the parameter's name or others."""
+    return typer.Option(*names, metavar=metavar, help=sentence, **more)
+
+
+def argument(metavar: str, sentence: str, **more: Any) -> Any:
+    """Return an argument."""
+    return typer.Argument(metavar=metavar, help=sentence, **more)
+
+
+def flag(name: str, sentence: str, **more: Any) -> Any:
+    """Return an option that is there or not."""
+    return typer.Option(name, help=sentence, **more)
+
+
+CellArgument = Annotated[Path, argument("CELL", "Cell file (YAML).")]
+CellOption = Annotated[Path, option("FILE", "Cell file (YAML).", "--cell")]
 Node = Annotated[
     str,
     typer.Option(help="Node of the cell that this computer is.", autocompletion=nodes),
 ]
 Traces = Annotated[
-    Path | None,
-    typer.Option(metavar="FOLDER", help="Where its trace files are; beside it if not given."),
+    Path | None, option("FOLDER", "Where its trace files are; beside it if not given.")
 ]
-Scenario = Annotated[
-    str,
-    typer.Option(metavar="NAME", help="One of the cell's scenarios.", autocompletion=scenarios),
-]
+Scenario = Annotated[str, option("NAME", "One of the cell's scenarios.", autocompletion=scenarios)]
 Policy = Annotated[
     str | None,
-    typer.Option(
-        metavar="NAME",
-        help="A policy, as dtp, or with its estimator, as cusum+corrected; a class of your own, as "
+    option(
+        "NAME",
+        "A policy, as dtp, or with its estimator, as cusum+corrected; a class of your own, as "
         "package.module:Class, beside the cell file or installed; or a candidate's name for the "
         "placement that never moves; what the cell says if not given.",
         autocompletion=policies,
@@ -77,63 +88,46 @@ Policy = Annotated[
 ]
 Estimator = Annotated[
     str | None,
-    typer.Option(
-        metavar="NAME",
-        help="An estimator, or a class of your own, as package.module:Class; what the cell says if "
+    option(
+        "NAME",
+        "An estimator, or a class of your own, as package.module:Class; what the cell says if "
         "not given.",
         autocompletion=estimators,
     ),
 ]
 Seed = Annotated[
-    int,
-    typer.Option(
-        min=0, metavar="S", help="Seed of all that is drawn; one seed, one course of events."
-    ),
+    int, option("S", "Seed of all that is drawn; one seed, one course of events.", min=0)
 ]
-Windows = Annotated[
-    int | None, typer.Option(min=1, metavar="N", help="Length in windows, the warm-up included.")
-]
+Windows = Annotated[int | None, option("N", "Length in windows, the warm-up included.", min=1)]
 Seconds = Annotated[
     float | None,
-    typer.Option(
-        min=1,
-        metavar="S",
-        callback=require_held,
-        help="Length in seconds instead, the warm-up included.",
-    ),
+    option("S", "Length in seconds instead, the warm-up included.", min=1, callback=require_held),
 ]
-Processes = Annotated[
-    int | None, typer.Option(min=1, metavar="N", help="How many to use; one a CPU if not given.")
-]
-Samples = Annotated[
-    int, typer.Option(min=1, max=1_000_000, metavar="N", help="Samples of each measurement.")
-]
+Processes = Annotated[int | None, option("N", "How many to use; one a CPU if not given.", min=1)]
+Samples = Annotated[int, option("N", "Samples of each measurement.", min=1, max=1_000_000)]
 Warmup = Annotated[
-    int,
-    typer.Option(
-        min=0, max=1_000_000, metavar="N", help="Rounds before the samples that are left out."
-    ),
+    int, option("N", "Rounds before the samples that are left out.", min=0, max=1_000_000)
 ]
 Keys = Annotated[
     Path | None,
-    typer.Option(
-        metavar="FOLDER",
+    option(
+        "FOLDER",
+        "Keyring: all connections are encrypted and authenticated with it.",
         envvar="DWELL_KEYS",
-        help="Keyring: all connections are encrypted and authenticated with it.",
     ),
 ]
 Insecure = Annotated[
     bool,
-    typer.Option(
+    flag(
         "--insecure",
+        "Without keys: leave this computer all the same, in a network that you trust.",
         envvar="DWELL_INSECURE",
-        help="Without keys: leave this computer all the same, in a network that you trust.",
     ),
 ]
 TestbedName = Annotated[
     str, typer.Option("--name", help="Of the testbed, among others on this machine.")
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
+Json = Annotated[bool, flag("--json", "Print JSON on stdout.")]
 
 #: Old spellings, which work until the next minor version, by the command that has them.
 OLD_SPELLINGS = {
@@ -179,7 +173,7 @@ def windows_of(seconds: float, *problems: Problem) -> int:
     """
     from dwell.model.instants import require_length
 
-    each_s = sorted({one.window_cycles * one.pipeline.period_ms / 1e3 for one in problems})
+    each_s = sorted({one.window_ms / 1e3 for one in problems})
     if len(each_s) > 1:
         lengths = ", ".join(f"{window_s:g}" for window_s in each_s)
         raise typer.BadParameter(

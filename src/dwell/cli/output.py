@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from dwell.files import Content, write_whole
+from dwell.record.json_documents import json_ready
 
 if TYPE_CHECKING:
     from dwell.errors import Fault
@@ -52,17 +52,7 @@ def print_json(value: Mapping[str, Any]) -> None:
 
 def json_text(value: Mapping[str, Any], indent: int | None = 2) -> str:
     """Return JSON, on one line where `indent` is None; NaN and infinities become null."""
-    return json.dumps(_plain(value), indent=indent, allow_nan=False)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return str(value) if isinstance(value, Path) else value
+    return json.dumps(json_ready(value), indent=indent, allow_nan=False)
 
 
 def file_name(name: str, *, more: str = "") -> str:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dwell.cli.options import Json, Samples, Warmup
+from dwell.cli.options import Json, Samples, Warmup, argument, flag, option
 from dwell.cli.output import aligned, file_name, print_json
 from dwell.errors import ProfileError
 from dwell.live.log import say
@@ -25,10 +25,9 @@ PORT = 7411
 
 profile = typer.Typer(no_args_is_help=True)
 
-Out = Annotated[Path | None, typer.Option(metavar="FILE", help="Parquet file to write.")]
+Out = Annotated[Path | None, option("FILE", "Parquet file to write.")]
 Period = Annotated[
-    float | None,
-    typer.Option(metavar="MS", help="Begin one every so often; one after another if not given."),
+    float | None, option("MS", "Begin one every so often; one after another if not given.")
 ]
 
 
@@ -40,23 +39,20 @@ def measure(
     ] = None,
     task: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="TASK=MODULE:FUNCTION", help="What to measure; may be given several times."
-        ),
+        option("TASK=MODULE:FUNCTION", "What to measure; may be given several times."),
     ] = None,
     inputs: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="[TASK=]MODULE:FUNCTION",
-            help="Called with the number of each run; what it returns is what the task is given "
+        option(
+            "[TASK=]MODULE:FUNCTION",
+            "Called with the number of each run; what it returns is what the task is given "
             "(all tasks, or the one named).",
         ),
     ] = None,
     samples: Samples = 500,
     warmup: Warmup = 50,
     core: Annotated[
-        str | None,
-        typer.Option(metavar="CORES", help="Core to run on, or several: 2, 0,2 or 0-3."),
+        str | None, option("CORES", "Core to run on, or several: 2, 0,2 or 0-3.")
     ] = None,
     period_ms: Period = None,
     out: Out = None,
@@ -95,8 +91,8 @@ def measure(
 
 @profile.command()
 def merge(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Profiles.")],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="Parquet file to write.")],
+    files: Annotated[list[Path], argument("FILE...", "Profiles.")],
+    out: Annotated[Path, option("FILE", "Parquet file to write.")],
     as_json: Json = False,
 ) -> None:
     """Put the profiles of several nodes and links into one file."""
@@ -113,7 +109,7 @@ def listen(
     host: Annotated[
         str, typer.Option(help="Address to listen on; this one is reached from this machine only.")
     ] = "127.0.0.1",
-    once: Annotated[bool, typer.Option("--once", help="End after the first connection.")] = False,
+    once: Annotated[bool, flag("--once", "End after the first connection.")] = False,
 ) -> None:
     """Answer the messages of `dwell profile link`, until Ctrl-C."""
     from dwell.calibration.round_trips import listen as answer
@@ -127,9 +123,7 @@ def listen(
 
 @profile.command()
 def link(
-    peer: Annotated[
-        str, typer.Argument(metavar="HOST:PORT", help="Where `dwell profile listen` runs.")
-    ],
+    peer: Annotated[str, argument("HOST:PORT", "Where `dwell profile listen` runs.")],
     source: Annotated[str, typer.Option("--from", help="Name that this computer has in the cell.")],
     target: Annotated[str, typer.Option("--to", help="Name that the peer has in the cell.")],
     payload_bytes: Annotated[
@@ -171,8 +165,8 @@ def _refuse_options(context: typer.Context, command: str) -> None:
     for parameter in context.command.params:
         source = context.get_parameter_source(parameter.name or "")
         if source is not None and source.name == "COMMANDLINE":
-            option = parameter.opts[0]
-            raise ProfileError(f"{option} stands before {command!r}; give it after that, if at all")
+            name = parameter.opts[0]
+            raise ProfileError(f"{name} stands before {command!r}; give it after that, if at all")
 
 
 def _measured(

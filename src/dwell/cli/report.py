@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,7 +13,7 @@ from urllib.parse import quote
 import typer
 
 import dwell
-from dwell.cli.options import Json
+from dwell.cli.options import Json, argument, flag, option
 from dwell.cli.output import print_json, progress, working, write_file, write_report
 from dwell.errors import RunError
 
@@ -27,41 +27,32 @@ PAGE = "report.html"
 
 def report(
     folder: Annotated[
-        Path,
-        typer.Argument(
-            metavar="FOLDER", help="Of a saved run, of a fleet, of a study, or of a campaign."
-        ),
+        Path, argument("FOLDER", "Of a saved run, of a fleet, of a study, or of a campaign.")
     ],
     out: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Page to write [default: FOLDER/report.html]."),
+        Path | None, option("FILE", "Page to write [default: FOLDER/report.html].")
     ] = None,
     trace: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Also write every job as a trace for Perfetto; the run must have kept its jobs.",
+        option(
+            "FILE", "Also write every job as a trace for Perfetto; the run must have kept its jobs."
         ),
     ] = None,
     mcap: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Also write its tables as an MCAP file for Foxglove, PlotJuggler and others.",
+        option(
+            "FILE", "Also write its tables as an MCAP file for Foxglove, PlotJuggler and others."
         ),
     ] = None,
     figures: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Also write figures and tables for a paper: PDF, SVG, LaTeX, CSV.",
-        ),
+        option("FOLDER", "Also write figures and tables for a paper: PDF, SVG, LaTeX, CSV."),
     ] = None,
     static: Annotated[
-        bool, typer.Option("--static", help="A page without scripts: nothing to hover or choose.")
+        bool, flag("--static", "A page without scripts: nothing to hover or choose.")
     ] = False,
     cells: Annotated[
-        bool, typer.Option("--cells", help="Of a fleet: also write the page of every cell.")
+        bool, flag("--cells", "Of a fleet: also write the page of every cell.")
     ] = False,
     as_json: Json = False,
 ) -> None:
@@ -104,7 +95,9 @@ def report(
             from dwell.report.run_page import run_page
 
             run = dwell.open_run(folder)
-            extras = {"trace": trace, **_recovered(run)}
+            extras["trace"] = trace
+            if lost := run.losses:
+                extras |= {"recovered": run.meta["recovered"], "lost": lost}
             if trace is not None:
                 from dwell.report import trace_events
 
@@ -154,37 +147,3 @@ def _links(folder: Path, page: Path) -> dict[str, str]:
     """Return where a page finds those of a fleet's cells that are there."""
     known = folder.glob(f"*/{PAGE}")
     return {one.parent.name: quote(os.path.relpath(one, page.parent)) for one in known}
-
-
-def _recovered(run: Run) -> dict[str, Any]:
-    """Return what a run that was killed or damaged has lost; nothing of others."""
-    recovered = run.meta.get("recovered", {})
-    lost = list(_losses(recovered))
-    return {"recovered": recovered, "lost": lost} if lost else {}
-
-
-def _losses(recovered: Mapping[str, Any]) -> Iterator[str]:
-    """Yield sentences on what is not in a run because something was killed or damaged."""
-    from dwell.report.formatting import listed
-
-    opened = int(recovered.get("opened", 1))
-    if opened > 1:
-        yield f"The controller was started {opened} times while the run went on."
-    lost = [
-        text
-        for name, text in (
-            ("torn_bytes", "{} bytes at the journal's end were torn by a kill"),
-            ("damaged_bytes", "{} bytes within the journal were damaged"),
-        )
-        if recovered.get(name)
-        for text in [text.format(recovered[name])]
-    ]
-    if lost:
-        yield f"{listed(lost)}; what they said is not here."
-    if recovered.get("missing_windows"):
-        yield f"Windows missing from the run: {recovered['missing_windows']}."
-    if recovered and not recovered.get("sealed", True):
-        yield (
-            "The run was not closed: it goes on, or its controller was killed. This is what its "
-            "journal holds; what came after its last window is not here."
-        )

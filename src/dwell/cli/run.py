@@ -22,6 +22,8 @@ from dwell.cli.options import (
     Seed,
     Traces,
     Windows,
+    flag,
+    option,
     require_one_length,
     windows_of,
 )
@@ -48,29 +50,27 @@ def run(
     seconds: Seconds = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Where to save the run; runs/CELL-SCENARIO-POLICY-SEED, and what --set says, if "
+        option(
+            "FOLDER",
+            "Where to save the run; runs/CELL-SCENARIO-POLICY-SEED, and what --set says, if "
             "not given.",
         ),
     ] = None,
     traces: Traces = None,
     settings: Annotated[
         list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="PATH=VALUE",
-            help="Another value of the cell, as period_ms=40 or links[0].delay_ms=5; YAML. May be "
+        option(
+            "PATH=VALUE",
+            "Another value of the cell, as period_ms=40 or links[0].delay_ms=5; YAML. May be "
             "repeated.",
+            "--set",
         ),
     ] = None,
-    jobs: Annotated[bool, typer.Option("--jobs", help="Keep every job's instants.")] = False,
+    jobs: Annotated[bool, flag("--jobs", "Keep every job's instants.")] = False,
     guard: Annotated[
-        bool, typer.Option("--guard", help="Let the robots' guard move to a fallback by itself.")
+        bool, flag("--guard", "Let the robots' guard move to a fallback by itself.")
     ] = False,
-    force: Annotated[
-        bool, typer.Option("--force", help="Replace another run in the folder.")
-    ] = False,
+    force: Annotated[bool, flag("--force", "Replace another run in the folder.")] = False,
     as_json: Json = False,
 ) -> None:
     """Simulate a policy on a scenario, save the run, sum it up.

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from dwell.cli.options import argument, flag
 from dwell.cli.output import write_file
 from dwell.errors import ProblemError
 
@@ -17,11 +18,10 @@ SCHEMA_FILE = "cell.schema.json"
 
 def schema(
     file: Annotated[
-        Path | None,
-        typer.Argument(metavar="FILE", help="What to write; cell.schema.json if not given."),
+        Path | None, argument("FILE", "What to write; cell.schema.json if not given.")
     ] = None,
     write: Annotated[
-        bool, typer.Option("--write", help="Write it, for an editor, instead of printing it.")
+        bool, flag("--write", "Write it, for an editor, instead of printing it.")
     ] = False,
 ) -> None:
     """Print the JSON Schema of the cell file, or write it."""

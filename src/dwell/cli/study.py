@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import chain, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,17 +16,17 @@ from dwell.cli.options import (
     Processes,
     Seconds,
     Windows,
+    argument,
+    option,
     require_few,
     require_one_length,
     windows_of,
 )
-from dwell.cli.output import aligned, file_name, print_json, progress, warn, working
+from dwell.cli.output import file_name, print_json, progress, warn, working
 from dwell.errors import ExitCode
 from dwell.model.bounds import counted
 
 if TYPE_CHECKING:
-    from dwell.errors import Fault
-    from dwell.model import Problem
     from dwell.model.progress import Progress
     from dwell.report.formatting import Measure
     from dwell.study import Study, StudyResult
@@ -35,28 +36,18 @@ SHOWN = 40
 
 
 def study(
-    file: Annotated[
-        Path,
-        typer.Argument(metavar="FILE", help="Study file (YAML)."),
-    ],
+    file: Annotated[Path, argument("FILE", "Study file (YAML).")],
     out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER", help="Where parts and tables go; studies/NAME if not given."
-        ),
+        Path | None, option("FOLDER", "Where parts and tables go; studies/NAME if not given.")
     ] = None,
     processes: Processes = None,
     dask: Annotated[
-        str | None,
-        typer.Option(metavar="ADDRESS", help="Scheduler of a Dask cluster that does the work."),
+        str | None, option("ADDRESS", "Scheduler of a Dask cluster that does the work.")
     ] = None,
     seeds: Annotated[
         int | None,
-        typer.Option(
-            min=1,
-            metavar="N",
-            callback=require_few,
-            help="Seeds 1 to N of every run; the file's if not given.",
+        option(
+            "N", "Seeds 1 to N of every run; the file's if not given.", min=1, callback=require_few
         ),
     ] = None,
     windows: Windows = None,
@@ -78,6 +69,7 @@ def study(
             "`dwell study paper` is now `make paper`, in the folder of Dwell's sources "
             "(reproduction/README.md)"
         )
+    from dwell.estimators import unplayed
     from dwell.study import load_study, run_study
 
     require_one_length(windows, seconds)
@@ -88,16 +80,12 @@ def study(
         windows = windows_of(seconds, *(point.problem for point in plan.points))
     if windows is not None:
         plan = replace(plan, windows=windows)
-    warn(file, {one: None for each in plan.points for one in _unplayed(plan, each.problem)})
+    played = product(plan.points, plan.scenarios)
+    late = (unplayed(point.problem, one, plan.windows) for point, one in played)
+    warn(file, dict.fromkeys(chain.from_iterable(late)))
     folder = out or Path("studies", file_name(plan.name))
     with _interruptible(folder, plan) as shown:
-        result = run_study(
-            plan,
-            folder=folder,
-            processes=processes,
-            dask=dask,
-            progress=shown,
-        )
+        result = run_study(plan, folder=folder, processes=processes, dask=dask, progress=shown)
     if as_json:
         with working("intervals"):
             table = result.table([measure.column for measure in _measures(plan)]).to_dicts()
@@ -107,14 +95,6 @@ def study(
     with working("intervals"):
         text = _text(result)
     typer.echo(f"{text}\n\ntables: {folder}")
-
-
-def _unplayed(study: Study, problem: Problem) -> Iterator[Fault]:
-    """Yield the scenarios of which nothing is played at a point."""
-    from dwell.estimators import unplayed
-
-    for scenario in study.scenarios:
-        yield from unplayed(problem, scenario, study.windows)
 
 
 @contextmanager
@@ -141,53 +121,34 @@ def _interruptible(folder: Path, study: Study) -> Iterator[Progress]:
 
 
 def _measures(study: Study) -> list[Measure]:
-    from dwell.report.formatting import Measure
+    """Return what the terminal shows."""
+    from dwell.report.formatting import COST, MIGRATIONS, RATE, REGRET
 
-    measures = [
-        Measure("violation_rate", "V_D", "%", 100.0),
-        Measure("cost", "J", decimals=2),
-        Measure("migrations", "migrations"),
-    ]
-    return measures + [Measure("regret", "regret", "%", 100.0)] * bool(study.references)
+    return [RATE, COST, MIGRATIONS, *([REGRET] if study.references else [])]
 
 
 def _text(result: StudyResult) -> str:
-    """Return the tables of a study as text: one a point and scenario, as many as a screen takes."""
+    """Return a table a point and scenario."""
     from dwell.report.formatting import few_seeds, shown_policy, shown_scenario
-    from dwell.study.over_seeds import over_seeds
+    from dwell.report.table import Table, Text, table_text
+    from dwell.study import over_seeds
 
     study = result.study
     measures = _measures(study)
     groups = len(study.points) * len(study.scenarios)
-    keys = (*result.parameters, "scenario")
     # Intervals take time: only of what is shown.
     some = result.runs.head(SHOWN * len(study.policies) * len(study.seeds))
-    lines = []
-    for labels, runs in some.group_by(keys, maintain_order=True):
-        *values, scenario = labels
-        at = ", ".join(
-            f"{name} = {value}" for name, value in zip(study.parameters, values, strict=True)
-        )
-        table = over_seeds(runs, ("policy",), [measure.column for measure in measures])
-        rows = [
-            [shown_policy(row["policy"]), *(_written(row, measure) for measure in measures)]
-            for row in table.to_dicts()
-        ]
-        title = shown_scenario(str(scenario))
-        lines += [f"{title} ({at})" if at else title]
-        lines += [aligned(["", *(measure.heading for measure in measures)], rows), ""]
+    keys = (*result.parameters, "scenario", "policy")
+    rows = over_seeds(some, keys, [measure.column for measure in measures]).to_dicts()
+    for row in rows:
+        point = zip(study.parameters, result.parameters, strict=True)
+        at = ", ".join(f"{name} = {row[column]}" for name, column in point)
+        title = shown_scenario(row["scenario"])
+        row |= {"policy": shown_policy(row["policy"]), "group": f"{title} ({at})" if at else title}
+    lines = [table_text(Table("", "", [Text("policy", ""), *measures], rows, Text("group", "")))]
     seeds = len(study.seeds)
     means = f"Mean over {seeds} seeds, with its 95 % interval" if seeds > 1 else "One seed"
     lines.append(f"{means}{few_seeds(seeds) or '.'}")
     if groups > SHOWN:
         lines.append(f"{SHOWN} of {groups} tables are shown; runs.parquet has all runs.")
     return "\n".join(lines)
-
-
-def _written(row: dict[str, Any], measure: Measure) -> str:
-    from dwell.report.formatting import write_interval
-    from dwell.study import Interval
-
-    ends = (row[f"{measure.column}{end}"] for end in ("", "_low", "_high"))
-    known = Interval(*(float("nan") if end is None else end for end in ends))
-    return str(write_interval(known, measure))

@@ -19,6 +19,9 @@ from dwell.cli.options import (
     Seed,
     TestbedName,
     Windows,
+    argument,
+    flag,
+    option,
     require_one_length,
     seconds_of_runs,
 )
@@ -41,14 +44,10 @@ def run(
     seconds: Seconds = None,
     seed: Seed = 1,
     out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Where logs and the run go; below testbed-out if not given.",
-        ),
+        Path | None, option("FOLDER", "Where logs and the run go; below testbed-out if not given.")
     ] = None,
     name: TestbedName = "bed",
-    jobs: Annotated[bool, typer.Option("--jobs", help="Keep every job of the run.")] = False,
+    jobs: Annotated[bool, flag("--jobs", "Keep every job of the run.")] = False,
     as_json: Json = False,
 ) -> None:
     """Play a scenario once, and take everything down again. Needs root.
@@ -120,13 +119,10 @@ def _lines(totals: dict[str, Any]) -> str:
 @testbed.command()
 def doctor(
     cells: Annotated[
-        list[Path] | None, typer.Argument(metavar="CELL...", help="Cell files to have checked too.")
+        list[Path] | None, argument("CELL...", "Cell files to have checked too.")
     ] = None,
     watch: Annotated[
-        float,
-        typer.Option(
-            min=0, metavar="SECONDS", help="Watch for so long whether the machine stands still."
-        ),
+        float, option("SECONDS", "Watch for so long whether the machine stands still.", min=0)
     ] = 0.0,
     as_json: Json = False,
 ) -> None:
@@ -152,12 +148,12 @@ testbed.command()(campaign)
 @testbed.command()
 def calibrate(
     cell: CellArgument,
-    out: Annotated[Path, typer.Option(metavar="FILE", help="Cell file to write.")],
+    out: Annotated[Path, option("FILE", "Cell file to write.")],
     runs: Annotated[
         list[Path] | None,
-        typer.Argument(
-            metavar="RUN...",
-            help="Folders of runs with their jobs: baseline, and single-task stress. Without any, "
+        argument(
+            "RUN...",
+            "Folders of runs with their jobs: baseline, and single-task stress. Without any, "
             "the baseline is run under every candidate.",
         ),
     ] = None,
@@ -166,8 +162,7 @@ def calibrate(
     seed: Seed = 1,
     name: TestbedName = "calibrate",
     real: Annotated[
-        bool,
-        typer.Option("--real-links", help="Links are real: their delays are what was measured."),
+        bool, flag("--real-links", "Links are real: their delays are what was measured.")
     ] = False,
 ) -> None:
     """Put what runs have shown of tasks and links into a cell file.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import dwell
-from dwell.cli.options import Json, Processes, Traces, require_few
+from dwell.cli.options import Json, Processes, Traces, argument, option, require_few
 from dwell.cli.output import json_text, print_json, progress, write_file
 from dwell.errors import RunError
 
@@ -21,25 +21,19 @@ if TYPE_CHECKING:
 
 
 def validate(
-    runs: Annotated[
-        list[Path], typer.Argument(metavar="RUN...", help="Folders of runs that were measured.")
-    ],
-    cell: Annotated[Path, typer.Option(metavar="FILE", help="Calibrated cell file (YAML).")],
+    runs: Annotated[list[Path], argument("RUN...", "Folders of runs that were measured.")],
+    cell: Annotated[Path, option("FILE", "Calibrated cell file (YAML).")],
     out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER", help="Where page and table go; validations/CELL if not given."
-        ),
+        Path | None, option("FOLDER", "Where page and table go; validations/CELL if not given.")
     ] = None,
     seeds: Annotated[
-        int,
-        typer.Option(min=2, metavar="N", callback=require_few, help="Seeds 1 to N of every run."),
+        int, option("N", "Seeds 1 to N of every run.", min=2, callback=require_few)
     ] = 20,
     calibrated_from: Annotated[
         list[Path] | None,
-        typer.Option(
-            metavar="RUN",
-            help="A run that the cell was calibrated from, besides those that the file "
+        option(
+            "RUN",
+            "A run that the cell was calibrated from, besides those that the file "
             "CELL.calibration.json beside it names; may be repeated.",
         ),
     ] = None,

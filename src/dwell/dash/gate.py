@@ -10,15 +10,17 @@ header that no other site's form or image can set.
 from __future__ import annotations
 
 import hmac
-import json
 import re
 import secrets
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from http import HTTPStatus
-from http.cookies import CookieError, SimpleCookie
-from typing import TYPE_CHECKING, Any
-from urllib.parse import parse_qs
+from typing import TYPE_CHECKING
+
+from starlette.datastructures import MutableHeaders, QueryParams
+from starlette.requests import cookie_parser
+from starlette.responses import JSONResponse
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -78,34 +80,24 @@ class Gate:
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
-        headers = _single(scope["headers"])
-        brings = scope["path"] == "/" and self._is(_query_token(scope))
+        token = QueryParams(scope["query_string"]).get("token", "")
+        brings = scope["path"] == "/" and self._is(token)
 
         async def sent(message: Message) -> None:
             if message["type"] == "http.response.start":
-                more = dict(HEADERS)
+                headers = MutableHeaders(scope=message)
+                headers.update(HEADERS)
                 if brings:
-                    more["set-cookie"] = (
-                        f"{self.cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
-                    )
-                raw = [(name.encode(), value.encode()) for name, value in more.items()]
-                kept = [pair for pair in message["headers"] if pair[0].decode() not in HEADERS]
-                message = {**message, "headers": [*kept, *raw]}
+                    cookie = f"{self.cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+                    headers["set-cookie"] = cookie
             await send(message)
 
-        refusal = self._refusal(scope, headers, brings=brings)
+        refusal = self._refusal(scope, _single(scope["headers"]), brings=brings)
         if refusal is None:
             await self.app(scope, receive, sent)
         else:
             status, why = refusal
-            await sent(
-                {
-                    "type": "http.response.start",
-                    "status": status,
-                    "headers": [(b"content-type", b"application/json")],
-                }
-            )
-            await sent({"type": "http.response.body", "body": json.dumps({"error": why}).encode()})
+            await JSONResponse({"error": why}, status)(scope, receive, sent)
 
     def _refusal(
         self, scope: Scope, headers: Mapping[str, str], *, brings: bool
@@ -136,11 +128,7 @@ class Gate:
         scheme, _, bearer = headers.get("authorization", "").partition(" ")
         if scheme.lower() == "bearer" and self._is(bearer.strip()):
             return True
-        try:
-            cookies = SimpleCookie(headers.get("cookie", ""))
-        except CookieError:
-            return False
-        return self.cookie in cookies and self._is(cookies[self.cookie].value)
+        return self._is(cookie_parser(headers.get("cookie", "")).get(self.cookie, ""))
 
     def _is(self, token: str) -> bool:
         return hmac.compare_digest(token.encode(), self.token.encode())
@@ -148,16 +136,6 @@ class Gate:
 
 def _single(raw: list[tuple[bytes, bytes]]) -> dict[str, str]:
     """Return headers by name; one that comes twice is none that counts."""
-    found: dict[str, str] = {}
-    twice: set[str] = set()
-    for name, value in raw:
-        key = name.decode("latin-1").lower()
-        if key in found:
-            twice.add(key)
-        found[key] = value.decode("latin-1")
-    return {name: value for name, value in found.items() if name not in twice}
-
-
-def _query_token(scope: Mapping[str, Any]) -> str:
-    query = parse_qs(str(scope["query_string"], "latin-1"))
-    return query.get("token", [""])[0]
+    pairs = [(name.decode("latin-1").lower(), value.decode("latin-1")) for name, value in raw]
+    counts = Counter(name for name, _ in pairs)
+    return {name: value for name, value in pairs if counts[name] == 1}

@@ -22,6 +22,8 @@ from dwell.live.failures import start_thread
 from dwell.live.health import Health
 from dwell.live.wiring import roles
 
+Kind: TypeAlias = Literal["counter", "gauge", "info"]
+
 #: Upper bounds of the latencies that are counted together; the cell's deadline is one more.
 BUCKETS_S = (
     *(0.001, 0.002, 0.005, 0.01, 0.015, 0.02, 0.025, 0.03, 0.04, 0.05, 0.075, 0.1, 0.15, 0.2),
@@ -29,8 +31,42 @@ BUCKETS_S = (
 )
 #: Time between two looks at the cycles: the observer does not keep them for long.
 EVERY_S = 2.0
+#: What each metric but the histogram of latencies says, by its kind.
+SENTENCES: Mapping[Kind, Mapping[str, str]] = {
+    "gauge": {
+        "dwell_health": "1 of the health that the cell has, 0 of every other.",
+        "dwell_deadline_seconds": "Deadline of a cycle.",
+        "dwell_guard_fallback": "Whether the cell is where its guard has put it.",
+        "dwell_violation_ratio": "Share of the cycles of the last window that missed.",
+        "dwell_estimated_cost": "Cost J of a candidate as estimated at the close of the last "
+        "window.",
+        "dwell_utilisation_ratio": "Utilisation of a resource in the last window, foreign work "
+        "included.",
+        "dwell_clock_bound_seconds": "Largest error of the latencies of the last window, by the "
+        "clocks.",
+        "dwell_window_unproven": "Whether clocks or losses of messages leave the last window "
+        "unproven.",
+        "dwell_process_heard": "Whether the controller hears a process of the cell.",
+        "dwell_process_ready": "Whether a process that is heard can do its work.",
+        "dwell_certificate_expiry_timestamp_seconds": "Beginning of the day on which a certificate "
+        "ends.",
+    },
+    "info": {
+        "dwell_placement": "Placement of the newest cycle.",
+        "dwell_task_placement": "Where a task runs under the placement of the newest cycle.",
+    },
+    "counter": {
+        "dwell_cycles": "Cycles since the observer began, by what became of them.",
+        "dwell_missed_cycles": "Cycles since the observer began that missed.",
+        "dwell_unread_cycles": "Cycles that dwell_cycle_latency_seconds lacks, since this process "
+        "was too slow.",
+        "dwell_migrations": "Moves of the cell since the controller began, by reason; those of the "
+        "guard among them.",
+        "dwell_windows": "Closed windows of the run.",
+    },
+}
 #: What follows the name of a metric in its samples.
-SUFFIXES = {"counter": "_total", "gauge": "", "info": "_info"}
+SUFFIXES: Mapping[Kind, str] = {"counter": "_total", "gauge": "", "info": "_info"}
 
 #: Labels beside the cell's, and the value; None where nobody knows it.
 Samples: TypeAlias = Iterable[tuple[Mapping[str, str], float | None]]
@@ -86,46 +122,69 @@ class CellMetrics(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """Yield all metrics as they are now."""
-        now = self._observer.now()
-        health, problem = now.status["health"], self._problem
-        yield self._metric(
-            "gauge",
-            "dwell_health",
-            "1 of the health that the cell has, 0 of every other.",
-            (({"health": one}, health == one) for one in get_args(Health) if health),
-        )
-        yield self._metric(
-            "gauge", "dwell_deadline_seconds", "Deadline of a cycle.", [({}, self._deadline_s)]
-        )
-        placed: Mapping[str, str] = problem.candidates.get(now.placement, {})
-        yield self._metric(
-            "info",
-            "dwell_placement",
-            "Placement of the newest cycle.",
-            [({"placement": now.placement}, 1)] if placed else [],
-        )
-        yield self._metric(
-            "info",
-            "dwell_task_placement",
-            "Where a task runs under the placement of the newest cycle.",
-            (({"task": task, "node": node}, 1) for task, node in placed.items()),
-        )
-        yield self._metric(
-            "counter",
-            "dwell_cycles",
-            "Cycles since the observer began, by what became of them.",
-            (({"outcome": one}, now.cycles.get(one, 0)) for one in OUTCOMES if now.cycles),
-        )
-        yield self._metric(
-            "counter",
-            "dwell_missed_cycles",
-            "Cycles since the observer began that missed.",
-            [({}, now.missed)] if now.cycles else [],
-        )
-        yield from self._latencies()
+        self._count()
+        yield from self._latency.collect()
+        samples = self._samples()
+        for kind, sentences in SENTENCES.items():
+            for name, sentence in sentences.items():
+                metric = Metric(name, sentence, kind)
+                for labels, value in samples[name]:
+                    if isinstance(value, int | float):
+                        told = {"cell": self._problem.name, **labels}
+                        metric.add_sample(f"{name}{SUFFIXES[kind]}", told, float(value))
+                yield metric
+
+    def _samples(self) -> dict[str, Samples]:
+        now, problem = self._observer.now(), self._problem
+        health, placement = now.status["health"], now.placement
+        placed: Mapping[str, str] = problem.candidates.get(placement, {})
         # Of a controller that does not answer, nothing is known.
-        yield from self._told({} if health == "absent" else now.status)
-        yield from self._certificates()
+        status: Mapping[str, Any] = {} if health == "absent" else now.status
+        window, moves, processes = (
+            status.get(name) or {} for name in ("window", "moves", "processes")
+        )
+        estimates, used = window.get("estimates") or {}, window.get("utilisation") or {}
+        bound_ms, resources = status.get("bound_ms"), problem.fabric.resources
+        heard = {who: who in processes and processes[who]["heard"] for who in self._members}
+        return {
+            "dwell_health": [
+                ({"health": one}, health == one) for one in get_args(Health) if health
+            ],
+            "dwell_deadline_seconds": [({}, self._deadline_s)],
+            "dwell_guard_fallback": [({}, status.get("fallback"))],
+            "dwell_violation_ratio": [({}, window.get("violation_rate"))],
+            "dwell_estimated_cost": [
+                ({"placement": name}, estimates.get(name)) for name in problem.candidates
+            ],
+            "dwell_utilisation_ratio": [
+                ({"node": one.node, "kind": one.kind or "cpu"}, used.get(name))
+                for name, one in resources.items()
+            ],
+            "dwell_clock_bound_seconds": [({}, None if bound_ms is None else bound_ms / 1e3)],
+            "dwell_window_unproven": [({}, status.get("unproven"))],
+            "dwell_process_heard": [({"process": who}, heard[who]) for who in heard if status],
+            "dwell_process_ready": [
+                ({"process": who}, processes[who]["ready"]) for who in heard if heard[who]
+            ],
+            "dwell_certificate_expiry_timestamp_seconds": self._certificates(),
+            "dwell_placement": [({"placement": placement}, 1)] if placed else [],
+            "dwell_task_placement": [
+                ({"task": task, "node": node}, 1) for task, node in placed.items()
+            ],
+            "dwell_cycles": [
+                ({"outcome": one}, now.cycles.get(one, 0)) for one in OUTCOMES if now.cycles
+            ],
+            "dwell_missed_cycles": [({}, now.missed)] if now.cycles else [],
+            "dwell_unread_cycles": [({}, self._unread)],
+            "dwell_migrations": [({"reason": one}, moves.get(one)) for one in MOVED_BY],
+            "dwell_windows": [({}, status.get("windows"))],
+        }
+
+    def _certificates(self) -> Samples:
+        keyring = self._observer.security.keyring
+        for subject in () if keyring is None else keyring.roster.subjects.values():
+            ends = datetime.fromisoformat(subject.expires).replace(tzinfo=UTC)
+            yield {"subject": subject.name}, ends.timestamp()
 
     def _keep_up(self) -> None:
         while not self._stopped.wait(EVERY_S):
@@ -141,113 +200,3 @@ class CellMetrics(Collector):
                     exemplar = {"run": str(cycle.run), "cycle": str(cycle.number)}
                     of_cell = self._latency.labels(self._problem.name)
                     of_cell.observe(cycle.latency_ns / 1e9, exemplar)
-
-    def _latencies(self) -> Iterator[Metric]:
-        self._count()
-        yield from self._latency.collect()
-        yield self._metric(
-            "counter",
-            "dwell_unread_cycles",
-            "Cycles that dwell_cycle_latency_seconds lacks, since this process was too slow.",
-            [({}, self._unread)],
-        )
-
-    def _told(self, status: Mapping[str, Any]) -> Iterator[Metric]:
-        """Yield what the controller's status tells."""
-        problem = self._problem
-        window, moves, heard = (status.get(name) or {} for name in ("window", "moves", "processes"))
-        yield self._metric(
-            "gauge",
-            "dwell_guard_fallback",
-            "Whether the cell is where its guard has put it.",
-            [({}, status.get("fallback"))],
-        )
-        yield self._metric(
-            "counter",
-            "dwell_migrations",
-            "Moves of the cell since the controller began, by reason; those of the guard among "
-            "them.",
-            (({"reason": one}, moves.get(one)) for one in MOVED_BY),
-        )
-        yield self._metric(
-            "counter", "dwell_windows", "Closed windows of the run.", [({}, status.get("windows"))]
-        )
-        yield self._metric(
-            "gauge",
-            "dwell_violation_ratio",
-            "Share of the cycles of the last window that missed.",
-            [({}, window.get("violation_rate"))],
-        )
-        estimates, used = window.get("estimates") or {}, window.get("utilisation") or {}
-        yield self._metric(
-            "gauge",
-            "dwell_estimated_cost",
-            "Cost J of a candidate as estimated at the close of the last window.",
-            (({"placement": name}, estimates.get(name)) for name in problem.candidates),
-        )
-        yield self._metric(
-            "gauge",
-            "dwell_utilisation_ratio",
-            "Utilisation of a resource in the last window, foreign work included.",
-            (
-                ({"node": one.node, "kind": one.kind or "cpu"}, used.get(name))
-                for name, one in problem.fabric.resources.items()
-            ),
-        )
-        bound_ms = status.get("bound_ms")
-        yield self._metric(
-            "gauge",
-            "dwell_clock_bound_seconds",
-            "Largest error of the latencies of the last window, by the clocks.",
-            [({}, None if bound_ms is None else bound_ms / 1e3)],
-        )
-        yield self._metric(
-            "gauge",
-            "dwell_window_unproven",
-            "Whether clocks or losses of messages leave the last window unproven.",
-            [({}, status.get("unproven"))],
-        )
-        yield self._metric(
-            "gauge",
-            "dwell_process_heard",
-            "Whether the controller hears a process of the cell.",
-            (({"process": who}, who in heard and heard[who]["heard"]) for who in self._members)
-            if status
-            else (),
-        )
-        yield self._metric(
-            "gauge",
-            "dwell_process_ready",
-            "Whether a process that is heard can do its work.",
-            (
-                ({"process": who}, heard[who]["ready"])
-                for who in self._members
-                if who in heard and heard[who]["heard"]
-            ),
-        )
-
-    def _certificates(self) -> Iterator[Metric]:
-        keyring = self._observer.security.keyring
-        subjects = {} if keyring is None else keyring.roster.subjects
-        yield self._metric(
-            "gauge",
-            "dwell_certificate_expiry_timestamp_seconds",
-            "Beginning of the day on which a certificate ends.",
-            (
-                (
-                    {"subject": subject.name},
-                    datetime.fromisoformat(subject.expires).replace(tzinfo=UTC).timestamp(),
-                )
-                for subject in subjects.values()
-            ),
-        )
-
-    def _metric(
-        self, kind: Literal["counter", "gauge", "info"], name: str, sentence: str, samples: Samples
-    ) -> Metric:
-        metric = Metric(name, sentence, kind)
-        for labels, value in samples:
-            if isinstance(value, int | float):
-                told = {"cell": self._problem.name, **labels}
-                metric.add_sample(f"{name}{SUFFIXES[kind]}", told, float(value))
-        return metric

@@ -373,8 +373,7 @@ class Observer:
 
     def _ask_on(self) -> None:
         """Ask the controller again and again, so often that no window is left out."""
-        window_s = self.problem.window_cycles * self.problem.pipeline.period_ms / 1e3
-        every_s = min(max(window_s / 2, LEAST_ASK_S), MOST_ASK_S)
+        every_s = min(max(self.problem.window_ms / 2e3, LEAST_ASK_S), MOST_ASK_S)
         while not self._stopped.wait(every_s):
             self._look()
 

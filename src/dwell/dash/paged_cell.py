@@ -7,8 +7,8 @@ are places on it: seconds since the first release, or numbers of cycles.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any, Literal, Protocol, TypeAlias
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Literal, NamedTuple, Protocol, TypeAlias
 
 from dwell.display import placement_hues
 from dwell.model import Link, Problem, Trace
@@ -19,6 +19,8 @@ Unit: TypeAlias = Literal["s", "cycle"]
 #: Plain values, ready for JSON.
 Plain: TypeAlias = dict[str, Any]
 
+#: Health of a recorded run before its first window has closed.
+UNMEASURED, NO_WINDOW = "unmeasured", "no window has closed yet"
 #: Cycles of which the jobs are told at a time.
 MOST_WITH_JOBS = 200
 
@@ -30,23 +32,18 @@ class PagedCell(Protocol):
 
     def described(self) -> Plain:
         """Return what does not change, and where its time line begins and ends."""
-        ...
 
     def view(self, begin: float, end: float, bins: int) -> Plain:
         """Return what is drawn between two places, in so many bins at most."""
-        ...
 
     def state(self, at: float) -> Plain:
         """Return how the cell was at a place; a cell that runs, how it is."""
-        ...
 
     def jobs(self, begin: float, end: float) -> Plain:
         """Return the jobs of the cycles between two places, as far as they are known."""
-        ...
 
     def refreshed(self) -> bool:
         """Whether there is more of it than at the last call."""
-        ...
 
 
 def cell_document(problem: Problem) -> Plain:
@@ -81,35 +78,46 @@ def cell_document(problem: Problem) -> Plain:
     }
 
 
-def job_since(job: Mapping[str, Any], origin_ns: int) -> Plain:
-    """Return a row of ``jobs`` with its instants in milliseconds since an origin."""
-    since = {
-        f"{name}_ms": None if (at_ns := job[f"{name}_ns"]) is None else (at_ns - origin_ns) / 1e6
-        for name in ("ready", "start", "end")
-    }
-    names = {name: str(job[name]) for name in ("task", "node", "outcome")}
-    return {**names, **since, "cycle": job["cycle"], "shadow": bool(job.get("shadow"))}
+class TimedCycle(NamedTuple):
+    """A cycle whose jobs are shown; without a latency it is lost, or not done."""
+
+    number: int
+    release_ns: int
+    latency_ms: float | None
+    missed: bool
 
 
-def cycle_since(
-    number: int, release_ns: int, latency_ns: float | None, origin_ns: int, *, missed: bool
+def jobs_document(
+    cycles: Sequence[TimedCycle], jobs: Iterable[Mapping[str, Any]], *, known: bool = True
 ) -> Plain:
-    """Return a cycle beside its jobs, in milliseconds since their origin."""
+    """Return cycles and their jobs, in ms since the first of these releases."""
+    origin_ns = min((cycle.release_ns for cycle in cycles), default=0)
+
+    def since(at_ns: int | None) -> float | None:
+        return None if at_ns is None else (at_ns - origin_ns) / 1e6
+
     return {
-        "cycle": number,
-        "release_ms": (release_ns - origin_ns) / 1e6,
-        "latency_ms": None if latency_ns is None else latency_ns / 1e6,
-        "missed": missed,
+        "origin_s": origin_ns / 1e9,
+        "jobs": [
+            {
+                **{name: str(job[name]) for name in ("task", "node", "outcome")},
+                **{f"{name}_ms": since(job[f"{name}_ns"]) for name in ("ready", "start", "end")},
+                "cycle": job["cycle"],
+                "shadow": bool(job.get("shadow")),
+            }
+            for job in jobs
+        ],
+        "cycles": [
+            {
+                "cycle": cycle.number,
+                "release_ms": since(cycle.release_ns),
+                "latency_ms": cycle.latency_ms,
+                "missed": cycle.missed,
+            }
+            for cycle in cycles
+        ],
+        "known": known,
     }
-
-
-def finite(value: Any) -> Any:
-    """Return plain values of which the numbers that are not finite are None: JSON has no others."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {name: finite(one) for name, one in value.items()}
-    return [finite(one) for one in value] if isinstance(value, list | tuple) else value
 
 
 def _link(link: Link) -> str:
@@ -123,6 +131,8 @@ def _link(link: Link) -> str:
 
 def health_by(problem: Problem, rates: list[float]) -> Mapping[str, str | None]:
     """Return health and headline of a cell of which the last windows' V_D is all that is known."""
+    if not rates:
+        return {"health": UNMEASURED, "headline": NO_WINDOW}
     if not problem.live.degraded_by(rates):
         return {"health": "ok", "headline": None}
     rate = sum(rates) / len(rates)

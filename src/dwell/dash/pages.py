@@ -2,75 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 from dwell.errors import DwellError, RunError, TrustError
-from dwell.live.log import printable
+from dwell.live.log import printable, say
 from dwell.record import is_fleet, is_run
 
 if TYPE_CHECKING:
     from dwell.dash.observer import Observer
-    from dwell.dash.recorded_fleet import RecordedFleet
-
-#: Prints a line for people.
-Say: TypeAlias = Callable[[str], None]
+    from dwell.dash.server import Dash
 
 #: Folders of runs that are named.
 MOST_NAMED = 8
 
 
-def show_run(
-    folder: Path,
-    beside: Path | None,
-    *,
-    port: int,
-    browser: bool,
-    say: Say,
-    token: str | None = None,
-) -> None:
-    """Show a recorded run until interrupted, or two on one time line.
+def recorded_page(folder: Path, beside: Path | None) -> Dash:
+    """Read a recorded run, two for one time line, or the runs of a fleet.
 
     Raises
     ------
     RunError
-        If a folder is no run, or damaged.
+        If a folder is neither, or damaged, or no run of a fleet is whole.
     """
-    for one in (folder, beside):
+    fleet = is_fleet(folder)
+    for one in () if fleet else (folder, beside):
         if one is not None:
             _require_run(one)
-    _serve(lambda: _on_one_line(folder, beside), port=port, browser=browser, say=say, token=token)
-
-
-def show_fleet(
-    folder: Path, *, port: int, browser: bool, say: Say, token: str | None = None
-) -> None:
-    """Show the recorded runs of a fleet until interrupted.
-
-    Raises
-    ------
-    RunError
-        If the folder is no fleet's, or no run in it is whole.
-    """
-    _serve(lambda: {"fleet": _fleet(folder)}, port=port, browser=browser, say=say, token=token)
-
-
-def _serve(
-    read: Callable[[], Mapping[str, Any]], *, port: int, browser: bool, say: Say, token: str | None
-) -> None:
-    """Serve what is read from a folder."""
     with ThreadPoolExecutor(1) as reader:
-        reading = reader.submit(read)
+        reading = reader.submit(_fleet if fleet else _on_one_line, folder, beside)
         # Meanwhile: both take as long.
         from dwell.dash.server import Dash
-        from dwell.dash.serving import serve
 
-        dash = Dash(**reading.result())
-    serve(dash, port, browser=browser, say=say, token=token)
+        return Dash(**reading.result())
 
 
 def _require_run(folder: Path) -> None:
@@ -93,10 +61,10 @@ def _runs_in(folder: Path) -> list[Path]:
     return [path for path in (*folder.glob("*"), *folder.glob("runs/*")) if is_run(path)]
 
 
-def _fleet(folder: Path) -> RecordedFleet:
+def _fleet(folder: Path, _: Path | None) -> dict[str, Any]:
     from dwell.dash.recorded_fleet import RecordedFleet
 
-    return RecordedFleet(folder)
+    return {"fleet": RecordedFleet(folder)}
 
 
 def _on_one_line(folder: Path, beside: Path | None) -> dict[str, Any]:
@@ -115,18 +83,15 @@ def _on_one_line(folder: Path, beside: Path | None) -> dict[str, Any]:
     return {"cells": [one, other], "line": line}
 
 
-def show_cell(
+@contextmanager
+def live_page(
     file: Path,
     environment: Mapping[str, str],
     *,
-    port: int,
-    browser: bool,
     control: bool,
-    say: Say,
     mcap: Path | None = None,
-    token: str | None = None,
-) -> None:
-    """Show a live cell until interrupted.
+) -> Iterator[Dash]:
+    """Observe a live cell.
 
     Parameters
     ----------
@@ -136,8 +101,6 @@ def show_cell(
         Whether the page may act.
     mcap : Path, optional
         File to record it to; there must be none.
-    token : str, optional
-        See `dwell.dash.serving.serve`.
 
     Raises
     ------
@@ -150,7 +113,6 @@ def show_cell(
     from dwell.dash.metrics import CellMetrics
     from dwell.dash.observer import Observer
     from dwell.dash.server import Dash
-    from dwell.dash.serving import serve
     from dwell.dash.watched_cell import WatchedCell
 
     with ExitStack() as stack:
@@ -159,12 +121,12 @@ def show_cell(
         dash = Dash([WatchedCell(observer)], metrics=metrics.page)
         if control:
             _require_operator(observer)
-            dash.act = _logged(observer, say)
+            dash.act = _logged(observer)
         if mcap is not None:
             from dwell.dash.recorder import CellRecorder
 
             stack.enter_context(CellRecorder(observer, mcap, say))
-        serve(dash, port, browser=browser, say=say, token=token)
+        yield dash
 
 
 def _require_operator(observer: Observer) -> None:
@@ -181,7 +143,7 @@ def _require_operator(observer: Observer) -> None:
         raise TrustError(f"{keyring.folder}: keys of an observer, who may look and no more")
 
 
-def _logged(observer: Observer, say: Say) -> Callable[[str, str], Mapping[str, Any]]:
+def _logged(observer: Observer) -> Callable[[str, str], Mapping[str, Any]]:
     """Return what carries out acts, and says of each when, what, by whose certificate, and how."""
     keyring = observer.security.keyring
     who = "without keys" if keyring is None else f"by {keyring.own.common_name}"

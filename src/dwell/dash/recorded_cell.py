@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from dwell.dash.paged_cell import (
     MOST_WITH_JOBS,
     Plain,
+    TimedCycle,
     Unit,
     cell_document,
-    cycle_since,
-    job_since,
+    jobs_document,
 )
 from dwell.dash.recorded_events import RecordedEvents, disturbance_events, disturbances_met
 from dwell.dash.recorded_windows import RecordedWindows, placement_codes
-from dwell.dash.strip import Floats, Strip, binned_means
+from dwell.dash.strip import Floats, Strip, binned_means, plain
 from dwell.errors import RunError
 from dwell.model.instants import NEVER_NS
 from dwell.record import Run, open_run
@@ -117,8 +117,7 @@ class _Contents:
 
     def __init__(self, run: Run, unit: Unit, source: str) -> None:
         self.run, self.unit, self.source, self.problem = run, unit, source, run.problem
-        recovered = run.meta.get("recovered", {})
-        self.growing = bool(recovered) and not recovered.get("sealed", True)
+        self.growing = run.unfinished
         self._candidates = tuple(self.problem.candidates)
         cycles = run.arrays("cycles")
         self._release_ns = cycles["release_ns"].astype(np.int64, copy=False)
@@ -181,16 +180,8 @@ class _Contents:
             "missed": int(self.strip.missed.sum()),
             "windows": len(self.windows.number),
             "has_jobs": self.run.has_jobs,
-            "notes": list(self._notes()),
+            "notes": self.run.losses,
         }
-
-    def _notes(self) -> Iterator[str]:
-        recovered = self.run.meta.get("recovered", {})
-        if self.growing:
-            yield "This run was not closed: it goes on, or its controller was killed."
-        for name in ("torn_bytes", "damaged_bytes", "missing_cycles", "missing_windows"):
-            if recovered.get(name):
-                yield f"{name.replace('_', ' ').capitalize()}: {recovered[name]}."
 
     def view(self, begin: float, end: float, bins: int) -> Plain:
         windows = self.windows
@@ -232,22 +223,15 @@ class _Contents:
 
     def jobs(self, begin: float, end: float) -> Plain:
         rows = self.strip.rows(begin, end)
-        if rows.start >= rows.stop or not self.run.has_jobs:
-            return {"origin_s": 0.0, "jobs": [], "cycles": [], "known": self.run.has_jobs}
-        origin_ns = int(self._release_ns[rows.start])
         rows = slice(rows.start, min(rows.stop, rows.start + MOST_WITH_JOBS))
-        first, last = int(self._cycle[rows.start]), int(self._cycle[rows.stop - 1])
-        table = self.run.jobs
-        mine = table.filter(table["cycle"].is_between(first, last))
+        if rows.start >= rows.stop or not self.run.has_jobs:
+            return jobs_document((), (), known=self.run.has_jobs)
+        numbers, latency_ms = self._cycle[rows].tolist(), self.strip.latency_ms[rows]
+        columns = (numbers, self._release_ns[rows], plain(latency_ms, 6), self.strip.missed[rows])
         cycles = [
-            cycle_since(
-                int(self._cycle[row]),
-                int(self._release_ns[row]),
-                None if np.isnan(self.strip.latency_ms[row]) else self.strip.latency_ms[row] * 1e6,
-                origin_ns,
-                missed=bool(self.strip.missed[row]),
-            )
-            for row in range(rows.start, rows.stop)
+            TimedCycle(number, int(release_ns), latency_ms, bool(missed))
+            for number, release_ns, latency_ms, missed in zip(*columns, strict=True)
         ]
-        jobs = [job_since(job, origin_ns) for job in mine.iter_rows(named=True)]
-        return {"origin_s": origin_ns / 1e9, "jobs": jobs, "cycles": cycles, "known": True}
+        table = self.run.jobs
+        mine = table.filter(table["cycle"].is_between(numbers[0], numbers[-1]))
+        return jobs_document(cycles, mine.iter_rows(named=True))

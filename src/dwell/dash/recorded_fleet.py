@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.dash.paged_cell import Plain
+from dwell.dash.paged_cell import NO_WINDOW, UNMEASURED, Plain
 from dwell.dash.recorded_cell import RecordedCell
 from dwell.dash.recorded_events import RecordedEvents, disturbance_events, disturbances_met
 from dwell.dash.recorded_windows import RecordedWindows
@@ -151,8 +151,7 @@ class RecordedFleet:
             self._faults.append(str(error))
             return self._members[0].windows.closes, {}
         first = self._run.fleet.entries[0].cell
-        length_s = first.window_cycles * first.pipeline.period_ms / 1e3
-        closes = table["start_ns"].to_numpy() / 1e9 + length_s
+        closes = table["start_ns"].to_numpy() / 1e9 + first.window_ms / 1e3
         names = [name for name in table.columns if name.startswith("u_")]
         return closes, {name.removeprefix("u_"): table[name].to_numpy() for name in names}
 
@@ -265,13 +264,17 @@ class RecordedFleet:
     def state(self, at: float) -> Plain:
         """Return how the cells were at a place, and the load of the shared nodes."""
         cells = [self._cell_state(one, at) for one in self._members]
-        unwell = sum(cell["health"] != "ok" for cell in cells)
+        unwell = sum(cell["health"] == "degraded" for cell in cells)
+        health = "degraded" if unwell else "ok"
+        headline = f"{unwell} of {len(cells)} cells" if unwell else None
+        if all(cell["health"] == UNMEASURED for cell in cells):
+            health, headline = UNMEASURED, NO_WINDOW
         k = int(np.searchsorted(self._grid, at, "right")) - 1
         row = self._rounds.last(at)
         return {
             "at": at,
-            "health": "degraded" if unwell else "ok",
-            "headline": f"{unwell} of {len(cells)} cells" if unwell else None,
+            "health": health,
+            "headline": headline,
             "cells": cells,
             "used": {
                 name: None if k < 0 else plain(column[k : k + 1], 4)[0]
@@ -298,8 +301,7 @@ def _member(place: int, cell: FleetCell, run: Run, phase_ms: float) -> _Member:
     def opens(first: NDArray[np.int64]) -> Floats:
         return (phase_ms + first.astype(np.float64) * pipeline.period_ms) / 1e3
 
-    length_s = cell.problem.window_cycles * pipeline.period_ms / 1e3
-    windows = RecordedWindows(run, cell.problem, opens, length_s)
+    windows = RecordedWindows(run, cell.problem, opens, cell.problem.window_ms / 1e3)
     if not len(windows.number):
         raise RunError(f"{cell.name}: this run has no windows")
     l95_ms = run.arrays("windows")["l95_ms"].astype(np.float64)

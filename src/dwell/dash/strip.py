@@ -8,7 +8,7 @@ cycles than bins, a bin is a cycle.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -47,21 +47,12 @@ class Strip:
     def __repr__(self) -> str:
         return f"<Strip of {len(self.at)} cycles>"
 
-    @classmethod
-    def empty(cls) -> Strip:
-        """Return a strip without cycles."""
-        none = np.zeros(0)
-        return cls(none, none, np.zeros(0, bool), np.zeros(0, np.int32), np.zeros(0, np.int64))
-
     def followed_by(self, other: Strip, most: int) -> Strip:
-        """Return both together, by release, the last `most` of them."""
-        at = np.concatenate((self.at, other.at))
-        order = np.argsort(at, kind="stable")[-most:]
-        latency_ms = np.concatenate((self.latency_ms, other.latency_ms))
-        missed = np.concatenate((self.missed, other.missed))
-        placement = np.concatenate((self.placement, other.placement))
-        number = np.concatenate((self.number, other.number))
-        return Strip(at[order], latency_ms[order], missed[order], placement[order], number[order])
+        """Return this and what comes next, in order of instants; the newest `most` of both."""
+        named = [field.name for field in fields(self)]
+        columns = [np.concatenate((getattr(self, one), getattr(other, one))) for one in named]
+        order = np.argsort(columns[0], kind="stable")[-most:]
+        return Strip(*(column[order] for column in columns))
 
     def rows(self, begin: float, end: float) -> slice:
         """Return the cycles between two places, the second one excluded."""

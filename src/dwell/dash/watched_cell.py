@@ -9,15 +9,9 @@ from typing import Any
 import numpy as np
 
 from dwell.dash.observer import ObservedCycle, ObservedWindow, Observer
-from dwell.dash.paged_cell import (
-    MOST_WITH_JOBS,
-    Plain,
-    cell_document,
-    cycle_since,
-    finite,
-    job_since,
-)
+from dwell.dash.paged_cell import MOST_WITH_JOBS, Plain, TimedCycle, cell_document, jobs_document
 from dwell.dash.strip import Floats, Strip, binned_means
+from dwell.record.json_documents import json_ready
 
 #: Cycles of the time line, which reaches farther back than the observer.
 MOST_CYCLES = 40_000
@@ -37,7 +31,7 @@ class WatchedCell:
         self.observer, self.problem = observer, observer.problem
         self._taking = threading.Lock()
         self._codes = {name: code for code, name in enumerate(self.problem.candidates)}
-        self._strip, self._cycles_upto = Strip.empty(), 0
+        self._strip, self._cycles_upto = self._strip_of(()), 0
         self._windows: list[ObservedWindow] = []
         self._windows_upto = -1
         # When the windows closed, and their values: what is drawn as lines.
@@ -133,10 +127,9 @@ class WatchedCell:
             "processes": _processes(status),
             **(self._window_state(window) if window else {}),
         }
-        return {name: finite(value) for name, value in state.items()}
+        return dict(json_ready(state))
 
     def _window_state(self, window: Mapping[str, Any]) -> Plain:
-        length_s = self.problem.window_cycles * self.problem.pipeline.period_ms / 1e3
         seen = {name: window[name] for name in ("l95_ms", "violation_rate", "cost")}
         ends = {one.number: one for one in self._windows[-3:]}
         known, before = ends.get(window["number"]), ends.get(window["number"] - 1)
@@ -144,7 +137,7 @@ class WatchedCell:
         return {
             "window": {
                 "number": window["number"],
-                "begin": end_s - length_s,
+                "begin": end_s - self.problem.window_ms / 1e3,
                 "end": end_s,
                 "placement": window["placement"],
                 "seen": seen,
@@ -161,22 +154,17 @@ class WatchedCell:
 
     def jobs(self, begin: float, end: float) -> Plain:
         """See `PagedCell`."""
-        cycles = self.observer.cycles.since(0).items
-        mine = [one for one in cycles if begin <= one.release_ns / 1e9 < end][-MOST_WITH_JOBS:]
-        if not mine:
-            return {"origin_s": 0.0, "jobs": [], "cycles": [], "known": True}
-        origin_ns = min(one.release_ns for one in mine)
-        return {
-            "origin_s": origin_ns / 1e9,
-            "jobs": [job_since(job, origin_ns) for one in mine for job in one.jobs],
-            "cycles": [
-                cycle_since(
-                    *(one.number, one.release_ns, one.latency_ns, origin_ns), missed=one.missed
-                )
-                for one in mine
-            ],
-            "known": True,
-        }
+        heard = self.observer.cycles.since(0).items
+        mine = [one for one in heard if begin <= one.release_ns / 1e9 < end][-MOST_WITH_JOBS:]
+        cycles = [
+            TimedCycle(
+                *(one.number, one.release_ns),
+                None if one.latency_ns is None else one.latency_ns / 1e6,
+                one.missed,
+            )
+            for one in mine
+        ]
+        return jobs_document(cycles, (job for one in mine for job in one.jobs))
 
     def refreshed(self) -> bool:
         """See `PagedCell`; cycles are taken in meanwhile, before the observer lets go of them."""

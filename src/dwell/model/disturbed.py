@@ -49,7 +49,7 @@ def disturbed(scenario: Iterable[Disturbance], fabric: Fabric) -> list[Disturbed
             continue
         begin_s, end_s = item.at_s, item.end_s
         if isinstance(item, NodeDisturbance):
-            who, what = item.node, _on_node(item)
+            who, what = item.node, on_node(item)
             kind = f"{fabric.nodes[who].tier} {'outage' if item.down else 'stress'}"
         else:
             who, what = "–".join(sorted((item.source, item.target))), _on_link(item)
@@ -64,7 +64,8 @@ def disturbed(scenario: Iterable[Disturbance], fabric: Fabric) -> list[Disturbed
     ]
 
 
-def _on_node(item: NodeDisturbance) -> str:
+def on_node(item: NodeDisturbance) -> str:
+    """Return what is done to a node, as ``2 busy threads``."""
     if item.down:
         return "down"
     threads = item.stress_threads

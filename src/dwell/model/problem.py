@@ -263,6 +263,11 @@ class Problem(Displayed):
         return require_length(windows, self.window_cycles, self.pipeline.period_ms)
 
     @property
+    def window_ms(self) -> float:
+        """Length of a window: W P."""
+        return self.window_cycles * self.pipeline.period_ms
+
+    @property
     def censor_ms(self) -> float:
         """Latency that stands for any longer one in J: max(4 D, 2 P), and no less than L_max.
 

@@ -6,13 +6,13 @@ and ``failed``.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from dwell.cellfile.work_folder import FolderMark
 from dwell.errors import RunError
+from dwell.record.json_documents import read_document
 
 RUNS, FAILED, TRACES = "runs", "failed", "traces"
 #: Beside the tables of a run: when it was made, and how the machine was.
@@ -53,17 +53,11 @@ def read_campaign(folder: Path) -> CampaignFolder:
     """
     if not is_campaign(folder):
         raise RunError(f"{folder}: not a campaign (it has no {CAMPAIGN.file})")
-    described = _read(folder / CAMPAIGN.file)
+    described = read_document(folder / CAMPAIGN.file)
     if "plan" not in described:
         raise RunError(f"{folder / CAMPAIGN.file} describes no campaign")
-    done = {file.parent: _read(file) for file in sorted((folder / RUNS).glob(f"*/{ATTEMPT}"))}
-    failed = tuple(_read(file) for file in sorted((folder / FAILED).glob(f"*/{ATTEMPT}")))
+    done = {
+        file.parent: read_document(file) for file in sorted((folder / RUNS).glob(f"*/{ATTEMPT}"))
+    }
+    failed = tuple(read_document(file) for file in sorted((folder / FAILED).glob(f"*/{ATTEMPT}")))
     return CampaignFolder(described, done, failed)
-
-
-def _read(file: Path) -> dict[str, Any]:
-    try:
-        record = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise RunError(f"{file}: cannot be read ({error})") from None
-    return record if isinstance(record, dict) else {}

@@ -19,6 +19,7 @@ from dwell.files import write_whole
 from dwell.model.declaration import declared_fields
 from dwell.model.document import Document, to_document
 from dwell.model.fleet import Fleet, FleetEntry
+from dwell.record.json_documents import read_document
 from dwell.record.run import FLEET, Run, open_run, read_table, write_table
 
 if TYPE_CHECKING:
@@ -219,7 +220,7 @@ def require_free_or_same(folder: Path, described: Mapping[str, Any]) -> None:
     if file is None:
         raise RunError(f"{folder} exists and is no fleet's; choose another folder")
     same = {"versions": None, "file": None}
-    if {**_read(file), **same} != {**json.loads(json.dumps(described)), **same}:
+    if {**read_document(file), **same} != {**json.loads(json.dumps(described)), **same}:
         raise RunError(f"{folder} holds the runs of another fleet; choose another folder")
 
 
@@ -252,7 +253,7 @@ def open_fleet(path: str | os.PathLike[str], *, whole: bool = True) -> FleetRun:
     file = _described_in(folder)
     if file is None:
         raise RunError(f"{folder}: no fleet's folder (it has no {FLEET})")
-    described = _read(file)
+    described = read_document(file)
     version = described.get("schema_version")
     if not isinstance(version, int) or version > VERSION:
         raise RunError(f"{file}: schema_version is {version!r}; this version reads up to {VERSION}")
@@ -295,13 +296,3 @@ def listed(faults: Sequence[str]) -> list[str]:
     """Return the first of some faults, and how many more there are."""
     more = [f"and {len(faults) - LISTED} more"] if len(faults) > LISTED else []
     return [*faults[:LISTED], *more]
-
-
-def _read(file: Path) -> dict[str, Any]:
-    try:
-        known = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise RunError(f"{file}: cannot be read ({error})") from None
-    if not isinstance(known, dict):
-        raise RunError(f"{file}: describes no fleet")
-    return known

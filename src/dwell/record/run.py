@@ -19,6 +19,7 @@ from dwell.files import write_whole
 from dwell.model import Problem, Scenario
 from dwell.model.table_columns import TABLES
 from dwell.record.journal import JOURNAL, Journal, read_journal
+from dwell.record.json_documents import read_document
 from dwell.record.schema import SCHEMA_VERSION
 from dwell.record.table_arrays import TableArrays, arrays_of
 
@@ -31,6 +32,14 @@ PLAYED = "played"
 #: Last file of a fleet's folder (see `dwell.record.fleet_run`).
 FLEET = "fleet.json"
 ON_REQUEST = tuple(name for name, table in TABLES.items() if table.on_request)
+
+#: What is said of each loss of a journal.
+LOSSES = {
+    "torn_bytes": "{} bytes at the journal's end were torn by a kill; what they said is not here.",
+    "damaged_bytes": "{} bytes within the journal were damaged; what they said is not here.",
+    "missing_cycles": "Cycles missing from the run: {}.",
+    "missing_windows": "Windows missing from the run: {}.",
+}
 
 Table: TypeAlias = "pl.DataFrame | Callable[[], pl.DataFrame]"
 
@@ -202,6 +211,27 @@ class Run(Displayed):
         """Whether the run kept its jobs."""
         return "jobs" in self._tables
 
+    @property
+    def unfinished(self) -> bool:
+        """Whether its journal was not closed: it goes on, or its controller was killed."""
+        return not self.meta.get("recovered", {}).get("sealed", True)
+
+    @property
+    def losses(self) -> list[str]:
+        """Sentences on what is not in it because something was killed or damaged."""
+        recovered = self.meta.get("recovered", {})
+        told = [
+            text.format(recovered[name]) for name, text in LOSSES.items() if recovered.get(name)
+        ]
+        if (opened := recovered.get("opened", 1)) > 1:
+            told.insert(0, f"The controller was started {opened} times while the run went on.")
+        if self.unfinished:
+            told.append(
+                "The run was not closed: it goes on, or its controller was killed. This is what "
+                "its journal holds; what came after its last window is not here."
+            )
+        return told
+
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the run's folder; it appears complete, or not at all.
 
@@ -320,15 +350,12 @@ def open_run(path: str | os.PathLike[str]) -> Run:
         if missing:
             raise RunError(f"{folder / JOURNAL}: no run, without {', '.join(missing)}")
         return Run(meta, tables)
-    try:
-        meta = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    if not file.exists():
         if (folder / FLEET).is_file():
-            raise RunError(f"{folder} is a fleet's folder; name the run of a cell in it") from None
-        raise RunError(f"{folder}: not a run (it has no run.json)") from None
-    except (OSError, ValueError) as error:
-        raise RunError(f"{file}: cannot be read ({error})") from None
-    version = meta.get("schema_version") if isinstance(meta, dict) else None
+            raise RunError(f"{folder} is a fleet's folder; name the run of a cell in it")
+        raise RunError(f"{folder}: not a run (it has no run.json)")
+    meta = read_document(file)
+    version = meta.get("schema_version")
     if not isinstance(version, int) or version > SCHEMA_VERSION:
         raise RunError(
             f"{file}: schema_version is {version!r}; this version reads up to {SCHEMA_VERSION}"

@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from dwell.report.charts import BOUNDED, Limit, layer, limit_rule, quantity
-from dwell.report.figure import Draw, Figure, Spec
+from dwell.report.charts import Limit, curves
+from dwell.report.figure import Figure
 from dwell.report.formatting import Measure
 from dwell.report.page import Definitions, Fact, Page, Section
-from dwell.report.palette import INK, MUTED
+from dwell.report.palette import CIRCLE, INK, SOLID, Style
 from dwell.report.table import Table, Text, interval_row
 
 if TYPE_CHECKING:
     from dwell.study.capacity import Capacity, WhatIf
 
 RATE = Measure("violation_rate", "V_D of the worst cell", "%", 100.0, decimals=2)
-HEIGHT = 240
 
 
 def capacity_page(name: str, found: Capacity, what_ifs: Sequence[WhatIf] = ()) -> Page:
@@ -75,64 +74,18 @@ PHASES = {
 def _figure(found: Capacity) -> Figure:
     import polars as pl
 
-    rows = [
-        {
-            "robots": point.robots,
-            "mean": point.violation_rate.value * 100,
-            "low": point.violation_rate.low * 100,
-            "high": point.violation_rate.high * 100,
-        }
-        for point in found.curve
-    ]
-    frame = pl.DataFrame(rows).with_columns(pl.col("low", "high").fill_nan(None))
+    rows = [(found.policy, point.robots, *point.violation_rate) for point in found.curve]
+    ends = ("mean", "low", "high")
+    frame = pl.DataFrame(rows, schema=["policy", "at", *ends], orient="row")
+    frame = frame.with_columns(pl.col(ends).fill_nan(None) * 100)
     limit = Limit(found.bound * 100, f"limit: {found.bound * 100:.3g} %")
     return Figure(
-        slug="capacity",
-        title="V_D of the worst cell by number of robots",
-        frames={"curve": frame},
-        draw=_drawing(limit, len(rows)),
-        caption="Mean over seeds of the cell that misses most, with its 95 % interval; dashed: "
-        "the limit.",
+        "capacity",
+        "V_D of the worst cell by number of robots",
+        {"rows": frame},
+        curves(frame, RATE, {found.policy: Style(INK, CIRCLE, SOLID)}, "robots", limit),
+        "Mean over seeds of the cell that misses most, with its 95 % interval; dashed: the limit.",
     )
-
-
-def _drawing(limit: Limit, sizes: int) -> Draw:
-    def draw(width: float) -> Spec:
-        axis = {"tickMinStep": 1, "tickCount": min(sizes, 12), "format": "d"}
-        shared = {
-            "x": quantity("robots", "robots", scale={"nice": False, "padding": 8}, axis=axis),
-            "y": quantity("mean", RATE.heading, scale={"domainMin": 0}),
-        }
-        tip = [
-            quantity(name, title, format=".4~g")
-            for name, title in (
-                ("robots", "robots"),
-                ("mean", RATE.heading),
-                ("low", "from"),
-                ("high", "to"),
-            )
-        ]
-        ends = {"y": {"field": "low"}, "y2": {"field": "high"}}
-        return {
-            "width": width - 80,
-            "height": HEIGHT * min(1.0, width / 400),
-            "data": {"name": "curve"},
-            "layer": [
-                *limit_rule("y", *limit),
-                {
-                    "encoding": shared,
-                    "layer": [
-                        layer("line", {}, color=MUTED, strokeWidth=1),
-                        layer("rule", ends, where=[BOUNDED], color=INK, strokeWidth=1.5),
-                        layer(
-                            "point", {"tooltip": tip}, filled=True, size=36, color=INK, opacity=1
-                        ),
-                    ],
-                },
-            ],
-        }
-
-    return draw
 
 
 def _changes(found: Capacity, what_ifs: Sequence[WhatIf]) -> Table:

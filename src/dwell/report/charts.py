@@ -29,6 +29,8 @@ WIDE = 30.0
 #: Least width of a panel, room beside panels of named rows and of numbers, and between, pixels.
 PANEL_PX, NAMES_PX, AXIS_PX, GAP_PX = 170, 150, 60, 16
 ROW_PX = 17
+#: Values of a parameter that have grid lines, at most.
+MOST_LINES = 20
 #: Width of a legend's symbol with what is beside it, and of a letter.
 SYMBOL_PX, LETTER_PX = 34, 6.2
 #: Share of cycles below which a distribution is not drawn.
@@ -80,8 +82,9 @@ def layer(
 
     Parameters
     ----------
-    encoding : mapping of str to Spec
-        Encoding of this layer alone; what layers share stands in their group.
+    encoding : mapping of str to Spec or str
+        Encoding of this layer alone, a text for a bare field; what layers share stands in their
+        group.
     rows : str
         Name of its data, where these are not the chart's.
     where : sequence of str
@@ -89,12 +92,21 @@ def layer(
     **style : Any
         Properties of the mark.
     """
-    drawn: Spec = {"mark": {"type": mark, **style}, "encoding": dict(encoding)}
+    fields = {
+        channel: {"field": one} if isinstance(one, str) else one
+        for channel, one in encoding.items()
+    }
+    drawn: Spec = {"mark": {"type": mark, **style}, "encoding": fields}
     if rows:
         drawn["data"] = {"name": rows}
     if where:
         drawn["transform"] = [{"filter": test} for test in where]
     return drawn
+
+
+def disc(encoding: Mapping[str, Any], size: float, **more: Any) -> Spec:
+    """Return a layer of filled points; further arguments as `layer` has them."""
+    return layer("point", encoding, **{"filled": True, "size": size, "opacity": 1, **more})
 
 
 def styled(styles: Mapping[str, Style], width: float = 0.0) -> dict[str, Spec]:
@@ -130,6 +142,26 @@ def limit_rule(axis: str, limit: float, name: str, **style: Any) -> list[Spec]:
     # Data of its own: one line, and not one for every row of the chart's.
     rule = layer("rule", {axis: {"datum": limit}, **along}, **style)
     return [{"data": {"values": [{}]}, **rule}]
+
+
+def square(
+    side: float, across: Spec, up: Spec, limit: Limit, beneath: Spec, marks: Mapping[str, Any]
+) -> Spec:
+    """Return a square panel of the same quantity on both axes.
+
+    Parameters
+    ----------
+    limit : Limit
+        Of both axes.
+    beneath : Spec
+        Layer below the marks, with its data.
+    marks : mapping of str to object
+        A group of layers over the chart's rows, without the two encodings.
+    """
+    rules = [rule for axis in ("x", "y") for rule in limit_rule(axis, *limit)]
+    encoding = {"x": across, "y": up, **marks["encoding"]}
+    group = {"data": {"name": "rows"}, **marks, "encoding": encoding}
+    return {"width": side, "height": side, "layer": [beneath, *rules, group]}
 
 
 def is_wide(values: Sequence[float]) -> bool:
@@ -175,22 +207,15 @@ def intervals(
     }
     about = names("policy", "scenario")
     seed = {
-        "x": {"field": "value"},
+        "x": "value",
         "opacity": {"condition": {"test": "seed === datum.seed", "value": 1}, "value": 0.22},
         "tooltip": [*about, quantity("seed", "seed"), quantity("value", measure.heading)],
     }
     mean = {"shape": colours["shape"], "tooltip": [*about, *_mean_and_ends(measure)]}
     marks = [
         layer("tick", seed, where=[CHOSEN, "isValid(datum.value)"], thickness=1.2, size=9),
-        layer(
-            "rule",
-            {"x": {"field": "low"}, "x2": {"field": "high"}},
-            where=[CHOSEN, BOUNDED],
-            strokeWidth=2,
-        ),
-        layer(
-            "point", mean, where=[CHOSEN, "isValid(datum.mean)"], filled=True, size=55, opacity=1
-        ),
+        layer("rule", {"x": "low", "x2": "high"}, where=[CHOSEN, BOUNDED], strokeWidth=2),
+        disc(mean, 55, where=[CHOSEN, "isValid(datum.mean)"]),
     ]
     layers = [*limit_rule("x", *limit), {"encoding": shared, "layer": marks}]
     return _panels(frame, list(styles), lambda _: layers, seeds=True)
@@ -330,29 +355,24 @@ def curves(
     numeric = frame["at"].dtype.is_numeric()
     values = frame["at"].unique(maintain_order=True).to_list()
     at = {"field": "at", "type": "quantitative" if numeric else "ordinal", "title": heading}
-    axis = {"values": values, "labelOverlap": True, "labelAngle": 0, "grid": numeric}
+    axis = {"values": values, "labelOverlap": True, "labelSeparation": 4, "labelAngle": 0}
+    axis["grid"] = numeric and len(values) <= MOST_LINES
     across: Spec = {**at, "axis": axis, "sort": None}
     if numeric:
-        scale = "log" if min(values) > 0 and is_wide(values) else "linear"
+        # Values at even distances, as numbers of robots are, stand at even distances.
+        wide = min(values) > 0 and is_wide(values) and np.ptp(np.diff(values)) > 0
+        scale = "log" if wide else "linear"
         across |= {"scale": {"type": scale, "zero": False}, "axis": {**axis, "format": ".6~g"}}
     up = quantity("mean", measure.heading, axis={"tickCount": 5})
     about = [*names("policy"), at, *_mean_and_ends(measure)]
 
     def layers(width: float) -> list[Spec]:
         look = styled(styles, width)
-        ends = {"y": {"field": "low"}, "y2": {"field": "high"}}
         point = {**_of(look, "shape"), "tooltip": about}
         marks = [
-            layer("rule", ends, where=[CHOSEN, BOUNDED], strokeWidth=1.3),
+            layer("rule", {"y": "low", "y2": "high"}, where=[CHOSEN, BOUNDED], strokeWidth=1.3),
             layer("line", _of(look, "strokeDash"), where=[CHOSEN], strokeWidth=1.3),
-            layer(
-                "point",
-                point,
-                where=[CHOSEN, "isValid(datum.mean)"],
-                filled=True,
-                size=40,
-                opacity=1,
-            ),
+            disc(point, 40, where=[CHOSEN, "isValid(datum.mean)"]),
         ]
         shared = {"x": across, "y": up, **_of(look, "color")}
         return [*limit_rule("y", *limit), {"encoding": shared, "layer": marks}]

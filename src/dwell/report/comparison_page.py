@@ -10,13 +10,12 @@ from dwell.model.bounds import counted
 from dwell.model.disturbed import disturbed
 from dwell.report.charts import curves
 from dwell.report.figure import Figure
-from dwell.report.formatting import Measure, few_seeds, shown_policy, shown_scenario
+from dwell.report.formatting import COST, RATE, Measure, few_seeds, shown_policy, shown_scenario
 from dwell.report.method import numbered
 from dwell.report.page import Page, Section, page_html
-from dwell.report.palette import Palette
-from dwell.report.policy_blocks import COST, RATE, THE_AIM, PolicyBlocks, named, scaled
+from dwell.report.policy_blocks import THE_AIM, PolicyBlocks, named, scaled
 from dwell.report.table import Columns, Table, Text, table_text, wrapped
-from dwell.report.timeline import begins_by_number, resources_in, run_timeline
+from dwell.report.timeline import begins_by_number, run_timeline
 from dwell.study import Comparison, StudyResult, paper_predictions
 from dwell.study.drawn_disturbances import drawn_disturbances
 
@@ -160,10 +159,8 @@ def _timeline(comparison: Comparison, blocks: PolicyBlocks, scenario: str, polic
         example.windows,
         example.decisions,
         begins_by_number(example.windows, problem.pipeline.period_ms),
+        problem,
         slug=f"{blocks.prefix}time-{scenario}",
-        palette=Palette.of(problem.candidates),
-        resources=resources_in(example.windows, problem),
-        deadline_ms=problem.pipeline.deadline_ms,
         disturbed=disturbed(
             drawn_disturbances(problem, scenario, comparison.seeds[0], comparison.windows),
             problem.fabric,

@@ -10,12 +10,11 @@ from dwell.errors import SimulationError
 from dwell.model.bounds import counted
 from dwell.model.disturbed import Disturbed, disturbed
 from dwell.report.capacity_page import PHASES
-from dwell.report.charts import coloured, layer, name_of, names, quantity
+from dwell.report.charts import coloured, disc, layer, name_of, names, quantity
 from dwell.report.figure import Figure, Spec
-from dwell.report.formatting import Measure, percent, write_ms, write_number
+from dwell.report.formatting import COST, L95, RATE, Measure, percent, write_ms, write_number
 from dwell.report.page import Definitions, Fact, Page, Section
 from dwell.report.palette import INK, MUTED, Palette
-from dwell.report.policy_blocks import COST, L95, RATE
 from dwell.report.table import MOST_ROWS, Columns, Table, Text
 from dwell.report.timeline import fleet_timeline, rows_px
 from dwell.study import AIM
@@ -316,7 +315,7 @@ def _dots(cells: Sequence[str], headings: Sequence[str], width: float) -> Spec:
             "height": rows_px(len(cells)),
             "layer": [
                 layer("tick", limit, color=INK, thickness=1, height={"band": 0.6}),
-                layer("point", where, filled=True, size=34, color=INK, opacity=1),
+                disc(where, 34, color=INK),
             ],
         },
     }
@@ -343,13 +342,7 @@ def _phi(colours: Mapping[str, str], width: float) -> Spec:
             "color": coloured("to", colours),
         },
         "layer": [
-            layer("rule", {"y": up, "y2": {"field": "phi_after"}}, strokeWidth=1.3),
-            layer(
-                "point",
-                {"y": {**up, "field": "phi_after"}, "tooltip": about},
-                filled=True,
-                size=34,
-                opacity=1,
-            ),
+            layer("rule", {"y": up, "y2": "phi_after"}, strokeWidth=1.3),
+            disc({"y": {**up, "field": "phi_after"}, "tooltip": about}, 34),
         ],
     }

@@ -63,6 +63,15 @@ class Measure(NamedTuple):
         return self._replace(decimals=decimals_for(size, self.decimals))
 
 
+RATE = Measure("violation_rate", "V_D", "%", 100.0)
+L95 = Measure("l95_ms", "L95", "ms")
+#: Of the latencies that cycles had in the end.
+FINAL_L95 = L95._replace(name="L95 final")
+COST = Measure("cost", "J", decimals=2)
+MIGRATIONS = Measure("migrations", "migrations")
+REGRET = Measure("regret", "regret", "%", 100.0)
+
+
 class Written(NamedTuple):
     """A number and what is known of its error, each as text."""
 

@@ -9,6 +9,7 @@ from dwell.display import decimals_for
 from dwell.estimators.registry import REGISTRY as ESTIMATORS
 from dwell.model import LinkDisturbance, Node, NodeDisturbance, Problem, Process, Trace
 from dwell.model.bounds import counted
+from dwell.model.disturbed import on_node
 from dwell.report.formatting import OURS, Measure, percent, shown_contender, write_ms, write_number
 from dwell.report.page import Block, Definitions
 from dwell.report.palette import FAMILIES, Palette, contended
@@ -45,7 +46,7 @@ def method_blocks(
 def cell_definitions(problem: Problem) -> dict[str, str]:
     """Return what a cell is, and what its controller does, by headings."""
     pipeline, controller = problem.pipeline, problem.controller
-    span_s = problem.window_cycles * pipeline.period_ms / 1e3
+    span_s = problem.window_ms / 1e3
     nodes = problem.fabric.nodes.values()
     return {
         "cell": problem.name,
@@ -115,12 +116,9 @@ def scenarios_table(problem: Problem, names: Sequence[str], prefix: str = "") ->
 
 
 def _disturbance(item: NodeDisturbance | LinkDisturbance) -> dict[str, str]:
-    what = ["down"] if item.down else []
     if isinstance(item, NodeDisturbance):
-        if item.stress_threads:
-            threads = "thread" if item.stress_threads == 1 else "threads"
-            what.append(f"{item.stress_threads} busy {threads}")
-        return {"where": item.node, "what": ", ".join(what)}
+        return {"where": item.node, "what": on_node(item)}
+    what = ["down"] if item.down else []
     if item.add_delay_ms is not None:
         what.append(f"delay {_process(item.add_delay_ms)}")
     if item.loss:

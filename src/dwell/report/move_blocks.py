@@ -6,15 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from dwell.report.charts import (
-    NO_LIMIT,
-    Limit,
-    coloured,
-    layer,
-    limit_rule,
-    names,
-    quantity,
-)
+from dwell.report.charts import NO_LIMIT, Limit, coloured, disc, layer, names, quantity, square
 from dwell.report.figure import Figure, Spec
 from dwell.report.formatting import Measure
 from dwell.report.palette import MUTED, Palette
@@ -117,7 +109,7 @@ def _scatter(
     bars = [
         layer(
             "rule",
-            {axis: {"field": f"{when}_low"}, f"{axis}2": {"field": f"{when}_high"}},
+            {axis: f"{when}_low", f"{axis}2": f"{when}_high"},
             where=[f"isValid(datum.{when}_{error})"],
             strokeWidth=1.3,
             opacity=0.6,
@@ -127,22 +119,20 @@ def _scatter(
     ]
     colour = coloured("to", colours, legend={"symbolOpacity": 1})
     moves = {
-        "data": {"name": "rows"},
         "transform": [
             {"filter": f"isValid(datum.predicted_{column}) && isValid(datum.seen_{column})"},
             *ends,
         ],
-        "encoding": {"x": across, "y": up, "color": colour},
-        "layer": [*bars, layer("point", {"tooltip": about}, filled=True, size=26, opacity=0.9)],
+        "encoding": {"color": colour},
+        "layer": [*bars, disc({"tooltip": about}, 26, opacity=0.9)],
     }
     both = {"x": {**across, "field": "at"}, "y": {**up, "field": "at"}}
     diagonal = {
         "data": {"values": [{"at": low}, {"at": high}]},
         **layer("line", both, color=MUTED, strokeWidth=1),
     }
-    rules = [rule for axis in ("x", "y") for rule in limit_rule(axis, *limit)]
-    inside = rules if low <= limit.value <= high else []
-    return {"width": side, "height": side, "layer": [diagonal, *inside, moves]}
+    inside = limit if low <= limit.value <= high else NO_LIMIT
+    return square(side, across, up, inside, diagonal, moves)
 
 
 def _range(frame: pl.DataFrame, column: str, error: str) -> tuple[float, float]:

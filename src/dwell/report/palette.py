@@ -129,7 +129,6 @@ class Style:
     colour: str
     marker: str
     dashes: Dashes
-    width: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +164,7 @@ class Palette:
         spare = [hue for hue in reversed(HUES) if hue not in placements.values()]
         # Hues that a family has by its name are not given to others while there are more.
         spare.sort(key=lambda hue: hue in COLOURS.values())
-        styles = {name: Style(hue, CIRCLE, SOLID, 1.3) for name, hue in placements.items()}
+        styles = {name: Style(hue, CIRCLE, SOLID) for name, hue in placements.items()}
         variants: dict[str, int] = {}
         unknown = 0
         for name, known in moving.items():
@@ -181,7 +180,7 @@ class Palette:
             if colour == INK:
                 colour = _of_several(place)
             shift = tuple(FAMILIES).index(known.family)
-            styles[name] = _style(colour, place + shift, strong=known.family == "dtp")
+            styles[name] = _style(colour, place + shift)
         return cls(placements, {name: styles[name] for name in policies})
 
 
@@ -202,9 +201,8 @@ def _of_several(place: int) -> str:
     return colours[1 + (place - len(BELIEFS)) % (len(colours) - 1)]
 
 
-def _style(colour: str, place: int, *, strong: bool = False) -> Style:
-    width = 1.8 if strong and place == 0 else 1.3
-    return Style(colour, MARKERS[place % len(MARKERS)], DASHES[place % len(DASHES)], width)
+def _style(colour: str, place: int) -> Style:
+    return Style(colour, MARKERS[place % len(MARKERS)], DASHES[place % len(DASHES)])
 
 
 def ramp_styles(names: Iterable[str]) -> dict[str, Style]:

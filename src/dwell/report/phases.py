@@ -8,6 +8,9 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from dwell.model.disturbed import Disturbed
+from dwell.report.formatting import FINAL_L95, RATE, Measure
+from dwell.report.palette import Palette
+from dwell.report.table import Columns, Table, Text
 from dwell.study.summary import latency_ms, order_statistic
 
 if TYPE_CHECKING:
@@ -120,6 +123,35 @@ def phase_rows(run: Run, header: RunHeader) -> list[PhaseRow]:
             )
         )
     return rows
+
+
+def phase_table(rows: Sequence[PhaseRow], palette: Palette) -> Table:
+    """Return the phases of a run, one a row; its error only where that is known."""
+    used = {name for row in rows for name in row.shares}
+    names = [name for name in palette.placements if name in used]
+    columns: Columns = [
+        Text("name", "phase"),
+        Measure("begin_s", "from", "s", decimals=0),
+        Measure("end_s", "to", "s", decimals=0),
+        RATE,
+        FINAL_L95,
+        Measure("lost", "lost", decimals=0),
+        *(Measure(f"share {name}", name, "%", 100.0, 0) for name in names),
+        Measure("migrations", "migrations", decimals=0),
+        Measure("guard_moves", "by the guard", decimals=0),
+    ]
+    if any(math.isfinite(row.rms_mm) for row in rows):
+        errors = Measure("rms_mm", "error", "mm", decimals=2), Measure("rms_px", "error", "px")
+        columns += errors
+    shown = [
+        {**row._asdict(), **{f"share {name}": row.shares.get(name, 0.0) for name in names}}
+        for row in rows
+    ]
+    caption = (
+        "All cycles by when they were released, the warm-up included. Lost: cycles that never "
+        "finished."
+    )
+    return Table("phases", "By phase", columns, shown, caption=caption)
 
 
 def _moves(run: Run) -> list[tuple[float, str]]:

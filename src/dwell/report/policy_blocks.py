@@ -20,7 +20,16 @@ from dwell.report.charts import (
     stacked,
 )
 from dwell.report.figure import Figure
-from dwell.report.formatting import Measure, shown_contender, shown_policy, shown_scenario
+from dwell.report.formatting import (
+    COST,
+    L95,
+    MIGRATIONS,
+    RATE,
+    Measure,
+    shown_contender,
+    shown_policy,
+    shown_scenario,
+)
 from dwell.report.method import method_blocks
 from dwell.report.page import Block, Definitions
 from dwell.report.palette import Palette
@@ -32,16 +41,13 @@ if TYPE_CHECKING:
 
     from dwell.study import StudyRuns
 
-RATE = Measure("violation_rate", "V_D", "%", 100.0)
-L95 = Measure("l95_ms", "L95", "ms")
-COST = Measure("cost", "J", decimals=2)
 MEASURES = (
     RATE,
     L95,
     COST,
     Measure("u_robot", "U_r", "%", 100.0),
     Measure("u_edge", "U_e", "%", 100.0),
-    Measure("migrations", "migrations"),
+    MIGRATIONS,
 )
 MORE = (
     Measure("p95_ms", "P95 of all cycles", "ms", ends=True),

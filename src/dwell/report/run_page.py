@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from itertools import islice
 from typing import TYPE_CHECKING
 
@@ -31,6 +31,9 @@ from dwell.report.charts import (
 )
 from dwell.report.figure import Figure
 from dwell.report.formatting import (
+    COST,
+    FINAL_L95,
+    RATE,
     Measure,
     percent,
     shown_policy,
@@ -41,21 +44,23 @@ from dwell.report.formatting import (
 from dwell.report.move_blocks import move_blocks
 from dwell.report.page import Definitions, Fact, Page, Section, page_html
 from dwell.report.palette import BAD, Palette
-from dwell.report.phases import phase_rows
-from dwell.report.policy_blocks import COST, L95, RATE
+from dwell.report.phases import phase_rows, phase_table
 from dwell.report.run_header import RunHeader
 from dwell.report.table import MOST_ROWS, Columns, Table, Text
 from dwell.report.timeline import begins_by_number, resources_in, run_timeline
 from dwell.study.predicted_moves import predicted_moves
-from dwell.study.summary import Counted, count_in, latency_ms, longest_streak, order_statistic
+from dwell.study.summary import (
+    Counted,
+    count_in,
+    latency_ms,
+    summarise,
+)
 
 if TYPE_CHECKING:
     import polars as pl
 
     from dwell.record import Run
 
-#: Of the latencies that cycles had in the end.
-FINAL_L95 = L95._replace(name="L95 final")
 WORST = 10
 #: Share of a deadline that clocks may be off by, where a window's latencies are proven.
 PROVEN_SHARE = 0.2
@@ -88,7 +93,7 @@ class _RunPage:
         self.run = run
         self.most = sections
         self.header = header
-        self.counted = counted
+        self.counted, self.row = counted, summarise(run, header.problem, {}).row
         self.palette = Palette.of(header.problem.candidates)
         self.begin_s = _begins(run, header)
         numbers = run.windows["window"].to_list()
@@ -122,23 +127,17 @@ class _RunPage:
         return shown_policy(self.header.policy_name)
 
     def _facts(self) -> Iterator[Fact]:
-        cycles, decisions = self.counted.cycles, self.counted.decisions
-        missed = cycles["missed"].to_numpy()
-        l95_ms = order_statistic(latency_ms(cycles), 95)
+        row = {name: float(value) for name, value in self.row.items() if not isinstance(value, str)}
         deadline = f"deadline {write_ms(self.header.deadline_ms)}"
-        yield Fact("V_D, deadlines missed", percent(float(missed.mean()), 1), "aim: under 5 %")
-        yield Fact("L95 of all cycles", write_ms(l95_ms), deadline)
-        yield Fact("misses in a row", write_number(longest_streak(missed), 0), "at most")
-        cost = self.counted.windows["cost"].mean()
-        yield Fact("J", write_number(_number(cost), 2), "mean")
-        moves = decisions.filter(decisions["migrated"])
-        by_guard = moves["reason"].cast(str) == "guard"
-        own = moves.filter(~by_guard)
-        undone = f"{_undone(own)} undone"
-        yield Fact("migrations", write_number(own.height, 0), undone)
-        if by_guard.any():
-            yield Fact("moves of the guard", write_number(int(by_guard.sum()), 0))
-        yield Fact("cycles", write_number(cycles.height, 0))
+        yield Fact("V_D, deadlines missed", percent(row["violation_rate"], 1), "aim: under 5 %")
+        yield Fact("L95 of all cycles", write_ms(row["p95_ms"]), deadline)
+        yield Fact("misses in a row", write_number(row["longest_misses"], 0), "at most")
+        yield Fact("J", write_number(row["cost"], 2), "mean")
+        undone = f"{self.row['returns']} undone"
+        yield Fact("migrations", write_number(row["migrations"], 0), undone)
+        if row["guard_moves"]:
+            yield Fact("moves of the guard", write_number(row["guard_moves"], 0))
+        yield Fact("cycles", write_number(row["cycles"], 0))
 
     def _sections(self) -> Iterator[Section]:
         yield Section("", [self._timeline(), *self._phases()])
@@ -171,10 +170,8 @@ class _RunPage:
             self.run.windows,
             self.run.decisions,
             self.begin_s,
+            self.header.problem,
             slug="time",
-            palette=self.palette,
-            resources=resources_in(self.run.windows, self.header.problem),
-            deadline_ms=self.header.deadline_ms,
             disturbed=self.header.disturbed,
             tracking=self.header.tracking,
             links=links,
@@ -190,40 +187,8 @@ class _RunPage:
 
     def _phases(self) -> Iterator[Table]:
         rows = phase_rows(self.run, self.header)
-        if len(rows) < 2:
-            return
-        used = {name for row in rows for name in row.shares}
-        names = [name for name in self.palette.placements if name in used]
-        columns: Columns = [
-            Text("name", "phase"),
-            Measure("begin_s", "from", "s", decimals=0),
-            Measure("end_s", "to", "s", decimals=0),
-            RATE,
-            FINAL_L95,
-            Measure("lost", "lost", decimals=0),
-            *(Measure(f"share {name}", name, "%", 100.0, 0) for name in names),
-            Measure("migrations", "migrations", decimals=0),
-            Measure("guard_moves", "by the guard", decimals=0),
-        ]
-        if self.header.tracking is not None:
-            columns += [
-                Measure("rms_mm", "error", "mm", decimals=2),
-                Measure("rms_px", "error", "px"),
-            ]
-        shown = [
-            {**row._asdict(), **{f"share {name}": row.shares.get(name, 0.0) for name in names}}
-            for row in rows
-        ]
-        yield Table(
-            "phases",
-            "By phase",
-            columns,
-            shown,
-            caption=(
-                "All cycles by when they were released, the warm-up included. Lost: cycles that "
-                "never finished."
-            ),
-        )
+        if len(rows) > 1:
+            yield phase_table(rows, self.palette)
 
     # -------------------------------------------------------------------------- worst windows
 
@@ -346,44 +311,20 @@ class _RunPage:
     # ------------------------------------------------------------------ outcomes and placements
 
     def _outcomes(self) -> Table:
-        cycles = self.counted.cycles
-        counts = Counter(cycles["outcome"].cast(str))
-        rows = [
-            {
-                "outcome": name,
-                "why": why,
-                "cycles": counts[name],
-                "share": counts[name] / cycles.height,
-            }
-            for name, why in OUTCOME_SENTENCES.items()
-        ]
-        columns: Columns = [
-            Text("outcome", "outcome"),
-            Text("why", "meaning"),
-            Measure("cycles", "cycles", decimals=0),
-            Measure("share", "share", "%", 100.0, 2),
-        ]
-        return Table("outcomes", "What became of the cycles", columns, rows)
+        columns = (Text("outcome", "outcome"), Text("why", "meaning"))
+        found = self.counted.cycles["outcome"]
+        title = "What became of the cycles"
+        return _counts("outcomes", title, columns, OUTCOME_SENTENCES, found, "cycles", 2)
 
     def _shares(self) -> Table:
-        windows = self.counted.windows
-        counts = Counter(windows["placement"].cast(str))
-        rows = [
-            {
-                "placement": name,
-                "where": _moving(self.header, name),
-                "windows": counts[name],
-                "share": counts[name] / windows.height,
-            }
-            for name in self.palette.placements
-        ]
-        columns: Columns = [
+        columns = (
             Text("placement", "placement", "placement"),
             Text("where", "tasks that not all have on one node"),
-            Measure("windows", "windows", decimals=0),
-            Measure("share", "share", "%", 100.0, 0),
-        ]
-        return Table("placements", "Where it was", columns, rows, palette=self.palette)
+        )
+        places = {name: _moving(self.header, name) for name in self.palette.placements}
+        found = self.counted.windows["placement"]
+        table = _counts("placements", "Where it was", columns, places, found, "windows", 0)
+        return replace(table, palette=self.palette)
 
     # ----------------------------------------------------------------------------- decisions
 
@@ -429,7 +370,7 @@ class _RunPage:
 
     def _migrations(self, moves: pl.DataFrame) -> Table:
         cost = dict(self.run.windows.select("window", "cost").rows())
-        length_s = self.header.window_cycles * self.header.period_ms / 1e3
+        length_s = self.header.problem.window_ms / 1e3
         rows = []
         for move in moves.head(MOST_ROWS).iter_rows(named=True):
             window, target, reason = move["window"], move["placement"], str(move["reason"])
@@ -527,9 +468,28 @@ def _begins(run: Run, header: RunHeader) -> NDArray[np.float64]:
     return np.array([released[cycle] / 1e9 for cycle in run.windows["first_cycle"]], np.float64)
 
 
-def _undone(moves: pl.DataFrame) -> int:
-    pairs = moves.select("incumbent", "placement").rows()
-    return sum(now == before[::-1] for before, now in itertools.pairwise(pairs))
+def _counts(
+    slug: str,
+    title: str,
+    columns: tuple[Text, Text],
+    meanings: Mapping[str, str],
+    found: pl.Series,
+    what: str,
+    decimals: int,
+) -> Table:
+    """Return a table of names, their meanings, and how often each stands in a column."""
+    counts, (name, meaning) = Counter(found.cast(str)), columns
+    rows = [
+        {
+            name.column: one,
+            meaning.column: text,
+            what: counts[one],
+            "share": counts[one] / len(found),
+        }
+        for one, text in meanings.items()
+    ]
+    measures = Measure(what, what, decimals=0), Measure("share", "share", "%", 100.0, decimals)
+    return Table(slug, title, [*columns, *measures], rows)
 
 
 def _moving(header: RunHeader, name: str) -> str:

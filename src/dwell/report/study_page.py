@@ -10,20 +10,18 @@ from typing import TYPE_CHECKING
 from dwell.model.bounds import counted
 from dwell.report.charts import NO_LIMIT, Limit, curves
 from dwell.report.figure import Figure
-from dwell.report.formatting import Measure, few_seeds
+from dwell.report.formatting import COST, L95, MIGRATIONS, RATE, REGRET, Measure, few_seeds
 from dwell.report.method import numbered
 from dwell.report.page import Block, Definitions, Page, Section, page_html
-from dwell.report.policy_blocks import COST, L95, RATE, THE_AIM, PolicyBlocks, named, scaled
+from dwell.report.policy_blocks import THE_AIM, PolicyBlocks, named, scaled
 from dwell.report.table import Table, Text
 from dwell.study import StudyRuns, over_seeds
 
 if TYPE_CHECKING:
     import polars as pl
 
-REGRET = Measure("regret", "regret", "%", 100.0)
 #: Parameters that change the deadline.
 DEADLINES = ("parameter.deadline_ms", "parameter.period_ms")
-MIGRATIONS = Measure("migrations", "migrations")
 
 
 def study_html(study: StudyRuns, *, static: bool = False) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dwell.report.charts import coloured, is_wide, layer, limit_rule, name_of, names, quantity
+from dwell.report.charts import coloured, disc, is_wide, layer, limit_rule, name_of, names, quantity
 from dwell.report.figure import Draw, Figure, Spec
 from dwell.report.palette import BAD, INK, MUTED, SHADE, Palette
 from dwell.study import AIM
@@ -45,8 +45,8 @@ AT = quantity("time", "at (s)", format=".1f")
 SHADES = layer(
     "rect",
     {
-        "x": {"field": "begin"},
-        "x2": {"field": "end"},
+        "x": "begin",
+        "x2": "end",
         "opacity": {"condition": {"test": f"datum.what === '{WARMUP}'", "value": 0.5}, "value": 1},
     },
     rows="spans",
@@ -64,11 +64,9 @@ def run_timeline(
     windows: pl.DataFrame,
     decisions: pl.DataFrame,
     begin_s: NDArray[np.float64],
+    problem: Problem,
     *,
     slug: str,
-    palette: Palette,
-    resources: Sequence[str],
-    deadline_ms: float,
     disturbed: Iterable[Disturbed] = (),
     tracking: Tracking | None = None,
     links: Mapping[int, str] | None = None,
@@ -84,10 +82,6 @@ def run_timeline(
     ----------
     begin_s : float64 array, shape (windows,)
         When each window began, seconds.
-    resources : sequence of str
-        Whose utilisation is drawn (see `resources_in`).
-    palette : Palette
-        Colours of the candidates.
     disturbed : iterable of Disturbed
         Disturbances, cut at the ends of the run.
     links : mapping of int to str, optional
@@ -99,7 +93,8 @@ def run_timeline(
 
     length_s = float(np.median(np.diff(begin_s))) if len(begin_s) > 1 else 1.0
     end_s = float(begin_s[-1]) + length_s
-    candidates = tuple(palette.placements)
+    deadline_ms, resources = problem.pipeline.deadline_ms, resources_in(windows, problem)
+    placements = Palette.of(problem.candidates).placements
     each = 1 if windows.height <= MOST_MARKS else math.ceil(windows.height / MOST_BINS)
     frame = pl.DataFrame(
         {
@@ -118,7 +113,7 @@ def run_timeline(
         frame = frame.with_columns(error=pl.Series(errors, dtype=pl.Float64))
     frames = {
         "windows": _binned(frame, each),
-        "estimates": _estimates(windows, decisions, begin_s + length_s, candidates, each),
+        "estimates": _estimates(windows, decisions, begin_s + length_s, [*placements], each),
         "moves": _moves(windows, decisions, begin_s, length_s),
         "spans": _spans(windows, disturbed, begin_s, length_s, end_s),
         "nodes": _used(windows, begin_s + length_s / 2, resources, each),
@@ -126,11 +121,11 @@ def run_timeline(
     wide = is_wide([*frame["l95"].drop_nulls().drop_nans(), deadline_ms])
     aim, due = limit_rule("y", 100 * AIM, "5 %"), limit_rule("y", deadline_ms, "deadline")
     used = set(frame["placement"])
-    colours = {name: colour for name, colour in palette.placements.items() if name in used}
+    colours = {name: colour for name, colour in placements.items() if name in used}
     panels: list[tuple[float, list[Spec]]] = [
         (PANEL_PX, [*aim, *_marks("v_d", "V_D (%)", colours, each)]),
         (PANEL_PX, [*due, *_marks("l95", L95, colours, each, log=wide)]),
-        (PANEL_PX, [_others(palette), *_marks("j", "J", colours, each)]),
+        (PANEL_PX, [_others(placements), *_marks("j", "J", colours, each)]),
         (USE_PX, _use(resources, each)),
     ]
     if tracking is not None:
@@ -167,9 +162,7 @@ def fleet_timeline(
     import polars as pl
 
     problems = run.fleet.problems
-    length_s = {
-        name: one.window_cycles * one.pipeline.period_ms / 1e3 for name, one in problems.items()
-    }
+    length_s = {name: one.window_ms / 1e3 for name, one in problems.items()}
     first, *_ = run.cells
     step_s = length_s[first]
     count = max(run.cells[name].windows.height for name in cells)
@@ -428,7 +421,7 @@ def _named_spans(width: float, time: Spec) -> Spec:
     """Return a row for everything that went on, with its name."""
     encoding = {
         "x": {"field": "begin", **time, "axis": None},
-        "x2": {"field": "end"},
+        "x2": "end",
         "y": name_of("what", sort=None, axis={"domain": False, "ticks": False}),
         "tooltip": [
             *names("what"),
@@ -473,7 +466,7 @@ def _marks(
     }
     # On paper many stand side by side.
     size = 18 if each == 1 else 8
-    marks = [layer("point", point, rows="windows", filled=True, size=size, opacity=0.9)]
+    marks = [disc(point, size, rows="windows", opacity=0.9)]
     if each == 1:
         return marks
     bars = [
@@ -481,7 +474,7 @@ def _marks(
             "rule",
             {
                 "y": quantity(f"{field}_{low}", title, scale=scale, axis={"tickCount": 4}),
-                "y2": {"field": f"{field}_{high}"},
+                "y2": f"{field}_{high}",
                 "color": colour,
             },
             rows="windows",
@@ -496,8 +489,8 @@ def _marks(
 def _placed(cells: Sequence[str], colours: Mapping[str, str]) -> Spec:
     """Return the stays of cells at their placements, a row a cell."""
     encoding = {
-        "x": {"field": "begin"},
-        "x2": {"field": "end"},
+        "x": "begin",
+        "x2": "end",
         "y": name_of("cell", sort=list(cells), axis={"labelOverlap": True}),
         "color": coloured("placement", colours, legend={"symbolType": "square"}),
         "tooltip": [
@@ -515,7 +508,7 @@ def _rates() -> list[Spec]:
     about = [AT, *names("worst")]
     about += [quantity(how, f"{how} (%)") for how in ("max", "mean", "min")]
     up = {"y": quantity("mean", "V_D (%)", axis={"tickCount": 4})}
-    band = {"y": quantity("min", "V_D (%)"), "y2": {"field": "max"}}
+    band = {"y": quantity("min", "V_D (%)"), "y2": "max"}
     return [
         layer("area", band, rows="rates", color=MUTED, opacity=0.3),
         layer("line", up, rows="rates", color=INK, strokeWidth=1.1),
@@ -523,10 +516,10 @@ def _rates() -> list[Spec]:
     ]
 
 
-def _others(palette: Palette) -> Spec:
+def _others(colours: Mapping[str, str]) -> Spec:
     encoding = {
         "y": quantity("j", "J", scale={"zero": False}, axis={"tickCount": 4}),
-        "color": coloured("placement", palette.placements, legend=None),
+        "color": coloured("placement", colours, legend=None),
     }
     return layer("line", encoding, rows="estimates", strokeWidth=1, opacity=0.75)
 
@@ -553,7 +546,7 @@ def _use(resources: Sequence[str], each: int) -> list[Spec]:
     bands = [
         layer(
             "area",
-            {"y": up(low), "y2": {"field": f"used{high}"}, "color": colour},
+            {"y": up(low), "y2": f"used{high}", "color": colour},
             rows="nodes",
             opacity=opacity,
         )

@@ -66,32 +66,20 @@ def topology(problem: Problem) -> Figure:
         "x": quantity("x", None, axis=None, scale={"domain": [-1.0, 1.0]}),
         "y": quantity("y", None, axis=None, scale={"domain": [low, high or 1.0]}),
     }
-    middle = {"x": {"field": "mx"}, "y": {"field": "my"}, "text": {"field": "text"}}
+    middle = {"x": "mx", "y": "my", "text": "text"}
     halo: Spec = {"stroke": PAPER, "strokeWidth": 6, "strokeJoin": "round"}
-    box: Spec = {
-        "width": NODE_PX,
-        "height": tall,
-        "cornerRadius": 4,
-        "fill": SHADE,
-        "stroke": MUTED,
-    }
+    box: Spec = {"width": NODE_PX, "height": tall, "fill": SHADE, "stroke": MUTED}
     first = -(tall - LINE_PX) / 2 + 7
     layers = [
-        layer(
-            "rule",
-            {"x2": {"field": "x2"}, "y2": {"field": "y2"}},
-            rows="links",
-            color=MUTED,
-            strokeWidth=1.2,
-        ),
+        layer("rule", {"x2": "x2", "y2": "y2"}, rows="links", color=MUTED, strokeWidth=1.2),
         layer("text", middle, rows="links", color=MUTED, **halo),
         layer("text", middle, rows="links", color=MUTED, stroke=None),
-        layer("rect", {}, rows="boxes", where=["datum.head"], **box),
+        layer("rect", {}, rows="boxes", where=["datum.head"], cornerRadius=4, **box),
     ]
     layers += [
         layer(
             "text",
-            {"text": {"field": "text"}},
+            {"text": "text"},
             rows="boxes",
             where=[f"datum.line == {line}"],
             dy=first + line * LINE_PX,

@@ -18,10 +18,10 @@ from dwell.report.charts import (
     coloured,
     cumulative,
     layer,
-    limit_rule,
     name_of,
     names,
     quantity,
+    square,
     stacked,
 )
 from dwell.report.figure import Figure, Spec
@@ -50,8 +50,8 @@ GOAL_NAMES = {
 POINTS, DEADLINES = 120, 3.0
 MEASURED, PREDICTED = "measured", "predicted"
 BOTH = {
-    MEASURED: Style(INK, "circle", DASHES[0], 1.5),
-    PREDICTED: Style(MUTED, "diamond", DASHES[1], 1.5),
+    MEASURED: Style(INK, "circle", DASHES[0]),
+    PREDICTED: Style(MUTED, "diamond", DASHES[1]),
 }
 #: Columns of verdicts that a terminal has room for.
 SHORT = {
@@ -304,22 +304,20 @@ def _scatter(
     domain = {"domain": [0, high], "nice": False}
     across = quantity("measured", f"{title}, measured", scale=domain, axis={"tickCount": 4})
     up = quantity("predicted", "predicted", scale=domain, axis={"tickCount": 4})
-    allowed = {"x": {**across, "field": "at"}, "y": {**up, "field": "low"}, "y2": {"field": "high"}}
+    allowed = {"x": {**across, "field": "at"}, "y": {**up, "field": "low"}, "y2": "high"}
     about = names("policy", "scenario", "metric")
     about += [quantity("measured", "measured"), quantity("predicted", "predicted")]
     marks = [
-        layer("rule", {"x": {"field": "low"}, "x2": {"field": "high"}}, opacity=0.6),
+        layer("rule", {"x": "low", "x2": "high"}, opacity=0.6),
         layer("point", {"shape": name_of("scenario"), "tooltip": about}, size=45, strokeWidth=1.6),
     ]
     groups = {
-        "data": {"name": "rows"},
         "transform": [{"filter": f"datum.goal === '{goal}'"}],
-        "encoding": {"x": across, "y": up, "color": coloured("policy", policies)},
+        "encoding": {"color": coloured("policy", policies)},
         "layer": marks,
     }
     shade = {"data": {"values": band}, **layer("area", allowed, color=SHADE, clip=True)}
-    rules = [*limit_rule("x", *limit), *limit_rule("y", *limit)]
-    return {"width": size, "height": size, "layer": [shade, *rules, groups]}
+    return square(size, across, up, limit, shade, groups)
 
 
 def _panel(group: Group) -> str:

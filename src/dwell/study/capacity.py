@@ -30,6 +30,8 @@ USELESS = 0.5
 ROUNDING = 1e-12
 #: Sizes that are played together where no cell moves: they have draws in common.
 TOGETHER = 4
+#: Names of what a point of the curve says, in JSON.
+CURVE = ("robots", "violation_rate", "low", "high")
 #: Seeds that say where cycles wait.
 WAITING_SEEDS = 3
 
@@ -114,23 +116,14 @@ class Capacity:
     def as_json(self) -> dict[str, Any]:
         """Return it as plain values."""
         limits = self.limits
+        names = ("robots", "at_least", "interval", "limit", "limit_on", "phases", "policy")
         return {
-            "robots": self.robots,
-            "at_least": self.at_least,
+            **{name: getattr(self, name) for name in names},
             "interval": list(self.interval),
-            "limit": self.limit,
-            "limit_on": self.limit_on,
-            "phases": self.phases,
-            "policy": self.policy,
             "reason": self.reason or None,
             "limits": None if limits is None else {limits.kind: limits.name, "share": limits.share},
             "curve": [
-                {
-                    "robots": point.robots,
-                    "violation_rate": point.violation_rate.value,
-                    "low": point.violation_rate.low,
-                    "high": point.violation_rate.high,
-                }
+                dict(zip(CURVE, (point.robots, *point.violation_rate), strict=True))
                 for point in self.curve
             ],
         }

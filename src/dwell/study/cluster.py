@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import operator
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -127,7 +128,8 @@ def _work(
     """Send all units, and take their results as they come."""
     # Sent to each worker once, like the task of a local process.
     everywhere = client.scatter(task, broadcast=True, hash=False)
-    waiting = dict(zip(client.map(_do, units, task=everywhere, pure=False), units, strict=True))
+    futures = client.map(operator.call, [everywhere] * len(units), units, pure=False)
+    waiting = dict(zip(futures, units, strict=True))
     try:
         for future in dask.as_completed(list(waiting), loop=client.loop):
             take(waiting.pop(future), future.result())
@@ -140,8 +142,3 @@ def _work(
         raise SimulationError(
             "the Dask cluster was lost on the way: its scheduler, or all of its workers at a time"
         ) from None
-
-
-def _do(unit: Any, *, task: Callable[[Any], Any]) -> Any:
-    """Do the task on a unit, in a worker."""
-    return task(unit)

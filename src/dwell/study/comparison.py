@@ -14,8 +14,7 @@ from dwell.model import Problem
 from dwell.model.progress import Progress
 from dwell.study.player import Example, Player
 from dwell.study.results import StudyRuns
-from dwell.study.runner import play_in_memory
-from dwell.study.software import versions
+from dwell.study.runner import play_in_memory, results_of
 from dwell.study.study import Contender, Point, Study
 
 if TYPE_CHECKING:
@@ -92,18 +91,8 @@ def compare(
     )
     player = Player(study, kept=study.seeds[:1])
     tables, kept = play_in_memory(player, processes=processes, progress=progress)
-    return Comparison(
-        name=study.name,
-        problem=problem,
-        scenarios=study.scenarios,
-        policies=study.policies,
-        seeds=study.seeds,
-        windows=windows,
-        **tables,
-        labels=study.labels,
-        examples={(item.scenario, policy): one for (item, _, policy), one in kept.items()},
-        versions=versions(),
-    )
+    examples = {(item.scenario, policy): one for (item, _, policy), one in kept.items()}
+    return Comparison(**results_of(study, tables), examples=examples)
 
 
 def _contender(problem: Problem, name: str, policy: MinimalPolicy | str) -> Contender:

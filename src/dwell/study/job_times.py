@@ -130,20 +130,7 @@ def links_of(jobs: pl.DataFrame | None, problem: Problem) -> tuple[pl.DataFrame,
 
     inputs = [flow.target for flow in problem.pipeline.flows]
     flows = [flow for flow in problem.pipeline.flows if inputs.count(flow.target) == 1]
-    text = ("scenario", "link", "flow")
-    numbers = ("mean_ms", "std_ms", "p50_ms", "p95_ms")
-    empty = pl.DataFrame(
-        schema=dict.fromkeys(text, pl.String)
-        | {"messages": pl.Int64}
-        | dict.fromkeys(numbers, pl.Float64)
-    )
-    shares = pl.DataFrame(
-        schema={"scenario": pl.String, "link": pl.String}
-        | dict.fromkeys(("delay_ms", "share"), pl.Float64)
-    )
-    if jobs is None or not flows:
-        return empty, shares
-    keys = ["run", "scenario", "cycle"]
+    text, keys = ("scenario", "link", "flow"), ["run", "scenario", "cycle"]
     sent = [
         jobs.filter(pl.col("task") == flow.source)
         .select(*keys, "end_ns", source="node")
@@ -159,10 +146,10 @@ def links_of(jobs: pl.DataFrame | None, problem: Problem) -> tuple[pl.DataFrame,
             took_ms=(pl.col("ready_ns") - pl.col("end_ns")) / 1e6,
         )
         for flow in flows
+        if jobs is not None
     ]
-    every = pl.concat(sent)
-    if every.is_empty():
-        return empty, shares
+    none = pl.DataFrame(schema=dict.fromkeys(text, pl.String) | {"took_ms": pl.Float64})
+    every = pl.concat([none, *sent])
     took = pl.col("took_ms")
     table = every.group_by(*text, maintain_order=True).agg(
         messages=pl.len().cast(pl.Int64),
@@ -182,7 +169,9 @@ def _shares(sent: pl.DataFrame) -> pl.DataFrame:
     import polars as pl
 
     shares = np.linspace(0, 1, POINTS)
-    parts = []
+    names, numbers = ("scenario", "link"), ("delay_ms", "share")
+    schema = dict.fromkeys(names, pl.String) | dict.fromkeys(numbers, pl.Float64)
+    parts = [pl.DataFrame(schema=schema)]
     for (scenario, link), mine in sent.group_by("scenario", "link", maintain_order=True):
         delays_ms = np.quantile(mine["took_ms"].to_numpy(), shares, method="higher")
         parts.append(

@@ -86,26 +86,20 @@ class Prediction(NamedTuple):
 
 
 def _under_aim(words: str, policy: str) -> PaperClaim:
-    """The violation rate is under the aim."""
-    return PaperClaim(words, "V_D under 5 %", partial(_is_under_aim, policy))
+    return PaperClaim(words, "V_D under 5 %", partial(_stands, policy, "under"))
 
 
 def _over_aim(policy: str) -> PaperClaim:
-    """The violation rate is above the aim."""
-
-    def holds(comparison: StudyRuns, scenario: str) -> bool | None:
-        is_under = _is_under_aim(policy, comparison, scenario)
-        return None if is_under is None else not is_under
-
-    return PaperClaim("High V_D", "V_D above 5 %", holds)
+    return PaperClaim("High V_D", "V_D above 5 %", partial(_stands, policy, "over"))
 
 
-def _is_under_aim(policy: str, comparison: StudyRuns, scenario: str) -> bool | None:
+def _stands(policy: str, word: str, comparison: StudyRuns, scenario: str) -> bool | None:
+    """Whether V_D stands under or over the aim; None where that is not shown."""
     rates = _values(comparison, scenario, policy, "violation_rate")
     if rates is None:
         return None
-    word = under(rates, AIM, windows=comparison.windows_behind(scenario, policy))
-    return {"under": True, "over": False}.get(word)
+    shown = under(rates, AIM, windows=comparison.windows_behind(scenario, policy))
+    return None if shown == "not shown" else shown == word
 
 
 def _more(

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -88,19 +88,14 @@ def run_study(
         tables, _ = play_in_memory(player, processes=processes, dask=dask, progress=progress)
     else:
         tables = _play_in_folder(player, folder, processes, dask, progress)
-    return StudyResult(
-        name=study.name,
-        problem=study.points[0].problem,
-        scenarios=study.scenarios,
-        policies=study.policies,
-        seeds=study.seeds,
-        windows=study.windows,
-        **tables,
-        versions=versions(),
-        labels=study.labels,
-        study=study,
-        folder=folder,
-    )
+    return StudyResult(**results_of(study, tables), study=study, folder=folder)
+
+
+def results_of(study: Study, tables: Tables) -> dict[str, Any]:
+    """Return what all results of a study have: its plan, tables, and versions of the software."""
+    names = ("name", "scenarios", "policies", "seeds", "windows", "labels")
+    plan = {name: getattr(study, name) for name in names}
+    return {**plan, **tables, "problem": study.points[0].problem, "versions": versions()}
 
 
 def play_in_memory(

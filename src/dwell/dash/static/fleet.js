@@ -79,7 +79,7 @@ class Small {
   show(state) {
     panel.health(this.root, state, false);
     const { window: seen, decision } = state;
-    say(this.seen, seen ? `window ${seen.number}: L95 ${number(seen.seen.l95_ms, 1)} ms, V_D ${percent(seen.seen.violation_rate, 0)}` : "no window yet");
+    say(this.seen, seen ? `window ${seen.number}: L95 ${number(seen.seen.l95_ms, 1)} ms, V_D ${percent(seen.seen.violation_rate, 0)}` : "");
     say(this.last, decision ? `decided: ${panel.decided_in_words(decision)}` : `${state.placement}; no decision yet`);
   }
 }

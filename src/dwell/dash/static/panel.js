@@ -2,7 +2,7 @@
 
 import { ago, count, make, number, percent, place, say } from "./dom.js";
 
-const HEALTH = { ok: "●", degraded: "▲", stalled: "■", silent: "✕", absent: "✕" };
+const HEALTH = { ok: "●", degraded: "▲", stalled: "■", silent: "✕", absent: "✕", unmeasured: "○" };
 const REASONS = {
   dwell: "the last move is too young",
   hold: "no other candidate is better by enough",
@@ -16,7 +16,7 @@ export const health = (root, state, stale) => {
   const word = stale ? "absent" : (state.health ?? "absent");
   const element = root.querySelector(".health");
   element.classList.toggle("ok", word === "ok");
-  element.classList.toggle("bad", word !== "ok");
+  element.classList.toggle("bad", word !== "ok" && word !== "unmeasured");
   say(element, `${HEALTH[word] ?? "?"} ${word}${state.headline ? `: ${state.headline}` : ""}`);
 };
 

@@ -1,0 +1,37 @@
+"""JSON documents: what stands in the files beside tables, and what may stand in any."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from dwell.errors import RunError
+
+
+def read_document(file: Path) -> dict[str, Any]:
+    """Read a file that holds a mapping; of any other JSON an empty one.
+
+    Raises
+    ------
+    RunError
+        If it cannot be read, or is no JSON.
+    """
+    try:
+        document = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise RunError(f"{file}: cannot be read ({error})") from None
+    return document if isinstance(document, dict) else {}
+
+
+def json_ready(value: Any) -> Any:
+    """Return a value as JSON has it: null for a number that is not finite, a path as text."""
+    if isinstance(value, Mapping):
+        return {str(key): json_ready(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [json_ready(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value
