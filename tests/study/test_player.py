@@ -18,7 +18,8 @@ from dwell import draw, simulate, simulate_realisation
 from dwell.errors import SimulationError
 from dwell.model import FrozenDict, Problem
 from dwell.study import Contender, Study, run_study
-from dwell.study.player import Player, judged_cost, judged_costs
+from dwell.study.judged_cost import judged_cost, judged_costs
+from dwell.study.player import Player
 from dwell.study.summary import summarise
 from tests.cells.small import make_problem
 from tests.study.test_study import grid, make_study

@@ -16,7 +16,7 @@ from dwell import draw, simulate, simulate_realisation
 from dwell.cellfile.study_paths import with_settings
 from dwell.errors import MetricError
 from dwell.study import Contender, Point, StudyResult, compare, run_study
-from dwell.study.player import judged_cost
+from dwell.study.judged_cost import judged_cost
 from dwell.study.reference import references
 from dwell.study.summary import summarise
 from tests.cells.small import make_problem

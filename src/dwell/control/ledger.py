@@ -105,9 +105,7 @@ class FleetLedger:
         names = sorted(cell.name for cell in cells)
         #: Place of each cell where they take turns, and how long one is.
         self.order = [names.index(cell.name) for cell in cells]
-        self.turn_ns = max(
-            round(problem.window_cycles * problem.pipeline.period_ms * 1e6) for problem in problems
-        )
+        self.turn_ns = max(round(problem.window_ms * 1e6) for problem in problems)
         #: How often any cell has moved; and of each cell what it was when it was looked at.
         self._moves = 0
         self._looked = [(-1, -1)] * len(self.cells)

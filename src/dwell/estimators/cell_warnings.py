@@ -60,7 +60,7 @@ def warnings_of(problem: Problem, profile: Profile | None = None) -> Iterator[Fa
 def unplayed(problem: Problem, scenario: str, windows: int) -> Iterator[Fault]:
     """Yield a warning where nothing of a scenario falls into the windows of a run that count."""
     items = problem.scenario(scenario)
-    window_s = problem.window_cycles * problem.pipeline.period_ms / 1e3
+    window_s = problem.window_ms / 1e3
     begin_s, end_s = problem.warmup_windows * window_s, windows * window_s
     if not items or any(item.at_s < end_s and item.end_s > begin_s for item in items):
         return

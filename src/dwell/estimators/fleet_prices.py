@@ -322,5 +322,5 @@ def _windows_of(problem: Problem, cells: Sequence[PricedCell], cycles: int) -> i
     """Windows that are played of a cell: all cells for about as long."""
     periods_ms = [cell.problem.pipeline.period_ms for cell in cells]
     span_ms = cycles / sum(1 / period_ms for period_ms in periods_ms)
-    window_ms = problem.window_cycles * problem.pipeline.period_ms
+    window_ms = problem.window_ms
     return 1 + max(math.ceil(span_ms / window_ms), FEWEST - 1)

@@ -129,7 +129,7 @@ class ATP(ATPThresholds):
     def start(self, problem: Problem) -> None:
         """Begin again: the initial candidate, n_d = 0, and no window seen."""
         super().start(problem)
-        window_ms = problem.window_cycles * problem.pipeline.period_ms
+        window_ms = problem.window_ms
         self.every_windows = max(1, round(self.every_ms / window_ms))
 
     def _blank(self) -> tuple[_Window, ...]:

@@ -36,7 +36,7 @@ def shared_load(
     """
     first, *_ = played.values()
     problem = first.problem
-    window_ns = problem.window_cycles * problem.pipeline.period_ms * 1e6
+    window_ns = problem.window_ms * 1e6
     end_ns = min(one.close_ns[-1] if len(one.first) else 0 for one in played.values())
     count = int(end_ns // window_ns)
     edges_ns: Floats = window_ns * np.arange(count + 1, dtype=np.float64)

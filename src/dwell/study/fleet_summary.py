@@ -11,7 +11,7 @@ from typing import Any
 
 from dwell.model.fleet import Fleet
 from dwell.record import FleetRun
-from dwell.study.player import judged_cost
+from dwell.study.judged_cost import judged_cost
 from dwell.study.summary import PLAYED, Summary, summarise
 
 #: Columns that are the sum over cells.

@@ -6,7 +6,6 @@ another. What a window showed is the same for both.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, TypeAlias
@@ -14,13 +13,13 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.cost import hamming, price
 from dwell.errors import SimulationError
 from dwell.estimators.prices import Price, Question, known_prices, take_over
 from dwell.model import Problem
 from dwell.model.bounds import counted
 from dwell.study.hindsight import Hindsight
-from dwell.study.reference import References, kept, play_alone, references, regret, tier_use
+from dwell.study.judged_cost import judged_cost
+from dwell.study.reference import References, kept, play_alone, references, regret
 from dwell.study.software import software
 from dwell.study.study import Contender, Item, Study
 from dwell.study.summary import Summary, summarise
@@ -240,43 +239,3 @@ def _compared(summary: Summary, run: Run, problem: Problem, known: References | 
         "share_kept": kept(run, known, problem),
     }
     return replace(summary, row=row)
-
-
-def judged_cost(run: Run, problem: Problem) -> float:
-    """Mean J after the warm-up by a problem's objective.
-
-    Parameters
-    ----------
-    run : Run
-        A run of this problem, or of one with another controller and objective.
-
-    Returns
-    -------
-    float
-        Without unit; NaN where the controller saw no window.
-    """
-    windows = run.arrays("windows")
-    counted = ~windows["warmup"] & ~np.isnan(windows["cost"])
-    costs = judged_costs(run, problem)[counted]
-    return float(costs.mean()) if len(costs) else float("nan")
-
-
-def judged_costs(run: Run, problem: Problem) -> Floats:
-    """J of every window by a problem's objective, with the switching term of the move to it.
-
-    Parameters
-    ----------
-    run, problem
-        See `judged_cost`.
-
-    Returns
-    -------
-    float64 array, shape (windows,)
-        NaN where the controller did not see the window.
-    """
-    windows = run.arrays("windows")
-    names = [problem.candidates[name] for name in windows.names("placement").to_list()]
-    moved = [0.0, *(hamming(now, then) for then, now in itertools.pairwise(names))]
-    l95_ms, rate = windows["seen_l95_ms"], windows["seen_violation_rate"]
-    switching = np.array(moved[: len(names)])
-    return price(l95_ms, rate, *tier_use(windows, problem), switching, problem.objective)

@@ -1,0 +1,58 @@
+"""Judged cost: what a run came to by the J of a problem that may not be its own."""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.cost import hamming, price
+from dwell.model import Problem
+from dwell.study.reference import tier_use
+
+if TYPE_CHECKING:
+    from dwell.record import Run
+
+Floats: TypeAlias = NDArray[np.float64]
+
+
+def judged_cost(run: Run, problem: Problem) -> float:
+    """Mean J after the warm-up by a problem's objective.
+
+    Parameters
+    ----------
+    run : Run
+        A run of this problem, or of one with another controller and objective.
+
+    Returns
+    -------
+    float
+        Without unit; NaN where the controller saw no window.
+    """
+    windows = run.arrays("windows")
+    counted = ~windows["warmup"] & ~np.isnan(windows["cost"])
+    costs = judged_costs(run, problem)[counted]
+    return float(costs.mean()) if len(costs) else float("nan")
+
+
+def judged_costs(run: Run, problem: Problem) -> Floats:
+    """J of every window by a problem's objective, with the switching term of the move to it.
+
+    Parameters
+    ----------
+    run, problem
+        See `judged_cost`.
+
+    Returns
+    -------
+    float64 array, shape (windows,)
+        NaN where the controller did not see the window.
+    """
+    windows = run.arrays("windows")
+    names = [problem.candidates[name] for name in windows.names("placement").to_list()]
+    moved = [0.0, *(hamming(now, then) for then, now in itertools.pairwise(names))]
+    l95_ms, rate = windows["seen_l95_ms"], windows["seen_violation_rate"]
+    switching = np.array(moved[: len(names)])
+    return price(l95_ms, rate, *tier_use(windows, problem), switching, problem.objective)
