@@ -29,7 +29,7 @@ from dwell.cli.options import (
     option,
     require_held,
 )
-from dwell.cli.output import json_text, print_json
+from dwell.cli.output import json_text, print_json, proof
 from dwell.display import milliseconds
 from dwell.errors import ExitCode
 from dwell.live.state_folder import state_root
@@ -478,8 +478,3 @@ def status_lines(status: dict[str, Any]) -> list[str]:
         note = f"  {process['note']}" if process["note"] else ""
         lines.append(f"  {who:24} {state:10} {process['age_ms']:8.0f} ms{note}")
     return lines
-
-
-def proof(proving: Mapping[str, Any]) -> str:
-    """Return in words how far a proof is."""
-    return "proving {candidate}: {done} of {needed} cycles".format_map(proving)

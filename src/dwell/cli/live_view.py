@@ -17,8 +17,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from dwell.cli.live import proof
-from dwell.cli.output import block
+from dwell.cli.output import block, proof
 from dwell.model import Problem
 from dwell.model.disturbed import Disturbed
 from dwell.report.palette import Palette

@@ -153,3 +153,8 @@ def progress(what: str, *, cycles: float | None = None) -> Iterator[Progress | N
                 bar.update(row, rate=f"{speed * cycles / 1e6:.2f} M cycles/s")
 
         yield show
+
+
+def proof(proving: Mapping[str, Any]) -> str:
+    """Return in words how far a proof is."""
+    return "proving {candidate}: {done} of {needed} cycles".format_map(proving)
