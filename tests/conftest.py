@@ -36,24 +36,20 @@ HERE = Path(__file__).parent
 #: Tests by file or folder: those whose names have one of these parts, or all.
 Chosen: TypeAlias = Mapping[str, tuple[str, ...]]
 
-#: Real processes that have to keep to a period, or to shares of the machine, or that prove a
-#: placement with what is left of it.
+#: Real processes that have to keep to a period, or to shares of the machine.
 ALONE: Chosen = {
-    "cli/test_live.py": (),
-    "cli/test_live_run.py": ("test_any_cell_with_stages_runs",),
     "live/test_real_faults.py": (),
-    "test_package.py": ("test_a_robot_runs_and_moves_a_cell",),
-    "test_readme.py": ("[Live, on this machine]",),
     "testbed/chaos/test_fault_campaign.py": (),
     "testbed/chaos/test_strike.py": (),
     "testbed/test_execution.py": (),
 }
 
 #: Files and folders whose tests one process has, one after another: real processes that may take
-#: their time, but look for free ports, or for free CPUs.
+#: their time, but look for free ports, or for free CPUs; and what is built once.
 TOGETHER = {
     "cells": (
         "cli/test_background.py",
+        "cli/test_live.py",
         "cli/test_live_run.py",
         "cli/test_live_secure.py",
         "cli/test_new.py",
@@ -61,6 +57,7 @@ TOGETHER = {
         "dash/test_live_page_with_keys.py",
         "live/test_security.py",
         "live/transport",
+        "test_readme.py",
     ),
     "testbeds": (
         "cli/test_testbed.py",
@@ -68,6 +65,7 @@ TOGETHER = {
         "testbed/test_run.py",
         "test_two_computers.py",
     ),
+    "packages": ("test_package.py",),
 }
 
 #: What only `make test-all` runs.
@@ -101,12 +99,18 @@ LISTED = {"alone": ALONE, "exhaustive": EXHAUSTIVE}
 
 #: Files whose tests share nothing, and take longest: any process has any of them.
 APART = (
+    "test_sanitizers.py",
+    "test_compilers.py",
     "reference/test_against.py",
     "reference/test_guarded.py",
     "live/test_protocol_model.py",
     "live/test_seeded_faults.py",
     "reproduction/test_questions.py",
+    "test_docs.py",
+    "live/test_controlled_cell.py",
+    "live/test_faults.py",
     "live/test_continuity.py",
+    "regression/test_runs.py",
 )
 
 
