@@ -70,20 +70,28 @@ TOGETHER = {
 
 #: What only `make test-all` runs.
 EXHAUSTIVE: Chosen = {
-    "cli/test_live_run.py": ("test_it_needs_no_more_than_the_extra_live[sim]",),
+    "cli/test_live_run.py": ("test_it_needs_no_more_than_the_extra_live",),
     "cli/test_testbed.py": ("test_interrupted_it_takes_everything_down[15]",),
     "live/test_protocol_model.py": (
-        "test_nothing_goes_wrong_and_there_is_always_a_way_back[states 3]",
+        *(
+            f"test_nothing_goes_wrong_and_there_is_always_a_way_back[{case}]"
+            for case in ("orders 2", "states 1", "states 3", "states 4")
+        ),
         *(f"test_the_stamper_does_what_the_model_does[{seed}]" for seed in (3, 4, 5)),
+        "test_every_rule_is_needed[orders-charge]",
     ),
     "live/test_real_faults.py": (
         "test_cell_survives[freeze",
         *(f"test_cell_survives[cut {a}->{b}]" for a, b in permutations(("R1", "E", "R2"), 2)),
     ),
+    "live/test_seeded_faults.py": tuple(
+        f"test_no_fault_breaks_a_promise[{block}]" for block in range(2, 7)
+    ),
     "reference/test_against.py": ("the others",),
     "reference/test_guarded.py": ("the others",),
     "reproduction/test_questions.py": tuple(
-        f"test_a_question_is_answered[{name}]" for name in ("dynamic", "concurrent", "reversion")
+        f"test_a_question_is_answered[{name}]"
+        for name in ("chatter", "concurrent", "dominance", "dynamic", "jitter", "reversion")
     ),
     "test_compilers.py": (),
     "test_package.py": (),
