@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 import pytest
+import typer.main
 from hypothesis import settings
 from xdist.remote import Producer
 from xdist.scheduler import LoadScopeScheduling
@@ -30,6 +31,9 @@ if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
 settings.register_profile("ci", deadline=None, max_examples=25)
 settings.register_profile("night", deadline=None, max_examples=200)
 settings.load_profile("ci")
+
+# Commands are made of their functions once, and not whenever one is called in the tests' process.
+typer.main.get_command = cache(typer.main.get_command)
 
 HERE = Path(__file__).parent
 
