@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 import pytest
+import typer.main
 from hypothesis import settings
 from xdist.remote import Producer
 from xdist.scheduler import LoadScopeScheduling
@@ -31,29 +32,28 @@ settings.register_profile("ci", deadline=None, max_examples=25)
 settings.register_profile("night", deadline=None, max_examples=200)
 settings.load_profile("ci")
 
+# Commands are made of their functions once, and not whenever one is called in the tests' process.
+typer.main.get_command = cache(typer.main.get_command)
+
 HERE = Path(__file__).parent
 
 #: Tests by file or folder: those whose names have one of these parts, or all.
 Chosen: TypeAlias = Mapping[str, tuple[str, ...]]
 
-#: Real processes that have to keep to a period, or to shares of the machine, or that prove a
-#: placement with what is left of it.
+#: Real processes that have to keep to a period, or to shares of the machine.
 ALONE: Chosen = {
-    "cli/test_live.py": (),
-    "cli/test_live_run.py": ("test_any_cell_with_stages_runs",),
     "live/test_real_faults.py": (),
-    "test_package.py": ("test_a_robot_runs_and_moves_a_cell",),
-    "test_readme.py": ("[Live, on this machine]",),
     "testbed/chaos/test_fault_campaign.py": (),
     "testbed/chaos/test_strike.py": (),
     "testbed/test_execution.py": (),
 }
 
 #: Files and folders whose tests one process has, one after another: real processes that may take
-#: their time, but look for free ports, or for free CPUs.
+#: their time, but look for free ports, or for free CPUs; and what is built once.
 TOGETHER = {
     "cells": (
         "cli/test_background.py",
+        "cli/test_live.py",
         "cli/test_live_run.py",
         "cli/test_live_secure.py",
         "cli/test_new.py",
@@ -61,6 +61,7 @@ TOGETHER = {
         "dash/test_live_page_with_keys.py",
         "live/test_security.py",
         "live/transport",
+        "test_readme.py",
     ),
     "testbeds": (
         "cli/test_testbed.py",
@@ -68,24 +69,33 @@ TOGETHER = {
         "testbed/test_run.py",
         "test_two_computers.py",
     ),
+    "packages": ("test_package.py",),
 }
 
 #: What only `make test-all` runs.
 EXHAUSTIVE: Chosen = {
-    "cli/test_live_run.py": ("test_it_needs_no_more_than_the_extra_live[sim]",),
+    "cli/test_live_run.py": ("test_it_needs_no_more_than_the_extra_live",),
     "cli/test_testbed.py": ("test_interrupted_it_takes_everything_down[15]",),
     "live/test_protocol_model.py": (
-        "test_nothing_goes_wrong_and_there_is_always_a_way_back[states 3]",
+        *(
+            f"test_nothing_goes_wrong_and_there_is_always_a_way_back[{case}]"
+            for case in ("orders 2", "states 1", "states 3", "states 4")
+        ),
         *(f"test_the_stamper_does_what_the_model_does[{seed}]" for seed in (3, 4, 5)),
+        "test_every_rule_is_needed[orders-charge]",
     ),
     "live/test_real_faults.py": (
         "test_cell_survives[freeze",
         *(f"test_cell_survives[cut {a}->{b}]" for a, b in permutations(("R1", "E", "R2"), 2)),
     ),
+    "live/test_seeded_faults.py": tuple(
+        f"test_no_fault_breaks_a_promise[{block}]" for block in range(2, 7)
+    ),
     "reference/test_against.py": ("the others",),
     "reference/test_guarded.py": ("the others",),
     "reproduction/test_questions.py": tuple(
-        f"test_a_question_is_answered[{name}]" for name in ("dynamic", "concurrent", "reversion")
+        f"test_a_question_is_answered[{name}]"
+        for name in ("chatter", "concurrent", "dominance", "dynamic", "jitter", "reversion")
     ),
     "test_compilers.py": (),
     "test_package.py": (),
@@ -101,12 +111,18 @@ LISTED = {"alone": ALONE, "exhaustive": EXHAUSTIVE}
 
 #: Files whose tests share nothing, and take longest: any process has any of them.
 APART = (
+    "test_sanitizers.py",
+    "test_compilers.py",
     "reference/test_against.py",
     "reference/test_guarded.py",
     "live/test_protocol_model.py",
     "live/test_seeded_faults.py",
     "reproduction/test_questions.py",
+    "test_docs.py",
+    "live/test_controlled_cell.py",
+    "live/test_faults.py",
     "live/test_continuity.py",
+    "regression/test_runs.py",
 )
 
 

@@ -321,7 +321,7 @@ class _Maker:
             tier,
             background=background,
             background_beside=beside,
-            background_hz=rng.choice([0.0, 50.0, 700.0]) if turns else 0.0,
+            background_hz=rng.choice([0.0, 50.0, 200.0]) if turns else 0.0,
             interference=rng.choice([1.0, 1.0, 2.0]),
             contention=rng.choice([0.0, 0.0, 0.25, 0.5, 0.75]) if quota is not None else 0.0,
             cores=1 if turns else cores,

@@ -17,7 +17,7 @@ import yaml
 from dwell.live.local_addresses import taken_ports
 from dwell.live.supervision import survivor
 from dwell.live.wiring import wire
-from tests.cli.live_cell import PATIENCE_S, RealCell
+from tests.cli.live_cell import PATIENCE_S, RealCell, invoke
 from tests.cli.small_cell import environment
 from tests.waiting import wait_until
 
@@ -35,6 +35,7 @@ class Cell:
         self.folder = self.root / self.problem.name
 
     def dwell(self, *words: str | Path) -> tuple[int, str, str]:
+        """Run a command, in a process of its own: what it starts is no child of the test's."""
         done = subprocess.run(
             [sys.executable, "-m", "dwell", "live", *map(str, words), "--state", str(self.root)],
             cwd=self.cell.folder,
@@ -49,6 +50,13 @@ class Cell:
 
     def up(self, *more: str | Path) -> tuple[int, str, str]:
         return self.dwell("up", "--out", self.out, *more, self.file)
+
+    def refused(self, *more: str | Path) -> tuple[int, str]:
+        """Ask for what is not started, in this process; returns the exit code and what it says."""
+        words = ("--state", self.root, "--out", self.out, *more)
+        code, _, error = invoke("live", "up", *words, self.file)
+        assert "Traceback" not in error
+        return code, error
 
     def down(self) -> tuple[int, str, str]:
         return self.dwell("down", self.file)
@@ -78,7 +86,7 @@ def cell(tmp_path: Path) -> Iterator[Cell]:
     text = made.file.read_text()
     yield made
     made.file.write_text(text)
-    made.down()
+    invoke("live", "down", made.file, "--state", made.root)
 
 
 def test_a_cell_comes_up_is_looked_at_and_goes_down(cell: Cell) -> None:
@@ -159,7 +167,7 @@ def test_what_dead_agents_have_left_is_named_and_ended(cell: Cell) -> None:
 def test_a_taken_port_is_named_and_nothing_is_started(cell: Cell) -> None:
     port = wire(cell.problem).entry("perception@E").listen["control"].port
     with socket.create_server(("127.0.0.1", port)):
-        code, _, error = cell.up()
+        code, error = cell.refused()
         assert code == 1
         assert f"of the ports of light-follower are taken: {port} by " in error
     cell.assert_nothing_is_there()
@@ -188,7 +196,7 @@ def test_what_cannot_run_is_said_and_nothing_is_started(
         places = {"R1": 7450, "E": 7500, "R2": 7550}
         live = {"hosts": {node: {"address": AWAY, "port": port} for node, port in places.items()}}
     cell.change(**live)
-    found, _, error = cell.up(*options)
+    found, error = cell.refused(*options)
     assert (found, words in error) == (code, True), error
     cell.assert_nothing_is_there()
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
 import dwell
 from dwell.control import Controller
+from dwell.live import role as role_module
 from dwell.live.agent import Agent, CpuCount
 from dwell.live.controlled_cell import ControlledCell, Recorder
 from dwell.live.keys import CONTROLLER, Keys
@@ -28,14 +30,22 @@ from dwell.model import Host, Problem, QoS
 from dwell.policies import MinimalPolicy
 from tests.live.memory_transport import Clock, MemoryTransport, Network, NetworkConditions
 
+# All processes of a cell are here, and take the digest of one and the same.
+role_module.fingerprint = lru_cache(role_module.fingerprint)  # type: ignore[attr-defined]
+
 MS = 1_000_000
 #: What the stages of the canonical cell take.
 EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
 
 
+@cache
+def _canonical() -> Problem:
+    return dwell.load("examples/canonical.yaml")
+
+
 def canonical(window_cycles: int | None = None, **settings: Any) -> Problem:
     """Return the canonical cell with other windows, and settings of its controller."""
-    cell = dwell.load("examples/canonical.yaml")
+    cell = _canonical()
     if window_cycles is not None:
         cell = replace(cell, window_cycles=window_cycles, warmup_windows=0)
     return replace(cell, controller=replace(cell.controller, **settings))
