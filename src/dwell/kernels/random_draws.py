@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.errors import Fault, ProblemError, SimulationError
-from dwell.kernels.disturbances import LEVELS, LinkFault, NodeEffect, link_segments, node_changes
+from dwell.kernels.disturbances import LinkFault, NodeEffect, link_segments, node_changes
 from dwell.kernels.drawn_path import BLOCK, Path, PickedPath, ReplayedPath, independent, path_of
 from dwell.kernels.on_off_intervals import OnOffIntervals, drawn_intervals, interval, ramp
 from dwell.kernels.realisation import LinkSegments, NodeChanges, Phase, Realisation, TraceStart
+from dwell.kernels.rows import LEVELS, Floats, Ints
 from dwell.model import (
     Bursts,
     Constant,
@@ -32,9 +33,6 @@ from dwell.model import (
 from dwell.model.bounds import short
 from dwell.model.instants import HORIZON_NS
 from dwell.model.scenario import RAMP_STEPS
-
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
 
 NS_PER_MS = 1e6
 NS_PER_S = 1e9

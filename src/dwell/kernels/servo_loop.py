@@ -21,14 +21,10 @@ has the loop.
 
 from __future__ import annotations
 
-import ctypes
-from functools import cache
-from typing import Any
+from ctypes import c_double, c_int64
 
-import numpy as np
-from numpy.typing import NDArray
-
-from dwell.kernels.library import library
+from dwell.kernels.library import foreign
+from dwell.kernels.rows import FLOAT_ROWS_OUT, FLOATS_IN, FLOATS_OUT, Floats
 
 # Status.
 DONE, DIVERGED = 0, 1
@@ -38,8 +34,8 @@ N_STATE = 4
 
 
 def follow(
-    measured_s: NDArray[np.float64],
-    actuated_s: NDArray[np.float64],
+    measured_s: Floats,
+    actuated_s: Floats,
     begin_s: float,
     end_s: float,
     double: bool,
@@ -47,8 +43,8 @@ def follow(
     damping: float,
     amplitude: float,
     omega: float,
-    states: NDArray[np.float64],
-    integrals: NDArray[np.float64],
+    states: Floats,
+    integrals: Floats,
 ) -> int:
     """Play the loop from rest at 0 and integrate its error.
 
@@ -82,35 +78,12 @@ def follow(
     shapes = len(measured_s), states.shape, integrals.shape
     if shapes != (n, (n + 1, N_STATE), (2,)):
         raise ValueError(f"measured_s, states and integrals do not fit {n} actuations: {shapes}")
-    status: int = _dwell_follow()(
-        measured_s,
-        actuated_s,
-        n,
-        begin_s,
-        end_s,
-        double,
-        gain,
-        damping,
-        amplitude,
-        omega,
-        states,
-        integrals,
-    )
+    times, plant, target = (begin_s, end_s), (double, gain, damping), (amplitude, omega)
+    status: int = _follow()(measured_s, actuated_s, n, *times, *plant, *target, states, integrals)
     return status
 
 
-@cache
-def _dwell_follow() -> Any:
-    """Return the library's function; it refuses arrays of another type, or not in one piece."""
-    instants = np.ctypeslib.ndpointer(np.float64, ndim=1, flags="C_CONTIGUOUS")
-    written = np.ctypeslib.ndpointer(np.float64, flags=("C_CONTIGUOUS", "WRITEABLE"))
-    function = library().dwell_follow
-    function.restype = ctypes.c_int64
-    function.argtypes = [
-        *(instants, instants, ctypes.c_int64),
-        *(ctypes.c_double, ctypes.c_double),
-        *(ctypes.c_int64, ctypes.c_double, ctypes.c_double),
-        *(ctypes.c_double, ctypes.c_double),
-        *(written, written),
-    ]
-    return function
+_follow = foreign(
+    *("dwell_follow", c_int64, FLOATS_IN, FLOATS_IN, c_int64, c_double, c_double),
+    *(c_int64, c_double, c_double, c_double, c_double, FLOAT_ROWS_OUT, FLOATS_OUT),
+)
