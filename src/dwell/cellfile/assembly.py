@@ -66,9 +66,6 @@ class Assembly:
         Holds the faults so far, takes those found here.
     anchored : bool
         Whether a candidate may name anchored tasks where they are.
-    judged : bool
-        Whether policies and estimators must be known here, and the cell's name be one. A record
-        names what its machine had.
     home : str, optional
         `Problem.folder`.
     """
@@ -77,7 +74,6 @@ class Assembly:
     tables: Tables | None
     faults: Faults
     anchored: bool = False
-    judged: bool = True
     home: str | None = None
 
     def problem(self, name: str) -> Problem:
@@ -132,7 +128,8 @@ class Assembly:
         if not self.anchored:
             self._refuse_anchored(candidates, tasks)
         self._assume(parts)
-        if self.judged:
+        # A record names what its machine had.
+        if not self.faults.is_record:
             self._add(unregistered(parts, called))
         self._judge(parts)
         if self.faults or timing is None or objective is None or controller is None or live is None:

@@ -91,7 +91,7 @@ def from_document(
     *,
     folder: str | PathLike[str] = ".",
     source: str | None = None,
-    judged: bool = True,
+    is_record: bool = False,
 ) -> Problem:
     """Read a cell from plain values, as `dwell.model.document.to_document` makes them.
 
@@ -106,16 +106,16 @@ def from_document(
         Where the traces that it names are.
     source : str, optional
         Name of the document in messages.
-    judged : bool
-        See `read_problem`.
+    is_record : bool
+        Whether an earlier version may have written it, on a machine with other policies.
 
     Raises
     ------
     ProblemError
         With every fault found.
     """
-    faults = Faults(source, is_record=not judged)
-    return read_problem(document, faults, Path(folder), "cell", anchored=True, judged=judged)
+    faults = Faults(source, is_record=is_record)
+    return read_problem(document, faults, Path(folder), "cell", anchored=True)
 
 
 def from_record(document: Mapping[str, object]) -> Problem:
@@ -139,8 +139,7 @@ def from_record(document: Mapping[str, object]) -> Problem:
     ProblemError
         With every fault found.
     """
-    faults = Faults(is_record=True)
-    return read_problem(document, faults, None, "cell", anchored=True, judged=False)
+    return read_problem(document, Faults(is_record=True), None, "cell", anchored=True)
 
 
 def read_problem(
@@ -151,7 +150,6 @@ def read_problem(
     known: dict[object, Tables] | None = None,
     *,
     anchored: bool = False,
-    judged: bool = True,
     home: str | None = None,
 ) -> Problem:
     """Read a document into a Problem.
@@ -170,9 +168,6 @@ def read_problem(
         Traces that were read for documents like this one; takes those that are read now.
     anchored : bool
         Whether a candidate may name anchored tasks where they are.
-    judged : bool
-        Whether policies and estimators must be known here, and the cell's name be one; a record
-        names what its machine had.
     home : str, optional
         Folder of the modules that it names, for `Problem.folder`.
 
@@ -194,4 +189,4 @@ def read_problem(
         if declared not in known:
             known[declared] = read_traces(entry, folder, faults)
         tables = known[declared]
-    return Assembly(entry, tables, faults, anchored, judged, home).problem(name)
+    return Assembly(entry, tables, faults, anchored, home).problem(name)

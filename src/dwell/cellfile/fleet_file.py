@@ -24,7 +24,6 @@ from dwell.cellfile.forms import (
 )
 from dwell.cellfile.structure import FileKind, read_structure
 from dwell.cellfile.yaml_text import read_yaml
-from dwell.errors import ProblemError
 from dwell.estimators.registry import names as estimator_names
 from dwell.model import Problem
 from dwell.model.bounds import NOT_EMPTY, Bound
@@ -151,14 +150,8 @@ class _Reading:
 
     def _cell(self, path: str, file: str) -> Problem | None:
         """Return a cell; every file is read once."""
-        if file in self.known:
-            return self.known[file]
-        self.known[file] = None
-        try:
-            self.known[file] = load(self.path.parent / file)
-        except ProblemError as error:
-            for line in str(error).splitlines():
-                self.faults.add(path, line)
+        if file not in self.known:
+            self.known[file] = self.faults.of_file(path, load, self.path.parent / file)
         return self.known[file]
 
     def _check_names(self, path: str, entry: Entry, cell: Problem) -> None:

@@ -77,38 +77,16 @@ class SampledPath(Path):
 
 
 class ReplayedPath(Path):
-    """Values of a trace in the order in which a run replays its rows."""
+    """Values that are known, of a trace or of a whole path, in the order of some rows."""
 
-    def __init__(self, recorded: Floats, rows: Ints) -> None:
-        self.recorded, self.rows, self.taken = recorded, rows, 0
+    def __init__(self, known: Floats, rows: Ints) -> None:
+        self.known, self.rows, self.taken = known, rows, 0
 
     def values(self, count: int) -> Floats:
         """Return the next values, which the caller may change."""
         rows = self.rows[self.taken : self.taken + count]
         self.taken += count
-        return self.recorded[rows]
-
-
-class PickedPath(Path):
-    """Some cycles of a path that is drawn for every cycle: all at once.
-
-    Parameters
-    ----------
-    path : Path
-    cycles : int
-        Cycles of the whole path.
-    picked : int64 array
-        The cycles that are asked for.
-    """
-
-    def __init__(self, path: Path, cycles: int, picked: Ints) -> None:
-        self.path, self.cycles, self.picked = path, cycles, picked
-
-    def values(self, count: int) -> Floats:
-        """Return the values of the cycles that are picked, which the caller may change."""
-        if count != len(self.picked):
-            raise ValueError(f"{count} values are not those of {len(self.picked)} cycles")
-        return self.path.values(self.cycles)[self.picked]
+        return self.known[rows]
 
 
 class DrawnPath(Path):

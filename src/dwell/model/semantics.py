@@ -11,6 +11,7 @@ import re
 import unicodedata
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from graphlib import CycleError, TopologicalSorter
 from typing import TYPE_CHECKING
 
 from dwell.errors import Fault
@@ -261,30 +262,19 @@ def _flows(parts: CellParts) -> Iterator[Fault]:
 
 
 def _cycle(tasks: Iterable[str], flows: Sequence[Flow]) -> list[str]:
-    """Return the tasks of one directed cycle, or an empty list (depth-first search)."""
-    after: dict[str, list[str]] = {task: [] for task in tasks}
+    """Return the tasks of one directed cycle, or an empty list."""
+    before: dict[str, list[str]] = {task: [] for task in tasks}
     for flow in flows:
-        if flow.source in after and flow.target in after:
-            after[flow.source].append(flow.target)
-    finished: set[str] = set()
-    for root, first in after.items():
-        trail: list[str] = []
-        stack: list[tuple[str, Iterator[str]]] = []
-        if root not in finished:
-            trail.append(root)
-            stack.append((root, iter(first)))
-        while stack:
-            task, rest = stack[-1]
-            following = next(rest, None)
-            if following is None:
-                finished.add(task)
-                trail.pop()
-                stack.pop()
-            elif following in trail:
-                return trail[trail.index(following) :]
-            elif following not in finished:
-                trail.append(following)
-                stack.append((following, iter(after[following])))
+        if flow.source in before and flow.target in before:
+            before[flow.target].append(flow.source)
+    try:
+        TopologicalSorter(before).prepare()
+    except CycleError as error:
+        loop: list[str] = error.args[1]
+        first = next(task for task in before if task in loop)
+        at = loop.index(first)
+        # Its last task is its first.
+        return [*loop[at:-1], *loop[:at]]
     return []
 
 
