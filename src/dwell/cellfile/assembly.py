@@ -41,7 +41,7 @@ from dwell.model.declaration import declared_fields, made_at
 from dwell.model.fabric import accelerator_tiers
 from dwell.model.frozen import FrozenDict
 from dwell.model.process import DRAWN, UnreadTrace
-from dwell.model.semantics import CellParts, find_faults, find_unregistered
+from dwell.model.semantics import CellParts, UnreadNames, find_faults, find_unregistered
 from dwell.policies import registry as policies
 
 T = TypeVar("T")
@@ -340,31 +340,10 @@ class Assembly:
                 self.faults.add(fault.path, fault.message)
 
     def _assume(self, parts: CellParts) -> None:
-        """Take names for declared where the section that would declare them could not be read."""
-        faults, controller = self.faults, parts.controller
-        placed = list(parts.candidates.values())
-        if faults.at("nodes"):
-            names = [name for _, link in parts.links for name in (link.source, link.target)]
-            names += [name for task in parts.tasks.values() if task for name in task.on]
-            names += [name for moves in placed for name in moves.values()]
-            names += [
-                item.node
-                for items in parts.scenarios.values()
-                for _, item in items
-                if isinstance(item, NodeDisturbance)
-            ]
-            names += parts.tiers
-            names += [controller.on] if controller is not None and controller.on else []
-            parts.nodes = dict.fromkeys(names)
-        if faults.at("tasks"):
-            names = [name for _, flow in parts.flows for name in (flow.source, flow.target)]
-            names += [name for moves in placed for name in moves]
-            parts.tasks = dict.fromkeys(names)
-        if faults.at("scales"):
-            parts.scales = [task.scale for task in parts.tasks.values() if task and task.scale]
-        if faults.at("candidates") and controller is not None:
-            names = [controller.policy, *controller.fallbacks, controller.initial or ""]
-            parts.broken_candidates = names
+        """Take all names for declared where the section that declares them could not be read."""
+        for section in ("nodes", "tasks", "scales", "candidates"):
+            if self.faults.at(section):
+                setattr(parts, section, UnreadNames())
 
 
 def unregistered(parts: CellParts, name: str) -> list[Fault]:
