@@ -41,7 +41,15 @@ from dwell.model.declaration import declared_fields, made_at
 from dwell.model.fabric import accelerator_tiers
 from dwell.model.frozen import FrozenDict
 from dwell.model.process import DRAWN, UnreadTrace
-from dwell.model.semantics import CellParts, UnreadNames, find_faults, find_unregistered
+from dwell.model.semantics import (
+    CellParts,
+    UnreadNames,
+    find_faults,
+    find_unregistered,
+    nearest,
+    nearest_of,
+)
+from dwell.model.user_classes import is_class_path
 from dwell.policies import registry as policies
 
 T = TypeVar("T")
@@ -344,6 +352,22 @@ class Assembly:
         for section in ("nodes", "tasks", "scales", "candidates"):
             if self.faults.at(section):
                 setattr(parts, section, UnreadNames())
+
+
+def unknown_names(policy: str | None, estimator: str | None, cell: Problem) -> Iterator[Fault]:
+    """Yield a fault, at ``policy`` or ``estimator``, for each that a cell could not run with."""
+    known = [*policies.names(), *cell.candidates]
+    if policy is not None and policy not in known and not is_class_path(policy):
+        hint = nearest_of(policy, known, "policies")
+        yield Fault("policy", f"unknown policy {policy!r}; {hint}")
+    if estimator is not None and not is_estimator(estimator):
+        hint = nearest(estimator, estimators.names())
+        yield Fault("estimator", f"unknown estimator {estimator!r}; {hint}")
+
+
+def is_estimator(name: str) -> bool:
+    """Whether a name is that of an estimator, or of a class that may be one."""
+    return name in estimators.names() or is_class_path(name)
 
 
 def unregistered(parts: CellParts, name: str) -> list[Fault]:

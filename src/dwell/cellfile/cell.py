@@ -78,8 +78,6 @@ def read_document(source: str) -> tuple[object, Faults]:
 
     faults = Faults(source)
     document = read_yaml(source, faults)
-    if faults.at(""):
-        raise faults.error()  # the file as such; there is nothing to read on
     for key, (what, command) in OTHERS.items():
         if isinstance(document, dict) and key in document and "dwell" not in document:
             faults.refuse(key, f"this is a {what}, not a cell; run it by `{command} FILE`")

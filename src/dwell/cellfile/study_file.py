@@ -19,14 +19,11 @@ from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.overrides import OpenCell, Override, check_apart, open_cell
 from dwell.cellfile.study_paths import SETTINGS, with_settings
 from dwell.errors import ProblemError
-from dwell.estimators.registry import names as estimator_names
 from dwell.model import Problem
 from dwell.model.bounds import as_read
 from dwell.model.dotted_paths import Step, steps_of
 from dwell.model.fleet import Fleet
-from dwell.model.semantics import bad_name, nearest, nearest_of
-from dwell.model.user_classes import is_class_path
-from dwell.policies.registry import names as policy_names
+from dwell.model.semantics import bad_name, nearest
 
 if TYPE_CHECKING:
     from dwell.cellfile.forms import Entry
@@ -99,8 +96,6 @@ def read_study(path: str | PathLike[str], *, references: Collection[str] = ()) -
     source = fspath(path)
     faults = Faults(source)
     document = read_yaml(source, faults, STUDY.what, STUDY.begin)
-    if faults.at(""):
-        raise faults.error()
     of_fleet = isinstance(document, dict) and "fleet" in document
     entry = read_structure(document, faults, FLEET_STUDY if of_fleet else STUDY)
     reading = _FleetReading if of_fleet else _Reading
@@ -375,24 +370,25 @@ class _Reading:
 
     def _check_names(self, policy: DeclaredPolicy, problem: Problem) -> None:
         """Check that the names that a policy gives are known."""
+        from dwell.cellfile.assembly import unknown_names
+
         path = f"policies.{policy.name}"
-        known = [*policy_names(), *problem.candidates]
-        if policy.policy not in known and not is_class_path(policy.policy):
-            hint = nearest_of(policy.policy, known, "policies")
-            self.faults.add(path, f"unknown policy {policy.policy!r}; {hint}")
+        faults = {one.path: one for one in unknown_names(policy.policy, policy.estimator, problem)}
+        if "policy" in faults:
+            self.faults.add(path, faults["policy"].message)
         elif policy.name in problem.candidates and policy.policy != policy.name:
             self.faults.add(
                 path,
                 f"{policy.name!r} is a candidate's name, for the placement that never moves; give "
                 f"{policy.policy!r} another one",
             )
-        if policy.estimator is not None and not _is_estimator(policy.estimator):
-            hint = nearest(policy.estimator, estimator_names())
-            shown = f"unknown estimator {policy.estimator!r}; {hint}"
-            self.faults.add(f"{path}.estimator", shown)
+        if "estimator" in faults:
+            self.faults.add(f"{path}.estimator", faults["estimator"].message)
 
     def _check_settings(self, policy: DeclaredPolicy, points: Sequence[OpenCell]) -> None:
         """Check that the settings of a policy are right at every point."""
+        from dwell.cellfile.assembly import is_estimator
+
         path = f"policies.{policy.name}"
         for cell in points:
             steps = {key: self._steps(path, key, cell) for key in policy.settings}
@@ -402,7 +398,7 @@ class _Reading:
                 for key, found in steps.items()
                 if found is not None
             ]
-            if policy.estimator is not None and _is_estimator(policy.estimator):
+            if policy.estimator is not None and is_estimator(policy.estimator):
                 place = f"{path}.estimator"
                 overrides.append(Override(place, ("controller", "estimator"), policy.estimator))
             if overrides:
@@ -495,10 +491,6 @@ def _combinations(grid: Grid, axes: Axes) -> Iterator[tuple[dict[str, int], dict
     for picked in itertools.product(*(range(len(grid[first])) for first, *_ in axes)):
         at = {path: i for axis, i in zip(axes, picked, strict=True) for path in axis}
         yield at, {path: shown[path][i] for path, i in at.items()}
-
-
-def _is_estimator(name: str) -> bool:
-    return name in estimator_names() or is_class_path(name)
 
 
 def _shown(values: Sequence[Any]) -> list[Value]:

@@ -15,16 +15,18 @@ short (w h <= 0.2) that a Taylor polynomial of degree 4 about their middle stand
 is off by less than A (w h / 2)^5 / 120 < 1e-7 A. e^2 is integrated in closed form; |e| too, between
 the zeros of e, which are found where the error changes its sign or turns inside the piece.
 
-Work and results belong to the caller; times are seconds from the start of the run. `servo_loop.cpp`
-has the loop.
+Times are seconds from the start of the run. `servo_loop.cpp` has the loop.
 """
 
 from __future__ import annotations
 
 from ctypes import c_double, c_int64
 
+import numpy as np
+
 from dwell.kernels.library import foreign
 from dwell.kernels.rows import FLOAT_ROWS_OUT, FLOATS_IN, FLOATS_OUT, Floats
+from dwell.model import Servo
 
 # Status.
 DONE, DIVERGED = 0, 1
@@ -34,53 +36,40 @@ N_STATE = 4
 
 
 def follow(
-    measured_s: Floats,
-    actuated_s: Floats,
-    begin_s: float,
-    end_s: float,
-    double: bool,
-    gain: float,
-    damping: float,
-    amplitude: float,
-    omega: float,
-    states: Floats,
-    integrals: Floats,
-) -> int:
+    servo: Servo, measured_s: Floats, actuated_s: Floats, begin_s: float, end_s: float
+) -> tuple[int, Floats, Floats]:
     """Play the loop from rest at 0 and integrate its error.
 
     Parameters
     ----------
+    servo : Servo
+        Plant, control law and target.
     measured_s, actuated_s : float64 array, shape (n,)
         Instants at which the error of each command was seen, and at which it took effect; both
         ascending, none seen after it took effect.
     begin_s, end_s : float
         What the integrals are taken over.
-    double : bool
-        Whether the plant is the double integrator.
-    gain : float
-        K, 1/s; 1/s^2 for the double integrator.
-    damping : float
-        B, 1/s; not used for the integrator.
-    amplitude, omega : float
-        A, and w in rad/s, above 0.
-    states : float64 array, shape (n + 1, N_STATE)
-        Work: the state at the begin of every hold; the first holds 0.
-    integrals : float64 array, shape (2,)
-        Out: of e^2 and of |e|, in units of A squared times s, and of A times s.
 
     Returns
     -------
-    int
+    status : int
         DONE, or DIVERGED where the position went beyond 10^6 amplitudes; the integrals are then
         not complete.
+    integrals : float64 array, shape (2,)
+        Of e^2 and of |e|, in units of the amplitude squared times s, and of the amplitude times s.
+    states : float64 array, shape (n + 1, N_STATE)
+        The state at the begin of every hold; the first is 0.
     """
-    n = len(actuated_s)
-    shapes = len(measured_s), states.shape, integrals.shape
-    if shapes != (n, (n + 1, N_STATE), (2,)):
-        raise ValueError(f"measured_s, states and integrals do not fit {n} actuations: {shapes}")
-    times, plant, target = (begin_s, end_s), (double, gain, damping), (amplitude, omega)
-    status: int = _follow()(measured_s, actuated_s, n, *times, *plant, *target, states, integrals)
-    return status
+    n, target = len(actuated_s), servo.target
+    if len(measured_s) != n:
+        raise ValueError(f"{len(measured_s)} instants of measurement do not fit {n} actuations")
+    states, integrals = np.zeros((n + 1, N_STATE)), np.empty(2)
+    plant = servo.plant == "double-integrator", servo.gain, servo.damping
+    swing = target.amplitude_mm, target.omega
+    status: int = _follow()(
+        measured_s, actuated_s, n, begin_s, end_s, *plant, *swing, states, integrals
+    )
+    return status, integrals, states
 
 
 _follow = foreign(

@@ -442,8 +442,9 @@ def _registered(
     if not is_class_path(settings.estimator):
         path = "controller.estimator"
         yield from _unknown(path, "estimator", settings.estimator, estimators)
-    if settings.estimator in shadowing:
-        yield from _shadow_budget(settings, len(names))
+    given = settings.shadow_fraction if settings.estimator in shadowing else None
+    if given is not None and (message := too_many_shadows(given, len(names))):
+        yield Fault("controller.shadow_fraction", message)
 
 
 def _live(parts: CellParts) -> Iterator[Fault]:
@@ -471,13 +472,6 @@ def _columns(parts: CellParts) -> Iterator[Fault]:
             if message := bad_name(kind):
                 yield Fault(f"nodes.{name}.accelerators.{kind or repr(kind)}", message)
     yield from table_columns.clash_faults(resources_of(parts.nodes), list(parts.candidates))
-
-
-def _shadow_budget(settings: ControllerSettings, candidates: int) -> Iterator[Fault]:
-    given = settings.shadow_fraction
-    message = "" if given is None else too_many_shadows(given, candidates)
-    if message:
-        yield Fault("controller.shadow_fraction", message)
 
 
 def too_many_shadows(fraction: float, candidates: int) -> str:
