@@ -648,10 +648,6 @@ class _Layout:
         windows, slots = max(real.windows for _, real in self.cells), self._slots()
         margin = 64 + sum(len(rows[name]) for name in ("sites", "flows", "tasks", "servers"))
         n_layers = 1 + max((layer for known in self.layers for layer in known), default=0)
-        layers = np.zeros((len(self.layers), n_layers), np.uint64)
-        for hop, known in enumerate(self.layers):
-            for layer, address in known.items():
-                layers[hop, layer] = address
         clock = {
             "n_slots": slots,
             "n_tasks": self.max_tasks,
@@ -669,8 +665,6 @@ class _Layout:
         day_bits, n_days = self._calendar()
         rows["clock"].append(clock | {"day_bits": day_bits})
         self._announce_first(changes)
-        stamps = np.zeros((cells, cycles), np.int16)
-        stamps[[row["parent"] >= 0 for row in rows["cells"]]] = -1
         logged = cells * (cycles if self.logs_all else slots if self.logs_windows else 0)
         # Rows beyond those that are laid out.
         room = {
@@ -680,51 +674,49 @@ class _Layout:
             "jobs": cells * slots * self.max_tasks,
             "slots": cells * slots,
         }
-        structs: dict[str, Any] = {
-            name: _table(name, rows[name], room.get(name, 0)) for name in rows
+        types, of_parts = row_types(), (cells, windows, PARTS, self.max_resources)
+        blank: dict[str, Any] = {
+            **dict.fromkeys(("work", "switching", "shown", "priced", "tiers"), 0),
+            **dict.fromkeys(("stamps", "compute_ns", "network_ns", "outcome"), (cells, cycles)),
+            **dict.fromkeys(("opened", "closed", "shares"), of_parts),
+            "seen": (cells, windows),
+            "layers": (len(self.layers), n_layers),
+            "following": len(rows["events"]) + room["events"],
+            "days": n_days,
+            "dirty": len(rows["servers"]),
+            "ready": margin,
+            "attempts": (cells * slots, max(self.max_flows, 1)),
+            "own_ns": (cells, self.max_resources),
+            "ages": max(problem.window_cycles for problem, _ in self.cells),
+            "shadow_bytes": (cells if self.shadows else 0, cycles),
+            "log_outcome": logged * self.max_tasks,
         }
-        structs |= {
-            "segments": np.concatenate([structs["segments"], *self.segments]),
-            "rates": np.concatenate([structs["rates"], *self.rates]),
+        lists: dict[str, list[Any]] = {
+            "outputs": self.outputs,
+            "cell_servers": self.cell_servers,
+            "capacity": self.capacity,
+            "site_of": self.site_of,
+            "back_ns": self.back_ns,
+        }
+        tables: dict[str, NDArray[Any]] = {
+            **{name: _table(name, of, room.get(name, 0)) for name, of in rows.items()},
+            **{name: np.zeros(shape, types[name]) for name, shape in blank.items()},
+            **{name: np.array(values, types[name]) for name, values in lists.items()},
             "changes": changes,
-            "seen": np.zeros((cells, windows), row_types()["seen"]),
+            "latency_ns": np.full((cells, cycles), NEVER_NS),
             "log": _as_rows("log", np.full((logged * self.max_tasks, 4), -1)),
+            "log_arrived": np.full((logged, self.max_flows), -1),
+            "route": np.array(self.route, np.int32).reshape(len(self.route), self.max_flows),
+            "shadow_parts": np.array(self.shadow_parts, np.int8).reshape(-1, self.max_tasks),
+            "soonest_ns": np.full((len(self.site_of), self.max_tasks), -1),
         }
-        return Tables(
-            **structs,
-            outputs=np.array(self.outputs, np.int32),
-            cell_servers=np.array(self.cell_servers, np.int32),
-            capacity=np.array(self.capacity, np.float64),
-            work=np.zeros(0),
-            switching=np.zeros(0),
-            shown=np.zeros(0),
-            priced=np.zeros(0),
-            tiers=np.zeros(0, np.int8),
-            site_of=np.array(self.site_of, np.int32),
-            route=np.array(self.route, np.int32).reshape(len(self.route), self.max_flows),
-            back_ns=np.array(self.back_ns, np.int64),
-            shadow_parts=np.array(self.shadow_parts, np.int8).reshape(-1, self.max_tasks),
-            layers=layers,
-            stamps=stamps,
-            following=np.zeros(len(structs["events"]), np.int32),
-            days=np.zeros(n_days, np.int32),
-            dirty=np.zeros(len(rows["servers"]), np.int32),
-            ready=np.zeros(margin, np.int64),
-            attempts=np.zeros((cells * slots, max(self.max_flows, 1)), np.int64),
-            own_ns=np.zeros((cells, self.max_resources)),
-            soonest_ns=np.full((len(self.site_of), self.max_tasks), -1, np.int64),
-            ages=np.zeros(max(problem.window_cycles for problem, _ in self.cells), np.int64),
-            latency_ns=np.full((cells, cycles), NEVER_NS),
-            compute_ns=np.zeros((cells, cycles), np.int64),
-            network_ns=np.zeros((cells, cycles), np.int64),
-            outcome=np.zeros((cells, cycles), np.int8),
-            opened=np.zeros((cells, windows, PARTS, self.max_resources)),
-            closed=np.zeros((cells, windows, PARTS, self.max_resources)),
-            shares=np.zeros((cells, windows, PARTS, self.max_resources)),
-            shadow_bytes=np.zeros((cells if self.shadows else 0, cycles), np.int64),
-            log_outcome=np.zeros(logged * self.max_tasks, np.int8),
-            log_arrived=np.full((logged, self.max_flows), -1, np.int64),
-        )
+        tables["segments"] = np.concatenate([tables["segments"], *self.segments])
+        tables["rates"] = np.concatenate([tables["rates"], *self.rates])
+        tables["stamps"][[row["parent"] >= 0 for row in rows["cells"]]] = -1
+        for hop, known in enumerate(self.layers):
+            for layer, address in known.items():
+                tables["layers"][hop, layer] = address
+        return Tables(**tables)
 
     def _calendar(self) -> tuple[int, int]:
         """Bits of a day, in which about one event happens, and days of a year: two periods."""
