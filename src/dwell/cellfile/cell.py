@@ -20,10 +20,6 @@ if TYPE_CHECKING:
     from dwell.cellfile.traces import Tables
 
 
-#: By the key of its version: another kind of file, and the command that takes it.
-OTHERS = {"dwell-study": ("study", "dwell study"), "dwell-fleet": ("fleet", "dwell fleet run")}
-
-
 def load(path: str | PathLike[str], *, traces: str | PathLike[str] | None = None) -> Problem:
     """Read a cell file.
 
@@ -41,7 +37,7 @@ def load(path: str | PathLike[str], *, traces: str | PathLike[str] | None = None
         TraceError where the traces alone are at fault.
     """
     source = fspath(path)
-    return _load(source, Path(source).parent if traces is None else Path(traces))
+    return read_cell(source, Path(source).parent if traces is None else Path(traces))[1]
 
 
 def load_without_traces(path: str | PathLike[str]) -> Problem:
@@ -57,31 +53,25 @@ def load_without_traces(path: str | PathLike[str]) -> Problem:
     ProblemError
         With every fault found in the file, each with its line and field path.
     """
-    return _load(fspath(path), None)
+    return read_cell(fspath(path), None)[1]
 
 
-def _load(source: str, folder: Path | None) -> Problem:
-    document, faults = read_document(source)
-    home = str(Path(source).resolve().parent)
-    return read_problem(document, faults, folder, Path(source).stem or "cell", home=home)
-
-
-def read_document(source: str) -> tuple[object, Faults]:
-    """Return the plain values of a cell file, and what is wrong with them as such.
+def read_cell(
+    source: str, folder: Path | None, known: dict[object, Tables] | None = None
+) -> tuple[object, Problem]:
+    """Return the plain values of a cell file, and what they say (see `read_problem`).
 
     Raises
     ------
     ProblemError
-        If it is no cell file, or none that could be read on.
+        With every fault found.
     """
     from dwell.cellfile.yaml_text import read_yaml
 
-    faults = Faults(source)
+    faults, file = Faults(source), Path(source)
     document = read_yaml(source, faults)
-    for key, (what, command) in OTHERS.items():
-        if isinstance(document, dict) and key in document and "dwell" not in document:
-            faults.refuse(key, f"this is a {what}, not a cell; run it by `{command} FILE`")
-    return document, faults
+    home = str(file.resolve().parent)
+    return document, read_problem(document, faults, folder, file.stem or "cell", known, home=home)
 
 
 def from_document(
