@@ -193,7 +193,7 @@ def test_a_key_that_has_gone_is_passed_over_in_records_alone(tmp_path: Path) -> 
         from_document({**LEAST, "nodes": {"n": old}})
     plain, record = ({**LEAST, "nodes": {"n": one}} for one in (node, old))
     assert from_record(record) == from_record(plain)
-    assert from_document(record, judged=False) == from_document(plain)
+    assert from_document(record, is_record=True) == from_document(plain)
 
 
 def test_every_key_reaches_the_model() -> None:

@@ -157,10 +157,15 @@ phases: [1, 2, 3]
             "dwell-fleet: 1\ncells: [{cell: EXAMPLES/canonical.yaml}]\nphases: [100]\n",
             "phases[0]: 100 is not allowed; it must be at least 0 and less than period_ms, 33.3333",
         ),
-        ("dwell: 1\n", "dwell: this is a cell; a fleet file begins with `dwell-fleet: 1`"),
+        (
+            "dwell: 1\n",
+            "dwell: this is a cell, not a fleet, which begins with `dwell-fleet: 1`; run "
+            "it by `dwell run FILE`",
+        ),
         (
             "dwell-study: 1\n",
-            "dwell-study: this is a study; a fleet file begins with `dwell-fleet: 1`",
+            "dwell-study: this is a study, not a fleet, which begins with `dwell-fleet: 1`; run "
+            "it by `dwell study FILE`",
         ),
     ],
 )
@@ -184,7 +189,7 @@ def test_two_cells_of_one_name_are_a_fault(tmp_path: Path) -> None:
 def test_a_fleet_is_no_cell_and_no_study(tmp_path: Path) -> None:
     file = tmp_path / "fleet.yaml"
     file.write_text("dwell-fleet: 1\n")
-    with pytest.raises(ProblemError, match="1: dwell-fleet: this is a fleet, not a cell; run it"):
+    with pytest.raises(ProblemError, match="1: dwell-fleet: this is a fleet, not a cell, which"):
         dwell.load(file)
-    with pytest.raises(ProblemError, match="1: dwell-fleet: this is a fleet; a study file begins"):
+    with pytest.raises(ProblemError, match="1: dwell-fleet: this is a fleet, not a study, "):
         load_study(file)

@@ -435,7 +435,7 @@ def test_a_fault_of_the_cell_is_told_with_its_own_line(folder: Path) -> None:
     [
         ("", "the file is empty; a study file begins with `dwell-study: 1`"),
         ("- 1", "a study file is a mapping that begins with `dwell-study: 1`; this is a list"),
-        ("dwell: 1", "this is a cell; a study file begins with `dwell-study: 1`"),
+        ("dwell: 1", "this is a cell, not a study, which begins with `dwell-study: 1`; run it by"),
         ("dwell-study: 2", "schema version 2 is newer than this Dwell, which reads 1"),
         ("dwell-study: true", "true is not allowed; write `dwell-study: 1`"),
         ("{", "not a YAML document"),

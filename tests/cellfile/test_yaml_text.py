@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -13,14 +14,16 @@ from hypothesis import strategies as st
 
 from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.yaml_text import read_value, read_yaml
-from dwell.errors import Fault
+from dwell.errors import Fault, ProblemError
 from dwell.model.dotted_paths import dotted
 
 
 def _read(path: Path, text: str | bytes) -> tuple[object, list[Fault]]:
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     faults = Faults()
-    value = read_yaml(str(path), faults)
+    value = None
+    with suppress(ProblemError):
+        value = read_yaml(str(path), faults)
     return value, list(faults.error().faults)
 
 

@@ -114,10 +114,10 @@ def test_what_is_unknown_is_refused(
 
 def test_a_cell_is_no_fleet_and_a_fleet_is_no_cell(fleet: Path) -> None:
     cell = fleet.with_name("small.yaml")
-    assert_refused(call("fleet", "run", cell), f"{cell}:1: dwell: this is a cell; a fleet file")
+    assert_refused(call("fleet", "run", cell), f"{cell}:1: dwell: this is a cell, not a fleet")
     for command in ("run", "check"):
         assert_refused(call(command, fleet), f"{fleet}:1: dwell-fleet: this is a fleet, not")
-    assert_refused(call("study", fleet), f"{fleet}:1: dwell-fleet: this is a fleet; a study file")
+    assert_refused(call("study", fleet), f"{fleet}:1: dwell-fleet: this is a fleet, not a study")
 
 
 def test_faults_are_told_all_at_once(fleet: Path) -> None:

@@ -15,7 +15,7 @@ import polars
 
 import dwell
 from dwell.kernels import library, servo_loop
-from dwell.model import QoS
+from dwell.model import MovingTarget, QoS, Servo
 from tests.cells.generated import Scheduler, random_problem, random_stamps
 
 ROOT = Path(__file__).parents[2]
@@ -40,10 +40,14 @@ def servo_loops() -> Iterator[bytes]:
         n = int(rng.integers(0, 300))
         released = np.arange(n) * 0.03
         actuated = np.sort(released + rng.exponential(0.04, n))
-        plant = (True, 30.0, 8.0) if case % 2 else (False, rng.uniform(1, 60), 0.0)
-        states, integrals = np.zeros((n + 1, servo_loop.N_STATE)), np.empty(2)
-        stretch = np.minimum(released, actuated), actuated, 0.5, 0.03 * n
-        status = servo_loop.follow(*stretch, *plant, 40.0, rng.uniform(1, 9), states, integrals)
+        gain = 30.0 if case % 2 else rng.uniform(1, 60)
+        target = MovingTarget(40.0, 2 * np.pi / rng.uniform(1, 9))
+        if case % 2:
+            servo = Servo("double-integrator", gain, target, damping=8.0)
+        else:
+            servo = Servo("integrator", gain, target)
+        instants = np.minimum(released, actuated), actuated
+        status, integrals, states = servo_loop.follow(servo, *instants, 0.5, 0.03 * n)
         yield bytes([status])
         yield states.tobytes()
         yield integrals.tobytes()

@@ -8,8 +8,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dwell.kernels.disturbances import LEVELS, LinkFault, NodeEffect, link_segments, node_changes
+from dwell.kernels.disturbances import LinkFault, NodeEffect, link_segments, node_changes
 from dwell.kernels.on_off_intervals import OnOffIntervals, interval
+from dwell.kernels.rows import LEVELS
 from dwell.model.scenario import RAMP_STEPS
 from tests.kernels.levels import levels_at
 

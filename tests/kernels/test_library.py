@@ -16,6 +16,7 @@ from dwell.errors import KernelError
 from dwell.kernels import servo_loop
 from dwell.kernels.library import compiler, digest, library, load
 from dwell.kernels.library_file import MACHINES, NAME, source_digest
+from dwell.model import MovingTarget, Servo
 
 KERNELS = Path(str(files("dwell.kernels")))
 ROOT = Path(__file__).parents[2]
@@ -145,10 +146,8 @@ class Loop:
         self.expected = self.play()
 
     def play(self) -> bytes:
-        states = np.zeros((len(self.instants[0]) + 1, servo_loop.N_STATE))
-        integrals = np.empty(2)
-        stretch = *self.instants, 0.0, self.end
-        servo_loop.follow(*stretch, True, 30.0, 8.0, 40.0, 3.9, states, integrals)
+        servo = Servo("double-integrator", 30.0, MovingTarget(40.0, 1.6), damping=8.0)
+        _, integrals, states = servo_loop.follow(servo, *self.instants, 0.0, self.end)
         return states.tobytes() + integrals.tobytes()
 
 

@@ -15,15 +15,19 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import integrate, signal
 
-from dwell.kernels.servo_loop import DIVERGED, DONE, N_STATE, follow
+from dwell.kernels.servo_loop import DIVERGED, DONE, follow
+from dwell.model import MovingTarget, Servo
+from dwell.model.servo import Plant
 
 # NumPy's own types for what arithmetic makes of float64.
 Floats: TypeAlias = NDArray[np.floating[Any]]
 
-AMPLITUDE, OMEGA = 0.04, 2 * math.pi / 1.6
+AMPLITUDE, SWING_S = 0.04, 1.6
+OMEGA = 2 * math.pi / SWING_S
 PERIOD = 0.03
 INTEGRATOR: dict[str, Any] = {"double": False, "gain": 4.0, "damping": 0.0}
 DOUBLE: dict[str, Any] = {"double": True, "gain": 30.0, "damping": 8.0}
+SERVO = Servo("integrator", 4.0, MovingTarget(AMPLITUDE, SWING_S))
 PLANTS = pytest.mark.parametrize("law", [INTEGRATOR, DOUBLE], ids=["integrator", "double"])
 
 
@@ -31,20 +35,10 @@ def played(
     measured: Floats, actuated: Floats, begin: float, end: float, law: dict[str, Any]
 ) -> tuple[int, float, float]:
     """Return the status and the integrals of e^2 and |e|."""
-    states, integrals = np.empty((len(actuated) + 1, N_STATE)), np.empty(2)
-    status = follow(
-        np.asarray(measured, np.float64),
-        np.asarray(actuated, np.float64),
-        begin,
-        end,
-        law["double"],
-        law["gain"],
-        law["damping"],
-        AMPLITUDE,
-        OMEGA,
-        states,
-        integrals,
-    )
+    plant: Plant = "double-integrator" if law["double"] else "integrator"
+    servo = Servo(plant, law["gain"], MovingTarget(AMPLITUDE, SWING_S), law["damping"])
+    seen, acted = np.asarray(measured, np.float64), np.asarray(actuated, np.float64)
+    status, integrals, _ = follow(servo, seen, acted, begin, end)
     return status, float(integrals[0]), float(integrals[1])
 
 
@@ -268,26 +262,15 @@ def test_parts_of_a_stretch_add_up(law: dict[str, Any]) -> None:
 # ------------------------------------------------------- arguments
 
 
-@pytest.mark.parametrize(
-    ("measured", "actuated", "states", "integrals"),
-    [
-        (np.zeros(2), np.zeros(3), np.zeros((4, N_STATE)), np.zeros(2)),
-        (np.zeros(3), np.zeros(3), np.zeros((3, N_STATE)), np.zeros(2)),
-        (np.zeros(3), np.zeros(3), np.zeros((4, N_STATE - 1)), np.zeros(2)),
-        (np.zeros(3), np.zeros(3), np.zeros((4, N_STATE)), np.zeros(1)),
-    ],
-)
-def test_arrays_that_do_not_fit_are_refused(
-    measured: Any, actuated: Any, states: Any, integrals: Any
-) -> None:
+@pytest.mark.parametrize("measured", [np.zeros(2), np.zeros(4)])
+def test_instants_that_do_not_fit_are_refused(measured: Any) -> None:
     with pytest.raises(ValueError, match="do not fit"):
-        follow(measured, actuated, 0.0, 1.0, False, 4.0, 0.0, 1.0, 1.0, states, integrals)
+        follow(SERVO, measured, np.zeros(3), 0.0, 1.0)
 
 
 @pytest.mark.parametrize(
     "measured", [np.zeros(3, np.float32), np.zeros(3, np.int64), np.zeros(6)[::2]]
 )
 def test_arrays_of_another_type_or_in_pieces_are_refused(measured: Any) -> None:
-    states, integrals = np.zeros((4, N_STATE)), np.zeros(2)
     with pytest.raises(ctypes.ArgumentError):
-        follow(measured, np.zeros(3), 0.0, 1.0, False, 4.0, 0.0, 1.0, 1.0, states, integrals)
+        follow(SERVO, measured, np.zeros(3), 0.0, 1.0)

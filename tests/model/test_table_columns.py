@@ -11,7 +11,7 @@ import dwell
 from dwell.errors import ProblemError
 from dwell.model import Constant, Execution, Link, Node, Problem, Task
 from dwell.model.fabric import Resource, resources_of
-from dwell.model.table_columns import ENDS, TEMPLATES, clash_faults, columns_of, find_clashes
+from dwell.model.table_columns import ENDS, TEMPLATES, clash_faults, columns_of
 from dwell.record import column_types, open_run
 from dwell.study import compare
 from dwell.study.summary import summarise
@@ -126,13 +126,13 @@ def test_accelerators_follow_the_nodes() -> None:
 @pytest.mark.parametrize("name", CELLS)
 def test_the_examples_columns_are_apart(name: str) -> None:
     problem = dwell.load(EXAMPLES / f"{name}.yaml")
-    assert not list(find_clashes([*problem.fabric.resources.values()], tuple(problem.candidates)))
+    assert not list(clash_faults([*problem.fabric.resources.values()], tuple(problem.candidates)))
 
 
 def test_what_no_clash_is_found_for_has_as_many_columns_as_are_declared() -> None:
     """Names that contain what other columns begin and end with, and each other."""
     resources, candidates = cpus("u", "u_j", "est_u"), ("j", "l95_ms", "u_j_u")
-    assert not list(find_clashes(resources, candidates))
+    assert not list(clash_faults(resources, candidates))
     for templates in TEMPLATES.values():
         names = [one.name for of in templates for one in columns_of(of, resources, candidates)]
         assert len(set(names)) == len(names)
@@ -160,4 +160,4 @@ def test_a_run_that_was_recorded_before_opens(tmp_path: Path) -> None:
     file.write_text(text.replace('"local"', '"gpu"'), encoding="utf-8")
     opened = open_run(tmp_path / "run")
     assert tuple(opened.problem.fabric.nodes) == ("R", "R_gpu")
-    assert list(find_clashes(cpus("R", "R_gpu"), tuple(opened.problem.candidates)))
+    assert list(clash_faults(cpus("R", "R_gpu"), tuple(opened.problem.candidates)))

@@ -41,7 +41,15 @@ from dwell.model.declaration import declared_fields, made_at
 from dwell.model.fabric import accelerator_tiers
 from dwell.model.frozen import FrozenDict
 from dwell.model.process import DRAWN, UnreadTrace
-from dwell.model.semantics import CellParts, find_faults, find_unregistered
+from dwell.model.semantics import (
+    CellParts,
+    UnreadNames,
+    find_faults,
+    find_unregistered,
+    nearest,
+    nearest_of,
+)
+from dwell.model.user_classes import is_class_path
 from dwell.policies import registry as policies
 
 T = TypeVar("T")
@@ -66,9 +74,6 @@ class Assembly:
         Holds the faults so far, takes those found here.
     anchored : bool
         Whether a candidate may name anchored tasks where they are.
-    judged : bool
-        Whether policies and estimators must be known here, and the cell's name be one. A record
-        names what its machine had.
     home : str, optional
         `Problem.folder`.
     """
@@ -77,7 +82,6 @@ class Assembly:
     tables: Tables | None
     faults: Faults
     anchored: bool = False
-    judged: bool = True
     home: str | None = None
 
     def problem(self, name: str) -> Problem:
@@ -132,7 +136,8 @@ class Assembly:
         if not self.anchored:
             self._refuse_anchored(candidates, tasks)
         self._assume(parts)
-        if self.judged:
+        # A record names what its machine had.
+        if not self.faults.is_record:
             self._add(unregistered(parts, called))
         self._judge(parts)
         if self.faults or timing is None or objective is None or controller is None or live is None:
@@ -343,31 +348,26 @@ class Assembly:
                 self.faults.add(fault.path, fault.message)
 
     def _assume(self, parts: CellParts) -> None:
-        """Take names for declared where the section that would declare them could not be read."""
-        faults, controller = self.faults, parts.controller
-        placed = list(parts.candidates.values())
-        if faults.at("nodes"):
-            names = [name for _, link in parts.links for name in (link.source, link.target)]
-            names += [name for task in parts.tasks.values() if task for name in task.on]
-            names += [name for moves in placed for name in moves.values()]
-            names += [
-                item.node
-                for items in parts.scenarios.values()
-                for _, item in items
-                if isinstance(item, NodeDisturbance)
-            ]
-            names += parts.tiers
-            names += [controller.on] if controller is not None and controller.on else []
-            parts.nodes = dict.fromkeys(names)
-        if faults.at("tasks"):
-            names = [name for _, flow in parts.flows for name in (flow.source, flow.target)]
-            names += [name for moves in placed for name in moves]
-            parts.tasks = dict.fromkeys(names)
-        if faults.at("scales"):
-            parts.scales = [task.scale for task in parts.tasks.values() if task and task.scale]
-        if faults.at("candidates") and controller is not None:
-            names = [controller.policy, *controller.fallbacks, controller.initial or ""]
-            parts.broken_candidates = names
+        """Take all names for declared where the section that declares them could not be read."""
+        for section in ("nodes", "tasks", "scales", "candidates"):
+            if self.faults.at(section):
+                setattr(parts, section, UnreadNames())
+
+
+def unknown_names(policy: str | None, estimator: str | None, cell: Problem) -> Iterator[Fault]:
+    """Yield a fault, at ``policy`` or ``estimator``, for each that a cell could not run with."""
+    known = [*policies.names(), *cell.candidates]
+    if policy is not None and policy not in known and not is_class_path(policy):
+        hint = nearest_of(policy, known, "policies")
+        yield Fault("policy", f"unknown policy {policy!r}; {hint}")
+    if estimator is not None and not is_estimator(estimator):
+        hint = nearest(estimator, estimators.names())
+        yield Fault("estimator", f"unknown estimator {estimator!r}; {hint}")
+
+
+def is_estimator(name: str) -> bool:
+    """Whether a name is that of an estimator, or of a class that may be one."""
+    return name in estimators.names() or is_class_path(name)
 
 
 def unregistered(parts: CellParts, name: str) -> list[Fault]:

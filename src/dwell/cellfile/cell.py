@@ -20,10 +20,6 @@ if TYPE_CHECKING:
     from dwell.cellfile.traces import Tables
 
 
-#: By the key of its version: another kind of file, and the command that takes it.
-OTHERS = {"dwell-study": ("study", "dwell study"), "dwell-fleet": ("fleet", "dwell fleet run")}
-
-
 def load(path: str | PathLike[str], *, traces: str | PathLike[str] | None = None) -> Problem:
     """Read a cell file.
 
@@ -41,7 +37,7 @@ def load(path: str | PathLike[str], *, traces: str | PathLike[str] | None = None
         TraceError where the traces alone are at fault.
     """
     source = fspath(path)
-    return _load(source, Path(source).parent if traces is None else Path(traces))
+    return read_cell(source, Path(source).parent if traces is None else Path(traces))[1]
 
 
 def load_without_traces(path: str | PathLike[str]) -> Problem:
@@ -57,33 +53,25 @@ def load_without_traces(path: str | PathLike[str]) -> Problem:
     ProblemError
         With every fault found in the file, each with its line and field path.
     """
-    return _load(fspath(path), None)
+    return read_cell(fspath(path), None)[1]
 
 
-def _load(source: str, folder: Path | None) -> Problem:
-    document, faults = read_document(source)
-    home = str(Path(source).resolve().parent)
-    return read_problem(document, faults, folder, Path(source).stem or "cell", home=home)
-
-
-def read_document(source: str) -> tuple[object, Faults]:
-    """Return the plain values of a cell file, and what is wrong with them as such.
+def read_cell(
+    source: str, folder: Path | None, known: dict[object, Tables] | None = None
+) -> tuple[object, Problem]:
+    """Return the plain values of a cell file, and what they say (see `read_problem`).
 
     Raises
     ------
     ProblemError
-        If it is no cell file, or none that could be read on.
+        With every fault found.
     """
     from dwell.cellfile.yaml_text import read_yaml
 
-    faults = Faults(source)
+    faults, file = Faults(source), Path(source)
     document = read_yaml(source, faults)
-    if faults.at(""):
-        raise faults.error()  # the file as such; there is nothing to read on
-    for key, (what, command) in OTHERS.items():
-        if isinstance(document, dict) and key in document and "dwell" not in document:
-            faults.refuse(key, f"this is a {what}, not a cell; run it by `{command} FILE`")
-    return document, faults
+    home = str(file.resolve().parent)
+    return document, read_problem(document, faults, folder, file.stem or "cell", known, home=home)
 
 
 def from_document(
@@ -91,7 +79,7 @@ def from_document(
     *,
     folder: str | PathLike[str] = ".",
     source: str | None = None,
-    judged: bool = True,
+    is_record: bool = False,
 ) -> Problem:
     """Read a cell from plain values, as `dwell.model.document.to_document` makes them.
 
@@ -106,16 +94,16 @@ def from_document(
         Where the traces that it names are.
     source : str, optional
         Name of the document in messages.
-    judged : bool
-        See `read_problem`.
+    is_record : bool
+        Whether an earlier version may have written it, on a machine with other policies.
 
     Raises
     ------
     ProblemError
         With every fault found.
     """
-    faults = Faults(source, is_record=not judged)
-    return read_problem(document, faults, Path(folder), "cell", anchored=True, judged=judged)
+    faults = Faults(source, is_record=is_record)
+    return read_problem(document, faults, Path(folder), "cell", anchored=True)
 
 
 def from_record(document: Mapping[str, object]) -> Problem:
@@ -139,8 +127,7 @@ def from_record(document: Mapping[str, object]) -> Problem:
     ProblemError
         With every fault found.
     """
-    faults = Faults(is_record=True)
-    return read_problem(document, faults, None, "cell", anchored=True, judged=False)
+    return read_problem(document, Faults(is_record=True), None, "cell", anchored=True)
 
 
 def read_problem(
@@ -151,7 +138,6 @@ def read_problem(
     known: dict[object, Tables] | None = None,
     *,
     anchored: bool = False,
-    judged: bool = True,
     home: str | None = None,
 ) -> Problem:
     """Read a document into a Problem.
@@ -170,9 +156,6 @@ def read_problem(
         Traces that were read for documents like this one; takes those that are read now.
     anchored : bool
         Whether a candidate may name anchored tasks where they are.
-    judged : bool
-        Whether policies and estimators must be known here, and the cell's name be one; a record
-        names what its machine had.
     home : str, optional
         Folder of the modules that it names, for `Problem.folder`.
 
@@ -194,4 +177,4 @@ def read_problem(
         if declared not in known:
             known[declared] = read_traces(entry, folder, faults)
         tables = known[declared]
-    return Assembly(entry, tables, faults, anchored, judged, home).problem(name)
+    return Assembly(entry, tables, faults, anchored, home).problem(name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import NoReturn, ParamSpec, TypeVar
 
 from dwell.errors import Fault, ProblemError, TraceError
@@ -19,7 +20,8 @@ class Faults:
     source : str, optional
         Name of the document in messages.
     is_record : bool
-        Whether an earlier version may have written it: keys that have gone are passed over.
+        Whether an earlier version may have written it: keys that have gone are passed over, and
+        policies and estimators need not be known here.
     """
 
     def __init__(self, source: str | None = None, *, is_record: bool = False) -> None:
@@ -72,6 +74,15 @@ class Faults:
                 inner = f"{path}.{fault.path}" if path and fault.path else path or fault.path
                 if not self.at(inner):
                     self.add(inner, fault.message)
+            return None
+
+    def of_file(self, path: str, read: Callable[[Path], T], file: Path) -> T | None:
+        """Return what is read of a file, or record each of its faults, whole, at `path`."""
+        try:
+            return read(file)
+        except ProblemError as error:
+            for line in str(error).splitlines():
+                self.add(path, line)
             return None
 
     def __len__(self) -> int:

@@ -6,6 +6,7 @@ from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
 
+from dwell.cellfile.assembly import unknown_names
 from dwell.cellfile.cell import load
 from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.forms import (
@@ -24,14 +25,10 @@ from dwell.cellfile.forms import (
 )
 from dwell.cellfile.structure import FileKind, read_structure
 from dwell.cellfile.yaml_text import read_yaml
-from dwell.errors import ProblemError
-from dwell.estimators.registry import names as estimator_names
 from dwell.model import Problem
 from dwell.model.bounds import NOT_EMPTY, Bound
 from dwell.model.fleet import PHASE_WAYS, PHASES, Fleet, FleetEntry, Kind, fleet_faults
-from dwell.model.semantics import bad_name, nearest, nearest_of
-from dwell.model.user_classes import is_class_path
-from dwell.policies.registry import names as policy_names
+from dwell.model.semantics import bad_name
 
 
 class PhasesForm(Form):
@@ -96,8 +93,6 @@ def load_fleet(path: str | PathLike[str]) -> Fleet:
     source = fspath(path)
     faults = Faults(source)
     document = read_yaml(source, faults, FLEET.what, FLEET.begin)
-    if faults.at(""):
-        raise faults.error()
     entry = read_structure(document, faults, FLEET)
     fleet = _Reading(entry, Path(source), faults).fleet()
     if fleet is None or faults:
@@ -151,14 +146,8 @@ class _Reading:
 
     def _cell(self, path: str, file: str) -> Problem | None:
         """Return a cell; every file is read once."""
-        if file in self.known:
-            return self.known[file]
-        self.known[file] = None
-        try:
-            self.known[file] = load(self.path.parent / file)
-        except ProblemError as error:
-            for line in str(error).splitlines():
-                self.faults.add(path, line)
+        if file not in self.known:
+            self.known[file] = self.faults.of_file(path, load, self.path.parent / file)
         return self.known[file]
 
     def _check_names(self, path: str, entry: Entry, cell: Problem) -> None:
@@ -167,11 +156,5 @@ class _Reading:
         if policy is not None:
             policy, named = cell.policy_and_estimator(policy)
             estimator = named or estimator
-            policies = [*policy_names(), *cell.candidates]
-            if policy not in policies and not is_class_path(policy):
-                hint = nearest_of(policy, policies, "policies")
-                self.faults.add(f"{path}policy", f"unknown policy {policy!r}; {hint}")
-        known = estimator_names()
-        if estimator is not None and estimator not in known and not is_class_path(estimator):
-            hint = nearest(estimator, known)
-            self.faults.add(f"{path}estimator", f"unknown estimator {estimator!r}; {hint}")
+        for fault in unknown_names(policy, estimator, cell):
+            self.faults.add(f"{path}{fault.path}", fault.message)

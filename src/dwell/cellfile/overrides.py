@@ -14,7 +14,7 @@ from os import PathLike, fspath
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dwell.cellfile.cell import read_document, read_problem
+from dwell.cellfile.cell import read_cell, read_problem
 from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.study_paths import put
 from dwell.errors import ProblemError
@@ -104,12 +104,9 @@ def open_cell(file: Path, traces: Path | None = None) -> OpenCell:
     ProblemError
         With every fault found in the file.
     """
-    document, faults = read_document(str(file))
     folder = file.parent if traces is None else traces
     tables: dict[object, Tables] = {}
-    home = str(file.resolve().parent)
-    problem = read_problem(document, faults, folder, file.stem or "cell", tables, home=home)
-    return OpenCell(document, problem, folder, tables)
+    return OpenCell(*read_cell(str(file), folder, tables), folder, tables)
 
 
 def check_apart(places: Mapping[str, tuple[Step, ...] | None], faults: Faults) -> None:

@@ -15,8 +15,12 @@ from dwell.model.bounds import as_read, shown
 from dwell.model.dotted_paths import Step, dotted
 
 MAX_DEPTH = 40
-#: What is read, by the key of its version.
-KINDS = {"dwell": "cell", "dwell-study": "study", "dwell-fleet": "fleet"}
+#: By the key of its version: a kind of file, and the command that takes it.
+KINDS = {
+    "dwell": ("cell", "dwell run"),
+    "dwell-study": ("study", "dwell study"),
+    "dwell-fleet": ("fleet", "dwell fleet run"),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,9 +85,13 @@ def read_structure(document: object, faults: Faults, kind: FileKind) -> Entry:
         faults.refuse(
             "", f"a {kind.what} file is a mapping that begins with `{begin}`; this is {has}"
         )
-    for key, what in KINDS.items():
+    for key, (what, command) in KINDS.items():
         if key in document and kind.key not in document:
-            faults.refuse(key, f"this is a {what}; a {kind.what} file begins with `{kind.begin}`")
+            faults.refuse(
+                key,
+                f"this is a {what}, not a {kind.what}, which begins with `{kind.begin}`; run it by "
+                f"`{command} FILE`",
+            )
     values = _plain_mapping(document, (), faults)
     _check_version(values, faults, kind)
     # What it requires has a stand-in, so that it never is at fault itself.

@@ -13,20 +13,17 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike, fspath
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
 
 from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.overrides import OpenCell, Override, check_apart, open_cell
 from dwell.cellfile.study_paths import SETTINGS, with_settings
 from dwell.errors import ProblemError
-from dwell.estimators.registry import names as estimator_names
 from dwell.model import Problem
 from dwell.model.bounds import as_read
 from dwell.model.dotted_paths import Step, steps_of
 from dwell.model.fleet import Fleet
-from dwell.model.semantics import bad_name, nearest, nearest_of
-from dwell.model.user_classes import is_class_path
-from dwell.policies.registry import names as policy_names
+from dwell.model.semantics import bad_name, nearest
 
 if TYPE_CHECKING:
     from dwell.cellfile.forms import Entry
@@ -36,6 +33,7 @@ SEEDS = tuple(range(1, 21))
 # Every point is read and checked before the first run.
 MAX_POINTS = 10_000
 
+T = TypeVar("T")
 Value: TypeAlias = float | int | str
 #: Values of parameters by their paths, and the paths that vary together.
 Grid: TypeAlias = "Mapping[str, list[Any]]"
@@ -98,8 +96,6 @@ def read_study(path: str | PathLike[str], *, references: Collection[str] = ()) -
     source = fspath(path)
     faults = Faults(source)
     document = read_yaml(source, faults, STUDY.what, STUDY.begin)
-    if faults.at(""):
-        raise faults.error()
     of_fleet = isinstance(document, dict) and "fleet" in document
     entry = read_structure(document, faults, FLEET_STUDY if of_fleet else STUDY)
     reading = _FleetReading if of_fleet else _Reading
@@ -183,18 +179,16 @@ class _Reading:
 
     def _cell(self) -> OpenCell | None:
         """Read the cell as it is in its file."""
-        if not self.entry.cell:
-            if not self.faults.at("cell"):
-                self.faults.add("cell", "the text is empty; name the cell's file")
-            return None
         given = self.entry.traces
         traces = None if given is None else self.path.parent / given
-        try:
-            return open_cell(self.path.parent / self.entry.cell, traces)
-        except ProblemError as error:
-            for line in str(error).splitlines():
-                self.faults.add("cell", line)
-            return None
+        return self._opened("cell", lambda file: open_cell(file, traces))
+
+    def _opened(self, key: str, read: Callable[[Path], T]) -> T | None:
+        """Read the file that a key names; each of its faults is one of the key."""
+        named = self.entry.values[key]
+        if not named and not self.faults.at(key):
+            self.faults.add(key, f"the text is empty; name the {key}'s file")
+        return self.faults.of_file(key, read, self.path.parent / named) if named else None
 
     # ------------------------------------------------------------------------- scenarios
 
@@ -300,16 +294,13 @@ class _Reading:
         steps = {path: self._steps("parameters", path, cell) for path in grid}
         check_apart({f"parameters.{path}": found for path, found in steps.items()}, self.faults)
         places = {path: known for path, known in steps.items() if known is not None}
-        shown = {path: _shown(values) for path, values in grid.items()}
         right = [tuple(path for path in axis if path in places) for axis in axes]
-        right = [axis for axis in right if axis]
         points = []
-        for picked in itertools.product(*(range(len(grid[first])) for first, *_ in right)):
-            at = [(path, i) for axis, i in zip(right, picked, strict=True) for path in axis]
+        for at, values in _combinations(grid, [axis for axis in right if axis]):
             overrides = [
-                Override(f"parameters.{path}[{i}]", places[path], grid[path][i]) for path, i in at
+                Override(f"parameters.{path}[{i}]", places[path], grid[path][i])
+                for path, i in at.items()
             ]
-            values = {path: shown[path][i] for path, i in at}
             listed = ", ".join(f"{path} = {value}" for path, value in values.items())
             changed = cell.attempt(overrides, self.faults, "parameters", f" (at {listed})")
             if changed is not None:
@@ -379,24 +370,25 @@ class _Reading:
 
     def _check_names(self, policy: DeclaredPolicy, problem: Problem) -> None:
         """Check that the names that a policy gives are known."""
+        from dwell.cellfile.assembly import unknown_names
+
         path = f"policies.{policy.name}"
-        known = [*policy_names(), *problem.candidates]
-        if policy.policy not in known and not is_class_path(policy.policy):
-            hint = nearest_of(policy.policy, known, "policies")
-            self.faults.add(path, f"unknown policy {policy.policy!r}; {hint}")
+        faults = {one.path: one for one in unknown_names(policy.policy, policy.estimator, problem)}
+        if "policy" in faults:
+            self.faults.add(path, faults["policy"].message)
         elif policy.name in problem.candidates and policy.policy != policy.name:
             self.faults.add(
                 path,
                 f"{policy.name!r} is a candidate's name, for the placement that never moves; give "
                 f"{policy.policy!r} another one",
             )
-        if policy.estimator is not None and not _is_estimator(policy.estimator):
-            hint = nearest(policy.estimator, estimator_names())
-            shown = f"unknown estimator {policy.estimator!r}; {hint}"
-            self.faults.add(f"{path}.estimator", shown)
+        if "estimator" in faults:
+            self.faults.add(f"{path}.estimator", faults["estimator"].message)
 
     def _check_settings(self, policy: DeclaredPolicy, points: Sequence[OpenCell]) -> None:
         """Check that the settings of a policy are right at every point."""
+        from dwell.cellfile.assembly import is_estimator
+
         path = f"policies.{policy.name}"
         for cell in points:
             steps = {key: self._steps(path, key, cell) for key in policy.settings}
@@ -406,7 +398,7 @@ class _Reading:
                 for key, found in steps.items()
                 if found is not None
             ]
-            if policy.estimator is not None and _is_estimator(policy.estimator):
+            if policy.estimator is not None and is_estimator(policy.estimator):
                 place = f"{path}.estimator"
                 overrides.append(Override(place, ("controller", "estimator"), policy.estimator))
             if overrides:
@@ -452,16 +444,7 @@ class _FleetReading(_Reading):
         """Read the fleet as it is in its file."""
         from dwell.cellfile.fleet_file import load_fleet
 
-        if not self.entry.fleet:
-            if not self.faults.at("fleet"):
-                self.faults.add("fleet", "the text is empty; name the fleet's file")
-            return None
-        try:
-            return load_fleet(self.path.parent / self.entry.fleet)
-        except ProblemError as error:
-            for line in str(error).splitlines():
-                self.faults.add("fleet", line)
-            return None
+        return self._opened("fleet", load_fleet)
 
     def _fleets(self, fleet: Fleet, grid: Grid, axes: Axes) -> list[tuple[dict[str, Value], Fleet]]:
         """Return every combination of the values of axes, and the fleet with them."""
@@ -475,14 +458,12 @@ class _FleetReading(_Reading):
                 self._changed(fleet, {path: value}, f"{place}[{i}]")
         if self.faults.touches("parameters"):
             return []
-        shown = {path: _shown(values) for path, values in grid.items()}
         points = []
-        for picked in itertools.product(*(range(len(grid[first])) for first, *_ in axes)):
-            at = [(path, i) for axis, i in zip(axes, picked, strict=True) for path in axis]
-            given = {path: grid[path][i] for path, i in at}
+        for at, shown in _combinations(grid, axes):
+            given = {path: grid[path][i] for path, i in at.items()}
             changed = self._changed(fleet, given, "parameters")
             if changed is not None:
-                points.append(({path: shown[path][i] for path, i in at}, changed))
+                points.append((shown, changed))
         return points
 
     def _changed(self, fleet: Fleet, values: Mapping[str, Any], place: str) -> Fleet | None:
@@ -504,8 +485,12 @@ class _FleetReading(_Reading):
                 self.faults.attempt(place, with_settings, entry.cell, policy.settings)
 
 
-def _is_estimator(name: str) -> bool:
-    return name in estimator_names() or is_class_path(name)
+def _combinations(grid: Grid, axes: Axes) -> Iterator[tuple[dict[str, int], dict[str, Value]]]:
+    """Yield every combination of the values of axes: the place of each, and the value as shown."""
+    shown = {path: _shown(values) for path, values in grid.items()}
+    for picked in itertools.product(*(range(len(grid[first])) for first, *_ in axes)):
+        at = {path: i for axis, i in zip(axes, picked, strict=True) for path in axis}
+        yield at, {path: shown[path][i] for path, i in at.items()}
 
 
 def _shown(values: Sequence[Any]) -> list[Value]:

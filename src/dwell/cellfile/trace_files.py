@@ -80,17 +80,9 @@ class Reading:
             time = self._instants(time[keep], starts, np.flatnonzero(keep))
         if self.failed:
             return None
+        dropped = int(np.count_nonzero(~keep)) + clipped
         table = TraceTable(
-            file=self.source.file,
-            columns=values,
-            by=self.source.by,
-            starts=starts,
-            time_ms=time,
-            wrap=self.source.wrap,
-            group=self.source.group,
-            on_negative=self.source.on_negative,
-            time=self.source.time,
-            dropped=int(np.count_nonzero(~keep)) + clipped,
+            columns=values, starts=starts, time_ms=time, dropped=dropped, **self.source._asdict()
         )
         self._verify(table)
         return None if self.failed else table

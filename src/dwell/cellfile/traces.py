@@ -7,9 +7,8 @@ column is dropped for all and the columns of a cycle come from one row.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 from dwell.cellfile.cell_form import TRACE
 from dwell.cellfile.document_faults import Faults
@@ -19,8 +18,7 @@ from dwell.model import TraceTable
 DEFAULT_TIME = "sent_ms"
 
 
-@dataclass(frozen=True, slots=True)
-class Source:
+class Source(NamedTuple):
     """A file and a way to read it; the processes that share it share their rows."""
 
     file: str

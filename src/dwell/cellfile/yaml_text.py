@@ -70,21 +70,19 @@ def read_yaml(path: str, faults: Faults, what: str = "cell", begin: str = "dwell
     what, begin : str
         Kind of the file, and how such a file begins, for messages.
 
-    Returns
-    -------
-    object
-        None where the file could not be read at all.
+    Raises
+    ------
+    ProblemError
+        If it could not be read as such; there is nothing to read on.
     """
     text = _read_text(path, faults, what)
-    if text is None:
-        return None
-    known = len(faults)
-    root = _composed(text, faults)
-    if root is None:
-        if len(faults) == known:
-            faults.add("", f"the file is empty; a {what} file begins with `{begin}`")
-        return None
-    return _Builder(faults).build(root, ())
+    root = None if text is None else _composed(text, faults)
+    if root is None and not faults:
+        faults.add("", f"the file is empty; a {what} file begins with `{begin}`")
+    value = None if root is None else _Builder(faults).build(root, ())
+    if faults.at(""):
+        raise faults.error()
+    return value
 
 
 def read_value(text: str, faults: Faults, path: str) -> object:

@@ -7,6 +7,7 @@ returns the values of an option (its `autocompletion`) by the line before them a
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -50,14 +51,16 @@ def _cell(context: typer.Context) -> Mapping[str, Any]:
     """Return the content of the cell file that the line names, if it can be read."""
     from dwell.cellfile.document_faults import Faults
     from dwell.cellfile.yaml_text import read_yaml
+    from dwell.errors import ProblemError
 
     given = context.params.get("cell")
     named = given if isinstance(given, list) else [given] if given else []
     # Arguments before an option without its value are not taken apart yet.
     for path in (*named, *context.args):
-        content = read_yaml(str(Path(path).expanduser()), Faults())
-        if isinstance(content, dict):
-            return content
+        with suppress(ProblemError):
+            content = read_yaml(str(Path(path).expanduser()), Faults())
+            if isinstance(content, dict):
+                return content
     return {}
 
 

@@ -2,32 +2,23 @@
 
 from __future__ import annotations
 
-import ctypes
-from functools import cache
-from typing import Any
+from ctypes import POINTER, c_int32, c_int64, c_void_p
 
 import numpy as np
 
 from dwell.kernels.arrays import Arrays, CellArrays
 from dwell.kernels.codes import EventKind, Status, make_key
-from dwell.kernels.library import library
+from dwell.kernels.library import foreign
 from dwell.kernels.rows import Ints
 
-I64, TABLES = ctypes.c_int64, ctypes.c_void_p
 STATUSES = tuple(Status)
 
-
-@cache
-def _functions() -> tuple[Any, Any, Any, Any]:
-    """Return the functions of the library, with the types of their arguments."""
-    loaded = library()
-    advance, post, send = loaded.dwell_advance, loaded.dwell_post_event, loaded.dwell_send_state
-    logged = loaded.dwell_logged_instants
-    logged.argtypes, logged.restype = (TABLES, *(I64,) * 4, TABLES, I64, TABLES), None
-    advance.argtypes, advance.restype = (TABLES,), ctypes.c_int32
-    post.argtypes, post.restype = (TABLES, I64, I64), None
-    send.argtypes, send.restype = (TABLES, I64, I64, I64, I64, ctypes.POINTER(I64)), None
-    return advance, post, send, logged
+_advance = foreign("dwell_advance", c_int32, c_void_p)
+_post = foreign("dwell_post_event", None, c_void_p, c_int64, c_int64)
+_send = foreign("dwell_send_state", None, c_void_p, *(c_int64,) * 4, POINTER(c_int64))
+_logged = foreign(
+    "dwell_logged_instants", None, c_void_p, *(c_int64,) * 4, c_void_p, c_int64, c_void_p
+)
 
 
 def play(arrays: Arrays) -> Status:
@@ -40,7 +31,7 @@ def play(arrays: Arrays) -> Status:
     Status
         PAUSED, STEP or FINISHED.
     """
-    advance = _functions()[0]
+    advance = _advance()
     while True:
         status: int = advance(arrays.address)
         if status == Status.GROW_EVENTS:
@@ -53,7 +44,7 @@ def play(arrays: Arrays) -> Status:
 
 def post_event(of: CellArrays, at_ns: int, kind: EventKind, cycle: int = 0, item: int = 0) -> None:
     """Add an event of a cell; there is always room for a few (see `play`)."""
-    _functions()[1](of.whole.address, at_ns, make_key(kind, of.part.row, cycle, item))
+    _post()(of.whole.address, at_ns, make_key(kind, of.part.row, cycle, item))
 
 
 def logged_instants(
@@ -79,7 +70,7 @@ def logged_instants(
     part, tables, count = of.part, of.whole.tables, last - first
     jobs = count * (tables.jobs.size // tables.slots.size)
     found = np.empty((part.rows, 4 * jobs + count * len(flows)), np.int64)
-    _functions()[3](
+    _logged()(
         *(of.whole.address, part.row, part.rows, first, count),
         *(flows.ctypes.data, len(flows), found.ctypes.data),
     )
@@ -109,6 +100,6 @@ def send_state(
     attempt : int
         Number of the next attempt; waiting for the end of an outage is none.
     """
-    sent = (I64 * 3)()
-    _functions()[2](of.whole.address, of.part.hop_0 + hop, cycle, attempt, now_ns, sent)
+    sent = (c_int64 * 3)()
+    _send()(of.whole.address, of.part.hop_0 + hop, cycle, attempt, now_ns, sent)
     return sent[0], bool(sent[1]), sent[2]

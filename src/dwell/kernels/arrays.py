@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import itertools
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ from dwell.kernels import codes
 from dwell.kernels.codes import LAST_NS, EventKind, Scheduler, ShadowPart, make_key
 from dwell.kernels.realisation import LinkSegments, NodeChanges, Phase, Realisation
 from dwell.kernels.rows import Ints, Rows, Tables, row_types
-from dwell.model import Flow, Node, Pipeline, Placement, Problem, Quota, Task
+from dwell.model import Flow, Node, Pipeline, Placement, Problem, Quota
 from dwell.model.instants import NEVER_NS
 from dwell.model.window_close import close_after_ns, window_close_ns
 
@@ -40,7 +41,7 @@ class CellPart(NamedTuple):
     ----------
     row, rows : int
         Its row, and how many it has: two where a shadow is behind it.
-    cycles, windows, tasks, flows, resources, candidates : int
+    cycles, windows, tasks, resources, candidates : int
         How many it has of them.
     candidate_0, hop_0, site_0 : int
         Rows of its first candidate, hop and site.
@@ -51,7 +52,6 @@ class CellPart(NamedTuple):
     cycles: int
     windows: int
     tasks: int
-    flows: int
     resources: int
     candidate_0: int
     candidates: int
@@ -289,10 +289,7 @@ class _Layout:
         self.cell_servers: list[int] = []
         self.capacity: list[float] = []
         self.layers: list[dict[int, int]] = []
-        #: By cell: its row in the kernel's tables, its first hop and site, and its links.
-        self.cell_rows: list[int] = []
-        self.firsts: list[tuple[int, int]] = []
-        self.link_rows: list[dict[str, int]] = []
+        self.parts: list[CellPart] = []
         self.segments: list[Rows] = []
         self.rates: list[Rows] = []
         self.n_segments = 0
@@ -304,35 +301,32 @@ class _Layout:
 
     def arrays(self) -> Arrays:
         for index, (problem, real) in enumerate(self.cells):
-            self.cell_rows.append(len(self.rows["cells"]))
             self._add_nodes(index, problem, real)
+            self.parts.append(self._begun(problem, real))
+            link_row = self._add_links(problem, real)
             self._add_cell(index, problem, real)
-            if self.shadows and (shadow := self.shadows[index]) is not None:
-                self._add_shadow(index, problem, shadow)
+            self._add_candidates(index, problem, real, link_row)
+            self._add_changes(index, NodeChanges.of(real.node_changes))
+            if self.shadows:
+                self._add_pairs(problem)
+                if (shadow := self.shadows[index]) is not None:
+                    self._add_shadow(index, problem, shadow, link_row)
         self._check_keys()
-        return Arrays(self._tables(), self._parts(), self.behind)
+        return Arrays(self._tables(), tuple(self.parts), self.behind)
 
-    def _parts(self) -> tuple[CellPart, ...]:
-        """Return where each cell is in the tables."""
-        ends = [*self.cell_rows[1:], len(self.rows["cells"])]
-        cells = self.rows["cells"]
-        return tuple(
-            CellPart(
-                row=row,
-                rows=end - row,
-                cycles=real.cycles,
-                windows=real.windows,
-                tasks=len(problem.pipeline.tasks),
-                flows=len(problem.pipeline.flows),
-                resources=len(problem.fabric.resources),
-                candidate_0=cells[row]["candidate_0"],
-                candidates=len(problem.candidates),
-                hop_0=hop_0,
-                site_0=site_0,
-            )
-            for (problem, real), row, end, (hop_0, site_0) in zip(
-                self.cells, self.cell_rows, ends, self.firsts, strict=True
-            )
+    def _begun(self, problem: Problem, real: Realisation) -> CellPart:
+        """Return where the cell that is added next is in the tables."""
+        return CellPart(
+            row=len(self.rows["cells"]),
+            rows=1,
+            cycles=real.cycles,
+            windows=real.windows,
+            tasks=len(problem.pipeline.tasks),
+            resources=len(problem.fabric.resources),
+            candidate_0=len(self.site_of),
+            candidates=len(problem.candidates),
+            hop_0=len(self.rows["hops"]),
+            site_0=len(self.rows["sites"]),
         )
 
     def _addresses(self, table: Ints) -> list[int]:
@@ -415,32 +409,31 @@ class _Layout:
         return row
 
     def _add_cell(self, index: int, problem: Problem, real: Realisation) -> None:
-        pipeline, release_ns = problem.pipeline, real.release_ns
+        pipeline, release_ns, part = problem.pipeline, real.release_ns, self.parts[index]
         resources = problem.fabric.resources.values()
-        names, hop_0 = list(pipeline.tasks), len(self.rows["hops"])
-        self.firsts.append((hop_0, len(self.rows["sites"])))
+        names, flows = list(pipeline.tasks), ordered_flows(pipeline)
         due_ns, grace_ns = close_after_ns(problem)
         self.end_ns = max(self.end_ns, int(release_ns[-1]) + grace_ns, int(release_ns[-2]) + due_ns)
         cell = {
             "release_ns": self._addresses(release_ns[None])[0],
             "due_ns": due_ns,
             "grace_ns": grace_ns,
-            "n_cycles": real.cycles,
+            "n_cycles": part.cycles,
             "deadline_ns": round(pipeline.deadline_ms * 1e6),
             "longest_ms": round(problem.censor_ms * 1e6) / 1e6,
             "close_cycle": problem.window_cycles,
             "window_cycles": problem.window_cycles,
             "task_0": len(self.rows["tasks"]),
-            "n_tasks": len(names),
+            "n_tasks": part.tasks,
             "flow_0": len(self.rows["flows"]),
-            "candidate_0": len(self.site_of),
-            "n_candidates": len(problem.candidates),
+            "candidate_0": part.candidate_0,
+            "n_candidates": part.candidates,
             "n_sinks": sum(not pipeline.outputs(name) for name in names),
             "period_ns": round(pipeline.period_ms * 1e6),
             "given_up_after": problem.window_cycles + GIVEN_UP_AFTER,
             "pair_0": len(self.shadow_parts),
             "resource_0": len(self.cell_servers),
-            "n_resources": len(resources),
+            "n_resources": part.resources,
             "shadow": -1,
             "parent": -1,
         }
@@ -449,35 +442,35 @@ class _Layout:
             self.server_row[self.node_row[index, one.node], one.kind or None] for one in resources
         ]
         self.capacity += [one.capacity for one in resources]
-        flows = ordered_flows(pipeline)
         flow_row = {(flow.source, flow.target): i for i, flow in enumerate(flows)}
         self.rows["flows"] += [
             {"source": names.index(flow.source), "target": names.index(flow.target)}
             for flow in flows
         ]
-        for name in names:
+        for name, task in pipeline.tasks.items():
             outputs = [flow_row[flow.source, flow.target] for flow in pipeline.outputs(name)]
-            self._add_task(pipeline, pipeline.tasks[name], outputs)
-        self.link_rows.append(self._add_links(problem, real))
-        self._add_hops(problem, real, self.link_rows[index])
-        self._add_candidates(index, problem, real, hop_0)
-        if self.shadows:
-            self._add_pairs(problem)
-        self._add_changes(index, NodeChanges.of(real.node_changes))
+            self.rows["tasks"].append(
+                {
+                    "n_in": len(pipeline.inputs(name)),
+                    "n_out": len(outputs),
+                    "out_0": len(self.outputs),
+                    "offset_ns": round(task.offset_ms * 1e6),
+                }
+            )
+            self.outputs += outputs
 
     def _add_candidates(
         self,
         index: int,
         problem: Problem,
         real: Realisation,
-        hop_0: int,
-        *,
-        of_shadow: bool = False,
+        link_row: Mapping[str, int],
     ) -> None:
-        """Add where the tasks run and the flows cross under every candidate."""
-        names = list(problem.pipeline.tasks)
-        site_row = self._add_sites(index, problem, real, names, of_shadow)
+        """Add where tasks of the newest row of cells run, and flows cross, by candidate."""
+        hop_0 = self._add_hops(problem, real, link_row)
         hop_row = {hop: hop_0 + i for i, hop in enumerate(real.hops)}
+        names = list(problem.pipeline.tasks)
+        site_row = self._add_sites(index, problem, real, names)
         for placement in problem.candidates.values():
             on = [site_row[name, placement[name]] for name in names]
             self.site_of.append(on + [-1] * (self.max_tasks - len(on)))
@@ -492,24 +485,22 @@ class _Layout:
 
     def _add_pairs(self, problem: Problem) -> None:
         """Add what the tasks are to a shadow, by pair of candidates."""
-        for active in problem.candidates.values():
-            for other in problem.candidates.values():
-                self.shadow_parts.append(shadow_parts(problem.pipeline, active, other))
+        for active, other in itertools.product(problem.candidates.values(), repeat=2):
+            self.shadow_parts.append(shadow_parts(problem.pipeline, active, other))
 
-    def _add_shadow(self, index: int, problem: Problem, real: Realisation) -> None:
+    def _add_shadow(
+        self, index: int, problem: Problem, real: Realisation, link_row: Mapping[str, int]
+    ) -> None:
         """Add the shadow of a cell: workers and draws of its own, all else shared."""
-        cells = self.rows["cells"]
-        row = self.cell_rows[index]
-        parent = cells[row]
-        parent["shadow"] = row + 1
+        cells, part = self.rows["cells"], self.parts[index]
+        cells[part.row]["shadow"] = len(cells)
         # Its windows never close.
         shadow = {"candidate_0": len(self.site_of), "close_cycle": real.cycles + 1}
-        cells.append(parent | shadow | {"shadow": -1, "parent": row})
+        cells.append(cells[part.row] | shadow | {"shadow": -1, "parent": part.row})
+        self.parts[index] = part._replace(rows=2)
         for node, kind in list(self.server_row):
             self._add_below(node, kind)
-        hop_0 = len(self.rows["hops"])
-        self._add_hops(problem, real, self.link_rows[index])
-        self._add_candidates(index, problem, real, hop_0, of_shadow=True)
+        self._add_candidates(index, problem, real, link_row)
 
     def _add_below(self, node: int, kind: str | None) -> None:
         """Add what own jobs leave of a server, unless it is there."""
@@ -535,23 +526,12 @@ class _Layout:
             table[:, 1] = row[table[:, 1]]
         self.changes.append(_as_rows("changes", table))
 
-    def _add_task(self, pipeline: Pipeline, task: Task, outputs: list[int]) -> None:
-        self.rows["tasks"].append(
-            {
-                "n_in": len(pipeline.inputs(task.name)),
-                "n_out": len(outputs),
-                "out_0": len(self.outputs),
-                "offset_ns": round(task.offset_ms * 1e6),
-            }
-        )
-        self.outputs += outputs
-
     def _add_sites(
-        self, index: int, problem: Problem, real: Realisation, names: list[str], of_shadow: bool
+        self, index: int, problem: Problem, real: Realisation, names: list[str]
     ) -> dict[tuple[str, str], int]:
-        """Add the sites of a cell, or of its shadow."""
+        """Add the sites of the newest row of cells."""
         rows: dict[tuple[str, str], int] = {}
-        cell = self.cell_rows[index] + of_shadow
+        cell = len(self.rows["cells"]) - 1
         columns = list(problem.fabric.resources)
         for (task_name, node_name), exec_ns in zip(
             real.sites, self._addresses(real.exec_ns), strict=True
@@ -561,7 +541,7 @@ class _Layout:
             node = self.node_row[index, node_name]
             server = self.server_row[node, execution.accelerator]
             on = self.rows["servers"][server]
-            if of_shadow:
+            if self.rows["cells"][cell]["parent"] >= 0:
                 server = on["below"]
             fair, cores = on["scheduler"] in (Scheduler.FAIR, Scheduler.TURNS), on["cores"]
             threads = execution.threads if execution.accelerator is None else 1
@@ -594,12 +574,11 @@ class _Layout:
         link_row: dict[str, int] = {}
         for name, link in problem.fabric.links.items():
             link_row[name] = len(self.rows["links"])
-            first = self.n_segments
-            if name in pieces.links:
-                mine = pieces.table[:, 1] == pieces.links.index(name)
-                self.segments.append(_as_rows("segments", pieces.table[mine]))
-                self.rates.append(_as_rows("rates", pieces.table_f[mine]))
-                self.n_segments += int(mine.sum())
+            place = pieces.links.index(name) if name in pieces.links else -1
+            mine = pieces.table[:, 1] == place
+            self.segments.append(_as_rows("segments", pieces.table[mine]))
+            self.rates.append(_as_rows("rates", pieces.table_f[mine]))
+            first, self.n_segments = self.n_segments, self.n_segments + int(mine.sum())
             retransmit = link.retransmit_ms
             self.rows["links"].append(
                 {
@@ -611,7 +590,8 @@ class _Layout:
             )
         return link_row
 
-    def _add_hops(self, problem: Problem, real: Realisation, link_row: Mapping[str, int]) -> None:
+    def _add_hops(self, problem: Problem, real: Realisation, link_row: Mapping[str, int]) -> int:
+        """Add the hops of a row of cells; return which is the first."""
         hop_0 = len(self.layers)
         payload = {
             (flow.source, flow.target): flow.payload_bytes for flow in problem.pipeline.flows
@@ -634,6 +614,7 @@ class _Layout:
             self.layers.append({})
         for (hop, layer), extra_ns in zip(real.layers, self._addresses(real.extra_ns), strict=True):
             self.layers[hop_0 + hop][layer] = extra_ns
+        return hop_0
 
     def _check_keys(self) -> None:
         limits = (
@@ -667,10 +648,6 @@ class _Layout:
         windows, slots = max(real.windows for _, real in self.cells), self._slots()
         margin = 64 + sum(len(rows[name]) for name in ("sites", "flows", "tasks", "servers"))
         n_layers = 1 + max((layer for known in self.layers for layer in known), default=0)
-        layers = np.zeros((len(self.layers), n_layers), np.uint64)
-        for hop, known in enumerate(self.layers):
-            for layer, address in known.items():
-                layers[hop, layer] = address
         clock = {
             "n_slots": slots,
             "n_tasks": self.max_tasks,
@@ -688,8 +665,6 @@ class _Layout:
         day_bits, n_days = self._calendar()
         rows["clock"].append(clock | {"day_bits": day_bits})
         self._announce_first(changes)
-        stamps = np.zeros((cells, cycles), np.int16)
-        stamps[[row["parent"] >= 0 for row in rows["cells"]]] = -1
         logged = cells * (cycles if self.logs_all else slots if self.logs_windows else 0)
         # Rows beyond those that are laid out.
         room = {
@@ -699,51 +674,49 @@ class _Layout:
             "jobs": cells * slots * self.max_tasks,
             "slots": cells * slots,
         }
-        structs: dict[str, Any] = {
-            name: _table(name, rows[name], room.get(name, 0)) for name in rows
+        types, of_parts = row_types(), (cells, windows, PARTS, self.max_resources)
+        blank: dict[str, Any] = {
+            **dict.fromkeys(("work", "switching", "shown", "priced", "tiers"), 0),
+            **dict.fromkeys(("stamps", "compute_ns", "network_ns", "outcome"), (cells, cycles)),
+            **dict.fromkeys(("opened", "closed", "shares"), of_parts),
+            "seen": (cells, windows),
+            "layers": (len(self.layers), n_layers),
+            "following": len(rows["events"]) + room["events"],
+            "days": n_days,
+            "dirty": len(rows["servers"]),
+            "ready": margin,
+            "attempts": (cells * slots, max(self.max_flows, 1)),
+            "own_ns": (cells, self.max_resources),
+            "ages": max(problem.window_cycles for problem, _ in self.cells),
+            "shadow_bytes": (cells if self.shadows else 0, cycles),
+            "log_outcome": logged * self.max_tasks,
         }
-        structs |= {
-            "segments": np.concatenate([structs["segments"], *self.segments]),
-            "rates": np.concatenate([structs["rates"], *self.rates]),
+        lists: dict[str, list[Any]] = {
+            "outputs": self.outputs,
+            "cell_servers": self.cell_servers,
+            "capacity": self.capacity,
+            "site_of": self.site_of,
+            "back_ns": self.back_ns,
+        }
+        tables: dict[str, NDArray[Any]] = {
+            **{name: _table(name, of, room.get(name, 0)) for name, of in rows.items()},
+            **{name: np.zeros(shape, types[name]) for name, shape in blank.items()},
+            **{name: np.array(values, types[name]) for name, values in lists.items()},
             "changes": changes,
-            "seen": np.zeros((cells, windows), row_types()["seen"]),
+            "latency_ns": np.full((cells, cycles), NEVER_NS),
             "log": _as_rows("log", np.full((logged * self.max_tasks, 4), -1)),
+            "log_arrived": np.full((logged, self.max_flows), -1),
+            "route": np.array(self.route, np.int32).reshape(len(self.route), self.max_flows),
+            "shadow_parts": np.array(self.shadow_parts, np.int8).reshape(-1, self.max_tasks),
+            "soonest_ns": np.full((len(self.site_of), self.max_tasks), -1),
         }
-        return Tables(
-            **structs,
-            outputs=np.array(self.outputs, np.int32),
-            cell_servers=np.array(self.cell_servers, np.int32),
-            capacity=np.array(self.capacity, np.float64),
-            work=np.zeros(0),
-            switching=np.zeros(0),
-            shown=np.zeros(0),
-            priced=np.zeros(0),
-            tiers=np.zeros(0, np.int8),
-            site_of=np.array(self.site_of, np.int32),
-            route=np.array(self.route, np.int32).reshape(len(self.route), self.max_flows),
-            back_ns=np.array(self.back_ns, np.int64),
-            shadow_parts=np.array(self.shadow_parts, np.int8).reshape(-1, self.max_tasks),
-            layers=layers,
-            stamps=stamps,
-            following=np.zeros(len(structs["events"]), np.int32),
-            days=np.zeros(n_days, np.int32),
-            dirty=np.zeros(len(rows["servers"]), np.int32),
-            ready=np.zeros(margin, np.int64),
-            attempts=np.zeros((cells * slots, max(self.max_flows, 1)), np.int64),
-            own_ns=np.zeros((cells, self.max_resources)),
-            soonest_ns=np.full((len(self.site_of), self.max_tasks), -1, np.int64),
-            ages=np.zeros(max(problem.window_cycles for problem, _ in self.cells), np.int64),
-            latency_ns=np.full((cells, cycles), NEVER_NS),
-            compute_ns=np.zeros((cells, cycles), np.int64),
-            network_ns=np.zeros((cells, cycles), np.int64),
-            outcome=np.zeros((cells, cycles), np.int8),
-            opened=np.zeros((cells, windows, PARTS, self.max_resources)),
-            closed=np.zeros((cells, windows, PARTS, self.max_resources)),
-            shares=np.zeros((cells, windows, PARTS, self.max_resources)),
-            shadow_bytes=np.zeros((cells if self.shadows else 0, cycles), np.int64),
-            log_outcome=np.zeros(logged * self.max_tasks, np.int8),
-            log_arrived=np.full((logged, self.max_flows), -1, np.int64),
-        )
+        tables["segments"] = np.concatenate([tables["segments"], *self.segments])
+        tables["rates"] = np.concatenate([tables["rates"], *self.rates])
+        tables["stamps"][[row["parent"] >= 0 for row in rows["cells"]]] = -1
+        for hop, known in enumerate(self.layers):
+            for layer, address in known.items():
+                tables["layers"][hop, layer] = address
+        return Tables(**tables)
 
     def _calendar(self) -> tuple[int, int]:
         """Bits of a day, in which about one event happens, and days of a year: two periods."""
@@ -773,8 +746,8 @@ class _Layout:
     def _announce_first(self, changes: Rows) -> None:
         """Put the first release of every cell, and the first change of a node, into the queue."""
         first = [
-            (int(real.release_ns[0]), make_key(EventKind.RELEASE, row))
-            for row, (_, real) in zip(self.cell_rows, self.cells, strict=True)
+            (int(real.release_ns[0]), make_key(EventKind.RELEASE, part.row))
+            for part, (_, real) in zip(self.parts, self.cells, strict=True)
         ]
         if len(changes):
             first.append((int(changes[0]["at_ns"]), make_key(EventKind.CHANGE)))

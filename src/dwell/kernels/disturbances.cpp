@@ -6,38 +6,18 @@
 
 #include "export.h"
 #include "on_off_intervals.h"
-#include "rows.h"
 
 namespace dwell {
 namespace {
-
-// What one disturbance does to a node; disturbances.py has the same struct.
-struct NodeEffect {
-  OnOffIntervals intervals;
-  int64_t node;
-  int64_t down;
-  int64_t threads[kLevels];
-};
-static_assert(sizeof(NodeEffect) == 312);
 
 struct NodeState {
   int64_t threads;
   int64_t down;  // effects by which it is down
 };
 
-// What one disturbance does to a link; disturbances.py has the same struct.
-struct LinkFault {
-  OnOffIntervals intervals;
-  int64_t down;
-  int64_t layers[kLevels];
-  double arriving[kLevels];  // share of the attempts that it does not lose
-  double rate_mbps[kLevels];
-};
-static_assert(sizeof(LinkFault) == 816);
-
 bool before(const NodeEffect& one, const NodeEffect& other) noexcept {
-  const int64_t at_ns = one.intervals.next_ns();
-  const int64_t other_ns = other.intervals.next_ns();
+  const int64_t at_ns = next_ns(one.intervals);
+  const int64_t other_ns = next_ns(other.intervals);
   return at_ns != other_ns ? at_ns < other_ns : one.node < other.node;
 }
 
@@ -58,12 +38,12 @@ DWELL_EXPORT int64_t dwell_node_changes(NodeEffect** effects, int64_t count, int
                                         NodeState* nodes, Change* changes) noexcept {
   for (int64_t i = count / 2; i-- > 0;) sift_down(effects, count, i);
   int64_t made = 0;
-  while (count > 0 && effects[0]->intervals.next_ns() <= last_ns) {
+  while (count > 0 && next_ns(effects[0]->intervals) <= last_ns) {
     NodeEffect& next = *effects[0];
-    const int64_t at_ns = next.intervals.next_ns();
-    const int64_t sign = next.intervals.on() ? -1 : 1;
+    const int64_t at_ns = next_ns(next.intervals);
+    const int64_t sign = is_on(next.intervals) ? -1 : 1;
     NodeState& state = nodes[next.node];
-    state.threads += sign * next.threads[next.intervals.level()];
+    state.threads += sign * next.threads[level(next.intervals)];
     state.down += sign * next.down;
     // Of what changes at one instant, the node's state after all of it counts.
     const bool again =
@@ -88,23 +68,23 @@ DWELL_EXPORT int64_t dwell_link_segments(LinkFault* faults, int64_t count, Segme
     segment.at_ns = at_ns;
     double rate_mbps = own_rate.rate_mbps;
     double arriving = 1.0 - own_rate.loss;
-    int64_t next_ns = kAtNoTime;
+    int64_t change_ns = kAtNoTime;
     for (int64_t i = 0; i < count; ++i) {
       LinkFault& fault = faults[i];
       OnOffIntervals& intervals = fault.intervals;
-      while (intervals.next_ns() <= at_ns) ++intervals.passed;
-      next_ns = std::min(next_ns, intervals.next_ns());
-      if (!intervals.on()) continue;
-      const int64_t level = intervals.level();
+      while (next_ns(intervals) <= at_ns) ++intervals.passed;
+      change_ns = std::min(change_ns, next_ns(intervals));
+      if (!is_on(intervals)) continue;
+      const int64_t strength = level(intervals);
       segment.is_down |= fault.down;
-      segment.layers |= fault.layers[level];
-      arriving *= fault.arriving[level];
-      rate_mbps = std::min(rate_mbps, fault.rate_mbps[level]);
+      segment.layers |= fault.layers[strength];
+      arriving *= fault.arriving[strength];
+      rate_mbps = std::min(rate_mbps, fault.rate_mbps[strength]);
     }
     segments[made] = segment;
     rates[made] = {rate_mbps, 1.0 - arriving};
     ++made;
-    at_ns = next_ns;
+    at_ns = change_ns;
   }
   return made;
 }

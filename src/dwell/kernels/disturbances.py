@@ -4,22 +4,14 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from ctypes import c_double, c_int64, c_void_p
-from functools import cache
-from typing import Final, NamedTuple
+from ctypes import c_int64, c_void_p
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dwell.kernels.library import library
+from dwell.kernels.library import foreign
 from dwell.kernels.on_off_intervals import OnOffIntervals
-from dwell.model.scenario import RAMP_STEPS
-
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
-
-#: How strong a disturbance may be: not at all, or as strong as after each step of a ramp.
-LEVELS: Final = RAMP_STEPS + 1
+from dwell.kernels.rows import FLOAT_ROWS_OUT, INT_ROWS_OUT, PLAIN, Floats, Ints, structs
 
 
 class NodeEffect(NamedTuple):
@@ -83,14 +75,12 @@ def node_changes(effects: Sequence[NodeEffect], nodes: int, last_ns: int) -> Int
     int64 array, shape (changes, 4)
         Table of `dwell.kernels.realisation.NodeChanges`.
     """
-    rows = [
-        _NodeEffect(_pointers(i), node, down, _ints(threads)) for i, node, threads, down in effects
-    ]
-    heap = (ctypes.POINTER(_NodeEffect) * len(rows))(*map(ctypes.pointer, rows))
+    kind = structs()["NodeEffect"]
+    rows = [kind(_pointers(i), node, down, _levels(threads)) for i, node, threads, down in effects]
+    heap = (ctypes.POINTER(kind) * len(rows))(*map(ctypes.pointer, rows))
     changes = np.empty((_most_changes(effects), 4), np.int64)
     states = np.zeros((nodes, 2), np.int64)
-    made = _functions().dwell_node_changes(heap, len(rows), last_ns, states, changes)
-    return changes[:made]
+    return changes[: _node_changes()(heap, len(rows), last_ns, states, changes)]
 
 
 def link_segments(
@@ -111,9 +101,10 @@ def link_segments(
     int64 array, shape (segments, 4); float64 array, shape (segments, 2)
         Tables of `dwell.kernels.realisation.LinkSegments`.
     """
-    rows = (_LinkFault * len(faults))(
+    kind, shares = structs()["LinkFault"], PLAIN["Shares"]
+    rows = (kind * len(faults))(
         *(
-            _LinkFault(_pointers(i), down, _ints(layers), _floats(arriving), _floats(rates))
+            kind(_pointers(i), down, _levels(layers), shares(*arriving), shares(*rates))
             for i, layers, arriving, rates, down in faults
         )
     )
@@ -121,7 +112,7 @@ def link_segments(
     segments, qualities = np.zeros((most, 4), np.int64), np.empty((most, 2))
     segments[0, 1] = link
     qualities[0] = rate_mbps, loss
-    made = _functions().dwell_link_segments(rows, len(rows), segments, qualities)
+    made = _link_segments()(rows, len(rows), segments, qualities)
     return segments[:made], qualities[:made]
 
 
@@ -129,65 +120,19 @@ def _most_changes(disturbances: Sequence[NodeEffect] | Sequence[LinkFault]) -> i
     return sum(2 * len(one.intervals.begin) for one in disturbances)
 
 
-class _OnOffIntervals(ctypes.Structure):
-    """``on_off_intervals.h`` has the same struct."""
-
-    _fields_ = (
-        ("begin_ns", c_void_p),
-        ("end_ns", c_void_p),
-        ("levels", c_void_p),
-        ("count", c_int64),
-        ("passed", c_int64),
-    )
-
-
-class _NodeEffect(ctypes.Structure):
-    """``disturbances.cpp`` has the same struct."""
-
-    _fields_ = (
-        ("intervals", _OnOffIntervals),
-        ("node", c_int64),
-        ("down", c_int64),
-        ("threads", c_int64 * LEVELS),
-    )
-
-
-class _LinkFault(ctypes.Structure):
-    """``disturbances.cpp`` has the same struct."""
-
-    _fields_ = (
-        ("intervals", _OnOffIntervals),
-        ("down", c_int64),
-        ("layers", c_int64 * LEVELS),
-        ("arriving", c_double * LEVELS),
-        ("rate_mbps", c_double * LEVELS),
-    )
-
-
-def _pointers(intervals: OnOffIntervals) -> _OnOffIntervals:
+def _pointers(intervals: OnOffIntervals) -> Any:
     """Point to arrays, which must outlive the struct."""
-    begin, end, level = (column.ctypes.data for column in intervals)
-    return _OnOffIntervals(begin, end, level, len(intervals.begin), 0)
+    columns = (column.ctypes.data for column in intervals)
+    return structs()["OnOffIntervals"](*columns, len(intervals.begin), 0)
 
 
-def _ints(values: Ints | Floats) -> ctypes.Array[c_int64]:
-    kind: type[ctypes.Array[c_int64]] = c_int64 * LEVELS
-    return kind(*map(int, values))
+def _levels(values: Ints | Floats) -> Any:
+    return PLAIN["Levels"](*map(int, values))
 
 
-def _floats(values: Floats) -> ctypes.Array[c_double]:
-    kind: type[ctypes.Array[c_double]] = c_double * LEVELS
-    return kind(*values)
-
-
-@cache
-def _functions() -> ctypes.CDLL:
-    """Return the library; its functions refuse tables of another type, or not in one piece."""
-    kernel = library()
-    ints = np.ctypeslib.ndpointer(np.int64, ndim=2, flags=("C_CONTIGUOUS", "WRITEABLE"))
-    floats = np.ctypeslib.ndpointer(np.float64, ndim=2, flags=("C_CONTIGUOUS", "WRITEABLE"))
-    kernel.dwell_node_changes.restype = c_int64
-    kernel.dwell_node_changes.argtypes = [c_void_p, c_int64, c_int64, ints, ints]
-    kernel.dwell_link_segments.restype = c_int64
-    kernel.dwell_link_segments.argtypes = [c_void_p, c_int64, ints, floats]
-    return kernel
+_node_changes = foreign(
+    "dwell_node_changes", c_int64, c_void_p, c_int64, c_int64, INT_ROWS_OUT, INT_ROWS_OUT
+)
+_link_segments = foreign(
+    "dwell_link_segments", c_int64, c_void_p, c_int64, INT_ROWS_OUT, FLOAT_ROWS_OUT
+)

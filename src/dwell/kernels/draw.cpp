@@ -9,7 +9,7 @@
 #include "elementary.h"
 #include "export.h"
 #include "nanoseconds.h"
-#include "sfc64.h"
+#include "rows.h"
 #include "ziggurat.h"
 
 namespace dwell {
@@ -20,19 +20,6 @@ constexpr int64_t kConstant = 0;
 constexpr int64_t kUniform = 1;
 constexpr int64_t kNormal = 2;
 constexpr int64_t kLogNormal = 3;
-
-// A path and how far it is drawn; drawn_path.py has the same struct.
-struct DrawnPath {
-  Sfc64 stream;
-  int64_t kind;
-  double location;     // constant: the value; uniform: the lower end; else the normal's mean
-  double spread;       // uniform: length of the interval; else the normal's deviation
-  double least;        // normal: no value is below
-  double correlation;  // lognormal: of a cycle's logarithm with that of the cycle before
-  double gain;         // lognormal: sqrt(1 - correlation^2)
-  double last;         // lognormal: the last standard normal; NaN where the path has not begun
-};
-static_assert(sizeof(DrawnPath) == 88);
 
 // Values at a time: they stay in the first-level cache.
 constexpr int64_t kBlock = 512;

@@ -1,6 +1,4 @@
-// Where every field of every row lies, of which Python makes the types of its arrays.
-
-#include <cstddef>
+// The fields of every row, of which Python makes its own structs, and the types of its arrays.
 
 #include "export.h"
 #include "rows.h"
@@ -12,7 +10,6 @@ struct Field {
   const char* row;
   const char* name;
   const char* type;
-  i64 offset, row_size;
 };
 
 // Writes the fields of all rows, where `out` is given, then every table as a field of `Tables`,
@@ -23,10 +20,9 @@ i64 describe(Field* out) {
     if (out != nullptr) out[n] = field;
     ++n;
   };
-#define DWELL_FIELD(type, name) add({kName, #name, #type, offsetof(Row, name), sizeof(Row)});
+#define DWELL_FIELD(type, name) add({kName, #name, #type});
 #define DWELL_DESCRIBE(row, fields)     \
   {                                     \
-    using Row = row;                    \
     constexpr const char* kName = #row; \
     fields(DWELL_FIELD)                 \
   }

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from functools import cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
-from typing import Final, cast
+from typing import Any, Final
 
 from dwell.errors import DISTRIBUTION, KernelError
 from dwell.kernels.library_file import NAME, is_of, read_header, source_digest
@@ -36,14 +36,36 @@ def library() -> ctypes.CDLL:
     return load(files(__package__))
 
 
+def foreign(name: str, result: Any, *arguments: Any) -> Callable[[], Any]:
+    """Declare a function of the library, by the types of its result and of its arguments.
+
+    Returns
+    -------
+    callable
+        Returns the function; the first call loads the library, and raises what `library` does.
+    """
+
+    @cache
+    def loaded() -> Any:
+        function = getattr(library(), name)
+        function.restype, function.argtypes = result, arguments
+        return function
+
+    return loaded
+
+
+_digest = foreign("dwell_digest", ctypes.c_char_p)
+_compiler = foreign("dwell_compiler", ctypes.c_char_p)
+
+
 def digest() -> str:
     """Return the SHA-256 of the sources that the library was built of."""
-    return _text(library().dwell_digest)
+    return str(_digest()(), "ascii")
 
 
 def compiler() -> str:
     """Return the name and version of the compiler that built the library."""
-    return _text(library().dwell_compiler)
+    return str(_compiler()(), "utf-8")
 
 
 def load(folder: Traversable) -> ctypes.CDLL:
@@ -80,9 +102,3 @@ def _flaw(content: bytes, digest: str) -> str:
     if not is_of(content, digest):
         return "was built of other sources than those beside it"
     return ""
-
-
-def _text(function: Callable[[], object]) -> str:
-    """Call a function that returns a string of C."""
-    function.restype = ctypes.c_char_p  # type: ignore[attr-defined]
-    return cast(bytes, function()).decode()

@@ -9,26 +9,6 @@
 #include "rows.h"
 
 namespace dwell {
-namespace {
-
-// A row a cycle of a window: the candidate that it went through, when its jobs became ready, when
-// they completed, when its messages arrived, and the core time of its jobs, -1 for what had not
-// come or is not known; then, where there are shadows, the same of its shadow, the candidate being
-// -1 where it has none.
-struct Window {
-  const i64* rows;
-  i64 n, width;
-};
-
-// What cycles under one candidate go through: the source of each flow, then in row 0 for the cycles
-// themselves, in row 1 + i for their shadows through candidate i, the part of each task and of each
-// flow, -1 for none of their own, and whether a flow's source is shared with the cycle.
-struct Layout {
-  i64 n_tasks, n_flows;
-  const i64* sources;
-  const i64* parts;
-  const i8* shared;
-};
 
 // A message on a link with a rate: when it was sent, how long that takes, and its time so far.
 struct Crossing {
@@ -42,21 +22,7 @@ struct Crossing {
   }
 };
 
-// The times found: up to `most` of each part, and the parts in the order in which they were found.
-//
-// Where demands are asked for, and not times, there is a `cost` of each part: of a job its time
-// alone over its core time, of a message the nanoseconds that its link takes to send it; and a
-// `link` that has a rate, -1 for none.
-struct Found {
-  f64* ms;
-  i64* count;
-  i64* order;
-  i64 most, n_parts;
-  const f64* cost;
-  const i64* link;
-  Crossing* crossings;
-  i64 n_crossings;
-};
+namespace {
 
 void add(Found& found, i64 part, f64 ms) {
   if (found.count[part] == 0) found.order[found.n_parts++] = part;

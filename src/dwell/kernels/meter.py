@@ -2,49 +2,15 @@
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Sequence
-from ctypes import POINTER, c_double, c_int64, c_void_p
-from functools import cache
+from ctypes import byref, c_double, c_int64, c_void_p
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.kernels.library import library
-
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
-
-
-class _Window(ctypes.Structure):
-    """A window's cycles; ``meter.cpp`` has the same structs."""
-
-    _fields_ = (("rows", c_void_p), ("n", c_int64), ("width", c_int64))
-
-
-class _Layout(ctypes.Structure):
-    _fields_ = (
-        ("n_tasks", c_int64),
-        ("n_flows", c_int64),
-        ("sources", c_void_p),
-        ("parts", c_void_p),
-        ("shared", c_void_p),
-    )
-
-
-class _Found(ctypes.Structure):
-    _fields_ = (
-        ("ms", c_void_p),
-        ("count", c_void_p),
-        ("order", c_void_p),
-        ("most", c_int64),
-        ("n_parts", c_int64),
-        ("cost", c_void_p),
-        ("link", c_void_p),
-        ("crossings", c_void_p),
-        ("n_crossings", c_int64),
-    )
+from dwell.kernels.library import foreign
+from dwell.kernels.rows import Floats, Ints, structs
 
 
 class CyclesLayout:
@@ -66,7 +32,7 @@ class CyclesLayout:
         # Rows have addresses in these.
         self._behind = tuple(map(np.ascontiguousarray, (sources, parts, shared)))
         addresses = (table.ctypes.data for table in self._behind)
-        self.row = _Layout(parts.shape[1] - flows, flows, *addresses)
+        self.row = structs()["Layout"](parts.shape[1] - flows, flows, *addresses)
 
     def __reduce__(self) -> tuple[type[CyclesLayout], tuple[NDArray[Any], ...]]:
         # A copy has addresses of its own.
@@ -96,8 +62,8 @@ class PartTimes:
         self._meter = _meter()
         self._cost, self._link = cost, link
         self._count, self._order = np.zeros((2, parts), np.int64)
-        self._window = _Window()
-        self._found = _Found(None, self._count.ctypes.data, self._order.ctypes.data)
+        self._window, self._found = structs()["Window"](), structs()["Found"]()
+        self._found.count, self._found.order = self._count.ctypes.data, self._order.ctypes.data
         if cost is not None and link is not None:
             self._found.cost, self._found.link = cost.ctypes.data, link.ctypes.data
         self._ms, self._crossings = np.empty((parts, 0)), np.empty(0, np.int64)
@@ -146,7 +112,9 @@ class PartTimes:
 
     def add(self, active: int, layout: CyclesLayout) -> None:
         """Add what the cycles under one candidate show, and then their shadows."""
-        self._meter(layout.row, self._window, active, self._limit_ns, self._found)
+        self._meter(
+            byref(layout.row), byref(self._window), active, self._limit_ns, byref(self._found)
+        )
 
     def by_part(self) -> dict[int, Floats]:
         """Return the times by number of part, in the order in which they were found."""
@@ -174,20 +142,5 @@ def places(known: Floats, values: Floats) -> tuple[float, float, float]:
     return out[0], out[1], out[2]
 
 
-@cache
-def _places() -> Any:
-    """Return the function of the library, with the types of its arguments."""
-    function = library().dwell_places
-    function.argtypes = c_void_p, c_int64, c_void_p, c_int64, c_void_p
-    function.restype = None
-    return function
-
-
-@cache
-def _meter() -> Any:
-    """Return the function of the library, with the types of its arguments."""
-    function = library().dwell_meter
-    layout, window, found = POINTER(_Layout), POINTER(_Window), POINTER(_Found)
-    function.argtypes = layout, window, c_int64, c_int64, found
-    function.restype = None
-    return function
+_places = foreign("dwell_places", None, c_void_p, c_int64, c_void_p, c_int64, c_void_p)
+_meter = foreign("dwell_meter", None, c_void_p, c_void_p, c_int64, c_int64, c_void_p)

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from ctypes import POINTER, c_double, c_int64
-from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.kernels.drawn_path import BLOCK, path_of
-from dwell.kernels.library import library
+from dwell.kernels.library import foreign
+from dwell.kernels.rows import FLOATS_IN, INTS_OUT, Ints
 from dwell.model import Process
 from dwell.model.instants import HORIZON_NS
 from dwell.model.scenario import RAMP_STEPS
-
-Ints = NDArray[np.int64]
 
 
 class OnOffIntervals(NamedTuple):
@@ -94,7 +91,7 @@ def drawn_intervals(
             rows = min(BLOCK, count - at)
             begin, end = part[:, at : at + rows]
             off, on = times_off.values(rows), times_on.values(rows)
-            begun += _dwell_alternate()(
+            begun += _alternate()(
                 off, on, rows, unit_ns, since_ns, elapsed_ns, horizon_ns, begin, end
             )
             if begun < at + rows:
@@ -105,16 +102,7 @@ def drawn_intervals(
     return OnOffIntervals(begin, end, np.full(len(begin), RAMP_STEPS))
 
 
-@cache
-def _dwell_alternate() -> Any:
-    """Return the library's function; it refuses arrays of another type, or not in one piece."""
-    times = np.ctypeslib.ndpointer(np.float64, ndim=1, flags="C_CONTIGUOUS")
-    instants = np.ctypeslib.ndpointer(np.int64, ndim=1, flags=("C_CONTIGUOUS", "WRITEABLE"))
-    function = library().dwell_alternate
-    function.restype = c_int64
-    function.argtypes = [
-        *(times, times, c_int64),
-        *(c_double, c_double, POINTER(c_double), c_double),
-        *(instants, instants),
-    ]
-    return function
+_alternate = foreign(
+    *("dwell_alternate", c_int64, FLOATS_IN, FLOATS_IN, c_int64),
+    *(c_double, c_double, POINTER(c_double), c_double, INTS_OUT, INTS_OUT),
+)

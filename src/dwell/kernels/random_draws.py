@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.errors import Fault, ProblemError, SimulationError
-from dwell.kernels.disturbances import LEVELS, LinkFault, NodeEffect, link_segments, node_changes
-from dwell.kernels.drawn_path import BLOCK, Path, PickedPath, ReplayedPath, independent, path_of
+from dwell.kernels.disturbances import LinkFault, NodeEffect, link_segments, node_changes
+from dwell.kernels.drawn_path import BLOCK, Path, ReplayedPath, independent, path_of
 from dwell.kernels.on_off_intervals import OnOffIntervals, drawn_intervals, interval, ramp
 from dwell.kernels.realisation import LinkSegments, NodeChanges, Phase, Realisation, TraceStart
+from dwell.kernels.rows import LEVELS, Floats, Ints
 from dwell.model import (
     Bursts,
     Constant,
@@ -32,9 +33,6 @@ from dwell.model import (
 from dwell.model.bounds import short
 from dwell.model.instants import HORIZON_NS
 from dwell.model.scenario import RAMP_STEPS
-
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
 
 NS_PER_MS = 1e6
 NS_PER_S = 1e9
@@ -260,17 +258,7 @@ class Drawing:
                 f"{windows} windows are more than are left: {self.cycles - begin} cycles"
             )
         self.drawn += cycles
-        layers = self._layers()
-        # One piece of memory: the system maps large ones by larger pages.
-        sizes = len(self.sites), len(self.hops), len(layers)
-        ends = np.cumsum(sizes)
-        table = np.empty((ends[-1], cycles), np.int64)
-        exec_ns, delay_ns, extra_ns = np.split(table, ends[:-1])
-        for at in range(0, cycles, BLOCK):
-            block = slice(at, at + BLOCK)
-            self._fill_extra(extra_ns[:, block])
-            self._fill_executions(exec_ns[:, block])
-            self._fill_delays(delay_ns[:, block])
+        exec_ns, delay_ns, extra_ns = self._parts(self._filled(cycles))
         node_changes, link_segments = self.changes
         return Realisation(
             scenario=self.name,
@@ -282,7 +270,7 @@ class Drawing:
             hops=self.hops,
             delay_ns=delay_ns,
             loss_keys=self._loss_keys(),
-            layers=layers,
+            layers=self._layers(),
             extra_ns=extra_ns,
             node_changes=node_changes,
             link_segments=link_segments,
@@ -293,21 +281,13 @@ class Drawing:
 
     def take_sent(self, realisation: Realisation, whole: Realisation | None) -> Realisation:
         """Draw the cycles that are sent; the others are those of `whole`, or 0."""
-        sent, layers = self.sent, self._layers()
-        sizes = len(self.sites), len(self.hops), len(layers)
-        ends = np.cumsum(sizes)
-        drawn = np.empty((ends[-1], 0 if sent is None else len(sent)), np.int64)
-        exec_ns, delay_ns, extra_ns = np.split(drawn, ends[:-1])
-        if drawn.size:
-            self._fill_extra(extra_ns)
-            self._fill_executions(exec_ns)
-            self._fill_delays(delay_ns)
-        table = np.zeros((ends[-1], self.cycles), np.int64)
+        drawn = self._filled(0 if self.sent is None else len(self.sent))
+        table = np.zeros((len(drawn), self.cycles), np.int64)
         if whole is not None:
             np.concatenate((whole.exec_ns, whole.delay_ns, whole.extra_ns), out=table)
         for row, values in zip(table, drawn, strict=True):
-            row[sent] = values
-        exec_ns, delay_ns, extra_ns = np.split(table, ends[:-1])
+            row[self.sent] = values
+        exec_ns, delay_ns, extra_ns = self._parts(table)
         return replace(
             realisation,
             exec_ns=exec_ns,
@@ -315,6 +295,23 @@ class Drawing:
             loss_keys=self._loss_keys(),
             extra_ns=extra_ns,
         )
+
+    def _filled(self, cycles: int) -> Ints:
+        """Draw the next cycles: a row for each site, then hop, then layer of extra delay."""
+        # One piece of memory: the system maps large ones by larger pages.
+        rows = len(self.sites) + len(self.hops) + len(self._layers())
+        table = np.empty((rows, cycles), np.int64)
+        for at in range(0, cycles, BLOCK):
+            exec_ns, delay_ns, extra_ns = self._parts(table[:, at : at + BLOCK])
+            self._fill_extra(extra_ns)
+            self._fill_executions(exec_ns)
+            self._fill_delays(delay_ns)
+        return table
+
+    def _parts(self, table: Ints) -> list[Ints]:
+        """Return the rows of sites, of hops, and of layers of extra delay."""
+        sites = len(self.sites)
+        return np.split(table, (sites, sites + len(self.hops)))
 
     def _loss_keys(self) -> NDArray[np.uint64]:
         return np.array([self._key(f"loss/{_hop_name(hop)}") for hop in self.hops], np.uint64)
@@ -366,7 +363,8 @@ class Drawing:
                 if self.sent is not None and not (
                     name.startswith(OF_A_JOB) and independent(process)
                 ):
-                    path = PickedPath(path, self.cycles, self.sent)
+                    # Drawn for every cycle, and taken for those that are sent.
+                    path = ReplayedPath(path.values(self.cycles), self.sent)
             self.paths[name] = path
         return self.paths[name]
 

@@ -1,7 +1,7 @@
 // The rows of the kernel's tables, and what it is handed: every table and how many rows it has.
 //
-// Each field is declared here and nowhere else: the lists below make the structs, and library.cpp
-// tells Python where every field lies, of which it makes the types of its arrays.
+// Each field is declared here and nowhere else: the lists below make the structs, and layout.cpp
+// tells Python what fields they have, of which it makes structs of its own and types of arrays.
 //
 // A *site* is a task on one feasible node of one cell; a *server* is what executes jobs: the CPU of
 // a node, or one kind of its accelerators; a *hop* is a flow on a link. A cell may have a *shadow*:
@@ -12,6 +12,8 @@
 
 #include <cstdint>
 
+#include "sfc64.h"
+
 namespace dwell {
 
 using i8 = std::int8_t;
@@ -21,6 +23,14 @@ using i64 = std::int64_t;
 using u64 = std::uint64_t;
 using f64 = double;
 using Times = const i64*;
+
+// Number of strengths of a disturbance: those of a ramp's steps, and none
+// (dwell.model.scenario.RAMP_STEPS); and a number for each.
+constexpr i64 kLevels = 32;
+using Levels = i64[kLevels];
+using Shares = f64[kLevels];
+
+struct Crossing;  // of meter.cpp
 
 // The lists are tables: a row of fields a line.
 // clang-format off
@@ -187,14 +197,63 @@ using Times = const i64*;
   field(f64, measured) field(f64, delta_j) field(i64, dwell)                                     \
   field(i32, incumbent) field(i32, placement) field(i32, reason)
 
+// Intervals in order, none of which begins before the one ahead of it has ended (see
+// on_off_intervals.h); `passed` counts the begins and ends that are over.
+#define DWELL_ON_OFF(field)                                                                      \
+  field(Times, begin_ns) field(Times, end_ns) field(Times, levels) field(i64, count)             \
+  field(i64, passed)
+
+// What one disturbance does to a node.
+#define DWELL_EFFECT(field)                                                                      \
+  field(OnOffIntervals, intervals) field(i64, node) field(i64, down) field(Levels, threads)
+
+// What one disturbance does to a link; `arriving` is the share of attempts that it does not lose.
+#define DWELL_FAULT(field)                                                                       \
+  field(OnOffIntervals, intervals) field(i64, down) field(Levels, layers)                        \
+  field(Shares, arriving) field(Shares, rate_mbps)
+
+// A path of a random process and how far it is drawn (draw.cpp). `location` is the value of a
+// constant, the lower end of a uniform one, else the normal's mean; `spread` the length of the
+// interval, else the normal's deviation; no normal value is below `least`. Of a lognormal one
+// `correlation` is that of a cycle's logarithm with the cycle's before, `gain` sqrt(1 -
+// correlation^2), and `last` the last standard normal, NaN where the path has not begun.
+#define DWELL_PATH(field)                                                                        \
+  field(Sfc64, stream) field(i64, kind) field(f64, location) field(f64, spread)                  \
+  field(f64, least) field(f64, correlation) field(f64, gain) field(f64, last)
+
+// What cycles under one candidate go through (meter.cpp): the source of each flow, then in row 0 for
+// the cycles themselves, in row 1 + i for their shadows through candidate i, the part of each task
+// and of each flow, -1 for none of their own, and whether a flow's source is shared with the cycle.
+#define DWELL_LAYOUT(field)                                                                      \
+  field(i64, n_tasks) field(i64, n_flows) field(Times, sources) field(Times, parts)              \
+  field(const i8*, shared)
+
+// A row a cycle of a window: the candidate that it went through, when its jobs became ready, when
+// they completed, when its messages arrived, and the core time of its jobs, -1 for what had not
+// come or is not known; then, where there are shadows, the same of its shadow, the candidate being
+// -1 where it has none.
+#define DWELL_WINDOW(field) field(Times, rows) field(i64, n) field(i64, width)
+
+// The times found: up to `most` of each part, and the parts in the order in which they were found.
+// Where demands are asked for, and not times, there is a `cost` of each part: of a job its time
+// alone over its core time, of a message the nanoseconds that its link takes to send it; and a
+// `link` that has a rate, -1 for none.
+#define DWELL_FOUND(field)                                                                       \
+  field(f64*, ms) field(i64*, count) field(i64*, order) field(i64, most) field(i64, n_parts)     \
+  field(const f64*, cost) field(const i64*, link) field(Crossing*, crossings)                    \
+  field(i64, n_crossings)
+
 #define DWELL_ROWS(row)                                                                          \
   row(Clock, DWELL_CLOCK) row(Cell, DWELL_CELL) row(Task, DWELL_TASK) row(Flow, DWELL_FLOW)      \
   row(Site, DWELL_SITE) row(Server, DWELL_SERVER) row(Quota, DWELL_QUOTA)                        \
-  row(Node, DWELL_NODE) row(Change, DWELL_CHANGE) row(Hop, DWELL_HOP)      \
+  row(Node, DWELL_NODE) row(Change, DWELL_CHANGE) row(Hop, DWELL_HOP)                            \
   row(Link, DWELL_LINK) row(Segment, DWELL_SEGMENT) row(Rate, DWELL_RATE)                        \
   row(Event, DWELL_EVENT) row(Running, DWELL_RUNNING) row(Waiting, DWELL_WAITING)                \
   row(Job, DWELL_JOB) row(Slot, DWELL_SLOT) row(Log, DWELL_LOG) row(Seen, DWELL_SEEN)            \
-  row(Rule, DWELL_RULE) row(Option, DWELL_OPTION) row(Decided, DWELL_DECIDED)
+  row(Rule, DWELL_RULE) row(Option, DWELL_OPTION) row(Decided, DWELL_DECIDED)                    \
+  row(OnOffIntervals, DWELL_ON_OFF) row(NodeEffect, DWELL_EFFECT) row(LinkFault, DWELL_FAULT)    \
+  row(DrawnPath, DWELL_PATH) row(Layout, DWELL_LAYOUT) row(Window, DWELL_WINDOW)                 \
+  row(Found, DWELL_FOUND)
 
 // clang-format on
 

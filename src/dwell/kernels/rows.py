@@ -1,15 +1,17 @@
-"""The kernel's tables: arrays whose rows are the structs of ``rows.h``."""
+"""What the kernel is handed: the structs of ``rows.h``, and tables whose rows they are."""
 
 from __future__ import annotations
 
 import ctypes
 from functools import cache
-from typing import Any, NamedTuple, TypeAlias, cast
+from itertools import groupby
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.kernels.library import library
+from dwell.kernels.library import foreign
+from dwell.model.scenario import RAMP_STEPS
 
 #: Rows of structs, whose fields `row_types` has.
 Rows: TypeAlias = NDArray[np.void]
@@ -17,58 +19,64 @@ Floats: TypeAlias = NDArray[np.float64]
 Ints: TypeAlias = NDArray[np.int64]
 Row: TypeAlias = Any
 
-#: Types of rows that are plain numbers; a pointer to times is an address.
-NUMBERS: dict[str, np.dtype[Any]] = {
-    "i8": np.dtype(np.int8),
-    "i16": np.dtype(np.int16),
-    "i32": np.dtype(np.int32),
-    "i64": np.dtype(np.int64),
-    "u64": np.dtype(np.uint64),
-    "f64": np.dtype(np.float64),
-    "Times": np.dtype(np.uint64),
+#: How strong a disturbance may be: not at all, or as strong as after each step of a ramp.
+LEVELS = RAMP_STEPS + 1
+
+#: Arrays as functions of the library take them: of one type, in one piece.
+FLOATS_IN = np.ctypeslib.ndpointer(np.float64, ndim=1, flags="C_CONTIGUOUS")
+INTS_OUT, INT_ROWS_OUT, FLOATS_OUT, FLOAT_ROWS_OUT = (
+    np.ctypeslib.ndpointer(kind, ndim=ndim, flags=("C_CONTIGUOUS", "WRITEABLE"))
+    for kind in (np.int64, np.float64)
+    for ndim in (1, 2)
+)
+
+#: Types of fields that are no structs; a pointer, as to times, is an address.
+PLAIN: dict[str, Any] = {
+    "i8": ctypes.c_int8,
+    "i16": ctypes.c_int16,
+    "i32": ctypes.c_int32,
+    "i64": ctypes.c_int64,
+    "u64": ctypes.c_uint64,
+    "f64": ctypes.c_double,
+    "Times": ctypes.c_uint64,
+    "Levels": ctypes.c_int64 * LEVELS,
+    "Shares": ctypes.c_double * LEVELS,
+    "Sfc64": ctypes.c_uint64 * 4,
 }
 
 
 class _Field(ctypes.Structure):
-    """Where a field of a row lies."""
+    """A field of a struct."""
 
-    _fields_ = (
-        ("row", ctypes.c_char_p),
-        ("name", ctypes.c_char_p),
-        ("type", ctypes.c_char_p),
-        ("offset", ctypes.c_int64),
-        ("row_size", ctypes.c_int64),
-    )
+    _fields_ = tuple((name, ctypes.c_char_p) for name in ("struct", "name", "type"))
 
 
 @cache
-def row_types() -> dict[str, np.dtype[Any]]:
-    """Return the type of the rows of every table, by the table's name, in the kernel's order.
+def structs() -> dict[str, Any]:
+    """Return the structs of ``rows.h`` by name: classes of ctypes, and plain types.
 
     Raises
     ------
     KernelError
         If the library cannot be loaded (see `dwell.kernels.library`).
     """
-    describe = library().dwell_layout
-    describe.restype = ctypes.c_int64
+    describe = foreign("dwell_layout", ctypes.c_int64, ctypes.c_void_p)()
     fields = (_Field * describe(None))()
     describe(fields)
-    layouts: dict[str, dict[str, Any]] = {}
-    for field in fields:
-        layout = layouts.setdefault(
-            field.row.decode(),
-            {"names": [], "formats": [], "offsets": [], "itemsize": field.row_size},
-        )
-        layout["names"].append(field.name.decode())
-        layout["formats"].append(field.type.decode())
-        layout["offsets"].append(field.offset)
-    tables = layouts.pop("Tables")
-    known = dict(NUMBERS)
-    for name, layout in layouts.items():
-        layout["formats"] = [known[kind] for kind in layout["formats"]]
-        known[name] = np.dtype(cast(Any, layout))
-    return dict(zip(tables["names"], map(known.__getitem__, tables["formats"]), strict=True))
+    known = dict(PLAIN)
+    for struct, of in groupby(fields, lambda field: field.struct.decode()):
+        kinds = [(field.name.decode(), field.type.decode()) for field in of]
+        named = [
+            (name, ctypes.c_uint64 if kind.endswith("*") else known[kind]) for name, kind in kinds
+        ]
+        known[struct] = type(struct, (ctypes.Structure,), {"_fields_": named})
+    return known
+
+
+@cache
+def row_types() -> dict[str, np.dtype[Any]]:
+    """Return the type of the rows of every table, by the table's name, in the kernel's order."""
+    return {name: np.dtype(kind) for name, kind in structs()["Tables"]._fields_}
 
 
 class Tables(NamedTuple):

@@ -15,20 +15,18 @@ short (w h <= 0.2) that a Taylor polynomial of degree 4 about their middle stand
 is off by less than A (w h / 2)^5 / 120 < 1e-7 A. e^2 is integrated in closed form; |e| too, between
 the zeros of e, which are found where the error changes its sign or turns inside the piece.
 
-Work and results belong to the caller; times are seconds from the start of the run. `servo_loop.cpp`
-has the loop.
+Times are seconds from the start of the run. `servo_loop.cpp` has the loop.
 """
 
 from __future__ import annotations
 
-import ctypes
-from functools import cache
-from typing import Any
+from ctypes import c_double, c_int64
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dwell.kernels.library import library
+from dwell.kernels.library import foreign
+from dwell.kernels.rows import FLOAT_ROWS_OUT, FLOATS_IN, FLOATS_OUT, Floats
+from dwell.model import Servo
 
 # Status.
 DONE, DIVERGED = 0, 1
@@ -38,79 +36,43 @@ N_STATE = 4
 
 
 def follow(
-    measured_s: NDArray[np.float64],
-    actuated_s: NDArray[np.float64],
-    begin_s: float,
-    end_s: float,
-    double: bool,
-    gain: float,
-    damping: float,
-    amplitude: float,
-    omega: float,
-    states: NDArray[np.float64],
-    integrals: NDArray[np.float64],
-) -> int:
+    servo: Servo, measured_s: Floats, actuated_s: Floats, begin_s: float, end_s: float
+) -> tuple[int, Floats, Floats]:
     """Play the loop from rest at 0 and integrate its error.
 
     Parameters
     ----------
+    servo : Servo
+        Plant, control law and target.
     measured_s, actuated_s : float64 array, shape (n,)
         Instants at which the error of each command was seen, and at which it took effect; both
         ascending, none seen after it took effect.
     begin_s, end_s : float
         What the integrals are taken over.
-    double : bool
-        Whether the plant is the double integrator.
-    gain : float
-        K, 1/s; 1/s^2 for the double integrator.
-    damping : float
-        B, 1/s; not used for the integrator.
-    amplitude, omega : float
-        A, and w in rad/s, above 0.
-    states : float64 array, shape (n + 1, N_STATE)
-        Work: the state at the begin of every hold; the first holds 0.
-    integrals : float64 array, shape (2,)
-        Out: of e^2 and of |e|, in units of A squared times s, and of A times s.
 
     Returns
     -------
-    int
+    status : int
         DONE, or DIVERGED where the position went beyond 10^6 amplitudes; the integrals are then
         not complete.
+    integrals : float64 array, shape (2,)
+        Of e^2 and of |e|, in units of the amplitude squared times s, and of the amplitude times s.
+    states : float64 array, shape (n + 1, N_STATE)
+        The state at the begin of every hold; the first is 0.
     """
-    n = len(actuated_s)
-    shapes = len(measured_s), states.shape, integrals.shape
-    if shapes != (n, (n + 1, N_STATE), (2,)):
-        raise ValueError(f"measured_s, states and integrals do not fit {n} actuations: {shapes}")
-    status: int = _dwell_follow()(
-        measured_s,
-        actuated_s,
-        n,
-        begin_s,
-        end_s,
-        double,
-        gain,
-        damping,
-        amplitude,
-        omega,
-        states,
-        integrals,
+    n, target = len(actuated_s), servo.target
+    if len(measured_s) != n:
+        raise ValueError(f"{len(measured_s)} instants of measurement do not fit {n} actuations")
+    states, integrals = np.zeros((n + 1, N_STATE)), np.empty(2)
+    plant = servo.plant == "double-integrator", servo.gain, servo.damping
+    swing = target.amplitude_mm, target.omega
+    status: int = _follow()(
+        measured_s, actuated_s, n, begin_s, end_s, *plant, *swing, states, integrals
     )
-    return status
+    return status, integrals, states
 
 
-@cache
-def _dwell_follow() -> Any:
-    """Return the library's function; it refuses arrays of another type, or not in one piece."""
-    instants = np.ctypeslib.ndpointer(np.float64, ndim=1, flags="C_CONTIGUOUS")
-    written = np.ctypeslib.ndpointer(np.float64, flags=("C_CONTIGUOUS", "WRITEABLE"))
-    function = library().dwell_follow
-    function.restype = ctypes.c_int64
-    function.argtypes = [
-        *(instants, instants, ctypes.c_int64),
-        *(ctypes.c_double, ctypes.c_double),
-        *(ctypes.c_int64, ctypes.c_double, ctypes.c_double),
-        *(ctypes.c_double, ctypes.c_double),
-        *(written, written),
-    ]
-    return function
+_follow = foreign(
+    *("dwell_follow", c_int64, FLOATS_IN, FLOATS_IN, c_int64, c_double, c_double),
+    *(c_int64, c_double, c_double, c_double, c_double, FLOAT_ROWS_OUT, FLOATS_OUT),
+)

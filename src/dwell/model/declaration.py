@@ -88,7 +88,7 @@ def declared(section: str = "") -> Callable[[type[T]], type[T]]:
     """
 
     def make(cls: type[T]) -> type[T]:
-        further = cls.__dict__.get("__post_init__")
+        further = getattr(cls, "__post_init__", None)
 
         def check(self: Any) -> None:
             _check(self, section)

@@ -205,14 +205,7 @@ class Problem(Displayed):
     @property
     def drawn(self) -> Drawn:
         """What its realisations depend on."""
-        return Drawn(
-            self.pipeline,
-            self.fabric,
-            self.candidates,
-            self.scenarios,
-            self.window_cycles,
-            self.servo,
-        )
+        return Drawn(*(getattr(self, name) for name in Drawn._fields))
 
     def at_phase(self, phase_ms: float) -> Problem:
         """Return the problem with another offset of all its releases."""

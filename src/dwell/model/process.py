@@ -271,27 +271,20 @@ class TraceTable:
             return True
         if not isinstance(other, TraceTable) or self._declared != other._declared:
             return False
-        mine, theirs = self._arrays, other._arrays
-        return mine.keys() == theirs.keys() and all(
-            np.array_equal(values, theirs[name]) for name, values in mine.items()
-        )
+        return all(map(np.array_equal, self._arrays, other._arrays))
 
     def __hash__(self) -> int:
         return hash(self._declared)
 
     @property
-    def _arrays(self) -> dict[tuple[str, str], NDArray[Any]]:
-        arrays: dict[tuple[str, str], NDArray[Any]] = {("", "starts"): self.starts}
-        if self.time_ms is not None:
-            arrays["", "time_ms"] = self.time_ms
-        for name, values in self.columns.items():
-            arrays["column", name] = values
-        return arrays
+    def _arrays(self) -> list[NDArray[Any]]:
+        time_ms = () if self.time_ms is None else (self.time_ms,)
+        return [self.starts, *time_ms, *(self.columns[name] for name in sorted(self.columns))]
 
     @property
     def _declared(self) -> tuple[object, ...]:
-        declared = (self.file, self.by, self.group, self.time, self.on_negative, self.wrap)
-        return (*declared, self.rows)
+        replayed = (self.file, self.by, self.group, self.time, self.on_negative, self.wrap)
+        return (*replayed, self.rows, self.time_ms is None, frozenset(self.columns))
 
     @property
     def rows(self) -> int:

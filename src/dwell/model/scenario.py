@@ -67,8 +67,35 @@ def _ramp_s() -> Any:
     )
 
 
+class _Timed:
+    """What has a begin and a duration."""
+
+    __slots__ = ()
+    at_s: float
+    for_s: float
+    down: bool
+    episodes: Episodes | None
+    ramp_s: float
+
+    def __post_init__(self) -> None:
+        if self.ramp_s == 0:
+            return
+        ramp_s, half = (
+            self.ramp_s,
+            f"at most half of for_s = {self.for_s:g}: it grows, and it falls",
+        )
+        require(2 * ramp_s <= self.for_s, "ramp_s", ramp_s, half)
+        require(self.episodes is None, "ramp_s", ramp_s, "left out where there are `episodes`")
+        require(not self.down, "ramp_s", ramp_s, "left out of what is `down`: it has no strength")
+
+    @property
+    def end_s(self) -> float:
+        """End, seconds; infinite where it lasts."""
+        return self.at_s + self.for_s
+
+
 @declared()
-class NodeDisturbance:
+class NodeDisturbance(_Timed):
     """Foreign CPU load on a node, or the node down."""
 
     node: str = key("Node that it happens to.")
@@ -83,14 +110,6 @@ class NodeDisturbance:
     episodes: Episodes | None = _episodes()
     ramp_s: float = _ramp_s()
 
-    def __post_init__(self) -> None:
-        _check_time(self)
-
-    @property
-    def end_s(self) -> float:
-        """End, seconds; infinite where it lasts."""
-        return self.at_s + self.for_s
-
     @property
     def place(self) -> str:
         """The node's name."""
@@ -98,7 +117,7 @@ class NodeDisturbance:
 
 
 @declared()
-class LinkDisturbance:
+class LinkDisturbance(_Timed):
     """Extra delay, loss or another rate on a directed link, or the link down.
 
     Loss probabilities of disturbances at the same time, and the link's own, combine as
@@ -124,14 +143,6 @@ class LinkDisturbance:
     down: bool = _down()
     episodes: Episodes | None = _episodes()
     ramp_s: float = _ramp_s()
-
-    def __post_init__(self) -> None:
-        _check_time(self)
-
-    @property
-    def end_s(self) -> float:
-        """End, seconds; infinite where it lasts."""
-        return self.at_s + self.for_s
 
     @property
     def link(self) -> str:
@@ -159,12 +170,3 @@ def is_always_on(item: Disturbance) -> bool:
     """Whether a disturbance is on, at its full strength, from the first cycle to the last."""
     whole = item.at_s == 0 and math.isinf(item.for_s)
     return whole and item.episodes is None and not item.ramp_s
-
-
-def _check_time(item: Disturbance) -> None:
-    if item.ramp_s == 0:
-        return
-    half = f"at most half of for_s = {item.for_s:g}: it grows, and it falls"
-    require(2 * item.ramp_s <= item.for_s, "ramp_s", item.ramp_s, half)
-    require(item.episodes is None, "ramp_s", item.ramp_s, "left out where there are `episodes`")
-    require(not item.down, "ramp_s", item.ramp_s, "left out of what is `down`: it has no strength")

@@ -11,6 +11,7 @@ import re
 import unicodedata
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from graphlib import CycleError, TopologicalSorter
 from typing import TYPE_CHECKING
 
 from dwell.errors import Fault
@@ -42,6 +43,16 @@ NEEDED = frozenset({"node", "task", "candidate"})
 SHARE_TOLERANCE = 1e-9
 
 
+class UnreadNames(dict[str, None]):
+    """The names that a section declares which could not be read: any may be one of them."""
+
+    def __contains__(self, name: object) -> bool:
+        return True
+
+    def __missing__(self, name: str) -> None:
+        """Nothing is known of what has the name."""
+
+
 @dataclass(slots=True)
 class CellParts:
     """Parts of a cell, with the path each has in its file.
@@ -56,7 +67,7 @@ class CellParts:
     links_complete: bool = True
     tasks: Mapping[str, Task | None] = field(default_factory=dict)
     flows: Sequence[tuple[str, Flow]] = ()
-    scales: Iterable[str] = ()
+    scales: Collection[str] = ()
     candidates: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     broken_candidates: Iterable[str] = ()
     scenarios: Mapping[str, Sequence[tuple[str, Disturbance]]] = field(default_factory=dict)
@@ -154,15 +165,12 @@ def find_unregistered(
     ]
 
 
-def _unknown(path: str, what: str, word: str, known: Iterable[str]) -> Iterator[Fault]:
-    names = list(known)
-    if not names and what in NEEDED:
-        # That there is none is told once.
-        return
-    if word not in names:
+def _unknown(path: str, what: str, word: str, known: Collection[str]) -> Iterator[Fault]:
+    # That there is none is told once.
+    if word not in known and (known or what not in NEEDED):
         # Decomposed, a name looks like the one that is declared.
-        twin = unicodedata.normalize("NFC", word) in names and bad_name(word)
-        yield Fault(path, twin or f"unknown {what} {word!r}; {nearest(word, names)}")
+        twin = unicodedata.normalize("NFC", word) in known and bad_name(word)
+        yield Fault(path, twin or f"unknown {what} {word!r}; {nearest(word, known)}")
 
 
 def _names(parts: CellParts) -> Iterator[Fault]:
@@ -254,37 +262,23 @@ def _flows(parts: CellParts) -> Iterator[Fault]:
             again = f"flow {flow.source} -> {flow.target} is declared again"
             yield Fault(path, f"{again} (first at {seen[pair]}); keep one")
         seen.setdefault(pair, path)
-    loop = _cycle(parts.tasks, [flow for _, flow in parts.flows])
+    loop = _cycle([flow for _, flow in parts.flows])
     if loop:
         walk = " -> ".join((*loop, loop[0]))
         yield Fault("flows", f"the cycle {walk} never starts; remove one of these flows")
 
 
-def _cycle(tasks: Iterable[str], flows: Sequence[Flow]) -> list[str]:
-    """Return the tasks of one directed cycle, or an empty list (depth-first search)."""
-    after: dict[str, list[str]] = {task: [] for task in tasks}
+def _cycle(flows: Sequence[Flow]) -> list[str]:
+    """Return the tasks of one directed cycle from the first of its flows on, or an empty list."""
+    graph: TopologicalSorter[str] = TopologicalSorter()
     for flow in flows:
-        if flow.source in after and flow.target in after:
-            after[flow.source].append(flow.target)
-    finished: set[str] = set()
-    for root, first in after.items():
-        trail: list[str] = []
-        stack: list[tuple[str, Iterator[str]]] = []
-        if root not in finished:
-            trail.append(root)
-            stack.append((root, iter(first)))
-        while stack:
-            task, rest = stack[-1]
-            following = next(rest, None)
-            if following is None:
-                finished.add(task)
-                trail.pop()
-                stack.pop()
-            elif following in trail:
-                return trail[trail.index(following) :]
-            elif following not in finished:
-                trail.append(following)
-                stack.append((following, iter(after[following])))
+        graph.add(flow.target, flow.source)
+    try:
+        graph.prepare()
+    except CycleError as error:
+        loop: list[str] = error.args[1][:-1]
+        first = loop.index(next(flow.source for flow in flows if flow.source in loop))
+        return [*loop[first:], *loop[:first]]
     return []
 
 
@@ -442,14 +436,15 @@ def _registered(
     if settings is None:
         return
     names = [*parts.candidates, *parts.broken_candidates]
-    if not is_class_path(settings.policy):
+    if settings.policy not in parts.candidates and not is_class_path(settings.policy):
         known = [*policies, *names]
         yield from _unknown("controller.policy", "policy", settings.policy, known)
     if not is_class_path(settings.estimator):
         path = "controller.estimator"
         yield from _unknown(path, "estimator", settings.estimator, estimators)
-    if settings.estimator in shadowing:
-        yield from _shadow_budget(settings, len(names))
+    given = settings.shadow_fraction if settings.estimator in shadowing else None
+    if given is not None and (message := too_many_shadows(given, len(names))):
+        yield Fault("controller.shadow_fraction", message)
 
 
 def _live(parts: CellParts) -> Iterator[Fault]:
@@ -477,13 +472,6 @@ def _columns(parts: CellParts) -> Iterator[Fault]:
             if message := bad_name(kind):
                 yield Fault(f"nodes.{name}.accelerators.{kind or repr(kind)}", message)
     yield from table_columns.clash_faults(resources_of(parts.nodes), list(parts.candidates))
-
-
-def _shadow_budget(settings: ControllerSettings, candidates: int) -> Iterator[Fault]:
-    given = settings.shadow_fraction
-    message = "" if given is None else too_many_shadows(given, candidates)
-    if message:
-        yield Fault("controller.shadow_fraction", message)
 
 
 def too_many_shadows(fraction: float, candidates: int) -> str:

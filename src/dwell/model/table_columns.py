@@ -1,7 +1,7 @@
 """Columns of the tables that are made of a cell: each declared once, with the names in them.
 
 A `Column` says what a column is called, what it holds, in which unit, and when it is null. A table
-may have one for each resource, each candidate, or each pair of them; `find_clashes` says where two
+may have one for each resource, each candidate, or each pair of them; `clash_faults` says where two
 of a cell's are called the same.
 """
 
@@ -362,14 +362,6 @@ class NamedColumn(NamedTuple):
         return self.resource.path
 
 
-class Clash(NamedTuple):
-    """Two columns of a table with one name."""
-
-    table: str
-    first: NamedColumn
-    second: NamedColumn
-
-
 def those_with(features: Collection[Feature], columns: Iterable[Column]) -> Iterator[Column]:
     """Yield the columns that a run with some features has."""
     for column in columns:
@@ -399,24 +391,18 @@ def clash_faults(resources: Iterable[Resource], candidates: Sequence[str]) -> It
                 f"{first.described} and {resource.described} would both be called "
                 f"{resource.name!r} where a resource is named; rename one of them",
             )
-    for table, one, other in find_clashes(tuple(known.values()), candidates):
-        yield Fault(
-            other.path,
-            f"a table of {table} would have two columns {other.name!r}: of {one.of} and of "
-            f"{other.of}; rename one of them",
-        )
-
-
-def find_clashes(resources: Sequence[Resource], candidates: Sequence[str]) -> Iterator[Clash]:
-    """Yield where two columns of a table would have one name."""
     for table, templates in TEMPLATES.items():
-        known: dict[str, NamedColumn] = {}
+        taken: dict[str, NamedColumn] = {}
         # The table's own come first, so that a clash with one is that of the cell's name.
         for template in sorted(templates, key=lambda one: "{" in one):
-            for column in columns_of(template, resources, candidates):
-                first = known.setdefault(column.name, column)
-                if first is not column:
-                    yield Clash(table, first, column)
+            for column in columns_of(template, known.values(), candidates):
+                one = taken.setdefault(column.name, column)
+                if one is not column:
+                    yield Fault(
+                        column.path,
+                        f"a table of {table} would have two columns {column.name!r}: of {one.of} "
+                        f"and of {column.of}; rename one of them",
+                    )
 
 
 @cache

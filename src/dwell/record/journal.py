@@ -67,60 +67,24 @@ def _checksum(text: bytes) -> int:
     return zlib.crc32(text, zlib.crc32(len(text).to_bytes(4, "little")))
 
 
-@dataclass(slots=True)
-class _Scan:
-    """Frames of a journal from its beginning, and what between them is damaged."""
-
-    data: bytes | mmap.mmap
-    end: int = 0
-    damaged: list[tuple[int, int]] = field(default_factory=list)
-
-    def frames(self) -> Iterator[dict[str, Any]]:
-        data, position = self.data, 0
-        while position < len(data):
-            text = self._text(position)
-            if text is not None:
-                yield _content(text)
-                self.end = position = position + BEGIN + len(text)
-                continue
-            following = position
-            while (following := data.find(MARK, following + 1)) >= 0:
-                if self._text(following) is not None:
-                    self.damaged.append((position, following))
-                    break
-            if following < 0:
-                return
-            position = following
-
-    def _text(self, position: int) -> bytes | None:
-        data = self.data
-        if data[position : position + len(MARK)] != MARK or len(data) < position + BEGIN:
-            return None
-        length, checksum = HEAD.unpack(data[position + len(MARK) : position + BEGIN])
-        if length > len(data) - position - BEGIN:
-            return None
-        text = bytes(data[position + BEGIN : position + BEGIN + length])
-        return text if _checksum(text) == checksum else None
-
-    @property
-    def torn_bytes(self) -> int:
-        """Bytes after the last whole frame."""
-        return len(self.data) - self.end
-
-    def lost(self) -> dict[str, int]:
-        """Return how much was torn and damaged, while the data can be read."""
-        return {
-            "torn_bytes": self.torn_bytes,
-            "damaged_bytes": sum(end - begin for begin, end in self.damaged),
-            "damaged_places": len(self.damaged),
-        }
+def _frames(data: bytes | mmap.mmap) -> Iterator[tuple[int, bytes]]:
+    """Yield the place and the text of every frame that is whole."""
+    place = data.find(MARK)
+    while place >= 0:
+        text = _text_at(place, data)
+        if text is not None:
+            yield place, text
+        place = data.find(MARK, place + (1 if text is None else BEGIN + len(text)))
 
 
-def _content(text: bytes) -> dict[str, Any]:
-    content = json.loads(text)
-    if not isinstance(content, dict):
-        raise RunError("no journal of a run: a frame is not a mapping")
-    return content
+def _text_at(place: int, data: bytes | mmap.mmap) -> bytes | None:
+    if len(data) < place + BEGIN:
+        return None
+    length, checksum = HEAD.unpack(data[place + len(MARK) : place + BEGIN])
+    if length > len(data) - place - BEGIN:
+        return None
+    text = bytes(data[place + BEGIN : place + BEGIN + length])
+    return text if _checksum(text) == checksum else None
 
 
 class _Table:
@@ -170,7 +134,17 @@ class _Table:
 
 @dataclass(slots=True)
 class _Contents:
-    """Frames of a journal put together, with or without their rows."""
+    """Frames of a journal put together, with or without their rows.
+
+    Parameters
+    ----------
+    end : int
+        Where the last whole frame ends.
+    damaged : list of int
+        Bytes of every place between frames that is none.
+    torn_bytes : int
+        Bytes after the last whole frame.
+    """
 
     run: str | None = None
     meta: dict[str, Any] = field(default_factory=dict)
@@ -178,10 +152,15 @@ class _Contents:
     tables: dict[str, _Table] = field(default_factory=dict)
     following: dict[str, int] = field(default_factory=dict)
     opened: int = 0
+    end: int = 0
+    damaged: list[int] = field(default_factory=list)
+    torn_bytes: int = 0
     keep: bool = True
     packed: bool = True
 
-    def take(self, frame: Mapping[str, Any]) -> None:
+    def take(self, frame: Any) -> None:
+        if not isinstance(frame, dict):
+            raise RunError("no journal of a run: a frame is not a mapping")
         if "run" in frame:
             self._take_header(frame)
         elif self.run is None:
@@ -209,13 +188,15 @@ class _Contents:
         self.opened = max(self.opened, int(frame["opened"]))
 
 
-def _read(
-    data: bytes | mmap.mmap, *, keep: bool = True, packed: bool = True
-) -> tuple[_Contents, _Scan]:
-    contents, scan = _Contents(keep=keep, packed=packed), _Scan(data)
-    for frame in scan.frames():
-        contents.take(frame)
-    return contents, scan
+def _read(data: bytes | mmap.mmap, *, keep: bool = True, packed: bool = True) -> _Contents:
+    contents = _Contents(keep=keep, packed=packed)
+    for place, text in _frames(data):
+        if place > contents.end:
+            contents.damaged.append(place - contents.end)
+        contents.take(json.loads(text))
+        contents.end = place + BEGIN + len(text)
+    contents.torn_bytes = len(data) - contents.end
+    return contents
 
 
 def read_journal(
@@ -234,11 +215,13 @@ def read_journal(
     RunError
         If there is none, or nothing of it can be read.
     """
-    contents, lost, tables = _parsed(Path(folder) / JOURNAL, _Table.frame, packed=True)
+    contents, tables = _parsed(Path(folder) / JOURNAL, _Table.frame, packed=True)
     recovered = {
         "sealed": False,
         "opened": contents.opened,
-        **lost,
+        "torn_bytes": contents.torn_bytes,
+        "damaged_bytes": sum(contents.damaged),
+        "damaged_places": len(contents.damaged),
         **{
             f"missing_{name}": contents.following.get(name, 0) - len(tables[name])
             for name in NUMBERED
@@ -266,21 +249,20 @@ def read_plain_journal(
     RunError
         If there is none, or nothing of it can be read.
     """
-    contents, _, tables = _parsed(Path(folder) / JOURNAL, _Table.plain, packed=False)
+    contents, tables = _parsed(Path(folder) / JOURNAL, _Table.plain, packed=False)
     return contents.meta, tables
 
 
 def _parsed(
     file: Path, made: Callable[[_Table], T], *, packed: bool
-) -> tuple[_Contents, dict[str, int], dict[str, T]]:
-    """Put a journal's frames together; returns what was lost, and what each table was made."""
+) -> tuple[_Contents, dict[str, T]]:
+    """Put a journal's frames together; returns them, and what each table was made."""
     try:
         with file.open("rb") as stream:
             if os.fstat(stream.fileno()).st_size == 0:
                 raise RunError("empty; the run was killed before it began")
             with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
-                contents, scan = _read(data, packed=packed)
-                lost = scan.lost()
+                contents = _read(data, packed=packed)
         tables = {name: made(table) for name, table in contents.tables.items()}
     except FileNotFoundError:
         raise RunError(f"{file.parent}: no journal there") from None
@@ -292,7 +274,7 @@ def _parsed(
         raise RunError(f"{file}: no journal of a run ({error!r})") from None
     if contents.run is None:
         raise RunError(f"{file}: nothing in it can be read; the run was killed before it began")
-    return contents, lost, tables
+    return contents, tables
 
 
 def note_in_journal(folder: str | os.PathLike[str], **meta: object) -> None:
@@ -307,9 +289,9 @@ def note_in_journal(folder: str | os.PathLike[str], **meta: object) -> None:
     try:
         with file.open("r+b") as stream:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            _, scan = _read(stream.read(), keep=False)
-            stream.truncate(scan.end)
-            stream.seek(scan.end)
+            end = _read(stream.read(), keep=False).end
+            stream.truncate(end)
+            stream.seek(end)
             stream.write(_frame({"meta": meta}))
     except OSError as error:
         raise RunError(f"{file}: cannot be written ({error.strerror})") from None
@@ -415,8 +397,8 @@ class Journal:
             return _Contents()
         try:
             with mmap.mmap(self._descriptor, 0, access=mmap.ACCESS_READ) as data:
-                contents, scan = _read(data, keep=False)
-                self.cut_bytes = scan.torn_bytes
+                contents = _read(data, keep=False)
+                self.cut_bytes = contents.torn_bytes
         except (RunError, KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
             raise RunError(f"{self.file}: {error}") from None
         if contents.run is None:

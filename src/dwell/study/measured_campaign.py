@@ -101,7 +101,7 @@ def read_measured(folder: Path) -> MeasuredCampaign:
         raise RunError(f"{folder}: none of its {len(kept.description['plan'])} runs is done yet")
     described = kept.description
     cell = described["cell"]
-    problem = from_document(cell, folder=folder, source=str(folder), judged=False)
+    problem = from_document(cell, folder=folder, source=str(folder), is_record=True)
     rows: list[Row] = []
     costs: list[Row] = []
     logged: list[dict[str, Any]] = []

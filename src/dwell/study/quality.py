@@ -216,22 +216,11 @@ def track(servo: Servo, actuated: EffectiveCommands, begin_ns: int, end_ns: int)
     """
     from dwell.kernels import servo_loop as kernel
 
-    start_ns, target = actuated.start_ns, servo.target
-    states = np.empty((len(actuated.at_ns) + 1, kernel.N_STATE))
-    integrals = np.empty(2)
-    status = kernel.follow(
-        (actuated.release_ns - start_ns) / 1e9,
-        (actuated.at_ns - start_ns) / 1e9,
-        (begin_ns - start_ns) / 1e9,
-        (end_ns - start_ns) / 1e9,
-        servo.plant == "double-integrator",
-        float(servo.gain),
-        float(servo.damping),
-        float(target.amplitude_mm),
-        target.omega,
-        states,
-        integrals,
-    )
+    start_ns = actuated.start_ns
+    released_s = (actuated.release_ns - start_ns) / 1e9
+    actuated_s = (actuated.at_ns - start_ns) / 1e9
+    stretch = (begin_ns - start_ns) / 1e9, (end_ns - start_ns) / 1e9
+    status, integrals, _ = kernel.follow(servo, released_s, actuated_s, *stretch)
     seconds = (end_ns - begin_ns) / 1e9
     if status == kernel.DIVERGED:
         return TrackingError(np.inf, np.inf, seconds)

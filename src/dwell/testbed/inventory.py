@@ -164,8 +164,6 @@ def load_inventory(path: str | PathLike[str], problem: Problem) -> Inventory:
     """
     faults = Faults(fspath(path))
     document = read_yaml(fspath(path), faults, INVENTORY.what, INVENTORY.begin)
-    if faults.at(""):
-        raise faults.error()
     entry = read_structure(document, faults, INVENTORY)
     _judge("hosts", entry.hosts, problem.fabric.nodes, "node", faults)
     _judge("links", entry.links or {}, problem.fabric.links, "link", faults)
