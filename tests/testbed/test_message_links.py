@@ -189,8 +189,6 @@ def test_who_says_what_is_wrong_is_told(file: LinkFile, tmp_path: Path) -> None:
         file.set("R1", "X", loss=0.1)
     with pytest.raises(LiveError, match=r"link R1->E: loss: 1.5 is not allowed"):
         file.set("R1", "E", loss=1.5)
-    with pytest.raises(LiveError, match="a link has no jitter"):
-        file.set("R1", "E", jitter=1.5)
     with pytest.raises(LiveError, match="cannot be written"):
         LinkFile(tmp_path / "missing" / "links", NODES)
     with pytest.raises(LiveError, match=r"missing: cannot be read"):
