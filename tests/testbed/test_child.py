@@ -110,11 +110,9 @@ def test_what_is_started_is_stopped_whatever_happens_meanwhile() -> None:
     steps: list[str] = []
 
     class Lamp(Started):
-        def start(self) -> None:
+        def _start(self) -> None:
+            self._stack.callback(steps.append, "off")
             steps.append("on")
-
-        def stop(self) -> None:
-            steps.append("off")
 
     def work() -> None:
         with Lamp():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -46,7 +47,7 @@ class Direct:
 
 @pytest.fixture
 def file(tmp_path: Path) -> Iterator[LinkFile]:
-    with LinkFile(tmp_path / "links", NODES, seed=3) as opened:
+    with closing(LinkFile(tmp_path / "links", NODES, seed=3)) as opened:
         yield opened
 
 

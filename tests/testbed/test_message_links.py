@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,7 @@ RATE_MBPS, BYTES = 20.0, 25_000
 
 @pytest.fixture
 def file(tmp_path: Path) -> Iterator[LinkFile]:
-    with LinkFile(tmp_path / "links", NODES, seed=3) as opened:
+    with closing(LinkFile(tmp_path / "links", NODES, seed=3)) as opened:
         yield opened
 
 
@@ -144,7 +145,7 @@ def test_losses_and_cuts(file: LinkFile) -> None:
 
 def test_of_a_loss_of_1_all_is_lost_or_waits_where_it_would_be_sent_again(tmp_path: Path) -> None:
     links = [Link("R1", "E", Constant(0.0)), Link("E", "R1", Constant(0.0), retransmit_ms=40.0)]
-    with LinkFile(tmp_path / "links", NODES, links, seed=1) as file:
+    with closing(LinkFile(tmp_path / "links", NODES, links, seed=1)) as file:
         there, back = ends(file).to["E"], ends(file, "perception@E").to["R1"]
         file.set("R1", "E", loss=1.0)
         file.set("E", "R1", loss=1.0)
@@ -161,7 +162,7 @@ def test_a_link_that_retransmits_loses_nothing_and_keeps_order_where_it_is_to(
         Link("R1", "E", Constant(0.0), retransmit_ms=40.0),
         Link("E", "R1", Constant(0.0), in_order=True),
     ]
-    with LinkFile(tmp_path / "links", NODES, links, seed=1) as file:
+    with closing(LinkFile(tmp_path / "links", NODES, links, seed=1)) as file:
         file.set("R1", "E", loss=0.5)
         way = ends(file).to["E"]
         found = np.array([way.begin(0, 0) for _ in range(2_000)])

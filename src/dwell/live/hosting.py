@@ -7,9 +7,9 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 
-from dwell.errors import LiveError
+from dwell.errors import LiveError, describe_raised
 from dwell.live.continuity import SetbackDetector
-from dwell.live.failures import described, end_process, start_thread
+from dwell.live.failures import end_process, start_thread
 from dwell.live.role import RoleLogic
 from dwell.live.security import Security
 from dwell.live.stage import Message
@@ -128,7 +128,7 @@ class Hosted:
         except Exception as error:
             if self._complain is None:
                 raise
-            self._complain(LiveError(f"a message under {sample.key}: {described(error)}"))
+            self._complain(LiveError(f"a message under {sample.key}: {describe_raised(error)}"))
             return None
         except BaseException as error:  # an actuator that calls sys.exit(), a panic of Zenoh's
             end_process(f"a message under {sample.key}", error)

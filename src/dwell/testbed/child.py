@@ -26,15 +26,34 @@ PARENT_CHECK_S = 0.5
 
 
 class Started(ABC):
-    """Base of all that runs from the beginning of a ``with`` statement to its end."""
+    """Base of all that runs from the beginning of a ``with`` statement to its end.
 
-    @abstractmethod
+    What its beginning has put on `_stack` is undone at the end, last in first out.
+    """
+
+    def __init__(self) -> None:
+        self._stack = contextlib.ExitStack()
+
     def start(self) -> None:
-        """Start it."""
+        """Start it; where that fails, what has begun is ended.
+
+        Raises
+        ------
+        LiveError
+            If something is missing, in the way, or does not start.
+        """
+        try:
+            self._start()
+        except BaseException:
+            self.stop()
+            raise
 
     @abstractmethod
+    def _start(self) -> None: ...
+
     def stop(self) -> None:
         """End it; safe to call twice."""
+        self._stack.close()
 
     def __enter__(self) -> Self:
         """Start it."""
@@ -85,6 +104,7 @@ class Child(Started):
         descriptors: Sequence[int] = (),
         prefix: Sequence[str] = (),
     ) -> None:
+        super().__init__()
         self.name, self.settings = name, settings
         self.answered: Any = None
         self._module = module
@@ -117,6 +137,9 @@ class Child(Started):
         """
         if self._process is not None:
             raise LiveError(f"{self.name} has been started before")
+        super().start()
+
+    def _start(self) -> None:
         self._connection, theirs = Pipe()
         with theirs:
             # Standard output and error are the parent's: a child that fails says why there.
@@ -125,11 +148,7 @@ class Child(Started):
                 stdin=theirs.fileno(),
                 pass_fds=self._descriptors,
             )
-        try:
-            self.answered = self.ask(self.settings, START_S)
-        except LiveError:
-            self.stop()
-            raise
+        self.answered = self.ask(self.settings, START_S)
 
     def ask(self, request: object, timeout_s: float = ANSWER_S) -> Any:
         """Send a request and return the answer; safe from any thread.

@@ -105,32 +105,21 @@ class Groups(Started):
         ]
         if faults:
             raise LiveError("\n".join(faults))
+        super().__init__()
         self._cgroups = find_cgroups() if cgroups is None else cgroups
         self._parent = group_name(name)
         self._shares = dict(shares)
-        self._made = False
 
-    def start(self) -> None:
-        """Make the groups.
-
-        Raises
-        ------
-        LiveError
-            If groups of this name exist, or cannot be made.
-        """
+    def _start(self) -> None:
         for folder in self._cgroups.groups(self._parent):
             if folder.exists():
                 raise LiveError(f"the group {folder} exists already; use another name")
-        self._made = True
+        self._stack.callback(remove_group, self._parent, self._cgroups)
         try:
             self._make()
         except OSError as error:
-            self.stop()
             reason = f"{error.filename}: {error.strerror}"
             raise LiveError(f"no groups of processes can be made here ({reason})") from None
-        except BaseException:
-            self.stop()
-            raise
 
     def _make(self) -> None:
         for folder in self._cgroups.groups(self._parent):
@@ -259,12 +248,6 @@ class Groups(Started):
         """
         self._require(node)
         _kill(self._cgroups.groups(self._parent, node))
-
-    def stop(self) -> None:
-        """End all processes in the groups, and remove the groups; safe to call twice."""
-        if self._made:
-            remove_group(self._parent, self._cgroups)
-            self._made = False
 
 
 def remove_group(parent: str, cgroups: Cgroups) -> None:

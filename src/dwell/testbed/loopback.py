@@ -9,7 +9,7 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -100,6 +100,7 @@ class Loopback(LocalTestbed):
         clocks: Path | None = None,
         more: Sequence[str] = (),
     ) -> None:
+        super().__init__()
         self.problem, self.folder, self.cpus, self.seed = problem, folder, cpus, seed
         self.world = folder / "world"
         self.burners: dict[str, Burner] = {}
@@ -115,7 +116,6 @@ class Loopback(LocalTestbed):
         links = problem.fabric.links.items()
         self._conditions = {name: usual_conditions(link) for name, link in links}
         self._threads: dict[str, int] = {}
-        self._stack = ExitStack()
 
     @property
     def links(self) -> LinkFile:
@@ -124,38 +124,27 @@ class Loopback(LocalTestbed):
             raise LiveError("the cell has not been started")
         return self._links
 
-    def start(self) -> None:
-        """Start everything, and wait until every process is ready; the run began before that.
-
-        Raises
-        ------
-        LiveError
-            If the cell does not come up.
-        """
-        try:
-            self.processes.write()
-            self._start_links()
-            for cpu in sorted(set(self.cpus.values())):
-                burner = self._stack.enter_context(Burner([cpu]))
-                for node in (node for node, its in self.cpus.items() if its == cpu):
-                    self.burners[node] = burner
-            # Processes end before links and burners do.
-            self._stack.callback(self.processes.stop)
-            for node in self.problem.fabric.nodes:
-                self.processes.start_agent(node)
-            self.processes.start_controllers()
-            self.client = self._stack.enter_context(OperatorClient(self.problem, without_keys()))
-            awaited = expected(self.problem)
-            status = come_up(self.sample, awaited, self.folder, patience_s=START_S)
-            self.begun_ns = int(status.get("origin_ns") or clock_of(self.problem)())
-        except BaseException:
-            self.stop()
-            raise
+    def _start(self) -> None:
+        """Start everything, and wait until every process is ready; the run began before that."""
+        self.processes.write()
+        self._start_links()
+        for cpu in sorted(set(self.cpus.values())):
+            burner = self._stack.enter_context(Burner([cpu]))
+            for node in (node for node, its in self.cpus.items() if its == cpu):
+                self.burners[node] = burner
+        # Processes end before links and burners do.
+        self._stack.callback(self.processes.stop)
+        for node in self.problem.fabric.nodes:
+            self.processes.start_agent(node)
+        self.processes.start_controllers()
+        self.client = self._stack.enter_context(OperatorClient(self.problem, without_keys()))
+        status = come_up(self.sample, expected(self.problem), self.folder, patience_s=START_S)
+        self.begun_ns = int(status.get("origin_ns") or clock_of(self.problem)())
 
     def _start_links(self) -> None:
         nodes, links = tuple(self.problem.fabric.nodes), tuple(self.problem.fabric.links.values())
         file = LinkFile(self.folder / LINK_FILE, nodes, links, seed=self.seed)
-        self._links = self._stack.enter_context(file)
+        self._links = self._stack.enter_context(closing(file))
         for link in links:
             file.set(link.source, link.target, **fields_of(self._conditions[link.name]))
 
@@ -190,5 +179,5 @@ class Loopback(LocalTestbed):
 
     def stop(self) -> None:
         """End every process, links and burners last."""
-        self._stack.close()
+        super().stop()
         self._links = None

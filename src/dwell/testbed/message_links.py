@@ -24,7 +24,7 @@ import struct
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from dwell.errors import LiveError
 from dwell.files import write_whole
@@ -110,14 +110,6 @@ class LinkFile:
     def close(self) -> None:
         """Write no more; the files stay."""
         self._map.close()
-
-    def __enter__(self) -> Self:
-        """Return itself."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Write no more."""
-        self.close()
 
 
 def _size(count: int) -> int:

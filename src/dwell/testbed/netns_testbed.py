@@ -12,7 +12,7 @@ import signal
 import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import closing, suppress
 from dataclasses import replace
 from functools import partial
 from itertools import combinations
@@ -134,6 +134,7 @@ class NetnsTestbed(LocalTestbed):
         environment: Mapping[str, str] | None = None,
         clocks: Path | None = None,
     ) -> None:
+        super().__init__()
         self.problems = (problems,) if isinstance(problems, Problem) else tuple(problems)
         self.problem = self.problems[0]
         require_playable(self.problems)
@@ -151,7 +152,6 @@ class NetnsTestbed(LocalTestbed):
         self._claim = Claim(name, list(self.nodes))
         # Run of each cell that is no part of any measurement any more.
         self._past: dict[str, object] = {}
-        self._stack = ExitStack()
 
     # --------------------------------------------------------------------- up and down
 
@@ -165,26 +165,15 @@ class NetnsTestbed(LocalTestbed):
         """
         self._stack.enter_context(self._claim)
 
-    def start(self) -> None:
-        """Make hosts, links and groups, start everything, and begin a run of every cell.
-
-        Raises
-        ------
-        LiveError
-            If something is missing, or the cells do not come up.
-        """
-        try:
-            self.claim()
-            self._stack.callback(remove_orphans)
-            self._make()
-            for node in self.nodes:
-                self.processes.start_agent(node)
-            self._come_up()
-            self.begun_ns = self.begin()[0]
-        except BaseException:
-            with undisturbed():
-                self.stop()
-            raise
+    def _start(self) -> None:
+        """Make hosts, links and groups, start everything, and begin a run of every cell."""
+        self.claim()
+        self._stack.callback(remove_orphans)
+        self._make()
+        for node in self.nodes:
+            self.processes.start_agent(node)
+        self._come_up()
+        self.begun_ns = self.begin()[0]
 
     def _make(self) -> None:
         enter = self._stack.enter_context
@@ -198,7 +187,7 @@ class NetnsTestbed(LocalTestbed):
         )
         self.problem = self.problems[0]
         self.folder.mkdir(parents=True, exist_ok=True)
-        self._losses = enter(LinkFile(self.folder / LINK_FILE, nodes, seed=self.seed))
+        self._losses = enter(closing(LinkFile(self.folder / LINK_FILE, nodes, seed=self.seed)))
         for number, pair in enumerate(pairs):
             self.links[frozenset(pair)] = enter(self._link(pair, number))
         for link in self._usual.values():
@@ -267,7 +256,8 @@ class NetnsTestbed(LocalTestbed):
 
     def stop(self) -> None:
         """End everything, and leave nothing behind; safe to call twice."""
-        self._stack.close()
+        with undisturbed():
+            super().stop()
 
     # ------------------------------------------------------------------------- running
 

@@ -18,7 +18,6 @@ import sys
 import tarfile
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -79,13 +78,13 @@ class RealHosts(Testbed):
     ) -> None:
         if not NAME.fullmatch(name):
             raise LiveError(f"name is {name!r}; it must be letters, digits, - and _, at most 32")
+        super().__init__()
         hosts = {node: Host(host.address, host.port) for node, host in inventory.hosts.items()}
         self.problem = replace(problem, live=replace(problem.live, hosts=hosts))
         self.inventory, self.folder, self.name = inventory, folder.resolve(), name
         self.stress: dict[str, RemoteProcess] = {}
         self._threads: dict[str, int] = {}
         self._disturbed: set[str] = set()
-        self._stack = ExitStack()
         self.processes = Processes(
             [self.problem],
             self.folder,
@@ -95,34 +94,24 @@ class RealHosts(Testbed):
             owner=SHELL_ID,
         )
 
-    def start(self) -> None:
-        """Put the cell file everywhere, start everything, and begin a run.
-
-        Raises
-        ------
-        LiveError
-            If a host cannot be reached, or the cell does not come up.
-        """
-        try:
-            self.processes.write()
-            self._stack.callback(self._undisturb)
-            self._stack.callback(self.processes.stop)
-            for node in self.problem.fabric.nodes:
-                self._prepare(node)
-            for node in self.problem.fabric.nodes:
-                self.processes.start_agent(node)
-            self._client = self._stack.enter_context(OperatorClient(self.problem))
-            self._begin()
-            # The stamper's clock is another one: this one's, since the run was seen to begin.
-            self.begun_ns = clock_of(self.problem)()
-        except BaseException:
-            with undisturbed():
-                self.stop()
-            raise
+    def _start(self) -> None:
+        """Put the cell file everywhere, start everything, and begin a run."""
+        self.processes.write()
+        self._stack.callback(self._undisturb)
+        self._stack.callback(self.processes.stop)
+        for node in self.problem.fabric.nodes:
+            self._prepare(node)
+        for node in self.problem.fabric.nodes:
+            self.processes.start_agent(node)
+        self._client = self._stack.enter_context(OperatorClient(self.problem))
+        self._begin()
+        # The stamper's clock is another one: this one's, since the run was seen to begin.
+        self.begun_ns = clock_of(self.problem)()
 
     def stop(self) -> None:
         """End everything, and take disturbances back; runs stay there until the next start."""
-        self._stack.close()
+        with undisturbed():
+            super().stop()
 
     def sample(self, patience_s: float) -> Mapping[str, Any]:
         """Return the status of the cell, from its controller."""
@@ -347,8 +336,7 @@ def run_on_hosts(
         hosts.processes.stop_controllers()
         hosts.fetch_runs()
     finally:
-        with undisturbed():
-            hosts.stop()
+        hosts.stop()
     folder = require_run(out)
     release_ns = open_run(folder).cycles["release_ns"]
     last_ns = hosts.begun_ns + (int(release_ns[-1]) if len(release_ns) else 0)

@@ -23,7 +23,6 @@ from dwell.testbed.playing import (
     make_folder,
     play_on,
     require_run,
-    undisturbed,
 )
 from dwell.testbed.pressure import Rule, Span, judged
 from dwell.testbed.sampling import Sampler
@@ -127,8 +126,7 @@ def run_once(
                 tell(f"playing {scenario} for {seconds:g} s")
                 _play(testbed, seconds, played, samplers, rule)
             finally:
-                with undisturbed():
-                    testbed.stop()
+                testbed.stop()
     except KeyboardInterrupt:
         # Before it was played, what is there may be a run of long ago.
         folder = longest_run(out / "runs") if samplers else None

@@ -13,14 +13,14 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from dwell.errors import LiveError
 from dwell.live.keys import Keys
 from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import SESSIONS, Role, Session, Wiring, WiringEntry
 from dwell.testbed.chaos.invariants import Judge
-from dwell.testbed.child import Child, Parent
+from dwell.testbed.child import Child, Parent, Started
 from dwell.testbed.testbed import LocalTestbed
 
 _HEAD = struct.Struct("<QIII")
@@ -97,44 +97,29 @@ class Records:
         self._read += at
 
 
-class ActuatorObserver:
+class ActuatorObserver(Started):
     """Hears a cell by wiretaps on all its nodes, and judges what it hears; a context manager."""
 
     def __init__(self, testbed: LocalTestbed, cell: Path) -> None:
+        super().__init__()
         self.judge = Judge(testbed.problem)
         self._taps: list[Wiretap] = []
         self._records: list[Records] = []
-        self._stack = ExitStack()
         for nodes, prefix in testbed.taps().items():
             out = testbed.folder / f"heard-{'-'.join(nodes)}"
             self._taps.append(Wiretap(cell, nodes, out, prefix))
             self._records.append(Records(out))
 
-    def __enter__(self) -> Self:
-        """Begin to listen; returns when something has been heard.
-
-        Raises
-        ------
-        LiveError
-            If nothing is.
-        """
-        try:
-            for tap in self._taps:
-                self._stack.enter_context(tap)
-            until = time.monotonic() + HEARD_S
-            while not {"stamped", "done", "in"} <= self.judge.counts.keys():
-                if time.monotonic() > until:
-                    raise LiveError(f"of the cell only {sorted(self.judge.counts)} is heard")
-                time.sleep(0.05)
-                self.look()
-        except BaseException:
-            self._stack.close()
-            raise
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """End."""
-        self._stack.close()
+    def _start(self) -> None:
+        """Listen until something has been heard."""
+        for tap in self._taps:
+            self._stack.enter_context(tap)
+        until = time.monotonic() + HEARD_S
+        while not {"stamped", "done", "in"} <= self.judge.counts.keys():
+            if time.monotonic() > until:
+                raise LiveError(f"of the cell only {sorted(self.judge.counts)} is heard")
+            time.sleep(0.05)
+            self.look()
 
     def look(self) -> list[str]:
         """Return the faults of the messages heard since the last call."""
