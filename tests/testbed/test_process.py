@@ -78,7 +78,7 @@ def test_faults_are_around_an_agent_and_what_it_starts(tmp_path: Path) -> None:
         closing(ClockFile(clocks, NODES, time.monotonic_ns)) as file,
     ):
         file.set("R1", jump_ns=HOUR_NS)
-        processes = Processes([problem], tmp_path, program=program(links=links, clocks=clocks))
+        processes = Processes(problem, tmp_path, program=program(links=links, clocks=clocks))
         processes.write()
         transport = ZenohTransport(entry_for(wire(problem), ["R1"]))
         try:

@@ -75,7 +75,7 @@ def test_a_run_meets_what_a_simulation_of_its_seed_meets(tmp_path: Path) -> None
     ]
     cell = dwell.load(write_cell(tmp_path / "cell", scenarios={"some": items}))
     try:
-        require_machine([cell])
+        require_machine(cell)
     except LiveError as error:
         pytest.skip(str(error))
     folder = run_once(

@@ -21,14 +21,11 @@ from dwell.model import Problem
 from dwell.testbed.burner import Burner
 from dwell.testbed.conditions import Conditions, fields_of
 from dwell.testbed.message_links import LinkFile
-from dwell.testbed.playing import come_up
 from dwell.testbed.process import program
-from dwell.testbed.processes import Processes, expected, with_hosts, without_keys
+from dwell.testbed.processes import Processes, with_hosts, without_keys
 from dwell.testbed.testbed import LocalTestbed
 from dwell.testbed.timeline import NodeState, usual_conditions
 
-#: How long every process may take to be ready, on a machine that has a lot else to do.
-START_S = 60.0
 ADDRESS = "127.0.0.1"
 #: Where ports are looked for; below what the kernel gives out by itself.
 PORTS = range(10_000, 32_000, 500)
@@ -46,7 +43,7 @@ def on_this_machine(problem: Problem) -> Problem:
     count = PORTS_PER_ROLE * len(roles(problem))
     for base in PORTS:
         if all(_free(port) for port in range(base, base + count)):
-            return with_hosts(problem, lambda node: ADDRESS, {ADDRESS: base})
+            return with_hosts(problem, lambda node: ADDRESS, base)
     raise LiveError(f"no {count} free ports in a row on this machine")
 
 
@@ -106,7 +103,7 @@ class Loopback(LocalTestbed):
         self.burners: dict[str, Burner] = {}
         self._links: LinkFile | None = None
         self.processes = Processes(
-            [problem],
+            problem,
             folder,
             environment={"DWELL_WORLD": str(self.world), **(environment or {})},
             cpus=cpus,
@@ -136,9 +133,9 @@ class Loopback(LocalTestbed):
         self._stack.callback(self.processes.stop)
         for node in self.problem.fabric.nodes:
             self.processes.start_agent(node)
-        self.processes.start_controllers()
+        self.processes.start_controller()
         self.client = self._stack.enter_context(OperatorClient(self.problem, without_keys()))
-        status = come_up(self.sample, expected(self.problem), self.folder, patience_s=START_S)
+        status = self._came_up()
         self.begun_ns = int(status.get("origin_ns") or clock_of(self.problem)())
 
     def _start_links(self) -> None:

@@ -16,7 +16,6 @@ import shutil
 import subprocess
 import sys
 import tarfile
-import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -31,17 +30,16 @@ from dwell.policies.registry import by_name
 from dwell.record import open_run
 from dwell.testbed.conditions import Conditions
 from dwell.testbed.inventory import Inventory
-from dwell.testbed.playing import Played, come_up, make_folder, play_on, require_run, undisturbed
-from dwell.testbed.processes import Processes, end_all, expected
+from dwell.testbed.playing import Played, make_folder, play_on, require_run, undisturbed
+from dwell.testbed.processes import Processes, end_all
 from dwell.testbed.remote import SHELL_ID, RemoteProcess, script_of
-from dwell.testbed.testbed import Testbed
+from dwell.testbed.testbed import STARTING, Testbed
 from dwell.testbed.timeline import NodeState, timeline_of, usual_conditions
 
 MARK = ".dwell-testbed"
 NAME = re.compile(r"[A-Za-z0-9_-]{1,32}")
 #: For a command that is to end by itself.
 COMMAND_S = 60.0
-START_S = 120.0
 STOP_S = 10.0
 #: Less than any loss that is asked for, more than roundings.
 LEAST_LOSS = 1e-9
@@ -86,7 +84,7 @@ class RealHosts(Testbed):
         self._threads: dict[str, int] = {}
         self._disturbed: set[str] = set()
         self.processes = Processes(
-            [self.problem],
+            self.problem,
             self.folder,
             inside=self.inside,
             more=more,
@@ -104,7 +102,8 @@ class RealHosts(Testbed):
         for node in self.problem.fabric.nodes:
             self.processes.start_agent(node)
         self._client = self._stack.enter_context(OperatorClient(self.problem))
-        self._begin()
+        self._come_up()
+        self.begin()
         # The stamper's clock is another one: this one's, since the run was seen to begin.
         self.begun_ns = clock_of(self.problem)()
 
@@ -174,36 +173,18 @@ class RealHosts(Testbed):
 
     def _prepare(self, node: str) -> None:
         folder = shlex.quote(self.there(node))
-        text = self.processes.file_of(self.problem).read_bytes()
+        text = self.processes.file.read_bytes()
         self.shell(node, f"rm -rf {folder} && mkdir -p {folder} && cat > {folder}/cell.yaml", text)
         python = shlex.quote(self.inventory.hosts[node].python)
         self.shell(node, f"cd {folder} && {python} -c 'import dwell'")
 
     # ------------------------------------------------------------------------- running
 
-    def _begin(self) -> None:
-        """Wait until all processes are ready, and begin a run that knows nothing of the past."""
-        problem = self.problem
-        node = problem.controller_node
-        more = ["--policy", problem.initial]
-        self.processes.start_controller(node, out=self.folder / "starting", more=more)
-        self._came_up()
-        self.processes.stop_controllers()
-        stamper = problem.stamper_node
-        mark = f"{shlex.quote(self.there(stamper))}/{stamper}/stamper@{stamper}"
+    def _restart_stamper(self) -> None:
+        node = self.problem.stamper_node
+        mark = f"{shlex.quote(self.there(node))}/{node}/stamper@{node}"
         number = f"""sed 's/.*"pid": *\\([0-9]*\\).*/\\1/' {mark}.pid"""
-        self.shell(stamper, f"rm -f {mark}.book; kill -KILL $({number})")
-        self.processes.start_controller(node)
-        until = time.monotonic() + START_S
-        while self._came_up().get("origin_ns") is None:
-            if time.monotonic() > until:
-                raise LiveError(f"cell {problem.name!r} releases no cycles; see {self.folder}")
-            time.sleep(0.05)
-
-    def _came_up(self) -> Mapping[str, Any]:
-        """Return the status of the cell once all its processes are ready."""
-        problem = self.problem
-        return come_up(self.sample, expected(problem), self.folder, patience_s=START_S)
+        self.shell(node, f"rm -f {mark}.book; kill -KILL $({number})")
 
     def fetch_runs(self) -> None:
         """Copy the runs that the controller has written to this computer.
@@ -333,7 +314,7 @@ def run_on_hosts(
     try:
         hosts.start()
         play_on(hosts, played, seconds)
-        hosts.processes.stop_controllers()
+        hosts.processes.stop_controller()
         hosts.fetch_runs()
     finally:
         hosts.stop()
@@ -341,5 +322,5 @@ def run_on_hosts(
     release_ns = open_run(folder).cycles["release_ns"]
     last_ns = hosts.begun_ns + (int(release_ns[-1]) if len(release_ns) else 0)
     played.note(folder, (hosts.begun_ns, last_ns))
-    shutil.rmtree(out / "starting", ignore_errors=True)
+    shutil.rmtree(out / STARTING, ignore_errors=True)
     return folder

@@ -14,7 +14,7 @@ from dwell.model import Problem
 from dwell.policies.registry import by_name
 from dwell.record import Run, open_run
 from dwell.testbed.doctor import examine
-from dwell.testbed.netns_testbed import STARTING, NetnsTestbed
+from dwell.testbed.netns_testbed import NetnsTestbed
 from dwell.testbed.playing import (
     Played,
     begun,
@@ -26,6 +26,7 @@ from dwell.testbed.playing import (
 )
 from dwell.testbed.pressure import Rule, Span, judged
 from dwell.testbed.sampling import Sampler
+from dwell.testbed.testbed import STARTING
 from dwell.testbed.timeline import timeline_of
 
 #: A folder with this file is a testbed's, and may be replaced by its next run.
@@ -43,15 +44,15 @@ def length_s(problem: Problem, windows: int) -> float:
     return (cycles_ms + problem.controller.close_grace_ms) / 1e3 + LAST_S
 
 
-def require_machine(problems: Sequence[Problem]) -> None:
-    """Refuse cells that this machine cannot run.
+def require_machine(problem: Problem) -> None:
+    """Refuse a cell that this machine cannot run.
 
     Raises
     ------
     LiveError
         With everything that is missing, and what to do about it.
     """
-    missing = [one for one in examine(problems) if one.needed and not one.ok]
+    missing = [one for one in examine([problem]) if one.needed and not one.ok]
     if missing:
         reasons = "; ".join(f"{one.name}: {one.found}; {one.remedy}" for one in missing)
         raise LiveError(f"this machine cannot run the testbed: {reasons}")
@@ -111,7 +112,7 @@ def run_once(
     timeline = timeline_of(problem, scenario, seed=seed, seconds=seconds, outages=True)
     arguments = ["--jobs"] if jobs else []
     testbed = NetnsTestbed(problem, out, name=name, seed=seed, more=arguments)
-    require_machine([problem])
+    require_machine(problem)
     rule = rule or Rule()
     played = Played(problem, scenario, seed, timeline)
     samplers: list[Sampler] = []
@@ -154,7 +155,7 @@ def _play(
     ) as sampler:
         samplers.append(sampler)
         play_on(testbed, played, seconds)
-    testbed.processes.stop_controllers()
+    testbed.processes.stop_controller()
 
 
 def _seal(

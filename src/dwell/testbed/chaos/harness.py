@@ -225,11 +225,11 @@ class Harness(Started):
         if kind == "agent":
             self.testbed.processes.start_agent(node)
         else:
-            self.testbed.processes.start_controllers()
+            self.testbed.processes.start_controller()
 
     def stop_controller(self) -> None:
         """End the controller and wait until it has written its run."""
-        self.testbed.processes.stop_controllers()
+        self.testbed.processes.stop_controller()
 
     def _all_of(self, node: str) -> list[str]:
         """Return the processes of a node, its controller included."""
