@@ -135,11 +135,9 @@ def test_losses_and_cuts(file: LinkFile) -> None:
     lost = sum(way.begin(10, 0) < 0 for _ in range(20_000))
     # 400 expected, 19.8 of standard deviation.
     assert abs(lost - 400) < 6 * 19.8
-    file.set("R1", "E", loss=0.0, cut="drop")
-    assert way.begin(10, 0) < 0
-    file.set("R1", "E", cut="hold")
-    assert way.begin(10, 0) == HELD
-    file.set("R1", "E", cut=None)
+    file.set("R1", "E", loss=0.0, down=True)
+    assert way.begin(10, 0) == LOST
+    file.set("R1", "E", down=False)
     assert way.begin(10, 5) == 5
 
 
@@ -169,7 +167,7 @@ def test_a_link_that_retransmits_loses_nothing_and_keeps_order_where_it_is_to(
         assert (found >= 0).all()
         assert set(found // (40 * MS)) > {0, 1, 2}
         assert np.mean(found == 0) == pytest.approx(0.5, abs=6 * 0.5 / 2_000**0.5)
-        file.set("R1", "E", cut="drop")
+        file.set("R1", "E", down=True)
         assert way.begin(0, 0) == HELD
         file.set("E", "R1", delay_ms=Normal(25.0, 5.0))
         back = ends(file, "perception@E").to["R1"]

@@ -81,7 +81,7 @@ def test_stress_is_in_the_group_of_its_node(testbed: NetnsTestbed) -> None:
 def test_a_link_that_is_down_lets_nothing_through(testbed: NetnsTestbed) -> None:
     link = testbed.links[frozenset(("R1", "R2"))]
     usual = usual_conditions(testbed.problem.fabric.links["R1->R2"])
-    testbed.apply(Change(0, "R1->R2", replace(usual, cut="drop", loss=0.5)))
+    testbed.apply(Change(0, "R1->R2", replace(usual, down=True, loss=0.5)))
     wait_for(lambda: link.read()["R1", "R2"].vanished > 0, "packets that vanish")
     testbed.apply(Change(1, "R1->R2", usual))
     link.read()

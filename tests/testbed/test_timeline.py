@@ -123,7 +123,7 @@ def test_what_is_applied_is_what_the_simulator_draws(
             state = change.state
             assert isinstance(state, Conditions)
             assert (state.loss, state.rate_mbps) == (segment.loss, segment.rate_mbps)
-            assert (state.cut == "drop") == segment.down
+            assert state.down == segment.down
             pairs = zip(state.add_delays_ms, state.shares, strict=True)
             delay_ns = sum(delay.expectation * share for delay, share in pairs) * 1e6
             assert delay_ns == pytest.approx(extra_ns(drawn, link, segment.layers), abs=5)
@@ -189,7 +189,7 @@ def test_an_outage_is_played_where_it_can_be() -> None:
     found = timeline_of(problem, "some", seed=1, seconds=SECONDS, outages=True)
     states = [change.state for change in found.changes if change.place == "R2"]
     assert [getattr(state, "down", None) for state in states] == [True, False]
-    assert conditions_of(found, "R1->E")[0].cut == "drop"
+    assert conditions_of(found, "R1->E")[0].down
     assert conditions_of(found, "E->R1") == []
 
 

@@ -58,6 +58,10 @@ class Platform:
         return security.transport(who)
 
 
+#: As everybody's is, but for a testbed's.
+PLAIN = Platform()
+
+
 def keep_collections_short() -> None:
     """Spare the garbage collector what there is now: modules, settings, sessions.
 
@@ -185,10 +189,9 @@ def work(
     transport: Transport,
     *,
     stopped: threading.Event,
-    note: Callable[[Job | None], None] | None = None,
+    note: Callable[[Job | None], None] = lambda job: None,
     clock: Clock = time.monotonic_ns,
-    begin: Callable[[], None] | None = None,
-    ready: Callable[[], None] | None = None,
+    begin: Callable[[], None] = lambda: None,
 ) -> None:
     """Run a worker's jobs in this thread until it is told to stop.
 
@@ -198,21 +201,17 @@ def work(
         Told what job begins, and None when it is over.
     begin : callable, optional
         Called before the stage is started, when the thread of the beats runs.
-    ready : callable, optional
-        Called when the stage has started.
     """
     complain = worker.place.complain
     hosted = Hosted(worker, transport, clock, heard=lambda: worker.has_work, complain=complain)
     start_thread("beats", hosted.run)
     stage = worker.stage
-    if begin is not None:
-        begin()
+    begin()
     stage.start()
     with hosted.lock:
         worker.started = True
         worker.pulse.send(clock())
-    if ready is not None:
-        ready()
+    keep_collections_short()
     if worker.triggers:
         start_thread("frames", _frames, worker, hosted, stopped)
     try:
@@ -225,7 +224,7 @@ def work(
 
 
 def _drain(
-    worker: Worker, hosted: Hosted, note: Callable[[Job | None], None] | None, clock: Clock
+    worker: Worker, hosted: Hosted, note: Callable[[Job | None], None], clock: Clock
 ) -> None:
     """Do all that there is to do."""
     while True:
@@ -237,16 +236,14 @@ def _drain(
             continue
         if job is None:
             return
-        if note is not None:
-            note(job)
+        note(job)
         started_ns = clock()
         output: Message | None
         output, state_age = worker.run(job, started_ns)
         ended_ns = clock()
         with hosted.lock:
             worker.finish(job, output, started_ns, ended_ns, state_age)
-        if note is not None:
-            note(None)
+        note(None)
 
 
 def _frames(worker: Worker, hosted: Hosted, stopped: threading.Event) -> None:

@@ -12,7 +12,7 @@ import msgspec
 
 from dwell.errors import LiveError
 from dwell.live.control_group import ControlGroup, own_group
-from dwell.live.hosting import Clock, Hosted, Platform, keep_collections_short, work
+from dwell.live.hosting import PLAIN, Clock, Hosted, Platform, keep_collections_short, work
 from dwell.live.log import Log
 from dwell.live.lowest_class import take_lowest_class
 from dwell.live.messages import Header
@@ -38,7 +38,7 @@ def run_process(
     who: str,
     folder: Path,
     stopped: threading.Event,
-    platform: Platform | None = None,
+    platform: Platform = PLAIN,
 ) -> bool:
     """Run one process of a cell until it is told to end; returns whether it has ended in order.
 
@@ -59,7 +59,7 @@ def run_process(
         If the keys that it has been given are not its.
     """
     entry = wire(problem).entry(who)
-    node, platform = entry.role.node, platform or Platform()
+    node = entry.role.node
     security = Security.of(problem, entry.role)
     clock = platform.clock(problem, node)
     transport = platform.transport(security, who, node)
@@ -175,8 +175,7 @@ def _work(
         stopped=stopped,
         note=note,
         clock=clock,
-        begin=partial(take_lowest_class, role.who, _print) if worker.shadow else None,
-        ready=keep_collections_short,
+        begin=partial(take_lowest_class, role.who, _print) if worker.shadow else lambda: None,
     )
 
 

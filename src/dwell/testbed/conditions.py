@@ -17,9 +17,6 @@ from dwell.model.instants import NEVER_NS
 from dwell.model.process import AR1, Constant, LogNormal, Process, Trace
 from dwell.model.scenario import ADDED_LOSS
 
-#: `drop`: data is lost; `hold`: it waits, as in the sender's buffers; either way nothing passes.
-Cut: TypeAlias = Literal["drop", "hold"]
-CUTS: tuple[Cut, ...] = ("drop", "hold")
 #: How a link's process gets the CPU: by real-time priority, with short time slices, as any other.
 Scheduling: TypeAlias = Literal["fifo", "short slices", "usual"]
 
@@ -46,10 +43,9 @@ class Conditions:
         Serialisation rate that all connections share, Mbit/s; infinite where nothing queues.
     loss : float
         Probability that a message of data is lost, in [0, 1].
-    cut : {"drop", "hold"}, optional
-        Nothing begins its way while it is cut. Data is lost (`drop`, as on a link of the simulator
-        that drops), or waits until it is whole again (`hold`, as on one that retransmits). What
-        keeps the sessions going always waits.
+    down : bool
+        Whether nothing begins its way. Data is lost, or waits until the link is up again where that
+        retransmits; what keeps the sessions going always waits.
     """
 
     delay_ms: Process = field(default_factory=lambda: Constant(0.0))
@@ -57,7 +53,7 @@ class Conditions:
     shares: tuple[float, ...] = ()
     rate_mbps: float = math.inf
     loss: float = 0.0
-    cut: Cut | None = None
+    down: bool = False
 
     def __post_init__(self) -> None:
         named = [("add_delays_ms", process) for process in self.add_delays_ms]
@@ -67,8 +63,6 @@ class Conditions:
         bounds.require(good, "shares", self.shares, "one from 0 to 1 for each of add_delays_ms")
         bounds.RATE_MBPS.check("rate_mbps", self.rate_mbps)
         ADDED_LOSS.check("loss", self.loss)
-        known = self.cut is None or self.cut in CUTS
-        bounds.require(known, "cut", self.cut, f"one of {', '.join(CUTS)}, or none")
 
 
 def transmission_ns(size_bytes: int, rate_mbps: float) -> int:

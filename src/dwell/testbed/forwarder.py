@@ -185,7 +185,7 @@ class _Direction:
             counts.ignored += 1
             return
         # Where every attempt is lost, the sender's own repetitions are what waits for better times.
-        stopped = conditions.cut is not None or (kind.data and conditions.loss == 1)
+        stopped = conditions.down or (kind.data and conditions.loss == 1)
         if stopped or self._waiting_bytes > WAITING_BYTES:
             counts.vanished += 1
             return

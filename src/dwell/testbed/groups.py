@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dwell.errors import LiveError
+from dwell.live.control_group import COUNTERS, ControlGroup
 from dwell.model import Quota
 from dwell.testbed.cgroups import Cgroups, find_cgroups
 from dwell.testbed.child import Started
@@ -219,10 +220,9 @@ class Groups(Started):
 
     def used_ns(self, node: str) -> int:
         """Return the CPU time that a node's group has used since it was made."""
-        if self._cgroups.version == 1:
-            return int((self._folder("cpuacct", node) / "cpuacct.usage").read_text())
-        counts = (self._folder("cpu", node) / "cpu.stat").read_text().split()
-        return 1_000 * int(counts[counts.index("usage_usec") + 1])
+        of_v1 = self._cgroups.version == 1
+        controller, counter = ("cpuacct", "cgroup") if of_v1 else ("cpu", "cgroup2")
+        return ControlGroup(self._folder(controller, node) / COUNTERS[counter]).used_ns()
 
     def switches(self, node: str) -> dict[int, int]:
         """Return how often each thread of a node has gone to sleep by itself so far."""

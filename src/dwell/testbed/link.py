@@ -117,7 +117,7 @@ class TunLink(Child):
 
     def down(self, source: str, target: str, down: bool, *, at_ns: int | None = None) -> int:
         """Begin or end an outage of a direction: packets on their way arrive; returns as `set`."""
-        return self.set(source, target, at_ns=at_ns, cut="drop" if down else None)
+        return self.set(source, target, at_ns=at_ns, down=down)
 
     def read(self, *, reset: bool = True) -> dict[tuple[str, str], Passed]:
         """Return counts of each direction since they were last read.
@@ -143,7 +143,5 @@ class TunLink(Child):
                 f"{way}: without retransmit_ms it loses nothing; the transport of the sender "
                 "leaves messages out"
             )
-        if changes.get("cut") == "hold":
-            raise LiveError(f"{way}: what is sent while it is down vanishes (cut='drop')")
         conditions = self._conditions[source, target]
         self._conditions[source, target] = changed(way, conditions, changes)

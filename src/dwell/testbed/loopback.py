@@ -159,12 +159,12 @@ class Loopback(LocalTestbed):
     def cut(self, source: str, target: str, at_ns: int) -> int:
         """Lose messages that begin their way along a direction from an instant on; returns when."""
         time.sleep(max(at_ns - time.monotonic_ns(), 0) / 1e9)
-        self.links.set(source, target, cut="drop")
+        self.links.set(source, target, down=True)
         return time.monotonic_ns()
 
     def heal(self, source: str, target: str) -> None:
         """End a cut of a direction."""
-        self.links.set(source, target, cut=None)
+        self.links.set(source, target, down=False)
 
     def sample(self, patience_s: float) -> Mapping[str, Any]:
         """Return the status of the cell, from its controller."""

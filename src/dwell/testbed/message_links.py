@@ -157,10 +157,10 @@ class Way:
         """
         with self._lock:
             self._refresh()
-            cut, loss = self._draws.conditions.cut, self._draws.conditions.loss
+            conditions = self._draws.conditions
             # Attempts that are all lost are none: the message waits as while the link is down.
-            if cut is not None or loss == 1:
-                return HELD if cut == "hold" or self._retransmit_ms is not None else LOST
+            if conditions.down or conditions.loss == 1:
+                return LOST if self._retransmit_ms is None else HELD
             sent_ns = self._transmitted(size_bytes, now_ns)
             if sent_ns - now_ns > LONGEST_WAIT_S * 1e9:
                 return LOST

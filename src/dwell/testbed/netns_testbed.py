@@ -75,8 +75,6 @@ class NetnsTestbed(LocalTestbed):
         Seed of delays and losses.
     more : sequence of str
         Further arguments of the controller.
-    cpus : sequence of int, optional
-        CPUs that nodes may use; all that this process may use if left out.
     environment : mapping of str to str, optional
         Variables that all processes get as well.
     clocks : Path, optional
@@ -105,14 +103,13 @@ class NetnsTestbed(LocalTestbed):
         name: str,
         seed: int = 0,
         more: Sequence[str] = (),
-        cpus: Sequence[int] | None = None,
         environment: Mapping[str, str] | None = None,
         clocks: Path | None = None,
     ) -> None:
         super().__init__()
         self.problem = problem
         require_playable(problem)
-        self.shares = allot([problem], cpus or sorted(os.sched_getaffinity(0)))
+        self.shares = allot([problem], sorted(os.sched_getaffinity(0)))
         self.nodes: Mapping[str, Node] = problem.fabric.nodes
         self.folder, self.name, self.seed = folder.resolve(), name, seed
         self.links: dict[frozenset[str], TunLink] = {}

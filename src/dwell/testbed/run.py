@@ -31,6 +31,8 @@ from dwell.testbed.timeline import timeline_of
 
 #: A folder with this file is a testbed's, and may be replaced by its next run.
 MARK = ".dwell-testbed"
+#: From when on a window is excluded, and a run has failed.
+RULE = Rule()
 #: Time for a controller's last window, beyond its grace.
 LAST_S = 0.5
 
@@ -68,7 +70,6 @@ def run_once(
     out: Path,
     name: str,
     jobs: bool = False,
-    rule: Rule | None = None,
     tell: Callable[[str], None] = lambda line: None,
 ) -> Path:
     """Run a cell on a testbed of its own, and return the folder of its run.
@@ -89,8 +90,6 @@ def run_once(
         Name of the testbed, among others on this machine.
     jobs : bool
         Whether the run keeps its jobs.
-    rule : Rule, optional
-        When the machine was under too much pressure.
     tell : callable
         Takes a line on what happens.
 
@@ -113,7 +112,6 @@ def run_once(
     arguments = ["--jobs"] if jobs else []
     testbed = NetnsTestbed(problem, out, name=name, seed=seed, more=arguments)
     require_machine(problem)
-    rule = rule or Rule()
     played = Played(problem, scenario, seed, timeline)
     samplers: list[Sampler] = []
     try:
@@ -125,18 +123,18 @@ def run_once(
                 tell("starting the cell")
                 testbed.start()
                 tell(f"playing {scenario} for {seconds:g} s")
-                _play(testbed, seconds, played, samplers, rule)
+                _play(testbed, seconds, played, samplers)
             finally:
                 testbed.stop()
     except KeyboardInterrupt:
         # Before it was played, what is there may be a run of long ago.
         folder = longest_run(out / "runs") if samplers else None
         if folder is not None:
-            _seal(folder, testbed, played, samplers, rule, interrupted=True)
+            _seal(folder, testbed, played, samplers, interrupted=True)
             tell(f"interrupted; run: {folder}")
         raise
     folder = require_run(out)
-    _seal(folder, testbed, played, samplers, rule, interrupted=False)
+    _seal(folder, testbed, played, samplers, interrupted=False)
     shutil.rmtree(out / STARTING, ignore_errors=True)
     return folder
 
@@ -146,12 +144,11 @@ def _play(
     seconds: float,
     played: Played,
     samplers: list[Sampler],
-    rule: Rule,
 ) -> None:
     clock = clock_of(played.problem)
     links = {"-".join(link.nodes): link for link in testbed.links.values()}
     with Sampler(
-        testbed.cpus, testbed.used_ns, testbed.switches, links, clock, rule, testbed.probing
+        testbed.cpus, testbed.used_ns, testbed.switches, links, clock, RULE, testbed.probing
     ) as sampler:
         samplers.append(sampler)
         play_on(testbed, played, seconds)
@@ -163,7 +160,6 @@ def _seal(
     testbed: NetnsTestbed,
     played: Played,
     samplers: Sequence[Sampler],
-    rule: Rule,
     *,
     interrupted: bool,
 ) -> None:
@@ -174,7 +170,7 @@ def _seal(
     if samplers:
         sampler = samplers[0]
         spans = spans_of(open_run(folder), played)
-        pressure = judged(sampler.samples, spans, rule)
+        pressure = judged(sampler.samples, spans, RULE)
         more["pressure"] = {**pressure, "trouble": sampler.trouble} if sampler.trouble else pressure
         more["links"], more["wakes_hz"] = sampler.links(), sampler.wakes_hz()
     played.note(folder, **more)

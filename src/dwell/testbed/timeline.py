@@ -181,7 +181,7 @@ def _conditions(link: Link, segment: LinkSegment, scenario: Scenario) -> Conditi
         shares=tuple(shares),
         rate_mbps=segment.rate_mbps,
         loss=segment.loss,
-        cut="drop" if segment.down else None,
+        down=segment.down,
     )
 
 
