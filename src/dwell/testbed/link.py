@@ -111,8 +111,11 @@ class TunLink(Child):
             If there is no such direction or field, a value is out of its bounds or none that this
             kind of link has, or the process has ended.
         """
+        before = self._conditions[source, target]
         self._change(source, target, changes)
-        since_ns: int = self.ask(("set", source, changes, at_ns or 0))
+        # What stays may be a trace, which takes the process a while to read.
+        news = {name: value for name, value in changes.items() if value != getattr(before, name)}
+        since_ns: int = self.ask(("set", source, news, at_ns or 0))
         return since_ns
 
     def down(self, source: str, target: str, down: bool, *, at_ns: int | None = None) -> int:

@@ -152,9 +152,8 @@ class Loopback(LocalTestbed):
         burner.set(sum(self._threads.get(node, 0) for node in nodes))
 
     def _apply_to_link(self, name: str, now: Conditions) -> None:
-        link = self.problem.fabric.links[name]
-        if changes := self._changes(name, now):
-            self.links.set(link.source, link.target, **changes)
+        link, self._conditions[name] = self.problem.fabric.links[name], now
+        self.links.set(link.source, link.target, **fields_of(now))
 
     def cut(self, source: str, target: str, at_ns: int) -> int:
         """Lose messages that begin their way along a direction from an instant on; returns when."""

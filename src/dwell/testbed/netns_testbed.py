@@ -21,7 +21,7 @@ from dwell.live.transport.orphans import remove_orphans
 from dwell.model import Node, Problem
 from dwell.testbed.allotment import allot
 from dwell.testbed.burner import Burner, stress
-from dwell.testbed.conditions import Conditions
+from dwell.testbed.conditions import Conditions, fields_of
 from dwell.testbed.groups import PROBES, Groups, Share
 from dwell.testbed.hosts import Hosts
 from dwell.testbed.leftovers import Claim
@@ -255,12 +255,12 @@ class NetnsTestbed(LocalTestbed):
             self.processes.start_controller()
 
     def _apply_to_link(self, name: str, now: Conditions) -> None:
-        link, changes = self._usual[name], self._changes(name, now)
-        if link.retransmit_ms is None and "loss" in changes:
-            self._losses.set(link.source, link.target, loss=changes.pop("loss"))
-        if changes:
-            way = self.links[frozenset((link.source, link.target))]
-            way.set(link.source, link.target, **changes)
+        link, self._conditions[name] = self._usual[name], now
+        if link.retransmit_ms is None:
+            self._losses.set(link.source, link.target, loss=now.loss)
+            now = replace(now, loss=0.0)
+        way = self.links[frozenset((link.source, link.target))]
+        way.set(link.source, link.target, **fields_of(now))
 
     def cut(self, source: str, target: str, at_ns: int) -> int:
         """Cut a direction of a link; returns when that was."""

@@ -33,10 +33,9 @@ from dwell.testbed.inventory import Inventory
 from dwell.testbed.playing import Played, make_folder, play_on, require_run, undisturbed
 from dwell.testbed.processes import Processes, end_all
 from dwell.testbed.remote import SHELL_ID, RemoteProcess, script_of
-from dwell.testbed.testbed import STARTING, Testbed
+from dwell.testbed.testbed import MARK, STARTING, Testbed
 from dwell.testbed.timeline import NodeState, timeline_of, usual_conditions
 
-MARK = ".dwell-testbed"
 NAME = re.compile(r"[A-Za-z0-9_-]{1,32}")
 #: For a command that is to end by itself.
 COMMAND_S = 60.0

@@ -26,11 +26,9 @@ from dwell.testbed.playing import (
 )
 from dwell.testbed.pressure import Rule, Span, judged
 from dwell.testbed.sampling import Sampler
-from dwell.testbed.testbed import STARTING
+from dwell.testbed.testbed import MARK, STARTING
 from dwell.testbed.timeline import timeline_of
 
-#: A folder with this file is a testbed's, and may be replaced by its next run.
-MARK = ".dwell-testbed"
 #: From when on a window is excluded, and a run has failed.
 RULE = Rule()
 #: Time for a controller's last window, beyond its grace.
@@ -172,7 +170,7 @@ def _seal(
         spans = spans_of(open_run(folder), played)
         pressure = judged(sampler.samples, spans, RULE)
         more["pressure"] = {**pressure, "trouble": sampler.trouble} if sampler.trouble else pressure
-        more["links"], more["wakes_hz"] = sampler.links(), sampler.wakes_hz()
+        more["links"], more["wakes_hz"] = sampler.links(), sampler.wakes_hz
     played.note(folder, **more)
 
 

@@ -62,7 +62,8 @@ class Sampler(Started):
         self._totals: defaultdict[tuple[str, str], Passed] = defaultdict(Passed)
         self._switches = dict(switches)
         self._begun: dict[str, tuple[Mapping[int, int], float]] = {}
-        self._wakes_hz: dict[str, float] = {}
+        #: How often a node's threads have woken, per second, over all of them; once it has stopped.
+        self.wakes_hz: dict[str, float] = {}
         self._cpus, self._used_ns, self._links = sorted(cpus), dict(used_ns), dict(links)
         self._clock = clock
         self._first_late = next((i for i, ms in enumerate(LATE_MS) if ms >= rule.late_ms), 0) + 1
@@ -85,7 +86,7 @@ class Sampler(Started):
         super().stop()
         for node, (before, begun_s) in self._begun.items():
             after, lasted_s = self._switches[node](), time.monotonic() - begun_s
-            self._wakes_hz[node] = round(rate_hz(before, after, lasted_s), 1)
+            self.wakes_hz[node] = round(rate_hz(before, after, lasted_s), 1)
 
     def _run(self) -> None:
         due_s = time.monotonic()
@@ -128,10 +129,6 @@ class Sampler(Started):
                 for name, ways in passed.items()
             },
         )
-
-    def wakes_hz(self) -> dict[str, float]:
-        """Return how often a node's threads have woken, per second, over all of them."""
-        return self._wakes_hz
 
     def links(self) -> dict[str, Any]:
         """Return statistics of the delays drawn for each direction, ready for JSON."""

@@ -21,12 +21,14 @@ from dwell.model import Problem
 from dwell.testbed.child import Started
 from dwell.testbed.conditions import Conditions
 from dwell.testbed.processes import Processes, expected
-from dwell.testbed.timeline import Change, NodeState, differing
+from dwell.testbed.timeline import Change, NodeState
 
 #: Takes for how many seconds to wait, and returns how the cell is; a LiveError if nobody answers.
 Ask: TypeAlias = Callable[[float], Mapping[str, Any]]
 #: With a share of a CPU, a node's processes take a while to start.
 START_S = 120.0
+#: A folder with this file is a testbed's, and may be replaced by its next run.
+MARK = ".dwell-testbed"
 #: Folder of what the cell did until everybody was there.
 STARTING = "starting"
 
@@ -185,11 +187,6 @@ class LocalTestbed(Testbed):
     def conditions(self, name: str) -> Conditions:
         """Return the conditions of a link that hold now."""
         return self._conditions[name]
-
-    def _changes(self, name: str, now: Conditions) -> dict[str, Any]:
-        """Note the conditions of a link that hold now; returns the fields that have changed."""
-        before, self._conditions[name] = self._conditions[name], now
-        return differing(before, now)
 
     def _restart_stamper(self) -> None:
         node = self.problem.stamper_node
