@@ -77,7 +77,7 @@ def run_agent(
         known = ", ".join(problem.fabric.nodes)
         raise LiveError(f"no node {node!r} in cell {problem.name!r}; there are {known}")
     if cpus is not None:
-        _use_cpus(cpus)
+        os.sched_setaffinity(0, cpus)
     if accelerator is not None and (unused := _unused_hook(problem, node)):
         say(unused)
     wiring = wire(problem)
@@ -129,13 +129,6 @@ def _cpu_count(problem: Problem, node: str, say: Callable[[str], None]) -> CpuCo
             "utilisation counts all that its CPUs do"
         )
     return CpuCount(group=group)
-
-
-def _use_cpus(cpus: Iterable[int]) -> None:
-    wanted, there = set(cpus), os.sched_getaffinity(0)
-    if not wanted or not wanted <= there:
-        raise LiveError(f"CPUs {sorted(wanted)} cannot be had; there are {sorted(there)}")
-    os.sched_setaffinity(0, wanted)
 
 
 def run_controller(

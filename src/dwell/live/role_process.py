@@ -150,7 +150,8 @@ def _work(
     except LiveError as error:
         # It stays, and says in its beats what is wrong: a crash loop would say it less well.
         print(error, file=sys.stderr, flush=True)
-        _host(_Broken(place, f"{role.who}: {error}"), place, stopped, clock)
+        broken = False, f"{role.who}: {error}"
+        _host(_Broken(place, lambda: broken), place, stopped, clock)
         return
     worker = Worker(
         place,
@@ -183,21 +184,11 @@ def _print(line: str) -> None:
     print(f"{time.strftime('%Y-%m-%dT%H:%M:%S%z')} {line}", file=sys.stderr, flush=True)
 
 
-class _Broken:
+class _Broken(Pulse):
     """Stands for a worker whose stage cannot be had, and says so."""
 
-    def __init__(self, place: RolePlace, why: str) -> None:
-        self._why = why
-        self.pulse = Pulse(place, lambda: (False, self._why))
-
-    def subscriptions(self) -> tuple[str, ...]:
-        return self.pulse.subscriptions()
-
     def receive(self, sample: Arrival, now_ns: int) -> None:
-        self.pulse.receive(sample, now_ns)
-
-    def wake(self, now_ns: int) -> int:
-        return self.pulse.wake(now_ns)
+        super().receive(sample, now_ns)
 
 
 def _written(job: Job) -> bytes:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +100,6 @@ class Loopback(LocalTestbed):
         self.problem, self.folder, self.cpus, self.seed = problem, folder, cpus, seed
         self.world = folder / "world"
         self.burners: dict[str, Burner] = {}
-        self._links: LinkFile | None = None
         self.processes = Processes(
             problem,
             folder,
@@ -113,13 +111,6 @@ class Loopback(LocalTestbed):
         links = problem.fabric.links.items()
         self._conditions = {name: usual_conditions(link) for name, link in links}
         self._threads: dict[str, int] = {}
-
-    @property
-    def links(self) -> LinkFile:
-        """Conditions of the links, while the cell is there."""
-        if self._links is None:
-            raise LiveError("the cell has not been started")
-        return self._links
 
     def _start(self) -> None:
         """Start everything, and wait until every process is ready; the run began before that."""
@@ -140,10 +131,10 @@ class Loopback(LocalTestbed):
 
     def _start_links(self) -> None:
         nodes, links = tuple(self.problem.fabric.nodes), tuple(self.problem.fabric.links.values())
-        file = LinkFile(self.folder / LINK_FILE, nodes, links, seed=self.seed)
-        self._links = self._stack.enter_context(closing(file))
+        self._links = LinkFile(self.folder / LINK_FILE, nodes, links, seed=self.seed)
+        self._stack.callback(self._links.close)
         for link in links:
-            file.set(link.source, link.target, **fields_of(self._conditions[link.name]))
+            self._links.set(link.source, link.target, **fields_of(self._conditions[link.name]))
 
     def _apply_to_node(self, node: str, state: NodeState) -> None:
         self._threads[node] = state.threads
@@ -153,17 +144,17 @@ class Loopback(LocalTestbed):
 
     def _apply_to_link(self, name: str, now: Conditions) -> None:
         link, self._conditions[name] = self.problem.fabric.links[name], now
-        self.links.set(link.source, link.target, **fields_of(now))
+        self._links.set(link.source, link.target, **fields_of(now))
 
     def cut(self, source: str, target: str, at_ns: int) -> int:
         """Lose messages that begin their way along a direction from an instant on; returns when."""
         time.sleep(max(at_ns - time.monotonic_ns(), 0) / 1e9)
-        self.links.set(source, target, down=True)
+        self._links.set(source, target, down=True)
         return time.monotonic_ns()
 
     def heal(self, source: str, target: str) -> None:
         """End a cut of a direction."""
-        self.links.set(source, target, down=False)
+        self._links.set(source, target, down=False)
 
     def sample(self, patience_s: float) -> Mapping[str, Any]:
         """Return the status of the cell, from its controller."""
@@ -172,8 +163,3 @@ class Loopback(LocalTestbed):
     def taps(self) -> Mapping[tuple[str, ...], Sequence[str]]:
         """Return how to run a command that reaches all nodes: as it is."""
         return {tuple(self.problem.fabric.nodes): ()}
-
-    def stop(self) -> None:
-        """End every process, links and burners last."""
-        super().stop()
-        self._links = None
