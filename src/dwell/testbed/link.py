@@ -111,10 +111,7 @@ class TunLink(Child):
             If there is no such direction or field, a value is out of its bounds or none that this
             kind of link has, or the process has ended.
         """
-        before = self._conditions[source, target]
-        self._change(source, target, changes)
-        # What stays may be a trace, which takes the process a while to read.
-        news = {name: value for name, value in changes.items() if value != getattr(before, name)}
+        news = self._change(source, target, changes)
         since_ns: int = self.ask(("set", source, news, at_ns or 0))
         return since_ns
 
@@ -137,8 +134,14 @@ class TunLink(Child):
         if (source, target) not in self.ways:
             raise LiveError(f"{self.name} does not go from {source} to {target}")
 
-    def _change(self, source: str, target: str, changes: Mapping[str, Any]) -> None:
-        """Note the conditions of a direction; raise a LiveError where no such link has them."""
+    def _change(self, source: str, target: str, changes: Mapping[str, Any]) -> dict[str, Any]:
+        """Note the conditions of a direction; returns those that are others than before.
+
+        Raises
+        ------
+        LiveError
+            If no such link has them.
+        """
         self._require(source, target)
         way = f"{self.name}, {source} to {target}"
         if changes.get("loss") and source not in self._repeats:
@@ -146,5 +149,7 @@ class TunLink(Child):
                 f"{way}: without retransmit_ms it loses nothing; the transport of the sender "
                 "leaves messages out"
             )
-        conditions = self._conditions[source, target]
-        self._conditions[source, target] = changed(way, conditions, changes)
+        before = self._conditions[source, target]
+        self._conditions[source, target] = changed(way, before, changes)
+        # What stays may be a trace, which takes the process a while to read.
+        return {name: value for name, value in changes.items() if value != getattr(before, name)}

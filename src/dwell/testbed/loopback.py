@@ -84,6 +84,7 @@ class Loopback(LocalTestbed):
     """
 
     own_cpus = False
+    start_s = 60.0
 
     def __init__(
         self,

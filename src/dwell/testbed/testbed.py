@@ -25,8 +25,6 @@ from dwell.testbed.timeline import Change, NodeState
 
 #: Takes for how many seconds to wait, and returns how the cell is; a LiveError if nobody answers.
 Ask: TypeAlias = Callable[[float], Mapping[str, Any]]
-#: With a share of a CPU, a node's processes take a while to start.
-START_S = 120.0
 #: A folder with this file is a testbed's, and may be replaced by its next run.
 MARK = ".dwell-testbed"
 #: Folder of what the cell did until everybody was there.
@@ -98,6 +96,8 @@ class Testbed(Started):
     folder: Path
     processes: Processes
     begun_ns: int
+    #: How long its processes may take to be ready: with a share of a CPU they take a while, s.
+    start_s = 120.0
     #: Run that is no part of any measurement any more.
     _past: object = None
 
@@ -126,7 +126,7 @@ class Testbed(Started):
 
     def _came_up(self) -> Mapping[str, Any]:
         """Return the status of the cell once all its processes are ready."""
-        return come_up(self.sample, expected(self.problem), self.folder, patience_s=START_S)
+        return come_up(self.sample, expected(self.problem), self.folder, patience_s=self.start_s)
 
     def _come_up(self) -> None:
         """Wait until all processes are ready, with the cell on its initial placement.
@@ -154,7 +154,7 @@ class Testbed(Started):
         self.processes.stop_controller()
         self._restart_stamper()
         self.processes.start_controller()
-        until = time.monotonic() + START_S
+        until = time.monotonic() + self.start_s
         while time.monotonic() < until:
             status = self._came_up()
             # A late answer of the controller before tells of the run before.
