@@ -7,7 +7,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 from benchmarks.figures import Figure, Goal, Section
@@ -65,7 +65,7 @@ def measure(quick: bool) -> Section:
 def _pair() -> Iterator[tuple[LinkFile, LinkedTransport, LinkedTransport]]:
     with tempfile.TemporaryDirectory() as folder:
         carrier = _Carrier()
-        with LinkFile(Path(folder) / "links", NODES, seed=1) as file:
+        with closing(LinkFile(Path(folder) / "links", NODES, seed=1)) as file:
             sender = LinkedTransport(carrier, LinkEnds(file.path, "camera@R1", "R1"))
             receiver = LinkedTransport(carrier, LinkEnds(file.path, "perception@E", "E"))
             yield file, sender, receiver

@@ -62,7 +62,7 @@ def decision(quick: bool) -> Section:
             asked.append((time.monotonic_ns(), target))
             cell.client.ask("pin", target)
             cell.wait_until_at(target)
-        cell.processes.stop_controllers()
+        cell.processes.stop_controller()
         run = open_run(next((cell.folder / "runs").iterdir()))
         origin_ns = run.meta["origin_ns"]
         rows = run.cycles.select("release_ns", "placement").rows()

@@ -74,7 +74,7 @@ def measure(quick: bool) -> Section:
 @contextmanager
 def _page(cell: LightCell, browser: Browser) -> Iterator[psutil.Process]:
     """Open a page of a cell in a browser; gives the process that serves it."""
-    command = [sys.executable, "-m", "dwell", "dash", str(cell.processes.file_of(cell.problem))]
+    command = [sys.executable, "-m", "dwell", "dash", str(cell.processes.file)]
     command += ["--port", "0", "--no-browser"]
     served = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     page = browser.new_page()

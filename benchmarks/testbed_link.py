@@ -13,7 +13,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -187,7 +187,7 @@ def _bench() -> Iterator[_Bench]:
     with tempfile.TemporaryDirectory() as folder, Hosts(name, NODES, [NODES]) as hosts:
         tuns = {"A": hosts.tun("A", "B"), "B": hosts.tun("B", "A")}
         losses = LinkFile(Path(folder) / "links", NODES, seed=5)
-        with TunLink(NODES, tuns, seed=7) as link, losses:
+        with TunLink(NODES, tuns, seed=7) as link, closing(losses):
             yield _Bench(hosts, link, losses)
 
 

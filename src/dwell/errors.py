@@ -5,6 +5,7 @@ With what a command says of them, and the code that it exits with.
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -27,12 +28,15 @@ __all__ = [
     "TraceError",
     "TrustError",
     "UnwritableError",
+    "describe_raised",
     "installing",
     "line_and_code",
     "missing_package",
     "not_installed",
 ]
 
+#: Characters of what foreign code has raised.
+LONGEST = 300
 #: Name of the distribution: `dwell` on the package index is somebody else's.
 DISTRIBUTION = "dwell-placement"
 
@@ -189,6 +193,25 @@ class LiveError(DwellError, RuntimeError):
 
 class TrustError(DwellError, ValueError):
     """A key, a certificate or a list of them is missing, not valid, or not who it should be."""
+
+
+def describe_raised(error: BaseException, *, but: str = "") -> str:
+    """Return ``ValueError: no frame (stages.py:12)``, of an error that foreign code has raised.
+
+    Parameters
+    ----------
+    but : str
+        File that is not named: that of the caller, where the error may be of the call itself.
+    """
+    lines = str(error).strip().splitlines()
+    raised = f"{type(error).__name__}: {lines[0][:LONGEST]}" if lines else type(error).__name__
+    frames = traceback.extract_tb(error.__traceback__)
+    # A SyntaxError says by itself where it is.
+    if isinstance(error, SyntaxError) or not frames:
+        return raised
+    file, line = frames[-1].filename, frames[-1].lineno
+    hidden = file == but or "importlib" in file
+    return raised if hidden else f"{raised} ({file.rpartition('/')[2]}:{line})"
 
 
 def installing(extra: str) -> str:

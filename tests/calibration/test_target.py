@@ -88,7 +88,7 @@ def test_a_method_takes_inputs(folder: Path) -> None:
         ("a_package.broken:f", r"\(broken.py:2\)"),
         ("a_package.failing:f", r"failed: RuntimeError: no camera \(failing.py:3\)"),
         ("a_package.leaving:f", "failed: SystemExit: 3"),
-        ("a_package.wrong:f", r"failed: SyntaxError: .*\(wrong.py:1\)"),
+        ("a_package.wrong:f", r"failed: SyntaxError: .*\(wrong.py, line 1\)"),
         (
             "a_package.stages:percieve",
             "a_package.stages has no 'percieve'; did you mean 'perceive'",

@@ -29,9 +29,8 @@ from typing import Any, Self
 
 from dwell.cellfile import from_document
 from dwell.control import Controller
-from dwell.errors import UnwritableError
+from dwell.errors import UnwritableError, describe_raised
 from dwell.live.controlled_cell import Recorder
-from dwell.live.failures import described
 from dwell.live.recording import RunRecorder
 from dwell.live.run_rows import Rows
 from dwell.live.stage import CellActuator, CellStage, Message
@@ -463,7 +462,7 @@ def play(plan: Plan) -> Played:
     except MissingError as error:
         played.wrong.append(str(error))
     except Exception as error:  # a role that fails ends its process
-        played.wrong.append(f"a process has ended by itself: {described(error)}")
+        played.wrong.append(f"a process has ended by itself: {describe_raised(error)}")
     played.wrong = [*world.wrong, *played.wrong, *played.outcome.wrong, *played.outcome.late]
     played.cycles = world.judge.counts["stamped"]
     heard = world.seen, sorted(world.judge.counts.items()), world.judge.stamped_ns

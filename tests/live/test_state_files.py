@@ -150,7 +150,7 @@ def test_a_book_that_is_spoilt_is_that_of_the_time_before(tmp_path: Path) -> Non
     for entry in entries:
         book.write(entry)
     content = bytearray(path.read_bytes())
-    content[content.index(b'"term": 3')] ^= 1
+    content[content.index(b'"term":3')] ^= 1
     path.write_bytes(content)
     assert BookFile(path).read() == entries[1]
 

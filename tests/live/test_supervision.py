@@ -92,7 +92,7 @@ def test_a_message_that_kills_twice_is_put_aside_with_its_bytes(
     (kept,) = (tmp_path / "quarantine").iterdir()
     assert kept.read_bytes() == b"poison"
     assert any("has killed it twice" in line for line in said)
-    assert InFlight.read(child.inflight) is None
+    assert InFlight.read(child.file("inflight")) is None
     supervisor.step()
     assert child.pid is not None
     assert psutil.pid_exists(child.pid)
@@ -238,12 +238,12 @@ def test_an_agent_outlives_a_full_disk(tmp_path: Path) -> None:
             supervisor.step()
             supervisor.tend()
             assert "No space left" in "; ".join(said)
-            assert not child.mark.exists()
+            assert not child.file("pid").exists()
             disk.clear()
             child.next_s = 0.0
             supervisor.step()
             supervisor.tend()
-            assert json.loads(child.mark.read_text())["pid"] == child.pid
+            assert json.loads(child.file("pid").read_text())["pid"] == child.pid
         finally:
             supervisor.stop()
 
@@ -285,12 +285,12 @@ def test_a_log_does_not_grow_for_ever(tmp_path: Path) -> None:
             return older.exists()
 
         wait_until(began_anew)
-        wait_until(lambda: child.log.stat().st_size > 0)
+        wait_until(lambda: child.file("log").stat().st_size > 0)
     finally:
         supervisor.stop()
     assert older.stat().st_size > 100_000
     # What is appended after the cut follows no hole.
-    assert child.log.read_bytes()[:1] != b"\0"
+    assert child.file("log").read_bytes()[:1] != b"\0"
 
 
 # ------------------------------------------------------------------- what it leaves behind
@@ -434,7 +434,7 @@ def test_what_was_put_aside_is_told_for_a_while(supervisor: Supervisor, tmp_path
     child = keep(supervisor, "worker@E", "import time; time.sleep(60)")
     until(supervisor, lambda: child.pid is not None)
     for _ in range(supervision.POISONOUS):
-        InFlight(child.inflight).begin(b"poison")
+        InFlight(child.file("inflight")).begin(b"poison")
         starts, pid = child.starts, child.pid
         assert pid is not None
         os.kill(pid, signal.SIGKILL)

@@ -73,19 +73,6 @@ def test_as_many_threads_as_asked_for_are_busy_where_they_should_be(burner: Burn
     assert gone(three[0])
 
 
-def test_episodes_begin_and_end_at_their_instants(burner: Burner) -> None:
-    now_ns = time.monotonic_ns()
-    begin_ns, end_ns = now_ns + 50_000_000, now_ns + 150_000_000
-    assert burner.set(2, at_ns=begin_ns) == begin_ns
-    assert burner.set(1, at_ns=end_ns) == end_ns
-    assert not burner.pids or time.monotonic_ns() >= begin_ns
-    children = Path(f"/proc/{burner.pid}/task/{burner.pid}/children")
-    wait_until(lambda: len(children.read_text().split()) == 2)
-    assert time.monotonic_ns() >= begin_ns
-    wait_until(lambda: len(children.read_text().split()) == 1)
-    assert time.monotonic_ns() >= end_ns
-
-
 def test_all_threads_end_with_the_burner() -> None:
     burner = Burner([CPU])
     burner.start(2)

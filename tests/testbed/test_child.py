@@ -20,15 +20,18 @@ ECHO = """
 import os, sys
 sys.path.insert(0, {src!r})
 from dwell.testbed.child import Parent
-parent = Parent()
-try:
-    while True:
-        request = parent.receive()
-        if request.get("do") == "die":
-            os._exit(3)
-        parent.answer({{"error": "no"}} if request.get("do") == "fail" else request)
-except EOFError:
-    pass
+from dwell.errors import LiveError
+def answer(request):
+    if request == "die":
+        os._exit(3)
+    if request == "fail":
+        raise LiveError("no")
+    return request
+def begin(settings):
+    if settings == "wrong":
+        raise LiveError("it is wrong")
+    return answer
+Parent().serve(begin)
 """
 
 
@@ -49,10 +52,10 @@ def child(module: str) -> Iterator[Child]:
 
 def test_it_answers_until_it_is_stopped(child: Child) -> None:
     child.start()
-    assert child.answered == {"a": 1}
+    assert child.answered is None
     assert child.ask({"b": [2, "é"]}) == {"b": [2, "é"]}
     with pytest.raises(LiveError, match="the echo: no"):
-        child.ask({"do": "fail"})
+        child.ask("fail")
     with pytest.raises(LiveError, match="has been started before"):
         child.start()
     pid = child.pid
@@ -63,12 +66,19 @@ def test_it_answers_until_it_is_stopped(child: Child) -> None:
         child.ask({})
 
 
+def test_settings_that_are_refused_end_it(module: str) -> None:
+    child = Child(module, "the echo", "wrong")
+    with pytest.raises(LiveError, match="the echo: it is wrong"):
+        child.start()
+    assert not psutil.pid_exists(child.pid)
+
+
 def test_one_that_has_ended_is_told(child: Child) -> None:
     with pytest.raises(LiveError, match="has not been started"):
         _ = child.pid
     child.start()
     with pytest.raises(LiveError, match=r"the echo \(process \d+\) has ended"):
-        child.ask({"do": "die"})
+        child.ask("die")
 
 
 def test_one_that_hangs_is_told_and_ended(child: Child) -> None:
@@ -100,11 +110,9 @@ def test_what_is_started_is_stopped_whatever_happens_meanwhile() -> None:
     steps: list[str] = []
 
     class Lamp(Started):
-        def start(self) -> None:
+        def _start(self) -> None:
+            self._stack.callback(steps.append, "off")
             steps.append("on")
-
-        def stop(self) -> None:
-            steps.append("off")
 
     def work() -> None:
         with Lamp():

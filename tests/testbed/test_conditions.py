@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import math
+import pickle
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from dwell.errors import LiveError, ProblemError
+from dwell.errors import ProblemError
 from dwell.model import (
     AR1,
     Constant,
@@ -23,7 +23,7 @@ from dwell.model import (
     TraceTable,
     Uniform,
 )
-from dwell.testbed.conditions import Conditions, Draws, changed, delays_ns, to_json
+from dwell.testbed.conditions import Conditions, Draws, delays_ns
 
 PROCESSES = [
     Constant(3.0),
@@ -37,18 +37,15 @@ PROCESSES = [
 
 
 @pytest.mark.parametrize("process", PROCESSES, ids=lambda process: type(process).__name__)
-def test_processes_arrive(process: Process) -> None:
-    sent = json.dumps(to_json({"delay_ms": process, "rate_mbps": math.inf, "cut": None}))
-    assert changed(Conditions(cut="drop"), json.loads(sent)) == Conditions(process)
+def test_conditions_arrive(process: Process) -> None:
+    sent = Conditions(process, (Normal(25.0, 5.0), Constant(4.0)), (0.5, 1.0), loss=0.1)
+    assert pickle.loads(pickle.dumps(sent)) == sent
 
 
-def test_added_delays_arrive_with_their_shares() -> None:
-    added = {"add_delays_ms": (Normal(25.0, 5.0), Constant(4.0)), "shares": (0.5, 1.0)}
-    arrived = changed(Conditions(), json.loads(json.dumps(to_json(added))))
-    assert arrived == Conditions(**added)  # type: ignore[arg-type]
-    for shares in ((1.0,), (1.0, 1.5), (1.0, math.nan)):
-        with pytest.raises(ProblemError, match="shares"):
-            changed(arrived, {"shares": list(shares)})
+@pytest.mark.parametrize("shares", [(1.0,), (1.0, 1.5), (1.0, math.nan)])
+def test_each_added_delay_has_a_share(shares: tuple[float, ...]) -> None:
+    with pytest.raises(ProblemError, match="shares"):
+        Conditions(add_delays_ms=(Normal(25.0, 5.0), Constant(4.0)), shares=shares)
 
 
 @pytest.mark.parametrize("process", PROCESSES, ids=lambda process: type(process).__name__)
@@ -69,29 +66,20 @@ def test_a_process_with_memory_remembers() -> None:
 def test_a_trace_is_replayed_in_order_and_begins_again() -> None:
     rows = [1.0, 2.0, 3.0, 4.0, 5.0]
     trace = Trace(TraceTable("file", {"ms": np.array(rows)}), "ms")
-    sent = json.dumps(to_json({"delay_ms": trace}))
-    arrived = changed(Conditions(), json.loads(sent)).delay_ms
+    arrived = pickle.loads(pickle.dumps(trace))
     drawn = [value / 1e6 for value in islice(delays_ns(arrived, np.random.default_rng(3)), 10)]
     begin = rows.index(drawn[0])
     assert drawn == (rows[begin:] + rows[:begin]) * 2
 
 
-def test_unknown_processes_are_refused() -> None:
-    class Odd:
-        expectation = 1.0
-
-        def marginal(self, rng: np.random.Generator, size: int) -> NDArray[np.float64]:
-            return np.ones(size)
-
-    with pytest.raises(LiveError, match="knows no Odd; it knows constant, uniform"):
-        to_json({"delay_ms": Odd()})
+def test_a_loss_of_more_than_1_is_refused() -> None:
     with pytest.raises(ProblemError, match="loss"):
-        changed(Conditions(), {"loss": 1.001})
+        Conditions(loss=1.001)
 
 
 def test_of_a_loss_of_1_every_message_is_lost() -> None:
     draws = Draws((1, 0))
-    draws.apply({"loss": 1.0})
+    draws.apply(Conditions(loss=1.0))
     assert all(draws.lose() for _ in range(10_000))
 
 
@@ -99,11 +87,11 @@ def test_a_stream_goes_on_while_its_share_changes() -> None:
     process = AR1(20.0, 0.2, 0.9)
     plain, changing = Draws((1, 0)), Draws((1, 0))
     for draws in (plain, changing):
-        draws.apply(to_json({"add_delays_ms": (Constant(2.0), process), "shares": (0.0, 1.0)}))
+        draws.apply(Conditions(add_delays_ms=(Constant(2.0), process), shares=(0.0, 1.0)))
     whole = [plain.delay_ns() for _ in range(9)]
     found = []
     for share in (1.0, 0.0, 0.5):
-        changing.apply(to_json({"shares": (1.0, share)}))
+        changing.apply(replace(changing.conditions, shares=(1.0, share)))
         found += [(changing.delay_ns() - 2_000_000, share) for _ in range(3)]
     expected = [delay * share for delay, (_, share) in zip(whole, found, strict=True)]
     assert [delay for delay, _ in found] == pytest.approx(expected, abs=1)

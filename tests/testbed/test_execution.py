@@ -31,7 +31,7 @@ QUIET = Quiet(for_s=1.0, patience_s=1.0)
 def _missing() -> str:
     """Why this machine cannot run the testbed; empty if it can."""
     try:
-        require_machine([dwell.load(CELL)])
+        require_machine(dwell.load(CELL))
     except LiveError as error:
         return str(error)
     return ""

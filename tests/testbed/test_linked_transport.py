@@ -5,13 +5,14 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 from dwell.live.keys import Keys
 from dwell.live.transport.transport import Arrival, Lane, Receive
-from dwell.model import Constant, Normal
+from dwell.model import Constant, Link, Normal
 from dwell.testbed.linked_transport import LinkedTransport, target_of, without_source
 from dwell.testbed.message_links import LinkEnds, LinkFile
 from tests.live.transport.meshes import ZenohMesh, introduce
@@ -46,7 +47,7 @@ class Direct:
 
 @pytest.fixture
 def file(tmp_path: Path) -> Iterator[LinkFile]:
-    with LinkFile(tmp_path / "links", NODES, seed=3) as opened:
+    with closing(LinkFile(tmp_path / "links", NODES, seed=3)) as opened:
         yield opened
 
 
@@ -119,25 +120,37 @@ def test_a_rate_puts_messages_apart(file: LinkFile, pair: Pair) -> None:
     assert instants[-1] - instants[0] > 79e6
 
 
-def test_a_cut_loses_or_holds(file: LinkFile, pair: Pair) -> None:
-    file.set("R1", "E", cut="drop")
+def test_what_is_put_on_a_link_that_is_down_is_lost(file: LinkFile, pair: Pair) -> None:
+    file.set("R1", "E", down=True)
     pair.sender.put(TO_E, b"lost")
     pair.sender.put(KEYS.stamped(), b"lost")
-    file.set("R1", "E", cut="hold")
-    for number in range(5):
-        pair.sender.put(TO_E, b"%d" % number)
-    time.sleep(0.05)
-    assert pair.arrived == []
-    file.set("R1", "E", cut=None)
-    wait_until(lambda: len(pair.arrived) == 5)
-    pair.sender.put(TO_E, b"5")
-    wait_until(lambda: len(pair.arrived) == 6)
-    assert pair.payloads == [b"%d" % number for number in range(6)]
+    file.set("R1", "E", down=False)
+    pair.sender.put(TO_E, b"0")
+    wait_until(lambda: len(pair.arrived) == 1)
+    assert pair.payloads == [b"0"]
+
+
+def test_it_waits_for_a_link_that_retransmits(tmp_path: Path) -> None:
+    repeats = Link("R1", "E", Constant(0.0), retransmit_ms=5.0)
+    with closing(LinkFile(tmp_path / "links", NODES, [repeats], seed=3)) as file:
+        pair = Pair(file)
+        file.set("R1", "E", down=True)
+        for number in range(5):
+            pair.sender.put(TO_E, b"%d" % number)
+        time.sleep(0.05)
+        assert pair.arrived == []
+        file.set("R1", "E", down=False)
+        wait_until(lambda: len(pair.arrived) == 5)
+        pair.sender.put(TO_E, b"5")
+        wait_until(lambda: len(pair.arrived) == 6)
+        assert pair.payloads == [b"%d" % number for number in range(6)]
+        for one in (pair.sender, pair.receiver):
+            one.close()
 
 
 def test_what_stays_on_its_node_meets_no_link(file: LinkFile) -> None:
     for source, target in itertools.permutations(NODES, 2):
-        file.set(source, target, cut="drop")
+        file.set(source, target, down=True)
     carrier = Direct()
     here = LinkedTransport(carrier, LinkEnds(file.path, "perception@E", "E"))
     found: list[Arrival] = []

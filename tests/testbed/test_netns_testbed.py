@@ -53,28 +53,19 @@ def test_what_a_testbed_does_not_have_is_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_cells_that_share_a_link_have_to_agree_on_it(tmp_path: Path) -> None:
-    links = [dict(link) for link in document()["links"]]
-    links[0]["delay_ms"] = 7
-    one, other = from_document(document()), from_document(document(links=links, name="other"))
-    with pytest.raises(LiveError, match="links R1->E: two cells share it"):
-        NetnsTestbed([one, other], tmp_path, name="refused")
-    assert len(NetnsTestbed([one, replace(one, name="third")], tmp_path, name="fine").problems) == 2
-
-
 def test_a_run_begins_anew_with_everybody_there(testbed: NetnsTestbed) -> None:
-    (watcher,) = testbed.watchers.values()
+    watcher = testbed.watcher
     begun_ns = time.monotonic_ns()
-    before = {testbed.begin()[0]}
+    before = {testbed.begin()}
     # Nothing of the time until everybody was there is part of it.
     assert min(before) > begun_ns
     status = watcher.status(10.0)
     assert status["placement"] == "SO"
     assert status["origin_ns"] in before
-    assert set(expected(testbed.problems[0])) <= status["processes"].keys()
-    testbed.processes.stop_controllers()
+    assert set(expected(testbed.problem)) <= status["processes"].keys()
+    testbed.processes.stop_controller()
     # Another one is another run.
-    again = testbed.begin()[0]
+    again = testbed.begin()
     assert again not in before
     assert watcher.status(10.0)["run"] != status["run"]
 
@@ -89,8 +80,8 @@ def test_stress_is_in_the_group_of_its_node(testbed: NetnsTestbed) -> None:
 
 def test_a_link_that_is_down_lets_nothing_through(testbed: NetnsTestbed) -> None:
     link = testbed.links[frozenset(("R1", "R2"))]
-    usual = usual_conditions(testbed.problems[0].fabric.links["R1->R2"])
-    testbed.apply(Change(0, "R1->R2", replace(usual, cut="drop", loss=0.5)))
+    usual = usual_conditions(testbed.problem.fabric.links["R1->R2"])
+    testbed.apply(Change(0, "R1->R2", replace(usual, down=True, loss=0.5)))
     wait_for(lambda: link.read()["R1", "R2"].vanished > 0, "packets that vanish")
     testbed.apply(Change(1, "R1->R2", usual))
     link.read()
@@ -99,7 +90,7 @@ def test_a_link_that_is_down_lets_nothing_through(testbed: NetnsTestbed) -> None
 
 def test_delays_at_once_add_up_each_at_its_strength(testbed: NetnsTestbed) -> None:
     link = testbed.links[frozenset(("R1", "R2"))]
-    usual = usual_conditions(testbed.problems[0].fabric.links["R1->R2"])
+    usual = usual_conditions(testbed.problem.fabric.links["R1->R2"])
     own_ms, delays = usual.delay_ms.expectation, (Constant(4.0), Constant(9.0))
     for shares in ((1.0, 1.0), (1.0, 1 / 3), (0.0, 0.0)):
         now = replace(usual, add_delays_ms=delays, shares=shares)
@@ -113,7 +104,7 @@ def test_delays_at_once_add_up_each_at_its_strength(testbed: NetnsTestbed) -> No
 
 
 def test_a_node_that_was_down_comes_back(testbed: NetnsTestbed) -> None:
-    (watcher,) = testbed.watchers.values()
+    watcher = testbed.watcher
     if "controller@E" not in testbed.processes.running:
         testbed.begin()
     there = set(testbed._groups.pids("R2"))
@@ -123,7 +114,7 @@ def test_a_node_that_was_down_comes_back(testbed: NetnsTestbed) -> None:
 
     def ready() -> bool:
         heard = watcher.status(10.0)["processes"]
-        names = [who for who in expected(testbed.problems[0]) if "@R2" in who]
+        names = [who for who in expected(testbed.problem) if "@R2" in who]
         return all(who in heard and heard[who]["age_ms"] < 1_000 for who in names)
 
     wait_for(ready, "the processes of R2")

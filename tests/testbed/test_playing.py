@@ -17,13 +17,13 @@ from dwell.errors import LiveError
 from dwell.model import Problem
 from dwell.testbed.playing import (
     Played,
-    come_up,
     interruptible,
     longest_run,
     make_folder,
     play,
     undisturbed,
 )
+from dwell.testbed.testbed import come_up
 from dwell.testbed.timeline import Change, NodeState, timeline_of
 from tests.cells.light import document
 from tests.report.live_runs import PERIOD_NS, live_run
@@ -143,7 +143,7 @@ def test_a_cell_is_up_when_everybody_is_ready(tmp_path: Path) -> None:
         ready = next(states)
         return {"processes": {"a@E": {"ready": ready, "note": ""}}, "origin_ns": 5}
 
-    assert come_up(ask, ["a@E"], tmp_path)["origin_ns"] == 5
+    assert come_up(ask, ["a@E"], tmp_path, patience_s=30.0)["origin_ns"] == 5
 
 
 def test_who_is_missing_is_told_with_what_is_known(tmp_path: Path) -> None:

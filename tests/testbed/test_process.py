@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import time
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -72,9 +73,12 @@ def test_faults_are_around_an_agent_and_what_it_starts(tmp_path: Path) -> None:
         heard[beat.who] = source, beat.sent_ns - time.monotonic_ns()
 
     links, clocks = tmp_path / "links", tmp_path / "clocks"
-    with LinkFile(links, NODES), ClockFile(clocks, NODES, time.monotonic_ns) as file:
+    with (
+        closing(LinkFile(links, NODES)),
+        closing(ClockFile(clocks, NODES, time.monotonic_ns)) as file,
+    ):
         file.set("R1", jump_ns=HOUR_NS)
-        processes = Processes([problem], tmp_path, program=program(links=links, clocks=clocks))
+        processes = Processes(problem, tmp_path, program=program(links=links, clocks=clocks))
         processes.write()
         transport = ZenohTransport(entry_for(wire(problem), ["R1"]))
         try:

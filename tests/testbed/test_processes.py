@@ -17,7 +17,7 @@ import pytest
 
 import dwell
 from dwell.cellfile import from_document
-from dwell.errors import LiveError, TrustError
+from dwell.errors import TrustError
 from dwell.live.security import INSECURE, Security
 from dwell.live.trust import KEYS
 from dwell.live.wiring import Role
@@ -41,7 +41,7 @@ import dwell
 from dwell.testbed.loopback import on_this_machine
 from dwell.testbed.processes import Processes
 
-processes = Processes([on_this_machine(dwell.load(sys.argv[1]))], Path(sys.argv[2]))
+processes = Processes(on_this_machine(dwell.load(sys.argv[1])), Path(sys.argv[2]))
 processes.write()
 processes.start_agent("R1")
 print(processes.running["agent@R1"].pid, flush=True)
@@ -68,12 +68,12 @@ def logged(file: Path) -> str:
 
 
 def test_each_runs_where_it_belongs_with_what_it_needs(problem: Problem, tmp_path: Path) -> None:
-    processes = Processes([problem], tmp_path, inside=stays, environment={"MINE": "yes"})
+    processes = Processes(problem, tmp_path, inside=stays, environment={"MINE": "yes"})
     processes.write()
     assert dwell.load(tmp_path / "cell.yaml") == problem
     try:
         processes.start_agent("R1")
-        processes.start_controller("E", more=["--policy", "LOC"])
+        processes.start_controller(more=["--policy", "LOC"])
         assert processes.running.keys() == {"agent@R1", "controller@E"}
         agent = logged(tmp_path / "agent@R1.log")
         assert f'["R1", "{sys.executable}", "-m", "dwell", "agent", "--node", "R1"' in agent
@@ -109,8 +109,8 @@ def test_the_keys_of_another_cell_are_not_theirs(
         return [sys.executable, "-c", f"import os; print(os.environ.get('{KEYS}'), flush=True)"]
 
     monkeypatch.setenv(KEYS, str(tmp_path / "of another cell"))
-    processes = Processes([problem], tmp_path, inside=says)
-    given = Processes([problem], tmp_path, inside=says, environment={KEYS: "of this cell"})
+    processes = Processes(problem, tmp_path, inside=says)
+    given = Processes(problem, tmp_path, inside=says, environment={KEYS: "of this cell"})
     try:
         processes.start_agent("R1")
         assert logged(tmp_path / "agent@R1.log") == "None\n"
@@ -125,30 +125,19 @@ def test_the_keys_of_another_cell_are_not_theirs(
     assert Security.of(problem, role, {**without_keys(), INSECURE: "1"}).keyring is None
 
 
-def test_cells_that_share_a_node_have_an_agent_each_and_one_controller(
-    problem: Problem, tmp_path: Path
-) -> None:
-    other = replace(problem, name="other")
-    processes = Processes([problem, other], tmp_path, inside=stays, environment={"MINE": ""})
+def test_who_was_killed_with_its_node_is_forgotten(problem: Problem, tmp_path: Path) -> None:
+    processes = Processes(problem, tmp_path, inside=stays, environment={"MINE": ""})
     processes.write()
     try:
-        processes.start_agent("E")
-        processes.start_controllers()
-        assert processes.running.keys() == {"agent@E of light", "agent@E of other", "controller@E"}
-        told = logged(tmp_path / "controller@E.log")
-        for name in ("light", "other"):
-            assert f"{tmp_path}/{name}/cell.yaml" in told
-        for one in processes.running.values():
-            one.kill()
+        for node in ("E", "R1"):
+            processes.start_agent(node)
+        processes.start_controller()
+        for who in ("agent@E", "controller@E"):
+            processes.running[who].kill()
         processes.forget("E")
-        assert processes.running == {}
+        assert processes.running.keys() == {"agent@R1"}
     finally:
         processes.stop()
-
-
-def test_two_cells_of_one_name_are_refused(problem: Problem, tmp_path: Path) -> None:
-    with pytest.raises(LiveError, match="two cells have one name"):
-        Processes([problem, problem], tmp_path)
 
 
 def test_a_cell_that_is_written_elsewhere_still_finds_its_traces(tmp_path: Path) -> None:
@@ -156,7 +145,7 @@ def test_a_cell_that_is_written_elsewhere_still_finds_its_traces(tmp_path: Path)
     links = [dict(link) for link in document()["links"]]
     links[0]["delay_ms"] = {"trace": {"file": "delays.csv", "column": "delay", "by": "row"}}
     problem = from_document(document(links=links), folder=tmp_path)
-    processes = Processes([replace(problem, folder=str(tmp_path))], tmp_path / "out")
+    processes = Processes(replace(problem, folder=str(tmp_path)), tmp_path / "out")
     processes.write()
     link = dwell.load(tmp_path / "out" / "cell.yaml").fabric.links["R1->E"]
     assert link.delay_ms.expectation == 2.0

@@ -15,7 +15,8 @@ from dwell.kernels.random_draws import drawn_scenario
 from dwell.model import Disturbance, Problem
 from dwell.record import open_run
 from dwell.testbed.playing import Played
-from dwell.testbed.run import MARK, length_s, require_machine, run_once, spans_of
+from dwell.testbed.run import length_s, require_machine, run_once, spans_of
+from dwell.testbed.testbed import MARK
 from dwell.testbed.timeline import Timeline, timeline_of
 from tests.cells.light import document, write_cell
 from tests.report.live_runs import PERIOD_NS, live_run
@@ -75,7 +76,7 @@ def test_a_run_meets_what_a_simulation_of_its_seed_meets(tmp_path: Path) -> None
     ]
     cell = dwell.load(write_cell(tmp_path / "cell", scenarios={"some": items}))
     try:
-        require_machine([cell])
+        require_machine(cell)
     except LiveError as error:
         pytest.skip(str(error))
     folder = run_once(

@@ -39,7 +39,7 @@ def test_samples_are_taken_until_it_is_left() -> None:
         assert next_.used_s["E"] == pytest.approx(one.used_s["E"] + 0.01)
         assert next_.idle_s[CPU] >= one.idle_s[CPU]
     # Threads that are not there at both looks do not count.
-    assert sampler.wakes_hz()["E"] > 0
+    assert sampler.wakes_hz["E"] > 0
     assert counts == []
     assert sampler.links() == {}
     assert len(sampler.samples) == taken

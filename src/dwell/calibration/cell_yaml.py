@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import re
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from dwell.calibration.profile_file import Measurement
+import yaml
 
-# What YAML reads as this very text also inside of { }.
-PLAIN = re.compile(r"[A-Za-z_][\w./+@-]*(?:->[\w.+-]+)?")
-# Words that YAML, of any version, takes for something else.
-RESERVED = re.compile(r"(?i)null|true|false|yes|no|on|off|y|n|\.inf|\.nan")
+from dwell.calibration.profile_file import Measurement
 
 
 def cell_yaml(file: Path, measurements: Sequence[Measurement]) -> str:
@@ -40,12 +36,13 @@ def _tasks(file: Path, measurements: Sequence[Measurement]) -> Iterator[str]:
     if tasks:
         yield "tasks:"
     for task, nodes in tasks.items():
-        yield f"  {_scalar(task)}:"
+        yield f"  {_flow([task])[1:-1]}:"
         yield "    on:"
         for one in nodes:
             threads = max(1, round(one.about["cores_used"]))
-            more = f", threads: {threads}" if threads > 1 else ""
-            yield f"      {_scalar(one.about['node'])}: {{exec_ms: {_trace(file, one.name)}{more}}}"
+            more = {"threads": threads} if threads > 1 else {}
+            on = {one.about["node"]: {"exec_ms": _trace(file, one.name), **more}}
+            yield f"      {_flow(on)[1:-1]}"
 
 
 def _links(file: Path, measurements: Sequence[Measurement]) -> Iterator[str]:
@@ -53,22 +50,19 @@ def _links(file: Path, measurements: Sequence[Measurement]) -> Iterator[str]:
     if links:
         yield "links:"
     for one in links:
-        ends = f"from: {_scalar(one.about['from'])}, to: {_scalar(one.about['to'])}"
+        ends = {"from": one.about["from"], "to": one.about["to"]}
         rate = one.about["rate_mbps"]
-        # Four digits, without an exponent.
-        more = "" if rate is None else f", rate_mbps: {float(f'{rate:.4g}'):.15g}"
-        yield f"  - {{{ends}, delay_ms: {_trace(file, one.name)}{more}}}"
+        # Four digits.
+        more = {} if rate is None else {"rate_mbps": float(f"{rate:.4g}")}
+        yield f"  - {_flow({**ends, 'delay_ms': _trace(file, one.name), **more})}"
 
 
-def _trace(file: Path, column: str) -> str:
-    return (
-        f"{{trace: {{file: {_scalar(file.as_posix())}, column: {_scalar(column)}, "
-        "by: row, wrap: true}}"
-    )
+def _trace(file: Path, column: str) -> dict[str, object]:
+    return {"trace": {"file": file.as_posix(), "column": column, "by": "row", "wrap": True}}
 
 
-def _scalar(text: str) -> str:
-    """Return text as YAML reads it back: as it is, or quoted as JSON (which is YAML)."""
-    if PLAIN.fullmatch(text) and not RESERVED.fullmatch(text):
-        return text
-    return json.dumps(text, ensure_ascii=False)
+def _flow(value: Mapping[str, object] | Sequence[str]) -> str:
+    """Return a mapping or sequence as one line of YAML."""
+    return yaml.safe_dump(
+        value, default_flow_style=True, sort_keys=False, width=math.inf, allow_unicode=True
+    ).strip()

@@ -26,10 +26,9 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.calibration.error_origin import describe_raised, raised_here
 from dwell.calibration.machine_conditions import MachineConditions, MachineCounters, processor
 from dwell.calibration.profile_file import Measurement, stamp, task_name
-from dwell.errors import MeasurementError
+from dwell.errors import MeasurementError, describe_raised
 from dwell.model.bounds import MAX_COUNT, PERIOD_MS, Bound
 
 RUNS = Bound(1, MAX_COUNT, whole=True)
@@ -196,9 +195,11 @@ def _series(
         when = what.format(run)
         if not prepared:
             given, when = "the number of the run", f"inputs of {when}"
-        wrong_call = isinstance(error, TypeError) and raised_here(error.__traceback__)
+        # By the call itself, and not inside of what it called.
+        raised_here = error.__traceback__ is not None and error.__traceback__.tb_next is None
+        wrong_call = isinstance(error, TypeError) and raised_here
         hint = f"; it is called with {given}" if wrong_call else ""
-        raise MeasurementError(f"{when}: {describe_raised(error)}{hint}") from error
+        raise MeasurementError(f"{when}: {describe_raised(error, but=__file__)}{hint}") from error
     return wall_ns, cpu_ns
 
 

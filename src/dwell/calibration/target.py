@@ -8,8 +8,7 @@ import inspect
 from collections.abc import Callable
 from pathlib import Path
 
-from dwell.calibration.error_origin import describe_raised
-from dwell.errors import ProfileError
+from dwell.errors import ProfileError, describe_raised
 
 
 def find_callable(name: str, option: str) -> Callable[..., object]:

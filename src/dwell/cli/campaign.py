@@ -121,7 +121,7 @@ def _player(hosts: Path | None, problem: Problem, scenarios: Sequence[str]) -> t
         return partial(run_on_hosts, inventory), inventory.digest
     from dwell.testbed.run import require_machine, run_once
 
-    require_machine([problem])
+    require_machine(problem)
     return run_once, "testbed"
 
 

@@ -125,7 +125,13 @@ class Agent:
         # No guard waits for it: it carries nothing that a cycle needs.
         self.pulse = Pulse(place, self._state, every=AGENT_BEAT)
         self._relays = place.node == place.problem.relay_node
-        self._look_ns = self._load_ns = self._housekeeping_ns = 0
+        # What is done again and again, every so often; and when each is due.
+        self._chores: dict[Callable[[int], None], int] = {
+            lambda _: supervisor.step(): LOOK_NS,
+            lambda _: supervisor.tend(): HOUSEKEEPING_NS,
+            self._report: LOAD_NS,
+        }
+        self._due_ns = dict.fromkeys(self._chores, 0)
         self._carried = RelayBatch()
         self._carry_ns = NEVER_NS
         self._gathered = RelayBatch(MOST_MESSAGES // 2)
@@ -167,22 +173,17 @@ class Agent:
     def wake(self, now_ns: int) -> int:
         """Look after the processes, report the load, beat; returns what is due next."""
         if self._setback.back_ns(now_ns):
-            self._look_ns = self._load_ns = self._housekeeping_ns = now_ns
+            self._due_ns = dict.fromkeys(self._chores, now_ns)
             self._gather_ns = self._beats_ns = now_ns
             self._carry_ns = min(self._carry_ns, now_ns + self.place.period_ns // 4)
-        if now_ns >= self._look_ns:
-            self._try(self.supervisor.step)
-            self._look_ns = now_ns + LOOK_NS
-        if now_ns >= self._housekeeping_ns:
-            self._try(self.supervisor.tend)
-            self._housekeeping_ns = now_ns + HOUSEKEEPING_NS
-        if now_ns >= self._load_ns:
-            self._try(self._report, now_ns)
-            self._load_ns = now_ns + LOAD_NS
+        for chore, every_ns in self._chores.items():
+            if now_ns >= self._due_ns[chore]:
+                self._try(chore, now_ns)
+                self._due_ns[chore] = now_ns + every_ns
         if now_ns >= self._carry_ns:
             self._carry_ns = NEVER_NS
             self._put(self.place.keys.carried(), self._carried.taken())
-        wakes = [self.pulse.wake(now_ns), self._look_ns, self._load_ns, self._carry_ns]
+        wakes = [self.pulse.wake(now_ns), *self._due_ns.values(), self._carry_ns]
         if self._relays:
             if now_ns >= self._gather_ns:
                 self._tell(now_ns)
@@ -190,10 +191,10 @@ class Agent:
             wakes.append(self._gather_ns)
         return min(wakes)
 
-    def _try(self, chore: Callable[..., None], *arguments: object) -> None:
+    def _try(self, chore: Callable[[int], None], now_ns: int) -> None:
         """Do a chore, or leave it for the next time where strangers hold all descriptors."""
         try:
-            chore(*arguments)
+            chore(now_ns)
         except OSError as error:
             if error.errno not in OUT_OF_FILES:
                 raise

@@ -44,16 +44,6 @@ class Continuity:
         Messages that were not believed.
     """
 
-    __slots__ = (
-        "_confirmations",
-        "_heard_ns",
-        "_leap",
-        "_period_ns",
-        "_since_ns",
-        "leaps",
-        "newest",
-    )
-
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns
         self.newest: Cycle | None = None
@@ -120,8 +110,6 @@ class Continuity:
 class SetbackDetector:
     """Notices that the clock of its own node has been set back."""
 
-    __slots__ = ("_seen_ns",)
-
     def __init__(self) -> None:
         self._seen_ns = -NEVER_NS
 
@@ -136,8 +124,6 @@ class OvershootDetector:
 
     Late messages and copies are behind what is believed, too: but they do not go on.
     """
-
-    __slots__ = ("_behind", "_confirmations")
 
     def __init__(self) -> None:
         self.advanced()

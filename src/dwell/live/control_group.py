@@ -135,13 +135,13 @@ def own_group(process: Path = PROCESS) -> ControlGroup | None:
     """Return the control group of this process; None where that is the root, or nothing counts."""
     try:
         groups = _groups((process / "cgroup").read_text())
-        mounts = list(_mounts((process / "mountinfo").read_text()))
+        mounts = list(cgroup_mounts((process / "mountinfo").read_text()))
     except OSError:
         return None
-    for kind, controllers, root, folder in mounts:
+    for kind, options, root, folder in mounts:
         wanted = "cpuacct" if kind == "cgroup" else ""
         group = groups.get(wanted)
-        if group is None or wanted not in controllers or not _below(group, root):
+        if group is None or wanted not in ("", *options) or not _below(group, root):
             continue
         counter = folder / group.removeprefix(root).lstrip("/") / COUNTERS[kind]
         if group != root and counter.is_file():
@@ -162,11 +162,12 @@ def _groups(text: str) -> dict[str, str]:
     return found
 
 
-def _mounts(text: str) -> Iterator[tuple[str, tuple[str, ...], str, Path]]:
-    """Return version, controllers, root and place of every hierarchy that is mounted (proc(5))."""
+def cgroup_mounts(text: str) -> Iterator[tuple[str, list[str], str, Path]]:
+    """Yield kind, options, root and place of each mounted hierarchy (proc_pid_mountinfo(5))."""
     for line in text.splitlines():
-        words = line.split()
-        kind, options = words[words.index("-") + 1], words[-1].split(",")
-        if kind in COUNTERS:
-            controllers = tuple(options) if kind == "cgroup" else ("",)
-            yield kind, controllers, words[3], Path(words[4])
+        before, _, after = line.partition(" - ")
+        words = after.split()
+        if words and words[0] in COUNTERS:
+            root, place = before.split()[3:5]
+            folder = os.fsdecode(place.encode().decode("unicode_escape"))
+            yield words[0], words[2].split(","), root, Path(folder)

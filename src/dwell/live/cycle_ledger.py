@@ -28,6 +28,9 @@ from dwell.record import Values
 
 Ints: TypeAlias = NDArray[np.int64]
 Floats: TypeAlias = NDArray[np.float64]
+#: Whether it is the shadow's; task and node.
+JobName: TypeAlias = tuple[bool, str, str]
+Jobs: TypeAlias = dict[JobName, Hop]
 
 UNKNOWN = -1
 #: Shadow completions remembered of one cycle.
@@ -465,17 +468,12 @@ class Ledger:
         """Return rows of ``jobs``: all known to have become ready for a cycle or its shadow."""
         jobs = self._jobs(cycle)
         order = sorted(jobs, key=lambda key: (key[0], self._tasks[key[1]]))
-        rows = []
-        for key in order:
-            hop = jobs[key]
-            handover_ns = self._handover_ns(cycle, hop, jobs, shadow=key[0])
-            ending_ns = UNKNOWN if key[0] else self._ending_ns(cycle, hop)
-            rows.append(self._job_values(cycle, hop, (handover_ns, ending_ns), shadow=key[0]))
+        rows = (self._job_values(cycle, jobs, key) for key in order)
         return [row for row in rows if row is not None]
 
-    def _jobs(self, cycle: LiveCycle) -> dict[tuple[bool, str, str], Hop]:
-        """Jobs of a cycle and its shadow: by whether they are the shadow's, task and node."""
-        jobs: dict[tuple[bool, str, str], Hop] = {}
+    def _jobs(self, cycle: LiveCycle) -> Jobs:
+        """Jobs of a cycle and its shadow."""
+        jobs: Jobs = {}
         apart = self._diverging(cycle) if cycle.shadow in self._codes else frozenset[str]()
         hops = [(hop, False) for hop in cycle.hops]
         hops += [(hop, hop.task in apart) for done in cycle.shadows for hop in done.hops]
@@ -487,14 +485,7 @@ class Ledger:
                 jobs[shadow, hop.task, hop.node] = hop
         return jobs
 
-    def _handover_ns(
-        self,
-        cycle: LiveCycle,
-        hop: Hop,
-        jobs: Mapping[tuple[bool, str, str], Hop],
-        *,
-        shadow: bool,
-    ) -> int:
+    def _handover_ns(self, cycle: LiveCycle, jobs: Jobs, hop: Hop, *, shadow: bool) -> int:
         """CPU time that a node took between a release, or its job before, and a job of it."""
         flows = self._pipeline.inputs(hop.task)
         before_ns = UNKNOWN
@@ -511,9 +502,8 @@ class Ledger:
             return UNKNOWN
         return _between(hop.group_ns[1], done.group_ns)
 
-    def _job_values(
-        self, cycle: LiveCycle, hop: Hop, around_ns: tuple[int, int], *, shadow: bool
-    ) -> Values | None:
+    def _job_values(self, cycle: LiveCycle, jobs: Jobs, key: JobName) -> Values | None:
+        hop, shadow = jobs[key], key[0]
         ready_ns = self._since_origin(cycle, hop.node, hop.arrived_ns)
         if cycle.shifts[hop.node].bound_ns >= UNBOUNDED_NS:
             return None
@@ -521,15 +511,14 @@ class Ledger:
             # Its stamp may have been there before the cycle began.
             offset_ns = round(self._pipeline.tasks[hop.task].offset_ms * 1e6)
             ready_ns = max(ready_ns, cycle.at_ns + offset_ns)
-        handover_ns, ending_ns = around_ns
         ended = hop.ended_ns != UNKNOWN
         start_ns = max(self._since_origin(cycle, hop.node, hop.started_ns), ready_ns)
         counted_ns = {
             "cpu_ns": hop.cpu_ns,
             "others_ns": hop.others_ns,
             "outside_ns": hop.outside_ns,
-            "handover_ns": handover_ns,
-            "ending_ns": ending_ns,
+            "handover_ns": self._handover_ns(cycle, jobs, hop, shadow=shadow),
+            "ending_ns": UNKNOWN if shadow else self._ending_ns(cycle, hop),
         }
         return {
             "cycle": cycle.row,

@@ -13,19 +13,12 @@ import threading
 import traceback
 from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
 from typing import NoReturn
+
+from dwell.errors import describe_raised
 
 #: Exit code of a process that cannot go on.
 FAILED = 1
-
-
-def described(error: BaseException) -> str:
-    """Return kind and text of an exception, and where it was raised."""
-    frames = traceback.extract_tb(error.__traceback__)
-    where = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
-    text = str(error)
-    return f"{type(error).__name__}{f': {text}' if text else ''}{where}"
 
 
 def end_process(what: str, error: BaseException) -> NoReturn:
@@ -41,7 +34,11 @@ def end_process(what: str, error: BaseException) -> NoReturn:
     # There may be no memory left to say it, and no room where it is said.
     with suppress(BaseException):
         traceback.print_exception(error)
-        print(f"{what} failed: {described(error)}; the process ends", file=sys.stderr, flush=True)
+        print(
+            f"{what} failed: {describe_raised(error)}; the process ends",
+            file=sys.stderr,
+            flush=True,
+        )
     with suppress(BaseException):
         sys.stdout.flush()
     os._exit(FAILED)

@@ -7,9 +7,9 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 
-from dwell.errors import LiveError
+from dwell.errors import LiveError, describe_raised
 from dwell.live.continuity import SetbackDetector
-from dwell.live.failures import described, end_process, start_thread
+from dwell.live.failures import end_process, start_thread
 from dwell.live.role import RoleLogic
 from dwell.live.security import Security
 from dwell.live.stage import Message
@@ -56,6 +56,10 @@ class Platform:
             If there is no such process, or a port is taken.
         """
         return security.transport(who)
+
+
+#: As everybody's is, but for a testbed's.
+PLAIN = Platform()
 
 
 def keep_collections_short() -> None:
@@ -128,7 +132,7 @@ class Hosted:
         except Exception as error:
             if self._complain is None:
                 raise
-            self._complain(LiveError(f"a message under {sample.key}: {described(error)}"))
+            self._complain(LiveError(f"a message under {sample.key}: {describe_raised(error)}"))
             return None
         except BaseException as error:  # an actuator that calls sys.exit(), a panic of Zenoh's
             end_process(f"a message under {sample.key}", error)
@@ -185,10 +189,9 @@ def work(
     transport: Transport,
     *,
     stopped: threading.Event,
-    note: Callable[[Job | None], None] | None = None,
+    note: Callable[[Job | None], None] = lambda job: None,
     clock: Clock = time.monotonic_ns,
-    begin: Callable[[], None] | None = None,
-    ready: Callable[[], None] | None = None,
+    begin: Callable[[], None] = lambda: None,
 ) -> None:
     """Run a worker's jobs in this thread until it is told to stop.
 
@@ -198,21 +201,17 @@ def work(
         Told what job begins, and None when it is over.
     begin : callable, optional
         Called before the stage is started, when the thread of the beats runs.
-    ready : callable, optional
-        Called when the stage has started.
     """
     complain = worker.place.complain
     hosted = Hosted(worker, transport, clock, heard=lambda: worker.has_work, complain=complain)
     start_thread("beats", hosted.run)
     stage = worker.stage
-    if begin is not None:
-        begin()
+    begin()
     stage.start()
     with hosted.lock:
         worker.started = True
         worker.pulse.send(clock())
-    if ready is not None:
-        ready()
+    keep_collections_short()
     if worker.triggers:
         start_thread("frames", _frames, worker, hosted, stopped)
     try:
@@ -225,7 +224,7 @@ def work(
 
 
 def _drain(
-    worker: Worker, hosted: Hosted, note: Callable[[Job | None], None] | None, clock: Clock
+    worker: Worker, hosted: Hosted, note: Callable[[Job | None], None], clock: Clock
 ) -> None:
     """Do all that there is to do."""
     while True:
@@ -237,16 +236,14 @@ def _drain(
             continue
         if job is None:
             return
-        if note is not None:
-            note(job)
+        note(job)
         started_ns = clock()
         output: Message | None
         output, state_age = worker.run(job, started_ns)
         ended_ns = clock()
         with hosted.lock:
             worker.finish(job, output, started_ns, ended_ns, state_age)
-        if note is not None:
-            note(None)
+        note(None)
 
 
 def _frames(worker: Worker, hosted: Hosted, stopped: threading.Event) -> None:

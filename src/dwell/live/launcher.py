@@ -21,7 +21,7 @@ import time
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from typing import BinaryIO, Protocol
+from typing import BinaryIO, TypeAlias
 
 import psutil
 
@@ -33,22 +33,8 @@ PATIENCE_S = 10.0
 #: Time between two starts of a fork server.
 AGAIN_S = 1.0
 
-
-class Running(Protocol):
-    """A process that was started."""
-
-    @property
-    def pid(self) -> int:
-        """Process id."""
-        ...
-
-    def poll(self) -> int | None:
-        """Return its exit code, negative for a signal; None while it runs."""
-        ...
-
-    def wait(self) -> int:
-        """Return its exit code when it has ended."""
-        ...
+#: A process that was started.
+Running: TypeAlias = "subprocess.Popen[bytes] | Survivor"
 
 
 class Launcher:

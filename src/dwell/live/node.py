@@ -16,7 +16,7 @@ from dwell.errors import KernelError, LiveError
 from dwell.live.agent import Agent, CpuCount, Gauge
 from dwell.live.control_group import own_group
 from dwell.live.controlled_cell import ControlledCell
-from dwell.live.hosting import Hosted, Platform, keep_collections_short, take_turns
+from dwell.live.hosting import PLAIN, Hosted, Platform, keep_collections_short, take_turns
 from dwell.live.launcher import ForkServer
 from dwell.live.log import Log
 from dwell.live.recording import RunRecorder
@@ -43,7 +43,7 @@ def run_agent(
     cpus: Iterable[int] | None = None,
     accelerator: Callable[[], float] | None = None,
     environment: Mapping[str, str] | None = None,
-    platform: Platform | None = None,
+    platform: Platform = PLAIN,
     say: Callable[[str], None] = print,
 ) -> None:
     """Keep a node's processes running until told to stop; then end them.
@@ -77,7 +77,7 @@ def run_agent(
         known = ", ".join(problem.fabric.nodes)
         raise LiveError(f"no node {node!r} in cell {problem.name!r}; there are {known}")
     if cpus is not None:
-        _use_cpus(cpus)
+        os.sched_setaffinity(0, cpus)
     if accelerator is not None and (unused := _unused_hook(problem, node)):
         say(unused)
     wiring = wire(problem)
@@ -85,7 +85,6 @@ def run_agent(
     security = Security.of(problem, wiring.entry(who).role, environment)
     security.remember(make_folder(folder))
     security.remind(say, stopped)
-    platform = platform or Platform()
     transport = platform.transport(security, who, node)
     launcher = ForkServer(program, environment)
     supervisor = Supervisor(make_folder(folder), say, launcher=launcher)
@@ -132,13 +131,6 @@ def _cpu_count(problem: Problem, node: str, say: Callable[[str], None]) -> CpuCo
     return CpuCount(group=group)
 
 
-def _use_cpus(cpus: Iterable[int]) -> None:
-    wanted, there = set(cpus), os.sched_getaffinity(0)
-    if not wanted or not wanted <= there:
-        raise LiveError(f"CPUs {sorted(wanted)} cannot be had; there are {sorted(there)}")
-    os.sched_setaffinity(0, wanted)
-
-
 def run_controller(
     problems: Sequence[Problem],
     out: Path,
@@ -148,7 +140,7 @@ def run_controller(
     name: str | None = None,
     jobs: bool = False,
     environment: Mapping[str, str] | None = None,
-    platform: Platform | None = None,
+    platform: Platform = PLAIN,
     say: Callable[[str], None] = print,
 ) -> list[Path]:
     """Control cells until told to stop.
@@ -191,7 +183,7 @@ def run_controller(
     name = name or f"controller-{os.getpid()}"
     # No message waits for long while a window closes.
     sys.setswitchinterval(0.0005)
-    recorders, platform = [], platform or Platform()
+    recorders = []
     with ExitStack() as stack:
         hosted, hurry = [], threading.Event()
         for problem in problems:

@@ -13,7 +13,7 @@ from typing import TypeVar
 from dwell.cellfile import load, load_without_traces
 from dwell.errors import ExitCode
 from dwell.live.ending import end_when_told
-from dwell.live.hosting import Platform
+from dwell.live.hosting import PLAIN, Platform
 from dwell.live.lint import lint
 from dwell.live.log import say
 from dwell.live.node import run_agent, run_controller
@@ -43,7 +43,7 @@ def agent(
     keys: Path | None = None,
     insecure: bool = False,
     owner: int | None = None,
-    platform: Platform | None = None,
+    platform: Platform = PLAIN,
 ) -> None:
     """Run a node of a live cell until told to end (see `run_agent`).
 
@@ -81,7 +81,6 @@ def agent(
     wanted = _cpus(cpus)
     there = sorted(role.who for role in roles(problem) if role.node == node)
     of = _by_process("--cpus-of", cpus_of, there, lambda text: _cpus(text, "--cpus-of", wanted))
-    platform = platform or Platform()
     priorities = _by_process("--realtime", realtime, there, _priority)
     hurried = threading.Event()
     run_agent(
@@ -111,7 +110,7 @@ def controller(
     keys: Path | None = None,
     insecure: bool = False,
     owner: int | None = None,
-    platform: Platform | None = None,
+    platform: Platform = PLAIN,
 ) -> None:
     """Decide where the stages of live cells run until told to end (see `run_controller`).
 

@@ -55,8 +55,6 @@ class Instant(NamedTuple):
 class _Pair:
     """Offset of a node's clock from the reference's, as an interval that moves with its time."""
 
-    __slots__ = ("_overshoot", "breaks", "high_ns", "low_ns", "t_ns")
-
     def __init__(self) -> None:
         self.breaks = -1
         self._overshoot = OvershootDetector()

@@ -50,7 +50,7 @@ class OperatorClient:
         role = Role(self.name, problem.controller_node, "visitor")
         security = self._security = Security.of(problem, role, environment)
         self._transport = security.visit(self.name, self._controller)
-        self._transport.subscribe(self._keys.answer(self.name), self._heard)
+        self._transport.subscribe(self._keys.answer("*"), self._heard)
 
     def __enter__(self) -> OperatorClient:
         """Return itself."""
@@ -61,6 +61,9 @@ class OperatorClient:
         self._transport.close()
 
     def _heard(self, sample: Arrival) -> None:
+        # All others' answers are heard, too.
+        if not sample.key.startswith(self._keys.answer(self.name)):
+            return
         try:
             answer = decode(sample.payload, Answer)
         except LiveError:
@@ -121,7 +124,6 @@ class OperatorClient:
         else:
             # Each wish has a number of its own: no late answer to another is taken for its own.
             number, key = f"{self.name}-{next(self._wishes)}", self._keys.ask()
-            self._transport.subscribe(self._keys.answer(number), self._heard)
         ask = encode(Ask(number, what, about))
         # One question is sent several times; what was answered to the one before is old.
         while not self._answers.empty():

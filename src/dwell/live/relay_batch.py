@@ -34,8 +34,8 @@ class RelayBatch:
 
     def __init__(self, most: int = MOST_MESSAGES, *, newest: bool = False) -> None:
         self._most, self._newest = most, newest
-        self._messages: list[tuple[str, bytes]] = []
-        self._places: dict[str, int] = {}
+        # By key and number; one number is enough where the newest of a key counts.
+        self._messages: dict[tuple[str, int], bytes] = {}
         self._of_key: Counter[str] = Counter()
         self._bytes = 0
 
@@ -46,28 +46,21 @@ class RelayBatch:
         """Add a message; False where it is not carried on."""
         if len(key) > LONGEST_KEY or len(payload) > LONGEST_MESSAGE:
             return False
-        place = self._places.get(key) if self._newest else None
-        if place is not None:
-            grown = len(payload) - len(self._messages[place][1])
-            if self._bytes + grown > MOST_BYTES:
-                return False
-            self._bytes += grown
-            self._messages[place] = key, payload
-            return True
-        added = len(key.encode()) + len(payload)
-        full = len(self._messages) >= self._most or self._bytes + added > MOST_BYTES
-        if full or self._of_key[key] >= MOST_OF_A_KEY:
+        place = key, 0 if self._newest else self._of_key[key]
+        before = self._messages.get(place)
+        grown = len(payload) + (len(key.encode()) if before is None else -len(before))
+        most = before is None and len(self._messages) >= self._most
+        if most or place[1] >= MOST_OF_A_KEY or self._bytes + grown > MOST_BYTES:
             return False
-        self._bytes += added
+        self._bytes += grown
         self._of_key[key] += 1
-        self._places[key] = len(self._messages)
-        self._messages.append((key, payload))
+        self._messages[place] = payload
         return True
 
     def taken(self) -> list[tuple[str, bytes]]:
         """Return the messages, oldest first, and be empty."""
-        taken, self._messages = self._messages, []
-        self._places.clear()
+        taken = [(key, payload) for (key, _), payload in self._messages.items()]
+        self._messages.clear()
         self._of_key.clear()
         self._bytes = 0
         return taken

@@ -121,6 +121,7 @@ def _run(options: argparse.Namespace, platform: Platform | None) -> int:
     sys.path.insert(0, str(options.cell.resolve().parent))
 
     from dwell.cellfile import load_without_traces
+    from dwell.live.hosting import PLAIN
     from dwell.live.log import escape_output
     from dwell.live.memory import keep_memory
     from dwell.live.parent_death import end_with_owner
@@ -135,7 +136,7 @@ def _run(options: argparse.Namespace, platform: Platform | None) -> int:
     claim(options.state, options.who)
     problem = load_without_traces(options.cell)
     try:
-        in_order = run_process(problem, options.who, options.state, stopped, platform)
+        in_order = run_process(problem, options.who, options.state, stopped, platform or PLAIN)
     finally:
         end_helpers()
     return ExitCode.DONE if in_order else ExitCode.FAILED

@@ -12,7 +12,7 @@ import msgspec
 
 from dwell.errors import LiveError
 from dwell.live.control_group import ControlGroup, own_group
-from dwell.live.hosting import Clock, Hosted, Platform, keep_collections_short, work
+from dwell.live.hosting import PLAIN, Clock, Hosted, Platform, keep_collections_short, work
 from dwell.live.log import Log
 from dwell.live.lowest_class import take_lowest_class
 from dwell.live.messages import Header
@@ -38,7 +38,7 @@ def run_process(
     who: str,
     folder: Path,
     stopped: threading.Event,
-    platform: Platform | None = None,
+    platform: Platform = PLAIN,
 ) -> bool:
     """Run one process of a cell until it is told to end; returns whether it has ended in order.
 
@@ -59,7 +59,7 @@ def run_process(
         If the keys that it has been given are not its.
     """
     entry = wire(problem).entry(who)
-    node, platform = entry.role.node, platform or Platform()
+    node = entry.role.node
     security = Security.of(problem, entry.role)
     clock = platform.clock(problem, node)
     transport = platform.transport(security, who, node)
@@ -150,7 +150,8 @@ def _work(
     except LiveError as error:
         # It stays, and says in its beats what is wrong: a crash loop would say it less well.
         print(error, file=sys.stderr, flush=True)
-        _host(_Broken(place, f"{role.who}: {error}"), place, stopped, clock)
+        broken = False, f"{role.who}: {error}"
+        _host(_Broken(place, lambda: broken), place, stopped, clock)
         return
     worker = Worker(
         place,
@@ -175,8 +176,7 @@ def _work(
         stopped=stopped,
         note=note,
         clock=clock,
-        begin=partial(take_lowest_class, role.who, _print) if worker.shadow else None,
-        ready=keep_collections_short,
+        begin=partial(take_lowest_class, role.who, _print) if worker.shadow else lambda: None,
     )
 
 
@@ -184,21 +184,11 @@ def _print(line: str) -> None:
     print(f"{time.strftime('%Y-%m-%dT%H:%M:%S%z')} {line}", file=sys.stderr, flush=True)
 
 
-class _Broken:
+class _Broken(Pulse):
     """Stands for a worker whose stage cannot be had, and says so."""
 
-    def __init__(self, place: RolePlace, why: str) -> None:
-        self._why = why
-        self.pulse = Pulse(place, lambda: (False, self._why))
-
-    def subscriptions(self) -> tuple[str, ...]:
-        return self.pulse.subscriptions()
-
     def receive(self, sample: Arrival, now_ns: int) -> None:
-        self.pulse.receive(sample, now_ns)
-
-    def wake(self, now_ns: int) -> int:
-        return self.pulse.wake(now_ns)
+        super().receive(sample, now_ns)
 
 
 def _written(job: Job) -> bytes:

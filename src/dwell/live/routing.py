@@ -42,10 +42,10 @@ class Routes:
         self._targets[STAMPER] = tuple(sources)
         self._known: dict[tuple[object, ...], tuple[Destination, ...]] = {}
 
-    def runs(self, task: str, node: str, stamp: Stamp, *, shadow: bool = False) -> bool:
-        """Whether a task of a cycle, or of its shadow, runs on a node."""
-        placement = stamp.shadow if shadow else stamp.placement
-        return placement in self._candidates and self._candidates[placement][task] == node
+    def runs(self, task: str, node: str, stamp: Stamp) -> bool:
+        """Whether a task of a cycle runs on a node."""
+        placement = self._candidates.get(stamp.placement)
+        return placement is not None and placement[task] == node
 
     def destinations(
         self, task: str, stamp: Stamp, *, shadow: bool = False

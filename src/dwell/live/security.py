@@ -167,16 +167,16 @@ class Security:
     def remind(self, say: Callable[[str], None], stopped: threading.Event) -> None:
         """Have the log say now what is wrong with the keys, and every day from now on."""
 
+        def tell() -> None:
+            for line in self.warnings():
+                say(line)
+
         def repeat() -> None:
             while not stopped.wait(REMIND_S):
-                self._tell(say)
+                tell()
 
-        self._tell(say)
+        tell()
         start_thread("keys", repeat)
-
-    def _tell(self, say: Callable[[str], None]) -> None:
-        for line in self.warnings():
-            say(line)
 
     @property
     def _protocol(self) -> str:

@@ -167,48 +167,27 @@ class CellActuator(ABC):
 
 
 class _UserStage(CellStage):
-    """A user's stage, and what it does without."""
+    """A user's stage, or one that is a function, and what it does without."""
 
-    def __init__(self, given: Stage) -> None:
-        self._given = given
+    def __init__(self, given: object, process: Callable[[Mapping[str, Message]], Message]) -> None:
+        self._process = process
         self.stateful = isinstance(given, Stateful)
         self.has_frames = callable(getattr(given, "wait", None))
         _take(self, given, ("inputs", "start", "stop", "wait", "snapshot", "restore"))
 
     def process(self, inputs: Mapping[str, Message]) -> Message:
-        return self._given.process(inputs)
-
-
-class _FunctionStage(CellStage):
-    """A stage that is one function."""
-
-    def __init__(self, function: Callable[[Mapping[str, Message]], Message]) -> None:
-        self._function = function
-        _take(self, function, ("inputs",))
-
-    def process(self, inputs: Mapping[str, Message]) -> Message:
-        return self._function(inputs)
+        return self._process(inputs)
 
 
 class _UserActuator(CellActuator):
-    """A user's actuator, and what it does without."""
+    """A user's actuator, or one that is a function, and what it does without."""
 
-    def __init__(self, given: Actuator) -> None:
-        self._given = given
+    def __init__(self, given: object, apply: Callable[[Message], None]) -> None:
+        self._apply = apply
         _take(self, given, ("inputs", "hold", "zero", "stop"))
 
     def apply(self, command: Message) -> None:
-        self._given.apply(command)
-
-
-class _FunctionActuator(CellActuator):
-    """An actuator that is one function, and does nothing when commands stay out."""
-
-    def __init__(self, function: Callable[[Message], None]) -> None:
-        self._function = function
-
-    def apply(self, command: Message) -> None:
-        self._function(command)
+        self._apply(command)
 
 
 def _take(own: CellStage | CellActuator, given: object, members: Sequence[str]) -> None:
@@ -236,11 +215,10 @@ def load_stage(name: str, where: str) -> CellStage:
     found = _made(name, where)
     if isinstance(found, CellStage):
         return found
-    if callable(getattr(found, "process", None)):
-        return _UserStage(cast("Stage", found))
-    if _is_function(found):
-        return _FunctionStage(cast("Callable[[Mapping[str, Message]], Message]", found))
-    raise LiveError(f"{where}: {name} is no stage: it has no method process(inputs)")
+    process = found if _is_function(found) else getattr(found, "process", None)
+    if not callable(process):
+        raise LiveError(f"{where}: {name} is no stage: it has no method process(inputs)")
+    return _UserStage(found, process)
 
 
 def load_actuator(name: str, where: str) -> CellActuator:
@@ -248,14 +226,14 @@ def load_actuator(name: str, where: str) -> CellActuator:
     found = _made(name, where)
     if isinstance(found, CellActuator):
         return found
-    if callable(getattr(found, "apply", None)):
-        for method in ("hold", "zero"):
-            if not callable(getattr(found, method, None)):
-                raise LiveError(f"{where}: {name} has no method {method}()")
-        return _UserActuator(cast("Actuator", found))
-    if _is_function(found):
-        return _FunctionActuator(cast("Callable[[Message], None]", found))
-    raise LiveError(f"{where}: {name} is no actuator: it has no method apply(command)")
+    is_function = _is_function(found)
+    apply = found if is_function else getattr(found, "apply", None)
+    if not callable(apply):
+        raise LiveError(f"{where}: {name} is no actuator: it has no method apply(command)")
+    for method in () if is_function else ("hold", "zero"):
+        if not callable(getattr(found, method, None)):
+            raise LiveError(f"{where}: {name} has no method {method}()")
+    return _UserActuator(found, apply)
 
 
 def load_function(name: str, where: str) -> Callable[[], float]:

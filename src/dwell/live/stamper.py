@@ -19,6 +19,7 @@ from dwell.live.messages import (
     Accepted,
     Beat,
     Completion,
+    Count,
     Header,
     Order,
     Stamp,
@@ -49,9 +50,9 @@ class StamperState:
         Whether the placement is the guard's.
     """
 
-    run: int
-    reserved: int
-    term: int
+    run: Count
+    reserved: Count
+    term: Count
     placement: str
     on_fallback: bool
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import mmap
 import os
 import shlex
@@ -11,8 +10,10 @@ import stat
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import asdict
+from contextlib import suppress
 from pathlib import Path
+
+import msgspec
 
 from dwell.errors import LiveError
 from dwell.live.stamper import StamperState
@@ -123,13 +124,8 @@ class BookFile:
             text = self._map[begin + _PAGE.size : begin + _PAGE.size + length]
             if not number or zlib.crc32(text, number & 0xFFFFFFFF) != check:
                 continue
-            try:
-                entry = StamperState(**json.loads(text))
-            except (ValueError, TypeError):
-                continue
-            numbers = (entry.run, entry.reserved, entry.term)
-            if all(type(n) is int and n >= 0 for n in numbers):
-                yield number, entry
+            with suppress(msgspec.MsgspecError):
+                yield number, msgspec.json.decode(text, type=StamperState)
 
     def read(self) -> StamperState | None:
         """Return what was written last; None where nothing was, or it cannot be read."""
@@ -138,7 +134,7 @@ class BookFile:
 
     def write(self, entry: StamperState) -> None:
         """Write the slot that was not the last."""
-        text = json.dumps(asdict(entry)).encode()
+        text = msgspec.json.encode(entry)
         number = self._number + 1
         begin = number % 2 * _BOOK_BYTES
         place = begin + _PAGE.size

@@ -88,20 +88,13 @@ class SupervisedProcess:
         lives_s = time.monotonic() - self.started_s if self.process is not None else 0.0
         return self.failures > 1 and lives_s < HEALTHY_S
 
-    @property
-    def inflight(self) -> Path:
-        """File in which a worker notes the inputs of its present job."""
-        return self.folder / f"{self.who}.inflight"
+    def file(self, kind: str) -> Path:
+        """Return a file of its: its output (`log`), inputs of its present job (`inflight`), ...
 
-    @property
-    def log(self) -> Path:
-        """File of the process's output."""
-        return self.folder / f"{self.who}.log"
-
-    @property
-    def mark(self) -> Path:
-        """Tells the next agent of a process that outlives this one."""
-        return self.folder / f"{self.who}.pid"
+        ``pid`` tells the next agent of a process that outlives this one, and what is in ``again``
+        is worked on first by a worker that is started.
+        """
+        return self.folder / f"{self.who}.{kind}"
 
 
 class Supervisor:
@@ -139,7 +132,7 @@ class Supervisor:
     def keep(self, who: str, command: Sequence[str]) -> SupervisedProcess:
         """Have a process run from now on."""
         child = SupervisedProcess(who, command, self.folder)
-        child.group = marked_group(child.mark)
+        child.group = marked_group(child.file("pid"))
         if not self._adopts(child):
             self._end_group(child)
         self.children.append(child)
@@ -147,9 +140,9 @@ class Supervisor:
 
     def _adopts(self, child: SupervisedProcess) -> bool:
         """Take a process over that somebody before has started, if it runs."""
-        if (process := survivor(child.mark)) is None:
+        if (process := survivor(child.file("pid"))) is None:
             return False
-        child.process, child.group = Survivor(process.pid), marked_group(child.mark)
+        child.process, child.group = Survivor(process.pid), marked_group(child.file("pid"))
         self._say(f"{child.who}: goes on (process {process.pid})")
         child.started_s = time.monotonic()
         return True
@@ -185,7 +178,7 @@ class Supervisor:
     def _died(self, child: SupervisedProcess, reason: str) -> None:
         now_s = time.monotonic()
         lived_s = now_s - child.started_s
-        last = _last_line(child.log, child.log_begins)
+        last = _last_line(child.file("log"), child.log_begins)
         if starved := self._starved(child, reason, last):
             reason = starved
             child.told, child.told_s = f"{child.who} {starved}", now_s
@@ -216,12 +209,12 @@ class Supervisor:
 
     def _hand_on_suspect(self, child: SupervisedProcess, reason: str) -> None:
         """Give the message that a worker died of to the next one, but not twice."""
-        content = InFlight.read(child.inflight)
-        again = child.folder / f"{child.who}.again"
+        content = InFlight.read(child.file("inflight"))
+        again = child.file("again")
         again.unlink(missing_ok=True)
         if content is None:
             return
-        child.inflight.unlink(missing_ok=True)
+        child.file("inflight").unlink(missing_ok=True)
         name = hashlib.sha256(content).hexdigest()[:16]
         child.deaths[name] += 1
         if child.deaths[name] < POISONOUS:
@@ -250,13 +243,13 @@ class Supervisor:
     def _write_mark(self, child: SupervisedProcess) -> None:
         """Write who runs; the mark of somebody before it must not stay."""
         try:
-            child.mark.unlink(missing_ok=True)
-            write_mark(child.mark, child.group)
+            child.file("pid").unlink(missing_ok=True)
+            write_mark(child.file("pid"), child.group)
         except OSError as error:
             self._say(f"{child.who}: its mark cannot be written ({error.strerror})")
 
     def _run(self, child: SupervisedProcess) -> None:
-        with open(child.log, "ab", opener=open_own) as log:
+        with open(child.file("log"), "ab", opener=open_own) as log:
             child.log_begins = log.tell()
             child.process = self._launcher.start(child.command, log)
             child.group = ProcessGroup.of(child.process.pid)
@@ -265,9 +258,9 @@ class Supervisor:
         """Look how much memory the processes have taken, and how much they have printed."""
         self._oom_kills = _oom_kills()
         for child in self.children:
-            if _shorten(child.log, self._log_bytes):
+            if _shorten(child.file("log"), self._log_bytes):
                 child.log_begins = 0
-            if child.process is not None and not child.mark.exists():
+            if child.process is not None and not child.file("pid").exists():
                 self._write_mark(child)  # there was no room for it
             self._weigh(child)
 
@@ -356,12 +349,12 @@ class Supervisor:
             if child.process is not None:
                 code = child.process.wait()
                 if code not in (0, UNKNOWN_CODE):
-                    last = _last_line(child.log, child.log_begins)
+                    last = _last_line(child.file("log"), child.log_begins)
                     failed[child.who] = f"{_reason(code)}{f': {last}' if last else ''}"
             child.process = None
         self._end_groups(patience_s)
         for child in self.children:
-            child.mark.unlink(missing_ok=True)
+            child.file("pid").unlink(missing_ok=True)
         self._launcher.stop()
         return failed
 

@@ -93,25 +93,6 @@ class Wire:
 
 
 @dataclass(frozen=True, slots=True)
-class Passage:
-    """Where a process is reached from a node that does not reach it where it listens.
-
-    A translation of addresses, a tunnel or an emulated link takes what comes there on to it.
-
-    Parameters
-    ----------
-    source, target : str
-        Node of the process that connects, and of the process that listens.
-    """
-
-    source: str
-    target: str
-    session: Session
-    seen: Locator
-    to: Locator
-
-
-@dataclass(frozen=True, slots=True)
 class WiringEntry:
     """Endpoints that a process opens.
 
@@ -145,14 +126,11 @@ class Wiring:
     ----------
     entries : mapping of str to WiringEntry
         By name of the process.
-    passages : tuple of Passage
-        Ways that something outside the cell has to provide.
     """
 
     cell: str
     entries: Mapping[str, WiringEntry]
     wires: tuple[Wire, ...]
-    passages: tuple[Passage, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "entries", FrozenDict(self.entries))
@@ -261,7 +239,8 @@ def wire(problem: Problem, *, protocol: str = "tcp") -> Wiring:
     listen: dict[str, dict[Session, Locator]] = {who: {} for who in rank}
     connect: dict[str, dict[Session, list[Locator]]] = {who: {} for who in rank}
     wires = []
-    passages: dict[tuple[str, Locator], Passage] = {}
+    # Where what listens is seen from a node that does not reach it where it does.
+    elsewhere: list[tuple[Locator, Locator]] = []
     for session, pair in _wires(problem, everybody):
         target, source = sorted(pair, key=rank.__getitem__)
         wires.append(Wire(session, source, target))
@@ -269,7 +248,7 @@ def wire(problem: Problem, *, protocol: str = "tcp") -> Wiring:
         end = locator(target, session)
         seen = end if here == there else locator(target, session, here)
         if seen != end:
-            passages[here, seen] = Passage(here, there, session, seen, end)
+            elsewhere.append((seen, end))
         listen[target][session] = end
         connect[source].setdefault(session, []).append(seen)
     for role in everybody:
@@ -283,9 +262,8 @@ def wire(problem: Problem, *, protocol: str = "tcp") -> Wiring:
         )
         for role in everybody
     }
-    wiring = Wiring(problem.name, entries, tuple(wires), tuple(passages.values()))
-    _require_apart(wiring)
-    return wiring
+    _require_apart(entries, elsewhere)
+    return Wiring(problem.name, entries, tuple(wires))
 
 
 def lane_of(declared_bytes: int) -> Lane:
@@ -436,7 +414,9 @@ def _require_hosts(problem: Problem, everybody: Sequence[Role]) -> None:
         raise LiveError("\n".join(faults))
 
 
-def _require_apart(wiring: Wiring) -> None:
+def _require_apart(
+    entries: Mapping[str, WiringEntry], elsewhere: Iterable[tuple[Locator, Locator]]
+) -> None:
     """Raise a LiveError where one port of one address would stand for two things."""
     taken: dict[Locator, str] = {}
     faults = []
@@ -446,11 +426,11 @@ def _require_apart(wiring: Wiring) -> None:
         if other != what:
             faults.append(f"{other} and {what} are both at {end}")
 
-    for who, entry in wiring.entries.items():
+    for who, entry in entries.items():
         for session, end in entry.listen.items():
             take(end, f"{who} ({session})")
-    for passage in wiring.passages:
-        take(passage.seen, f"the way to {passage.to}")
+    for seen, end in elsewhere:
+        take(seen, f"the way to {end}")
     if faults:
         lines = "\n".join(faults)
         raise LiveError(

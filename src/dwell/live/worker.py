@@ -545,19 +545,17 @@ class Worker:
                 )
                 for source, (header, payload, _) in job.inputs.items()
             }
+            try:
+                output = self.stage.process(inputs)
+            except Exception as error:  # the user's code
+                raise LiveError(f"process() raised {type(error).__name__}: {error}") from error
+            after = self.group_clock()
+            self._counted = before, max(self.cpu_clock() - begun_ns, 0), after
+            if not isinstance(output, Message):
+                what = type(output).__name__
+                raise LiveError(f"process() returned a {what}, not a Message")
         except LiveError as error:
             self._failed(f"cycle {stamp.cycle}: {error}")
-            return None, state_age
-        try:
-            output = self.stage.process(inputs)
-        except Exception as error:  # the user's code
-            self._failed(f"cycle {stamp.cycle}: process() raised {type(error).__name__}: {error}")
-            return None, state_age
-        after = self.group_clock()
-        self._counted = before, max(self.cpu_clock() - begun_ns, 0), after
-        if not isinstance(output, Message):
-            what = type(output).__name__
-            self._failed(f"cycle {stamp.cycle}: process() returned a {what}, not a Message")
             return None, state_age
         return output, state_age
 

@@ -10,13 +10,12 @@ import pkgutil
 import re
 import sys
 import threading
-import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from dwell.errors import DwellError
+from dwell.errors import DwellError, describe_raised
 
 if TYPE_CHECKING:
     from dwell.model.problem import Problem
@@ -81,7 +80,7 @@ def make_user_class(
         raise
     except Exception as fault:
         call = f"{attribute}()" if from_problem is None else f"{attribute}.from_problem(problem)"
-        raise error(f"{who}: {call} failed: {_told(fault)}") from fault
+        raise error(f"{who}: {call} failed: {describe_raised(fault)}") from fault
 
 
 def source_digest(name: str, folder: str | None) -> str | None:
@@ -124,7 +123,7 @@ def import_user_module(
         if missing is not None and f"{name}.".startswith(f"{missing}."):
             place = "" if folder is None else f"neither beside the cell file ({folder}) nor "
             raise error(f"{who}: there is no module {missing!r}, {place}installed") from None
-        raise error(f"{who}: importing {name} failed: {_told(fault)}") from fault
+        raise error(f"{who}: importing {name} failed: {describe_raised(fault)}") from fault
 
 
 def _import_beside(name: str, folder: str) -> ModuleType:
@@ -195,13 +194,3 @@ def _is_in(module: ModuleType, folder: str) -> bool:
     # A package without __init__.py has no file, but places.
     places = [getattr(module, "__file__", None), *getattr(module, "__path__", ())]
     return any(isinstance(one, str) and one.startswith(f"{folder}/") for one in places)
-
-
-def _told(fault: BaseException) -> str:
-    """Return ``ValueError: no frame (policy.py:12)``; only the first line of a long message."""
-    lines = str(fault).strip().splitlines()
-    told = f"{type(fault).__name__}: {lines[0]}" if lines else type(fault).__name__
-    frames = traceback.extract_tb(fault.__traceback__)
-    if isinstance(fault, SyntaxError) or not frames or "importlib" in frames[-1].filename:
-        return told
-    return f"{told} ({frames[-1].filename.rpartition('/')[2]}:{frames[-1].lineno})"

@@ -8,17 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar
 
 from dwell.errors import LiveError
-from dwell.model import Link, Node, Problem
+from dwell.model import Node, Problem
 from dwell.testbed.groups import Share
 
 #: Of every CPU, and of all together, what no node gets.
 FREE_OF_A_CORE, FREE_CORES = 0.2, 0.4
 TOLERANCE = 1e-9
-
-T = TypeVar("T")
 
 
 @dataclass(slots=True)
@@ -40,7 +37,7 @@ class _Cpus:
         return tuple(sorted(best))
 
 
-def nodes_of(problems: Iterable[Problem]) -> dict[str, Node]:
+def _nodes_of(problems: Iterable[Problem]) -> dict[str, Node]:
     """Return the nodes of some cells; those of one name are one computer.
 
     Raises
@@ -48,31 +45,16 @@ def nodes_of(problems: Iterable[Problem]) -> dict[str, Node]:
     LiveError
         If two cells say different things of a node that they share.
     """
-    return _shared("nodes.", (problem.fabric.nodes for problem in problems))
-
-
-def links_of(problems: Iterable[Problem]) -> dict[str, Link]:
-    """Return the links of some cells; those of one name are one link.
-
-    Raises
-    ------
-    LiveError
-        If two cells say different things of a link that they share.
-    """
-    return _shared("links ", (problem.fabric.links for problem in problems))
-
-
-def _shared(kind: str, cells: Iterable[Mapping[str, T]]) -> dict[str, T]:
-    found: dict[str, T] = {}
+    nodes: dict[str, Node] = {}
     faults = [
-        f"{kind}{name}: two cells share it and say different things of it"
-        for parts in cells
-        for name, part in parts.items()
-        if found.setdefault(name, part) != part
+        f"nodes.{name}: two cells share it and say different things of it"
+        for problem in problems
+        for name, node in problem.fabric.nodes.items()
+        if nodes.setdefault(name, node) != node
     ]
     if faults:
         raise LiveError("; ".join(dict.fromkeys(faults)))
-    return found
+    return nodes
 
 
 def allot(problems: Sequence[Problem], cpus: Collection[int]) -> dict[str, Share]:
@@ -83,7 +65,7 @@ def allot(problems: Sequence[Problem], cpus: Collection[int]) -> dict[str, Share
     LiveError
         With everything that does not fit, and what would help.
     """
-    nodes = nodes_of(problems)
+    nodes = _nodes_of(problems)
     left = _Cpus(dict.fromkeys(sorted(cpus), 1.0 - FREE_OF_A_CORE))
     # What wants most has the least choice.
     order = sorted(nodes.values(), key=lambda node: (-node.capacity, node.tier == "robot"))

@@ -14,13 +14,10 @@ import os
 import shutil
 import signal
 import sys
-import time
-from collections.abc import Collection, Sequence
-from typing import cast
+from collections.abc import Callable, Collection, Sequence
 
 from dwell.errors import LiveError
 from dwell.testbed.child import Child, Parent
-from dwell.testbed.event_loop import Loop
 
 #: One busy process; a loop without memory traffic, as the simulator has its foreign threads.
 STRESS_NG = ("stress-ng", "--quiet", "--cpu", "1", "--cpu-method", "loop", "--timeout", "0")
@@ -59,8 +56,8 @@ class Burner(Child):
             raise LiveError(f"a burner cannot run on {asked}; this process may use {known}")
         #: Ids of the threads as of the last answer: each is a process.
         self.pids: tuple[int, ...] = ()
-        settings = {"cpus": sorted(cpus), "threads": 0, "program": list(program)}
         name = f"burner on {','.join(map(str, sorted(cpus)))}"
+        settings = sorted(cpus), tuple(program)
         super().__init__("dwell.testbed.burner", name, settings, prefix=prefix)
 
     def start(self, threads: int = 0) -> None:
@@ -73,25 +70,11 @@ class Burner(Child):
         LiveError
             If it has been started before, or does not start.
         """
-        _check(threads)
-        self.settings["threads"] = threads
         super().start()
-        self.pids = tuple(cast("list[int]", self.answered["pids"]))
+        self.set(threads)
 
-    def set(self, threads: int, *, at_ns: int | None = None) -> int:
-        """Have so many threads from now on, or from an instant on.
-
-        Instants given ahead do not drift, whatever this process does meanwhile.
-
-        Parameters
-        ----------
-        at_ns : int, optional
-            When, by the monotonic clock; at once if left out or past.
-
-        Returns
-        -------
-        int
-            That instant. `pids` are those of the threads when this returns.
+    def set(self, threads: int) -> None:
+        """Have so many threads from now on.
 
         Raises
         ------
@@ -100,10 +83,10 @@ class Burner(Child):
         LiveError
             If it does not run.
         """
-        _check(threads)
-        answer = self.ask({"threads": threads, "at_ns": at_ns})
-        self.pids = tuple(cast("list[int]", answer["pids"]))
-        return cast("int", answer["at_ns"])
+        from dwell.model.bounds import Bound  # the burner's own process does without the model
+
+        Bound(0, MAX_THREADS, whole=True).check("threads", threads)
+        self.pids = tuple(self.ask(threads))
 
     def stop(self) -> None:
         """End it, and with it all threads; safe to call twice."""
@@ -127,70 +110,34 @@ def stress(prefix: Sequence[str], cpus: Collection[int] = ()) -> Burner:
     return Burner(cpus or os.sched_getaffinity(0), prefix=prefix, program=program)
 
 
-def _check(threads: int) -> None:
-    from dwell.model.bounds import Bound  # the burner's own process does without the model
-
-    Bound(0, MAX_THREADS, whole=True).check("threads", threads)
-
-
 # ------------------------------------------------------------------------- the burner's process
 
 
 def main() -> None:
     """Keep as many busy processes as the parent wants, until it ends."""
-    parent = Parent()
     gc.freeze()
-    fire = _Fire(parent)
+    fire = _Fire()
     try:
-        fire.begin()
-        while parent.alive:
-            fire.loop.turn()
-    except EOFError:
-        pass
+        Parent().serve(fire.begin)
     finally:
         fire.burn(0)
 
 
 class _Fire:
-    """The busy processes: as many as the parent's requests say."""
+    """The busy processes."""
 
-    served_ns = 0
-
-    def __init__(self, parent: Parent) -> None:
-        self.loop, self._parent = Loop(), parent
+    def __init__(self) -> None:
         self._pids: list[int] = []
-        self._program: list[str] = []
+        self._program: tuple[str, ...] = ()
 
-    def begin(self) -> None:
-        """Do as the parent's settings say, and listen for its requests."""
-        settings = self._parent.receive()
-        self._program = cast("list[str]", settings["program"])
-        os.sched_setaffinity(0, cast("list[int]", settings["cpus"]))
-        self.burn(cast("int", settings["threads"]))
-        self._parent.answer({"pids": self._pids})
-        self.loop.watch(self._parent.fileno(), self)
+    def begin(self, settings: tuple[list[int], tuple[str, ...]]) -> Callable[[int], list[int]]:
+        """Take over CPUs and program."""
+        cpus, self._program = settings
+        os.sched_setaffinity(0, cpus)
+        return self.burn
 
-    def ready(self) -> None:
-        """Carry out a request when its instant has come; it is answered at once."""
-        request = self._parent.receive()
-        threads, now_ns = cast("int", request["threads"]), time.monotonic_ns()
-        at_ns = max(cast("int | None", request["at_ns"]) or 0, now_ns)
-
-        def answer() -> None:
-            self._parent.answer({"pids": self._pids, "at_ns": at_ns})
-
-        def burn(_: int) -> None:
-            self.burn(threads)
-            if at_ns == now_ns:
-                answer()
-
-        # Also where it is to be done at once: what is due before it has not been done yet.
-        self.loop.at(at_ns, burn)
-        if at_ns > now_ns:
-            answer()
-
-    def burn(self, threads: int) -> None:
-        """Have so many of them."""
+    def burn(self, threads: int) -> list[int]:
+        """Have so many of them; returns their ids."""
         while len(self._pids) < threads:
             self._pids.append(_fork(self._program))
         ended, self._pids = self._pids[threads:], self._pids[:threads]
@@ -198,6 +145,7 @@ class _Fire:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(pid, signal.SIGKILL)
             os.waitpid(pid, 0)
+        return self._pids
 
 
 def _fork(program: Sequence[str]) -> int:

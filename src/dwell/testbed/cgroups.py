@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from dwell.errors import LiveError
+from dwell.live.control_group import cgroup_mounts
 
 #: What v1 needs, and what it uses beside where it is mounted.
 NEEDED = ("cpu", "cpuacct")
@@ -46,14 +46,14 @@ def find_cgroups(mounts: Path = Path("/proc/self/mountinfo")) -> Cgroups:
         If neither has it.
     """
     try:
-        mounted = list(_mounted(mounts.read_text()))
+        mounted = list(cgroup_mounts(mounts.read_text()))
     except OSError as error:
         raise LiveError(f"{mounts} cannot be read ({error.strerror})") from None
-    for kind, top, _ in mounted:
+    for kind, _, _, top in mounted:
         if kind == "cgroup2" and "cpu" in (has := _controllers(top)):
             return Cgroups(2, {name: top for name in ("cpu", "cpuset") if name in has})
     folders: dict[str, Path] = {}
-    for kind, top, options in mounted:
+    for kind, options, _, top in mounted:
         if kind == "cgroup":
             folders.update({name: top for name in USED if name in options})
     missing = [name for name in NEEDED if name not in folders]
@@ -64,16 +64,6 @@ def find_cgroups(mounts: Path = Path("/proc/self/mountinfo")) -> Cgroups:
         f"cgroup v1 with {' and '.join(missing)}; in a container, start it with "
         "--privileged --cgroupns=host -v /sys/fs/cgroup:/sys/fs/cgroup"
     )
-
-
-def _mounted(text: str) -> Iterator[tuple[str, Path, Sequence[str]]]:
-    """Yield kind, place and options of each mounted hierarchy (proc_pid_mountinfo(5))."""
-    for line in text.splitlines():
-        before, _, after = line.partition(" - ")
-        words = after.split()
-        if words and words[0] in ("cgroup", "cgroup2"):
-            place = os.fsdecode(before.split()[4].encode().decode("unicode_escape"))
-            yield words[0], Path(place), words[2].split(",")
 
 
 def _controllers(top: Path) -> list[str]:

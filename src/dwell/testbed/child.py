@@ -1,43 +1,59 @@
-"""Child processes that answer their parent's requests, one JSON line each, and end with it."""
+"""Child processes that answer their parent's requests, and end with it."""
 
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from types import TracebackType
-from typing import Self, TypeAlias, cast
+from typing import Any, Self
 
-from dwell.errors import LiveError
-
-Json: TypeAlias = dict[str, object]
+from dwell.errors import DwellError, LiveError
 
 # A start imports NumPy, and what else runs on the CPU may be a lot of busy threads.
 START_S = 60.0
 ANSWER_S = 20.0
 STOP_S = 2.0
-RECEIVE_BYTES = 2**16
 #: How often a child looks for its parent, beside the end of their connection.
 PARENT_CHECK_S = 0.5
 
 
 class Started(ABC):
-    """Base of all that runs from the beginning of a ``with`` statement to its end."""
+    """Base of all that runs from the beginning of a ``with`` statement to its end.
 
-    @abstractmethod
+    What its beginning has put on `_stack` is undone at the end, last in first out.
+    """
+
+    def __init__(self) -> None:
+        self._stack = contextlib.ExitStack()
+
     def start(self) -> None:
-        """Start it."""
+        """Start it; where that fails, what has begun is ended.
+
+        Raises
+        ------
+        LiveError
+            If something is missing, in the way, or does not start.
+        """
+        try:
+            self._start()
+        except BaseException:
+            self.stop()
+            raise
 
     @abstractmethod
+    def _start(self) -> None: ...
+
     def stop(self) -> None:
         """End it; safe to call twice."""
+        self._stack.close()
 
     def __enter__(self) -> Self:
         """Start it."""
@@ -66,8 +82,8 @@ class Child(Started):
         Run as ``python -m``; its main function makes a `Parent`.
     name : str
         For messages.
-    settings : mapping
-        First request, which it is started with.
+    settings : object
+        First request, which it is started with; it and all others are pickled.
     descriptors : sequence of int
         Open files that it has under the same numbers.
     prefix : sequence of str
@@ -75,7 +91,7 @@ class Child(Started):
 
     Attributes
     ----------
-    answered : dict
+    answered : object
         Answer to the settings, once it has been started.
     """
 
@@ -83,18 +99,19 @@ class Child(Started):
         self,
         module: str,
         name: str,
-        settings: Mapping[str, object],
+        settings: object,
         *,
         descriptors: Sequence[int] = (),
         prefix: Sequence[str] = (),
     ) -> None:
-        self.name, self.settings = name, dict(settings)
-        self.answered: Json = {}
+        super().__init__()
+        self.name, self.settings = name, settings
+        self.answered: Any = None
         self._module = module
         self._descriptors = tuple(descriptors)
         self._prefix = tuple(prefix)
         self._process: subprocess.Popen[bytes] | None = None
-        self._socket: socket.socket | None = None
+        self._connection: Connection[Any, Any] | None = None
         self._lock = threading.Lock()
 
     @property
@@ -120,7 +137,10 @@ class Child(Started):
         """
         if self._process is not None:
             raise LiveError(f"{self.name} has been started before")
-        ours, theirs = socket.socketpair()
+        super().start()
+
+    def _start(self) -> None:
+        self._connection, theirs = Pipe()
         with theirs:
             # Standard output and error are the parent's: a child that fails says why there.
             self._process = subprocess.Popen(  # noqa: S603 (our own module)
@@ -128,14 +148,9 @@ class Child(Started):
                 stdin=theirs.fileno(),
                 pass_fds=self._descriptors,
             )
-        self._socket = ours
-        try:
-            self.answered = self.ask(self.settings, START_S)
-        except LiveError:
-            self.stop()
-            raise
+        self.answered = self.ask(self.settings, START_S)
 
-    def ask(self, request: Mapping[str, object], timeout_s: float = ANSWER_S) -> Json:
+    def ask(self, request: object, timeout_s: float = ANSWER_S) -> Any:
         """Send a request and return the answer; safe from any thread.
 
         Raises
@@ -144,38 +159,26 @@ class Child(Started):
             If it does not run, does not answer in time, or answers with an error.
         """
         with self._lock:
-            if self._socket is None:
+            if self._connection is None:
                 raise LiveError(f"{self.name} does not run")
-            self._socket.settimeout(timeout_s)
+            who = f"{self.name} (process {self.pid})"
             try:
-                self._socket.sendall(json.dumps(request).encode() + b"\n")
-                answer = self._receive(self._socket)
-            except TimeoutError:
-                raise LiveError(
-                    f"{self.name} (process {self.pid}) has not answered within {timeout_s:g} s"
-                ) from None
+                self._connection.send(request)
+                if not self._connection.poll(timeout_s):
+                    raise LiveError(f"{who} has not answered within {timeout_s:g} s")
+                answer = self._connection.recv()
             except (EOFError, OSError):
-                raise LiveError(f"{self.name} (process {self.pid}) has ended") from None
-        if "error" in answer:
-            raise LiveError(f"{self.name}: {answer['error']}")
+                raise LiveError(f"{who} has ended") from None
+        if isinstance(answer, DwellError):
+            raise LiveError(f"{self.name}: {answer}")
         return answer
-
-    @staticmethod
-    def _receive(connection: socket.socket) -> Json:
-        line = bytearray()
-        while not line.endswith(b"\n"):
-            received = connection.recv(RECEIVE_BYTES)
-            if not received:
-                raise EOFError
-            line += received
-        return cast("Json", json.loads(line))
 
     def stop(self) -> None:
         """End it and wait until it is gone; safe to call twice, and if it has ended by itself."""
         with self._lock:
-            if self._socket is not None:
-                self._socket.close()
-                self._socket = None
+            if self._connection is not None:
+                self._connection.close()
+                self._connection = None
             if self._process is None:
                 return
             try:
@@ -194,19 +197,18 @@ class Parent:
     def __init__(self) -> None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         self._pid = os.getppid()
-        self._socket = socket.socket(fileno=0)
-        self._lines = self._socket.makefile("rb")
+        self._connection: Connection[Any, Any] = Connection(os.dup(0))
 
     def fileno(self) -> int:
         """Descriptor that is readable when there is a request, or the parent has gone."""
-        return self._socket.fileno()
+        return self._connection.fileno()
 
     @property
     def alive(self) -> bool:
         """Whether the parent still runs."""
         return os.getppid() == self._pid
 
-    def receive(self) -> Json:
+    def receive(self) -> Any:
         """Return the next request; waits for it. The parent has at most one under way.
 
         Raises
@@ -214,14 +216,36 @@ class Parent:
         EOFError
             If the parent has gone, or wants this process to end.
         """
-        request = b""
-        with contextlib.suppress(ConnectionError):
-            request = self._lines.readline()
-        if not request.endswith(b"\n"):
-            raise EOFError
-        return cast("Json", json.loads(request))
+        try:
+            while not self._connection.poll(PARENT_CHECK_S):
+                if not self.alive:
+                    raise EOFError
+            return self._connection.recv()
+        except OSError:
+            raise EOFError from None
 
-    def answer(self, answer: Mapping[str, object]) -> None:
-        """Answer the request received last."""
+    def answer(self, answer: object) -> None:
+        """Answer the request received last; with a DwellError, that it is refused."""
         with contextlib.suppress(ConnectionError):
-            self._socket.sendall(json.dumps(answer).encode() + b"\n")
+            self._connection.send(answer)
+
+    def serve(self, begin: Callable[[Any], Callable[[Any], object]]) -> None:
+        """Answer requests until the parent ends, or wants this to.
+
+        Parameters
+        ----------
+        begin : callable
+            Takes the settings, and returns what takes a request and returns its answer.
+        """
+        answering: Callable[[Any], object] | None = None
+        with contextlib.suppress(EOFError):
+            while True:
+                request = self.receive()
+                try:
+                    if answering is None:
+                        answer, answering = None, begin(request)
+                    else:
+                        answer = answering(request)
+                except DwellError as error:
+                    answer = error
+                self.answer(answer)

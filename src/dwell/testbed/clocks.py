@@ -11,7 +11,6 @@ import mmap
 import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Self
 
 from dwell.errors import LiveError
 from dwell.testbed.mapped_file import HEAD, make_file, open_file
@@ -79,14 +78,6 @@ class ClockFile:
     def close(self) -> None:
         """Write no more; the file stays."""
         self._map.close()
-
-    def __enter__(self) -> Self:
-        """Return itself."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Write no more."""
-        self.close()
 
 
 def wrong_clock(clock: Callable[[], int], path: Path, node: str) -> Callable[[], int]:

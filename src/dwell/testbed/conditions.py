@@ -11,28 +11,15 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.errors import LiveError
+from dwell.errors import LiveError, ProblemError
 from dwell.model import bounds
 from dwell.model.instants import NEVER_NS
-from dwell.model.process import (
-    AR1,
-    DRAWN,
-    Constant,
-    LogNormal,
-    Process,
-    Trace,
-    TraceTable,
-)
+from dwell.model.process import AR1, Constant, LogNormal, Process, Trace
 from dwell.model.scenario import ADDED_LOSS
 
-#: `drop`: data is lost; `hold`: it waits, as in the sender's buffers; either way nothing passes.
-Cut: TypeAlias = Literal["drop", "hold"]
-CUTS: tuple[Cut, ...] = ("drop", "hold")
 #: How a link's process gets the CPU: by real-time priority, with short time slices, as any other.
 Scheduling: TypeAlias = Literal["fifo", "short slices", "usual"]
 
-NAMED: Mapping[str, type[Process]] = {"constant": Constant, **DRAWN}
-NAMES = {kind: name for name, kind in NAMED.items()}
 # Drawn at a time: a draw of one costs a hundred times as much a value.
 BLOCK = 256
 NS_PER_MS = 1e6
@@ -56,10 +43,9 @@ class Conditions:
         Serialisation rate that all connections share, Mbit/s; infinite where nothing queues.
     loss : float
         Probability that a message of data is lost, in [0, 1].
-    cut : {"drop", "hold"}, optional
-        Nothing begins its way while it is cut. Data is lost (`drop`, as on a link of the simulator
-        that drops), or waits until it is whole again (`hold`, as on one that retransmits). What
-        keeps the sessions going always waits.
+    down : bool
+        Whether nothing begins its way. Data is lost, or waits until the link is up again where that
+        retransmits; what keeps the sessions going always waits.
     """
 
     delay_ms: Process = field(default_factory=lambda: Constant(0.0))
@@ -67,7 +53,7 @@ class Conditions:
     shares: tuple[float, ...] = ()
     rate_mbps: float = math.inf
     loss: float = 0.0
-    cut: Cut | None = None
+    down: bool = False
 
     def __post_init__(self) -> None:
         named = [("add_delays_ms", process) for process in self.add_delays_ms]
@@ -77,8 +63,6 @@ class Conditions:
         bounds.require(good, "shares", self.shares, "one from 0 to 1 for each of add_delays_ms")
         bounds.RATE_MBPS.check("rate_mbps", self.rate_mbps)
         ADDED_LOSS.check("loss", self.loss)
-        known = self.cut is None or self.cut in CUTS
-        bounds.require(known, "cut", self.cut, f"one of {', '.join(CUTS)}, or none")
 
 
 def transmission_ns(size_bytes: int, rate_mbps: float) -> int:
@@ -86,67 +70,23 @@ def transmission_ns(size_bytes: int, rate_mbps: float) -> int:
     return round(size_bytes * 8e3 / rate_mbps)
 
 
-def fields_of(conditions: Conditions) -> dict[str, object]:
-    """Return all fields by their names, as `to_json` and the links' `set` take them."""
+def fields_of(conditions: Conditions) -> dict[str, Any]:
+    """Return all fields by their names, as the links' `set` takes them."""
     return {item.name: getattr(conditions, item.name) for item in fields(conditions)}
 
 
-# --------------------------------------------------------------- on the way to the process
-
-
-def to_json(changes: Mapping[str, object]) -> dict[str, object]:
-    """Return fields of conditions as JSON has them.
+def changed(way: str, conditions: Conditions, changes: Mapping[str, Any]) -> Conditions:
+    """Return conditions with some fields changed.
 
     Raises
     ------
     LiveError
-        If there is no such field, or no such process.
-    """
-    known = [item.name for item in fields(Conditions)]
-    unknown = [name for name in changes if name not in known]
-    if unknown:
-        raise LiveError(f"a link has no {', '.join(unknown)}; it has {', '.join(known)}")
-    return {name: _written(value) for name, value in changes.items()}
-
-
-def changed(conditions: Conditions, changes: Mapping[str, object]) -> Conditions:
-    """Return conditions with changes, as `to_json` has written them.
-
-    Raises
-    ------
-    ProblemError
         If a value is out of its bounds.
     """
-    values: dict[str, Any] = {name: _read(value) for name, value in changes.items()}
-    return replace(conditions, **values)
-
-
-def _written(value: object) -> object:
-    if isinstance(value, tuple):
-        return [_written(one) for one in value]
-    return _process(value) if isinstance(value, Process) else value
-
-
-def _process(process: Process) -> dict[str, object]:
-    if isinstance(process, Trace):
-        return {"trace": process.values.tolist()}
-    kind: Any = type(process)
-    name = NAMES.get(kind)
-    if name is None:
-        known = ", ".join((*NAMES.values(), "trace"))
-        raise LiveError(f"a link knows no {type(process).__name__}; it knows {known}")
-    return {name: {item.name: getattr(process, item.name) for item in fields(kind)}}
-
-
-def _read(written: object) -> object:
-    if isinstance(written, list):
-        return tuple(_read(one) for one in written)
-    if not isinstance(written, dict):
-        return written
-    ((name, values),) = written.items()
-    if name == "trace":
-        return Trace(TraceTable("trace", {"delay": np.asarray(values, np.float64)}), "delay")
-    return NAMED[name](**values)
+    try:
+        return replace(conditions, **changes)
+    except ProblemError as error:
+        raise LiveError(f"{way}: {error}") from None
 
 
 # ---------------------------------------------------------------------------------- delays
@@ -204,10 +144,9 @@ class Draws:
         self._delays = delays_ns(self.conditions.delay_ms, self._delays_rng)
         self._added: list[Iterator[int]] = []
 
-    def apply(self, changes: dict[str, object]) -> None:
-        """Change conditions, as `to_json` has written them."""
-        before, now = self.conditions, changed(self.conditions, changes)
-        self.conditions = now
+    def apply(self, now: Conditions) -> None:
+        """Have other conditions; a delay that stays goes on where it is."""
+        before, self.conditions = self.conditions, now
         if before.delay_ms != now.delay_ms:
             self._delays = delays_ns(now.delay_ms, self._delays_rng)
         if before.add_delays_ms != now.add_delays_ms:

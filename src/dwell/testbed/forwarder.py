@@ -15,18 +15,18 @@ import os
 import struct
 import time
 from bisect import bisect_right
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from typing import TypedDict, cast
+from typing import Any, NamedTuple
 
-from dwell.errors import DwellError
-from dwell.testbed.child import Json, Parent
+from dwell.errors import LiveError
+from dwell.testbed.child import Parent
 from dwell.testbed.conditions import (
     MOST_ATTEMPTS,
+    Conditions,
     Draws,
     Scheduling,
-    changed,
     transmission_ns,
 )
 from dwell.testbed.event_loop import Loop
@@ -57,17 +57,12 @@ SLICE_NS = 100_000
 SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 
 
-class _Set(TypedDict):
-    """A change of the direction from a node, as `to_json` has written it."""
+class _Settings(NamedTuple):
+    """What `TunLink` sends; all but nodes and descriptors is by source."""
 
-    source: str
-    changes: dict[str, object]
-
-
-class _Settings(TypedDict):
-    nodes: list[str]
+    nodes: tuple[str, str]
     descriptors: list[int]
-    sets: list[_Set]
+    usual: dict[str, Conditions]
     retransmit_ns: dict[str, int]
     seed: int
 
@@ -157,12 +152,13 @@ class _Direction:
     served_ns = 0
 
     def __init__(self, loop: Loop, settings: _Settings, index: int) -> None:
-        self.draws = Draws((settings["seed"], index))
+        source = settings.nodes[index]
+        self.draws = Draws((settings.seed, index))
+        self.draws.apply(settings.usual[source])
         self.counts = Passed()
         self._loop = loop
-        self._source = settings["descriptors"][index]
-        self._target = settings["descriptors"][1 - index]
-        self._retransmit_ns = settings["retransmit_ns"].get(settings["nodes"][index], 0)
+        self._source, self._target = settings.descriptors[index], settings.descriptors[1 - index]
+        self._retransmit_ns = settings.retransmit_ns.get(source, 0)
         self._flows: dict[bytes, _Flow] = {}
         self._free_ns = 0
         self._waiting_bytes = 0
@@ -189,7 +185,7 @@ class _Direction:
             counts.ignored += 1
             return
         # Where every attempt is lost, the sender's own repetitions are what waits for better times.
-        stopped = conditions.cut is not None or (kind.data and conditions.loss == 1)
+        stopped = conditions.down or (kind.data and conditions.loss == 1)
         if stopped or self._waiting_bytes > WAITING_BYTES:
             counts.vanished += 1
             return
@@ -252,40 +248,32 @@ class _Link:
         self.loop, self._parent = Loop(), parent
         self._directions = {
             name: _Direction(self.loop, settings, index)
-            for index, name in enumerate(settings["nodes"])
+            for index, name in enumerate(settings.nodes)
         }
-        self._apply(settings["sets"])
         self.loop.watch(parent.fileno(), self)
 
     def ready(self) -> None:
         """Carry out a request; an `EOFError` ends the process."""
-        request = self._parent.receive()
-        try:
-            self._parent.answer(self._answer(request))
-        except DwellError as error:
-            self._parent.answer({"error": str(error)})
+        what, *arguments = self._parent.receive()
+        answer = self._stats(*arguments) if what == "stats" else self._set(*arguments)
+        self._parent.answer(answer)
 
-    def _answer(self, request: Json) -> Json:
-        if request["do"] == "stats":
-            return {"stats": self._stats(reset=bool(request["reset"]))}
-        sets = cast("list[_Set]", request["sets"])
-        for item in sets:  # all faults before anything has changed
-            changed(self._directions[item["source"]].draws.conditions, item["changes"])
-        at_ns = cast("int | None", request["at_ns"]) or 0
-        now_ns = time.monotonic_ns()
+    def _set(self, source: str, changes: Mapping[str, Any], at_ns: int) -> int:
+        """Change conditions of a direction, from an instant on that is returned."""
+        draws, now_ns = self._directions[source].draws, time.monotonic_ns()
+
+        def change(_: int) -> None:
+            draws.apply(replace(draws.conditions, **changes))
+
         if at_ns <= now_ns:
-            self._apply(sets)
-            return {"at_ns": now_ns}
-        self.loop.at(at_ns, lambda _: self._apply(sets))
-        return {"at_ns": at_ns}
+            change(now_ns)
+            return now_ns
+        self.loop.at(at_ns, change)
+        return at_ns
 
-    def _apply(self, sets: Sequence[_Set]) -> None:
-        for item in sets:
-            self._directions[item["source"]].draws.apply(item["changes"])
-
-    def _stats(self, *, reset: bool) -> Json:
+    def _stats(self, reset: bool) -> dict[str, dict[str, Any]]:
         """Return the counts of each direction, by its source."""
-        counts: Json = {}
+        counts = {}
         for name, direction in self._directions.items():
             direction.counts.cpu_s = time.process_time()
             counts[name] = asdict(direction.counts)
@@ -317,13 +305,13 @@ def main() -> None:
     """Forward until the parent ends, or wants it to."""
     parent = Parent()
     with contextlib.suppress(EOFError):
-        settings = cast("_Settings", parent.receive())
+        settings = _Settings(*parent.receive())
         try:
             link = _Link(parent, settings)
-        except (DwellError, OSError) as error:
-            parent.answer({"error": str(error)})
+        except OSError as error:
+            parent.answer(LiveError(str(error)))
             return
-        parent.answer({"scheduling": _come_first()})
+        parent.answer(_come_first())
         gc.freeze()
         while parent.alive:
             link.loop.turn()

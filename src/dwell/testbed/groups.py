@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dwell.errors import LiveError
+from dwell.live.control_group import COUNTERS, ControlGroup
 from dwell.model import Quota
 from dwell.testbed.cgroups import Cgroups, find_cgroups
 from dwell.testbed.child import Started
@@ -105,32 +106,21 @@ class Groups(Started):
         ]
         if faults:
             raise LiveError("\n".join(faults))
+        super().__init__()
         self._cgroups = find_cgroups() if cgroups is None else cgroups
         self._parent = group_name(name)
         self._shares = dict(shares)
-        self._made = False
 
-    def start(self) -> None:
-        """Make the groups.
-
-        Raises
-        ------
-        LiveError
-            If groups of this name exist, or cannot be made.
-        """
+    def _start(self) -> None:
         for folder in self._cgroups.groups(self._parent):
             if folder.exists():
                 raise LiveError(f"the group {folder} exists already; use another name")
-        self._made = True
+        self._stack.callback(remove_group, self._parent, self._cgroups)
         try:
             self._make()
         except OSError as error:
-            self.stop()
             reason = f"{error.filename}: {error.strerror}"
             raise LiveError(f"no groups of processes can be made here ({reason})") from None
-        except BaseException:
-            self.stop()
-            raise
 
     def _make(self) -> None:
         for folder in self._cgroups.groups(self._parent):
@@ -230,10 +220,9 @@ class Groups(Started):
 
     def used_ns(self, node: str) -> int:
         """Return the CPU time that a node's group has used since it was made."""
-        if self._cgroups.version == 1:
-            return int((self._folder("cpuacct", node) / "cpuacct.usage").read_text())
-        counts = (self._folder("cpu", node) / "cpu.stat").read_text().split()
-        return 1_000 * int(counts[counts.index("usage_usec") + 1])
+        of_v1 = self._cgroups.version == 1
+        controller, counter = ("cpuacct", "cgroup") if of_v1 else ("cpu", "cgroup2")
+        return ControlGroup(self._folder(controller, node) / COUNTERS[counter]).used_ns()
 
     def switches(self, node: str) -> dict[int, int]:
         """Return how often each thread of a node has gone to sleep by itself so far."""
@@ -259,12 +248,6 @@ class Groups(Started):
         """
         self._require(node)
         _kill(self._cgroups.groups(self._parent, node))
-
-    def stop(self) -> None:
-        """End all processes in the groups, and remove the groups; safe to call twice."""
-        if self._made:
-            remove_group(self._parent, self._cgroups)
-            self._made = False
 
 
 def remove_group(parent: str, cgroups: Cgroups) -> None:

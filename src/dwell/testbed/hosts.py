@@ -78,6 +78,7 @@ class Hosts(Started):
     """
 
     def __init__(self, name: str, nodes: Sequence[str], pairs: Iterable[tuple[str, str]]) -> None:
+        super().__init__()
         self._name = name
         self._nodes = tuple(nodes)
         self._neighbours: dict[str, list[str]] = {node: [] for node in nodes}
@@ -88,30 +89,19 @@ class Hosts(Started):
                 if neighbour not in self._neighbours[node]:
                     self._neighbours[node].append(neighbour)
         self._tuns: dict[tuple[str, str], int] = {}
-        self._made: list[str] = []
 
-    def start(self) -> None:
-        """Make them.
-
-        Raises
-        ------
-        LiveError
-            If namespaces of these names exist, or this machine or user cannot make them.
-        """
+    def _start(self) -> None:
         for node in self._nodes:
             if namespace_path(self.namespace(node)).exists():
                 raise LiveError(
                     f"the network namespace {self.namespace(node)} exists already; use another "
                     f"name, or remove it: ip netns delete {self.namespace(node)}"
                 )
-        try:
-            for node in self._nodes:
-                self._made.append(node)  # before: a failed attempt may leave its file
-                _ip("netns", "add", self.namespace(node))
-                self._furnish(node)
-        except BaseException:
-            self.stop()
-            raise
+        for node in self._nodes:
+            # Before it is made: a failed attempt may leave its file.
+            self._stack.callback(remove_namespace, self.namespace(node))
+            _ip("netns", "add", self.namespace(node))
+            self._furnish(node)
 
     def _furnish(self, node: str) -> None:
         namespace = self.namespace(node)
@@ -119,7 +109,8 @@ class Hosts(Started):
         words = ["link set lo up", f"address add {self.address(node)}/32 dev lo"]
         for other in self._neighbours[node]:
             device = self.device(other)
-            self._tuns[node, other] = within(namespace, partial(_open_tun, device))
+            self._tuns[node, other] = tun = within(namespace, partial(_open_tun, device))
+            self._stack.callback(os.close, tun)
             words += [
                 f"link set {device} mtu {MTU} txqueuelen {QUEUE} up",
                 f"route add {self.address(other)}/32 dev {device} src {self.address(node)} "
@@ -166,13 +157,6 @@ class Hosts(Started):
         ``ip netns exec`` would hide.
         """
         return ["nsenter", f"--net={namespace_path(self.namespace(node))}", "--", *words]
-
-    def stop(self) -> None:
-        """End all processes in the namespaces, and remove these; safe to call twice."""
-        while self._tuns:
-            os.close(self._tuns.popitem()[1])
-        while self._made:
-            remove_namespace(self.namespace(self._made.pop()))
 
 
 def within(namespace: str, act: Callable[[], T]) -> T:

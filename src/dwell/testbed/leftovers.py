@@ -60,21 +60,15 @@ class Claim(Started):
                 f"a testbed cannot be named {name!r}: up to 40 letters, digits, - and _, the first "
                 "a letter or a digit"
             )
+        super().__init__()
         self.name = name
         self._namespaces = [namespace_name(name, node) for node in nodes]
         folder = claims_folder() if folder is None else folder
         self._lock, self._record = folder / f"{name}.lock", folder / f"{name}.json"
         self._handle: int | None = None
 
-    def start(self) -> None:
-        """Take the name; nothing if it is taken already.
-
-        Raises
-        ------
-        LiveError
-            If a testbed of this name runs (nothing is changed then), what one left cannot be
-            removed, or something is in the way that none of this name left.
-        """
+    def _start(self) -> None:
+        """Take the name, unless it is taken already; where another has it nothing is changed."""
         if self._handle is not None:
             return
         try:
@@ -82,13 +76,9 @@ class Claim(Started):
             self._handle = self._open()
         except OSError as error:
             raise LiveError(f"{self._lock}: {error.strerror}") from None
-        try:
-            self._clear()
-            self._require_free()
-            self._write()
-        except BaseException:
-            self._release()
-            raise
+        self._clear()
+        self._require_free()
+        self._write()
 
     def stop(self) -> None:
         """Give the name back, after removing any remains."""

@@ -18,11 +18,11 @@ What differs from a real link:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any
 
 from dwell.errors import LiveError
-from dwell.testbed.child import Child, Json
-from dwell.testbed.conditions import Conditions, Scheduling, fields_of, to_json
+from dwell.testbed.child import Child
+from dwell.testbed.conditions import Conditions, Scheduling, changed, fields_of
 from dwell.testbed.forwarder import Passed
 
 NO_CONDITIONS: Mapping[tuple[str, str], Conditions] = {}
@@ -68,19 +68,21 @@ class TunLink(Child):
         for source, target in timeouts:
             self._require(source, target)
         self._repeats = frozenset(source for source, _ in timeouts)
-        settings: Json = {
-            "nodes": nodes,
-            "descriptors": files,
-            "sets": [self._change(*way, fields_of(each)) for way, each in usual.items()],
-            "retransmit_ns": {source: round(ms * 1e6) for (source, _), ms in timeouts.items()},
-            "seed": seed,
-        }
+        self._conditions = dict.fromkeys(self.ways, Conditions())
+        for way, conditions in usual.items():
+            self._change(*way, fields_of(conditions))
+        settings = (
+            *(nodes, files, {source: now for (source, _), now in self._conditions.items()}),
+            {source: round(ms * 1e6) for (source, _), ms in timeouts.items()},
+            seed,
+        )
         super().__init__("dwell.testbed.forwarder", self.name, settings, descriptors=files)
 
     @property
     def scheduling(self) -> Scheduling:
         """How well it can keep its instants beside busy threads."""
-        return cast("Scheduling", self.answered.get("scheduling", "usual"))
+        scheduling: Scheduling = self.answered or "usual"
+        return scheduling
 
     @property
     def ways(self) -> tuple[tuple[str, str], tuple[str, str]]:
@@ -88,7 +90,7 @@ class TunLink(Child):
         first, second = self.nodes
         return (first, second), (second, first)
 
-    def set(self, source: str, target: str, *, at_ns: int | None = None, **changes: object) -> int:
+    def set(self, source: str, target: str, *, at_ns: int | None = None, **changes: Any) -> int:
         """Change some conditions of a direction for messages that begin their way from then on.
 
         Parameters
@@ -109,13 +111,13 @@ class TunLink(Child):
             If there is no such direction or field, a value is out of its bounds or none that this
             kind of link has, or the process has ended.
         """
-        sets = [self._change(source, target, changes)]
-        answer = self.ask({"do": "set", "sets": sets, "at_ns": at_ns})
-        return cast("int", answer["at_ns"])
+        news = self._change(source, target, changes)
+        since_ns: int = self.ask(("set", source, news, at_ns or 0))
+        return since_ns
 
     def down(self, source: str, target: str, down: bool, *, at_ns: int | None = None) -> int:
         """Begin or end an outage of a direction: packets on their way arrive; returns as `set`."""
-        return self.set(source, target, at_ns=at_ns, cut="drop" if down else None)
+        return self.set(source, target, at_ns=at_ns, down=down)
 
     def read(self, *, reset: bool = True) -> dict[tuple[str, str], Passed]:
         """Return counts of each direction since they were last read.
@@ -125,15 +127,21 @@ class TunLink(Child):
         LiveError
             If the process has ended.
         """
-        answer = self.ask({"do": "stats", "reset": reset})
-        counts = cast("dict[str, dict[str, Any]]", answer["stats"])
+        counts: dict[str, dict[str, Any]] = self.ask(("stats", reset))
         return {way: Passed(**counts[way[0]]) for way in self.ways}
 
     def _require(self, source: str, target: str) -> None:
         if (source, target) not in self.ways:
             raise LiveError(f"{self.name} does not go from {source} to {target}")
 
-    def _change(self, source: str, target: str, changes: Mapping[str, object]) -> Json:
+    def _change(self, source: str, target: str, changes: Mapping[str, Any]) -> dict[str, Any]:
+        """Note the conditions of a direction; returns those that are others than before.
+
+        Raises
+        ------
+        LiveError
+            If no such link has them.
+        """
         self._require(source, target)
         way = f"{self.name}, {source} to {target}"
         if changes.get("loss") and source not in self._repeats:
@@ -141,6 +149,7 @@ class TunLink(Child):
                 f"{way}: without retransmit_ms it loses nothing; the transport of the sender "
                 "leaves messages out"
             )
-        if changes.get("cut") == "hold":
-            raise LiveError(f"{way}: what is sent while it is down vanishes (cut='drop')")
-        return {"source": source, "changes": to_json(changes)}
+        before = self._conditions[source, target]
+        self._conditions[source, target] = changed(way, before, changes)
+        # What stays may be a trace, which takes the process a while to read.
+        return {name: value for name, value in changes.items() if value != getattr(before, name)}

@@ -9,7 +9,6 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +20,11 @@ from dwell.model import Problem
 from dwell.testbed.burner import Burner
 from dwell.testbed.conditions import Conditions, fields_of
 from dwell.testbed.message_links import LinkFile
-from dwell.testbed.playing import come_up
 from dwell.testbed.process import program
-from dwell.testbed.processes import Processes, expected, with_hosts, without_keys
+from dwell.testbed.processes import Processes, with_hosts, without_keys
 from dwell.testbed.testbed import LocalTestbed
 from dwell.testbed.timeline import NodeState, usual_conditions
 
-#: How long every process may take to be ready, on a machine that has a lot else to do.
-START_S = 60.0
 ADDRESS = "127.0.0.1"
 #: Where ports are looked for; below what the kernel gives out by itself.
 PORTS = range(10_000, 32_000, 500)
@@ -46,7 +42,7 @@ def on_this_machine(problem: Problem) -> Problem:
     count = PORTS_PER_ROLE * len(roles(problem))
     for base in PORTS:
         if all(_free(port) for port in range(base, base + count)):
-            return with_hosts(problem, lambda node: ADDRESS, {ADDRESS: base})
+            return with_hosts(problem, lambda node: ADDRESS, base)
     raise LiveError(f"no {count} free ports in a row on this machine")
 
 
@@ -88,6 +84,7 @@ class Loopback(LocalTestbed):
     """
 
     own_cpus = False
+    start_s = 60.0
 
     def __init__(
         self,
@@ -100,12 +97,12 @@ class Loopback(LocalTestbed):
         clocks: Path | None = None,
         more: Sequence[str] = (),
     ) -> None:
+        super().__init__()
         self.problem, self.folder, self.cpus, self.seed = problem, folder, cpus, seed
         self.world = folder / "world"
         self.burners: dict[str, Burner] = {}
-        self._links: LinkFile | None = None
         self.processes = Processes(
-            [problem],
+            problem,
             folder,
             environment={"DWELL_WORLD": str(self.world), **(environment or {})},
             cpus=cpus,
@@ -115,49 +112,30 @@ class Loopback(LocalTestbed):
         links = problem.fabric.links.items()
         self._conditions = {name: usual_conditions(link) for name, link in links}
         self._threads: dict[str, int] = {}
-        self._stack = ExitStack()
 
-    @property
-    def links(self) -> LinkFile:
-        """Conditions of the links, while the cell is there."""
-        if self._links is None:
-            raise LiveError("the cell has not been started")
-        return self._links
-
-    def start(self) -> None:
-        """Start everything, and wait until every process is ready; the run began before that.
-
-        Raises
-        ------
-        LiveError
-            If the cell does not come up.
-        """
-        try:
-            self.processes.write()
-            self._start_links()
-            for cpu in sorted(set(self.cpus.values())):
-                burner = self._stack.enter_context(Burner([cpu]))
-                for node in (node for node, its in self.cpus.items() if its == cpu):
-                    self.burners[node] = burner
-            # Processes end before links and burners do.
-            self._stack.callback(self.processes.stop)
-            for node in self.problem.fabric.nodes:
-                self.processes.start_agent(node)
-            self.processes.start_controllers()
-            self.client = self._stack.enter_context(OperatorClient(self.problem, without_keys()))
-            awaited = expected(self.problem)
-            status = come_up(self.sample, awaited, self.folder, patience_s=START_S)
-            self.begun_ns = int(status.get("origin_ns") or clock_of(self.problem)())
-        except BaseException:
-            self.stop()
-            raise
+    def _start(self) -> None:
+        """Start everything, and wait until every process is ready; the run began before that."""
+        self.processes.write()
+        self._start_links()
+        for cpu in sorted(set(self.cpus.values())):
+            burner = self._stack.enter_context(Burner([cpu]))
+            for node in (node for node, its in self.cpus.items() if its == cpu):
+                self.burners[node] = burner
+        # Processes end before links and burners do.
+        self._stack.callback(self.processes.stop)
+        for node in self.problem.fabric.nodes:
+            self.processes.start_agent(node)
+        self.processes.start_controller()
+        self.client = self._stack.enter_context(OperatorClient(self.problem, without_keys()))
+        status = self._came_up()
+        self.begun_ns = int(status.get("origin_ns") or clock_of(self.problem)())
 
     def _start_links(self) -> None:
         nodes, links = tuple(self.problem.fabric.nodes), tuple(self.problem.fabric.links.values())
-        file = LinkFile(self.folder / LINK_FILE, nodes, links, seed=self.seed)
-        self._links = self._stack.enter_context(file)
+        self._links = LinkFile(self.folder / LINK_FILE, nodes, links, seed=self.seed)
+        self._stack.callback(self._links.close)
         for link in links:
-            file.set(link.source, link.target, **fields_of(self._conditions[link.name]))
+            self._links.set(link.source, link.target, **fields_of(self._conditions[link.name]))
 
     def _apply_to_node(self, node: str, state: NodeState) -> None:
         self._threads[node] = state.threads
@@ -166,19 +144,18 @@ class Loopback(LocalTestbed):
         burner.set(sum(self._threads.get(node, 0) for node in nodes))
 
     def _apply_to_link(self, name: str, now: Conditions) -> None:
-        link = self.problem.fabric.links[name]
-        if changes := self._changes(name, now):
-            self.links.set(link.source, link.target, **changes)
+        link, self._conditions[name] = self.problem.fabric.links[name], now
+        self._links.set(link.source, link.target, **fields_of(now))
 
     def cut(self, source: str, target: str, at_ns: int) -> int:
         """Lose messages that begin their way along a direction from an instant on; returns when."""
         time.sleep(max(at_ns - time.monotonic_ns(), 0) / 1e9)
-        self.links.set(source, target, cut="drop")
+        self._links.set(source, target, down=True)
         return time.monotonic_ns()
 
     def heal(self, source: str, target: str) -> None:
         """End a cut of a direction."""
-        self.links.set(source, target, cut=None)
+        self._links.set(source, target, down=False)
 
     def sample(self, patience_s: float) -> Mapping[str, Any]:
         """Return the status of the cell, from its controller."""
@@ -187,8 +164,3 @@ class Loopback(LocalTestbed):
     def taps(self) -> Mapping[tuple[str, ...], Sequence[str]]:
         """Return how to run a command that reaches all nodes: as it is."""
         return {tuple(self.problem.fabric.nodes): ()}
-
-    def stop(self) -> None:
-        """End every process, links and burners last."""
-        self._stack.close()
-        self._links = None

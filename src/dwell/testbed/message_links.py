@@ -16,17 +16,17 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
-import json
 import math
 import mmap
 import os
+import pickle
 import struct
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Self
+from typing import Any
 
-from dwell.errors import LiveError, ProblemError
+from dwell.errors import LiveError
 from dwell.files import write_whole
 from dwell.model import Link
 from dwell.testbed.conditions import (
@@ -34,8 +34,6 @@ from dwell.testbed.conditions import (
     Conditions,
     Draws,
     changed,
-    fields_of,
-    to_json,
     transmission_ns,
 )
 from dwell.testbed.mapped_file import HEAD, make_file, open_file
@@ -83,7 +81,7 @@ class LinkFile:
                     self._conditions[source, target] = Conditions()
                     self.set(source, target)
 
-    def set(self, source: str, target: str, **changes: object) -> None:
+    def set(self, source: str, target: str, **changes: Any) -> None:
         """Change some conditions of a direction for messages that begin their way from now on.
 
         Parameters
@@ -99,33 +97,19 @@ class LinkFile:
         way = source, target
         if way not in self._conditions:
             raise LiveError(f"{self.path}: no link {source}->{target}")
-        try:
-            self._conditions[way] = changed(self._conditions[way], to_json(changes))
-        except ProblemError as error:
-            raise LiveError(f"link {source}->{target}: {error}") from None
+        self._conditions[way] = changed(f"link {source}->{target}", self._conditions[way], changes)
         kind = self._kinds.get(way)
-        document = {
-            "conditions": to_json(fields_of(self._conditions[way])),
-            "retransmit_ms": None if kind is None else kind.retransmit_ms,
-            "in_order": kind is not None and kind.in_order,
-        }
+        retransmit_ms = None if kind is None else kind.retransmit_ms
+        state = self._conditions[way], retransmit_ms, kind is not None and kind.in_order
         place = _place(self.nodes, source, target)
         # Whoever sees the number reads the file, or a newer one.
-        write_whole(_file_of(self.path, place), json.dumps(document), durable=False)
+        write_whole(_file_of(self.path, place), pickle.dumps(state), durable=False)
         (count,) = struct.unpack_from("<q", self._map, place)
         struct.pack_into("<q", self._map, place, count + 1)
 
     def close(self) -> None:
         """Write no more; the files stay."""
         self._map.close()
-
-    def __enter__(self) -> Self:
-        """Return itself."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Write no more."""
-        self.close()
 
 
 def _size(count: int) -> int:
@@ -173,10 +157,10 @@ class Way:
         """
         with self._lock:
             self._refresh()
-            cut, loss = self._draws.conditions.cut, self._draws.conditions.loss
+            conditions = self._draws.conditions
             # Attempts that are all lost are none: the message waits as while the link is down.
-            if cut is not None or loss == 1:
-                return HELD if cut == "hold" or self._retransmit_ms is not None else LOST
+            if conditions.down or conditions.loss == 1:
+                return LOST if self._retransmit_ms is None else HELD
             sent_ns = self._transmitted(size_bytes, now_ns)
             if sent_ns - now_ns > LONGEST_WAIT_S * 1e9:
                 return LOST
@@ -194,14 +178,9 @@ class Way:
         (count,) = struct.unpack_from("<q", self._memory, self._place)
         if count == self._seen:
             return
-        document = json.loads(_file_of(self._path, self._place).read_text(encoding="utf-8"))
-        # A delay that stays goes on where it is.
-        known = to_json(fields_of(self._draws.conditions))
-        changes = {
-            name: value for name, value in document["conditions"].items() if known[name] != value
-        }
-        self._draws.apply(changes)
-        self._retransmit_ms, self._in_order = document["retransmit_ms"], document["in_order"]
+        state = _file_of(self._path, self._place).read_bytes()
+        conditions, self._retransmit_ms, self._in_order = pickle.loads(state)  # noqa: S301 (our own)
+        self._draws.apply(conditions)
         self._seen = count
 
     def _transmitted(self, size_bytes: int, now_ns: int) -> int:

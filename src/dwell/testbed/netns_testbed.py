@@ -1,18 +1,14 @@
-"""Testbed on this machine: network namespaces as hosts, links, CPUs, and the cells on them.
+"""Testbed on this machine: network namespaces as hosts, links, CPUs, and the cell on them.
 
 Nothing here moves a stage: it plays what a scenario does to nodes and links, and what a controller
-makes of it is the controller's. Cells that share nodes (their edge, say) share hosts.
+makes of it is the controller's.
 """
 
 from __future__ import annotations
 
-import json
 import os
-import signal
-import time
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import closing, suppress
 from dataclasses import replace
 from functools import partial
 from itertools import combinations
@@ -23,83 +19,62 @@ from dwell.errors import LiveError
 from dwell.live.security import INSECURE
 from dwell.live.transport.orphans import remove_orphans
 from dwell.model import Node, Problem
-from dwell.testbed.allotment import allot, links_of, nodes_of
+from dwell.testbed.allotment import allot
 from dwell.testbed.burner import Burner, stress
-from dwell.testbed.conditions import Conditions
+from dwell.testbed.conditions import Conditions, fields_of
 from dwell.testbed.groups import PROBES, Groups, Share
 from dwell.testbed.hosts import Hosts
 from dwell.testbed.leftovers import Claim
 from dwell.testbed.link import TunLink
 from dwell.testbed.message_links import LinkFile
-from dwell.testbed.playing import come_up, undisturbed
+from dwell.testbed.playing import undisturbed
 from dwell.testbed.process import program
-from dwell.testbed.processes import Processes, expected, with_hosts
+from dwell.testbed.processes import Processes, with_hosts
 from dwell.testbed.testbed import LocalTestbed
 from dwell.testbed.timeline import NodeState, usual_conditions
 from dwell.testbed.watcher import Watcher
 
 FIRST_PORT = 7_450
-#: With a share of a CPU, a node's processes take a while to start.
-START_S = 120.0
 LINK_FILE = "links"
-#: What the cell did until everybody was there.
-STARTING = "starting"
 
 
-def require_playable(problems: Sequence[Problem]) -> None:
-    """Refuse cells with something that a testbed does not have.
+def require_playable(problem: Problem) -> None:
+    """Refuse a cell with something that a testbed does not have.
 
     Raises
     ------
     LiveError
         With every fault.
     """
-    faults = []
-    for problem in problems:
-        faults += [
-            f"nodes.{node.name}.bursts: drawn foreign work is not played"
-            for node in problem.fabric.nodes.values()
-            if node.bursts is not None
-        ]
-        faults += [
-            f"links {link.name}: bursts of extra delay are not played"
-            for link in problem.fabric.links.values()
-            if link.bursts is not None
-        ]
-    try:
-        links_of(problems)
-    except LiveError as error:
-        faults.append(str(error))
+    faults = [
+        f"nodes.{node.name}.bursts: drawn foreign work is not played"
+        for node in problem.fabric.nodes.values()
+        if node.bursts is not None
+    ]
+    faults += [
+        f"links {link.name}: bursts of extra delay are not played"
+        for link in problem.fabric.links.values()
+        if link.bursts is not None
+    ]
     if faults:
-        raise LiveError("; ".join(dict.fromkeys(faults)))
-
-
-def _pairs_of(problems: Sequence[Problem]) -> list[tuple[str, str]]:
-    """Return who is linked: the agents of a cell all talk to each other."""
-    pairs: dict[frozenset[str], tuple[str, str]] = {}
-    for problem in problems:
-        for pair in combinations(problem.fabric.nodes, 2):
-            pairs.setdefault(frozenset(pair), pair)
-    return list(pairs.values())
+        raise LiveError("; ".join(faults))
 
 
 class NetnsTestbed(LocalTestbed):
-    """Cells on hosts of their own on this machine; a context manager.
+    """A cell on hosts of its own on this machine; a context manager.
 
     Parameters
     ----------
-    problems : Problem or sequence of Problem
-        Where their nodes are is put into them.
+    problem : Problem
+        Where its nodes are is put into it.
     folder : Path
-        For cell files, states, logs and runs.
+        For cell file, states, logs and runs.
     name : str
         Name of this testbed, among others on this machine.
     seed : int
         Seed of delays and losses.
     more : sequence of str
-        Further arguments of the controllers.
-    cpus : sequence of int, optional
-        CPUs that nodes may use; all that this process may use if left out.
+        Further arguments of the controller.
     environment : mapping of str to str, optional
         Variables that all processes get as well.
     clocks : Path, optional
@@ -107,51 +82,44 @@ class NetnsTestbed(LocalTestbed):
 
     Attributes
     ----------
-    problems : tuple of Problem
-        `problem` is the first, and so are its run and what is said of it.
     links : dict of frozenset of str to TunLink
         By pair of nodes.
-    watchers : dict of str to Watcher
-        By the name of the cell.
+    watcher : Watcher
+        Tells how the cell is.
 
     Raises
     ------
     LiveError
-        If the cells cannot be played, or this machine has too few CPUs for their nodes.
+        If the cell cannot be played, or this machine has too few CPUs for its nodes.
     """
 
     own_cpus = True
 
     def __init__(
         self,
-        problems: Problem | Sequence[Problem],
+        problem: Problem,
         folder: Path,
         *,
         name: str,
         seed: int = 0,
         more: Sequence[str] = (),
-        cpus: Sequence[int] | None = None,
         environment: Mapping[str, str] | None = None,
         clocks: Path | None = None,
     ) -> None:
-        self.problems = (problems,) if isinstance(problems, Problem) else tuple(problems)
-        self.problem = self.problems[0]
-        require_playable(self.problems)
-        self.shares = allot(self.problems, cpus or sorted(os.sched_getaffinity(0)))
-        self.nodes: dict[str, Node] = nodes_of(self.problems)
+        super().__init__()
+        self.problem = problem
+        require_playable(problem)
+        self.shares = allot([problem], sorted(os.sched_getaffinity(0)))
+        self.nodes: Mapping[str, Node] = problem.fabric.nodes
         self.folder, self.name, self.seed = folder.resolve(), name, seed
         self.links: dict[frozenset[str], TunLink] = {}
-        self.watchers: dict[str, Watcher] = {}
         self.stress: dict[str, Burner] = {}
-        self._usual = links_of(self.problems)
+        self._usual = problem.fabric.links
         self._more = tuple(more)
         self._environment, self._clocks = dict(environment or {}), clocks
         self._conditions = {name: usual_conditions(link) for name, link in self._usual.items()}
         self._down: set[str] = set()
         self._claim = Claim(name, list(self.nodes))
-        # Run of each cell that is no part of any measurement any more.
-        self._past: dict[str, object] = {}
-        self._stack = ExitStack()
 
     # --------------------------------------------------------------------- up and down
 
@@ -165,40 +133,27 @@ class NetnsTestbed(LocalTestbed):
         """
         self._stack.enter_context(self._claim)
 
-    def start(self) -> None:
-        """Make hosts, links and groups, start everything, and begin a run of every cell.
-
-        Raises
-        ------
-        LiveError
-            If something is missing, or the cells do not come up.
-        """
-        try:
-            self.claim()
-            self._stack.callback(remove_orphans)
-            self._make()
-            for node in self.nodes:
-                self.processes.start_agent(node)
+    def _start(self) -> None:
+        """Make hosts, links and groups, start everything, and begin a run."""
+        self.claim()
+        self._stack.callback(remove_orphans)
+        self._make()
+        for node in self.nodes:
+            self.processes.start_agent(node)
+        # Interpreters that start would take most of a minute of what a small robot has.
+        with self._groups.unlimited():
             self._come_up()
-            self.begun_ns = self.begin()[0]
-        except BaseException:
-            with undisturbed():
-                self.stop()
-            raise
+        self.begun_ns = self.begin()
 
     def _make(self) -> None:
         enter = self._stack.enter_context
-        nodes, pairs = list(self.nodes), _pairs_of(self.problems)
+        # The agents of a cell all talk to each other.
+        nodes, pairs = list(self.nodes), list(combinations(self.nodes, 2))
         self._hosts = enter(Hosts(self.name, nodes, pairs))
         self._groups = enter(Groups(self.name, {**self.shares, PROBES: Share()}))
-        # On a node that cells share each has ports of its own.
-        following = defaultdict[str, int](lambda: FIRST_PORT)
-        self.problems = tuple(
-            with_hosts(problem, self._hosts.address, following) for problem in self.problems
-        )
-        self.problem = self.problems[0]
+        self.problem = with_hosts(self.problem, self._hosts.address, FIRST_PORT)
         self.folder.mkdir(parents=True, exist_ok=True)
-        self._losses = enter(LinkFile(self.folder / LINK_FILE, nodes, seed=self.seed))
+        self._losses = enter(closing(LinkFile(self.folder / LINK_FILE, nodes, seed=self.seed)))
         for number, pair in enumerate(pairs):
             self.links[frozenset(pair)] = enter(self._link(pair, number))
         for link in self._usual.values():
@@ -214,7 +169,7 @@ class NetnsTestbed(LocalTestbed):
             **self._environment,
         }
         self.processes = Processes(
-            self.problems,
+            self.problem,
             self.folder,
             inside=self._inside,
             environment=environment,
@@ -223,9 +178,8 @@ class NetnsTestbed(LocalTestbed):
         )
         self.processes.write()
         self._stack.callback(self.processes.stop)
-        for problem in self.problems:
-            watcher = Watcher(self.processes.file_of(problem), self.beside(problem.controller_node))
-            self.watchers[problem.name] = enter(watcher)
+        beside_controller = self.beside(self.problem.controller_node)
+        self.watcher = enter(Watcher(self.processes.file, beside_controller))
 
     @property
     def probing(self) -> list[str]:
@@ -240,7 +194,7 @@ class NetnsTestbed(LocalTestbed):
         return self._groups.inside(node, self._hosts.inside(node, words))
 
     def _link(self, pair: tuple[str, str], number: int) -> TunLink:
-        """Return the link of a pair; a direction that the cells do not have has no delay."""
+        """Return the link of a pair; a direction that the cell does not have has no delay."""
         usual: dict[tuple[str, str], Conditions] = {}
         retransmit_ms: dict[tuple[str, str], float] = {}
         for link in self._usual.values():
@@ -267,77 +221,14 @@ class NetnsTestbed(LocalTestbed):
 
     def stop(self) -> None:
         """End everything, and leave nothing behind; safe to call twice."""
-        self._stack.close()
+        with undisturbed():
+            super().stop()
 
     # ------------------------------------------------------------------------- running
 
-    def _come_up(self) -> None:
-        """Wait until all processes are ready, with every cell on its initial placement.
-
-        Controllers that never move anything look after the cells until then; the runs that they
-        write are in `STARTING`, and no part of any measurement.
-        """
-        for problem in self.problems:
-            node = problem.controller_node
-            if f"controller@{node}" not in self.processes.running:
-                more = ["--policy", problem.initial]
-                self.processes.start_controller(node, out=self.folder / STARTING, more=more)
-        # Interpreters that start would take most of a minute of what a small robot has.
-        with self._groups.unlimited():
-            for problem in self.problems:
-                self._past[problem.name] = self._status(problem)["run"]
-
-    def begin(self) -> list[int]:
-        """Begin a new run of every cell, with controllers that know nothing of the time before.
-
-        Returns
-        -------
-        list of int
-            First release of each, on its stamper's clock.
-
-        Raises
-        ------
-        LiveError
-            If a run does not begin, or somebody is missing.
-        """
-        self.processes.stop_controllers()
-        for problem in self.problems:
-            self._restart_stamper(problem)
-        self.processes.start_controllers()
-        return [self._origin(problem) for problem in self.problems]
-
-    def _restart_stamper(self, problem: Problem) -> None:
-        """Have a stamper begin anew, as if its cell had never run."""
-        node = problem.stamper_node
-        state = self.processes.folder_of(problem) / node
-        mark = state / f"stamper@{node}.pid"
-        pid = int(json.loads(mark.read_text(encoding="utf-8"))["pid"])
-        with suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGSTOP)  # so that it writes no book any more
-        (state / f"stamper@{node}.book").unlink(missing_ok=True)
-        with suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGKILL)
-
-    def _origin(self, problem: Problem) -> int:
-        until = time.monotonic() + START_S
-        while time.monotonic() < until:
-            status = self._status(problem)
-            # A late answer of the controller before tells of the run before.
-            new = status["run"] is not None and status["run"] != self._past.get(problem.name)
-            if new and status.get("origin_ns") is not None:
-                self._past[problem.name] = status["run"]
-                return int(status["origin_ns"])
-            time.sleep(0.05)
-        raise LiveError(f"cell {problem.name!r} releases no cycles; see the logs in {self.folder}")
-
-    def _status(self, problem: Problem) -> Mapping[str, Any]:
-        """Return the status of a cell once all its processes are ready."""
-        ask = self.watchers[problem.name].status
-        return come_up(ask, expected(problem), self.folder, patience_s=START_S)
-
     def sample(self, patience_s: float) -> Mapping[str, Any]:
-        """Return the status of the first cell, from its controller."""
-        return self.watchers[self.problem.name].status(patience_s)
+        """Return the status of the cell, from its controller."""
+        return self.watcher.status(patience_s)
 
     # --------------------------------------------------------------------- disturbances
 
@@ -360,16 +251,16 @@ class NetnsTestbed(LocalTestbed):
 
     def _start_processes(self, node: str) -> None:
         self.processes.start_agent(node)
-        if any(problem.controller_node == node for problem in self.problems):
-            self.processes.start_controller(node)
+        if node == self.problem.controller_node:
+            self.processes.start_controller()
 
     def _apply_to_link(self, name: str, now: Conditions) -> None:
-        link, changes = self._usual[name], self._changes(name, now)
-        if link.retransmit_ms is None and "loss" in changes:
-            self._losses.set(link.source, link.target, loss=changes.pop("loss"))
-        if changes:
-            way = self.links[frozenset((link.source, link.target))]
-            way.set(link.source, link.target, **changes)
+        link, self._conditions[name] = self._usual[name], now
+        if link.retransmit_ms is None:
+            self._losses.set(link.source, link.target, loss=now.loss)
+            now = replace(now, loss=0.0)
+        way = self.links[frozenset((link.source, link.target))]
+        way.set(link.source, link.target, **fields_of(now))
 
     def cut(self, source: str, target: str, at_ns: int) -> int:
         """Cut a direction of a link; returns when that was."""

@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import FrameType
-from typing import Any, NoReturn, TypeAlias
+from typing import Any, NoReturn
 
 from dwell.errors import DwellError, LiveError
 from dwell.live.hosting import clock_of
@@ -23,14 +23,10 @@ from dwell.testbed.conditions import Conditions
 from dwell.testbed.testbed import Testbed
 from dwell.testbed.timeline import Change, Timeline, first_ns, last_ns, step_ns
 
-#: Takes for how many seconds to wait, and returns how the cell is; a LiveError if nobody answers.
-Ask: TypeAlias = Callable[[float], Mapping[str, Any]]
-
 #: Time between two looks at a cell.
 LOOK_S = 0.5
 #: Utilisation of a node that is full, as far as counters of 10 ms can tell.
 FULL = 0.97
-START_S = 30.0
 
 
 @dataclass(slots=True)
@@ -202,48 +198,6 @@ def make_folder(out: Path, mark: str, whose: str) -> None:
         raise LiveError(f"{out} exists and is not {whose}; choose another folder with --out")
     out.mkdir(parents=True, exist_ok=True)
     (out / mark).touch()
-
-
-def come_up(
-    ask: Ask, awaited: Sequence[str], folder: Path, *, patience_s: float = START_S
-) -> Mapping[str, Any]:
-    """Wait until all processes are ready; returns the status of the cell then.
-
-    Parameters
-    ----------
-    ask : callable
-    awaited : sequence of str
-        Names of processes.
-    folder : Path
-        Where the logs are, for the message.
-
-    Raises
-    ------
-    LiveError
-        If they are not, with what is known of those that are missing.
-    """
-    until = time.monotonic() + patience_s
-    missing: Mapping[str, str] = {"the controller": "has not answered"}
-    while True:
-        if time.monotonic() > until:
-            found = "; ".join(f"{who} {why}" for who, why in sorted(missing.items()))
-            raise LiveError(
-                f"after {patience_s:.0f} s the cell is not complete: {found}; see the logs in "
-                f"{folder}"
-            )
-        try:
-            status = ask(1.0)
-        except LiveError:
-            continue
-        heard = status["processes"]
-        missing = {
-            who: heard[who]["note"] or "is not ready" if who in heard else "has not been heard"
-            for who in awaited
-            if who not in heard or not heard[who]["ready"]
-        }
-        if not missing:
-            return status
-        time.sleep(0.1)
 
 
 def play(

@@ -15,7 +15,7 @@ import os
 import select
 import time
 from collections.abc import Sequence
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 from dwell.testbed.child import Child, Parent
 
@@ -42,7 +42,7 @@ class Probe(Child):
 
     def __init__(self, cpu: int, prefix: Sequence[str] = ()) -> None:
         self.cpu = cpu
-        super().__init__("dwell.testbed.probe", f"probe of CPU {cpu}", {"cpu": cpu}, prefix=prefix)
+        super().__init__("dwell.testbed.probe", f"probe of CPU {cpu}", cpu, prefix=prefix)
 
     def read(self) -> Lateness:
         """Return how late it was since this was last asked.
@@ -52,17 +52,16 @@ class Probe(Child):
         LiveError
             If it does not run.
         """
-        counts = cast("dict[str, float]", self.ask({}))
-        works = counts["works"]
-        return Lateness(counts["max_ns"] / 1e6, counts["work_ns"] / works / 1e6 if works else None)
+        longest_ns, works, work_ns = self.ask(None)
+        return Lateness(longest_ns / 1e6, work_ns / works / 1e6 if works else None)
 
 
 def main() -> None:
     """Sleep, and note how long, until the parent ends."""
     parent = Parent()
     with contextlib.suppress(EOFError):
-        os.sched_setaffinity(0, [cast("int", parent.receive()["cpu"])])
-        parent.answer({})
+        os.sched_setaffinity(0, [parent.receive()])
+        parent.answer(None)
         gc.freeze()
         _measure(parent)
 
@@ -81,7 +80,7 @@ def _measure(parent: Parent) -> None:
             due_ns = time.monotonic_ns() + SLEEP_NS
         if asked:
             parent.receive()
-            parent.answer({"max_ns": longest_ns, "works": works, "work_ns": work_ns})
+            parent.answer((longest_ns, works, work_ns))
             longest_ns, works, work_ns = 0, 0, 0
 
 

@@ -10,14 +10,13 @@ import os
 import subprocess
 import sys
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
 from dwell.cellfile.yaml_text import yaml_of
-from dwell.errors import LiveError
 from dwell.live.parent_death import OPTION, start_sweeper
 from dwell.live.transport.orphans import remove_orphans
 from dwell.live.trust import KEYS
@@ -45,14 +44,12 @@ def without_keys() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if name != KEYS}
 
 
-def _module_path(problems: Iterable[Problem]) -> dict[str, str]:
-    """Return the variable by which processes find modules beside the cell files.
-
-    A testbed writes the cell files of its processes into a folder of its own.
-    """
-    folders = dict.fromkeys(one.folder for one in problems if one.folder is not None)
-    paths = [*folders, *filter(None, [os.environ.get("PYTHONPATH")])]
-    return {"PYTHONPATH": os.pathsep.join(paths)} if folders else {}
+def _module_path(problem: Problem) -> dict[str, str]:
+    """Return the variable by which processes find modules beside the cell file."""
+    if problem.folder is None:
+        return {}
+    paths = [problem.folder, *filter(None, [os.environ.get("PYTHONPATH")])]
+    return {"PYTHONPATH": os.pathsep.join(paths)}
 
 
 def expected(problem: Problem, node: str | None = None) -> list[str]:
@@ -64,20 +61,18 @@ def expected(problem: Problem, node: str | None = None) -> list[str]:
     ]
 
 
-def with_hosts(
-    problem: Problem, address: Callable[[str], str], following: dict[str, int]
-) -> Problem:
+def with_hosts(problem: Problem, address: Callable[[str], str], first_port: int) -> Problem:
     """Return a cell that knows where its nodes are.
 
     Parameters
     ----------
     address : callable
         Returns the address of a node.
-    following : dict of str to int
-        Next port by address; those that the nodes take are taken from it.
+    first_port : int
+        First one of the first node of an address; others have the ones behind.
     """
     counts = Counter(role.node for role in roles(problem))
-    hosts = {}
+    hosts, following = {}, defaultdict[str, int](lambda: first_port)
     for node in problem.fabric.nodes:
         place = address(node)
         hosts[node] = Host(place, following[place])
@@ -86,15 +81,14 @@ def with_hosts(
 
 
 class Processes:
-    """Agents and controllers of cells that share some nodes.
+    """Agents and controller of a cell.
 
     Parameters
     ----------
-    problems : sequence of Problem
-        With every node among `live.hosts`, and names of their own.
+    problem : Problem
+        With every node among `live.hosts`.
     folder : Path
-        For cell files, states, logs and runs. Where there are several cells, each has a folder of
-        its name in it; the runs are in ``runs``.
+        For cell file, states and logs; the runs are in ``runs``.
     inside : callable, optional
         Has a command run on a node; on this computer if left out.
     environment : mapping of str to str, optional
@@ -103,7 +97,7 @@ class Processes:
     cpus : mapping of str to int, optional
         CPU of each node; a node that is not there uses any.
     more : sequence of str
-        Further arguments of the controllers.
+        Further arguments of the controller.
     program : sequence of str
         Module, and its first arguments, that runs agents and controllers.
     popen : callable
@@ -114,12 +108,14 @@ class Processes:
     Attributes
     ----------
     running : dict of str to Popen
-        By name: ``agent@R1``, ``controller@E``; of several cells ``agent@R1 of CELL``.
+        By name: ``agent@R1``, ``controller@E``.
+    file : Path
+        The cell's.
     """
 
     def __init__(
         self,
-        problems: Sequence[Problem],
+        problem: Problem,
         folder: Path,
         *,
         inside: Inside = outright,
@@ -130,54 +126,28 @@ class Processes:
         popen: Callable[..., subprocess.Popen[bytes]] = subprocess.Popen,
         owner: str | None = None,
     ) -> None:
-        names = [problem.name for problem in problems]
-        if len(set(names)) < len(names):
-            raise LiveError(f"two cells have one name: {', '.join(sorted(names))}")
-        self.problems, self.folder = tuple(problems), folder
+        self.problem, self.folder, self.file = problem, folder, folder / "cell.yaml"
         self.running: dict[str, subprocess.Popen[bytes]] = {}
-        self.environment = {**_module_path(self.problems), **(environment or {})}
+        self.environment = {**_module_path(problem), **(environment or {})}
         self._program = tuple(program)
         self._popen = popen
         self._owner = str(os.getpid()) if owner is None else owner
         self._inside, self._cpus, self._more = inside, dict(cpus or {}), tuple(more)
         self._sweeper: subprocess.Popen[bytes] | None = None
 
-    def folder_of(self, problem: Problem) -> Path:
-        """Return where a cell's file is, and the states of its nodes."""
-        return self.folder if len(self.problems) == 1 else self.folder / problem.name
-
-    def file_of(self, problem: Problem) -> Path:
-        """Return a cell's file."""
-        return self.folder_of(problem) / "cell.yaml"
-
     def write(self) -> None:
-        """Write the cell files."""
-        for problem in self.problems:
-            file = self.file_of(problem)
-            file.parent.mkdir(parents=True, exist_ok=True)
-            document = to_document(problem)
-            move_traces(document, Path(problem.folder or "").resolve())
-            file.write_text(yaml_of(document), encoding="utf-8")
+        """Write the cell file."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        document = to_document(self.problem)
+        move_traces(document, Path(self.problem.folder or "").resolve())
+        self.file.write_text(yaml_of(document), encoding="utf-8")
 
     def start_agent(self, node: str) -> None:
-        """Start a node's agent, or start it again; of every cell that has the node."""
-        for problem in self.problems:
-            if node not in problem.fabric.nodes:
-                continue
-            who = f"agent@{node}"
-            who = who if len(self.problems) == 1 else f"{who} of {problem.name}"
-            state = self.folder_of(problem) / node
-            self._start(who, node, ["agent", "--node", node, "--state", str(state)], [problem])
+        """Start a node's agent, or start it again."""
+        self._start("agent", node, ["--node", node, "--state", str(self.folder / node)])
 
-    def start_controllers(self) -> None:
-        """Start the controllers, one on every node that decides for cells."""
-        for node in dict.fromkeys(problem.controller_node for problem in self.problems):
-            self.start_controller(node)
-
-    def start_controller(
-        self, node: str, *, out: Path | None = None, more: Sequence[str] = ()
-    ) -> None:
-        """Start a node's controller, or start it again.
+    def start_controller(self, *, out: Path | None = None, more: Sequence[str] = ()) -> None:
+        """Start the controller, or start it again.
 
         Parameters
         ----------
@@ -186,21 +156,18 @@ class Processes:
         more : sequence of str
             Further arguments.
         """
-        cells = [problem for problem in self.problems if problem.controller_node == node]
         runs = self.folder / "runs" if out is None else out
-        words = ["controller", "--out", str(runs), *self._more, *more]
-        self._start(f"controller@{node}", node, words, cells)
+        words = ["--out", str(runs), *self._more, *more]
+        self._start("controller", self.problem.controller_node, words)
 
-    def _start(
-        self, who: str, node: str, words: Sequence[str], problems: Iterable[Problem]
-    ) -> None:
+    def _start(self, kind: str, node: str, words: Sequence[str]) -> None:
         if self._sweeper is None:
             self._sweeper = start_sweeper()
-        command = [sys.executable, "-m", *self._program, *words, OPTION, self._owner]
+        command = [sys.executable, "-m", *self._program, kind, *words, OPTION, self._owner]
         if node in self._cpus:
             command += ["--cpus", str(self._cpus[node])]
-        for problem in problems:
-            command += ["--cell", str(self.file_of(problem))]
+        command += ["--cell", str(self.file)]
+        who = f"{kind}@{node}"
         with (self.folder / f"{who}.log").open("ab") as log:
             self.running[who] = self._popen(
                 self._inside(node, command),
@@ -214,16 +181,16 @@ class Processes:
     def forget(self, node: str) -> None:
         """Take note that everything on a node has been killed."""
         for who in list(self.running):
-            if who.partition("@")[2].partition(" of ")[0] == node:
+            if who.partition("@")[2] == node:
                 self.running.pop(who).wait(KILL_S)
 
-    def stop_controllers(self) -> None:
-        """End the controllers and wait until they have written their runs."""
+    def stop_controller(self) -> None:
+        """End the controller and wait until it has written its run."""
         self._end("controller@", CONTROLLER_STOP_S)
 
     def stop(self) -> None:
-        """End all processes, the agents after the controllers, and remove their shared memory."""
-        self.stop_controllers()
+        """End all processes, the agents after the controller, and remove their shared memory."""
+        self.stop_controller()
         self._end("", STOP_S)
         if self._sweeper is not None:
             self._sweeper.kill()

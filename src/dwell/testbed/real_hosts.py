@@ -16,9 +16,7 @@ import shutil
 import subprocess
 import sys
 import tarfile
-import time
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,17 +30,15 @@ from dwell.policies.registry import by_name
 from dwell.record import open_run
 from dwell.testbed.conditions import Conditions
 from dwell.testbed.inventory import Inventory
-from dwell.testbed.playing import Played, come_up, make_folder, play_on, require_run, undisturbed
-from dwell.testbed.processes import Processes, end_all, expected
+from dwell.testbed.playing import Played, make_folder, play_on, require_run, undisturbed
+from dwell.testbed.processes import Processes, end_all
 from dwell.testbed.remote import SHELL_ID, RemoteProcess, script_of
-from dwell.testbed.testbed import Testbed
+from dwell.testbed.testbed import MARK, STARTING, Testbed
 from dwell.testbed.timeline import NodeState, timeline_of, usual_conditions
 
-MARK = ".dwell-testbed"
 NAME = re.compile(r"[A-Za-z0-9_-]{1,32}")
 #: For a command that is to end by itself.
 COMMAND_S = 60.0
-START_S = 120.0
 STOP_S = 10.0
 #: Less than any loss that is asked for, more than roundings.
 LEAST_LOSS = 1e-9
@@ -79,15 +75,15 @@ class RealHosts(Testbed):
     ) -> None:
         if not NAME.fullmatch(name):
             raise LiveError(f"name is {name!r}; it must be letters, digits, - and _, at most 32")
+        super().__init__()
         hosts = {node: Host(host.address, host.port) for node, host in inventory.hosts.items()}
         self.problem = replace(problem, live=replace(problem.live, hosts=hosts))
         self.inventory, self.folder, self.name = inventory, folder.resolve(), name
         self.stress: dict[str, RemoteProcess] = {}
         self._threads: dict[str, int] = {}
         self._disturbed: set[str] = set()
-        self._stack = ExitStack()
         self.processes = Processes(
-            [self.problem],
+            self.problem,
             self.folder,
             inside=self.inside,
             more=more,
@@ -95,34 +91,25 @@ class RealHosts(Testbed):
             owner=SHELL_ID,
         )
 
-    def start(self) -> None:
-        """Put the cell file everywhere, start everything, and begin a run.
-
-        Raises
-        ------
-        LiveError
-            If a host cannot be reached, or the cell does not come up.
-        """
-        try:
-            self.processes.write()
-            self._stack.callback(self._undisturb)
-            self._stack.callback(self.processes.stop)
-            for node in self.problem.fabric.nodes:
-                self._prepare(node)
-            for node in self.problem.fabric.nodes:
-                self.processes.start_agent(node)
-            self._client = self._stack.enter_context(OperatorClient(self.problem))
-            self._begin()
-            # The stamper's clock is another one: this one's, since the run was seen to begin.
-            self.begun_ns = clock_of(self.problem)()
-        except BaseException:
-            with undisturbed():
-                self.stop()
-            raise
+    def _start(self) -> None:
+        """Put the cell file everywhere, start everything, and begin a run."""
+        self.processes.write()
+        self._stack.callback(self._undisturb)
+        self._stack.callback(self.processes.stop)
+        for node in self.problem.fabric.nodes:
+            self._prepare(node)
+        for node in self.problem.fabric.nodes:
+            self.processes.start_agent(node)
+        self._client = self._stack.enter_context(OperatorClient(self.problem))
+        self._come_up()
+        self.begin()
+        # The stamper's clock is another one: this one's, since the run was seen to begin.
+        self.begun_ns = clock_of(self.problem)()
 
     def stop(self) -> None:
         """End everything, and take disturbances back; runs stay there until the next start."""
-        self._stack.close()
+        with undisturbed():
+            super().stop()
 
     def sample(self, patience_s: float) -> Mapping[str, Any]:
         """Return the status of the cell, from its controller."""
@@ -185,36 +172,18 @@ class RealHosts(Testbed):
 
     def _prepare(self, node: str) -> None:
         folder = shlex.quote(self.there(node))
-        text = self.processes.file_of(self.problem).read_bytes()
+        text = self.processes.file.read_bytes()
         self.shell(node, f"rm -rf {folder} && mkdir -p {folder} && cat > {folder}/cell.yaml", text)
         python = shlex.quote(self.inventory.hosts[node].python)
         self.shell(node, f"cd {folder} && {python} -c 'import dwell'")
 
     # ------------------------------------------------------------------------- running
 
-    def _begin(self) -> None:
-        """Wait until all processes are ready, and begin a run that knows nothing of the past."""
-        problem = self.problem
-        node = problem.controller_node
-        more = ["--policy", problem.initial]
-        self.processes.start_controller(node, out=self.folder / "starting", more=more)
-        self._came_up()
-        self.processes.stop_controllers()
-        stamper = problem.stamper_node
-        mark = f"{shlex.quote(self.there(stamper))}/{stamper}/stamper@{stamper}"
+    def _restart_stamper(self) -> None:
+        node = self.problem.stamper_node
+        mark = f"{shlex.quote(self.there(node))}/{node}/stamper@{node}"
         number = f"""sed 's/.*"pid": *\\([0-9]*\\).*/\\1/' {mark}.pid"""
-        self.shell(stamper, f"rm -f {mark}.book; kill -KILL $({number})")
-        self.processes.start_controller(node)
-        until = time.monotonic() + START_S
-        while self._came_up().get("origin_ns") is None:
-            if time.monotonic() > until:
-                raise LiveError(f"cell {problem.name!r} releases no cycles; see {self.folder}")
-            time.sleep(0.05)
-
-    def _came_up(self) -> Mapping[str, Any]:
-        """Return the status of the cell once all its processes are ready."""
-        problem = self.problem
-        return come_up(self.sample, expected(problem), self.folder, patience_s=START_S)
+        self.shell(node, f"rm -f {mark}.book; kill -KILL $({number})")
 
     def fetch_runs(self) -> None:
         """Copy the runs that the controller has written to this computer.
@@ -344,14 +313,13 @@ def run_on_hosts(
     try:
         hosts.start()
         play_on(hosts, played, seconds)
-        hosts.processes.stop_controllers()
+        hosts.processes.stop_controller()
         hosts.fetch_runs()
     finally:
-        with undisturbed():
-            hosts.stop()
+        hosts.stop()
     folder = require_run(out)
     release_ns = open_run(folder).cycles["release_ns"]
     last_ns = hosts.begun_ns + (int(release_ns[-1]) if len(release_ns) else 0)
     played.note(folder, (hosts.begun_ns, last_ns))
-    shutil.rmtree(out / "starting", ignore_errors=True)
+    shutil.rmtree(out / STARTING, ignore_errors=True)
     return folder

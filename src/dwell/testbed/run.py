@@ -14,7 +14,7 @@ from dwell.model import Problem
 from dwell.policies.registry import by_name
 from dwell.record import Run, open_run
 from dwell.testbed.doctor import examine
-from dwell.testbed.netns_testbed import STARTING, NetnsTestbed
+from dwell.testbed.netns_testbed import NetnsTestbed
 from dwell.testbed.playing import (
     Played,
     begun,
@@ -23,14 +23,14 @@ from dwell.testbed.playing import (
     make_folder,
     play_on,
     require_run,
-    undisturbed,
 )
 from dwell.testbed.pressure import Rule, Span, judged
 from dwell.testbed.sampling import Sampler
+from dwell.testbed.testbed import MARK, STARTING
 from dwell.testbed.timeline import timeline_of
 
-#: A folder with this file is a testbed's, and may be replaced by its next run.
-MARK = ".dwell-testbed"
+#: From when on a window is excluded, and a run has failed.
+RULE = Rule()
 #: Time for a controller's last window, beyond its grace.
 LAST_S = 0.5
 
@@ -44,15 +44,15 @@ def length_s(problem: Problem, windows: int) -> float:
     return (cycles_ms + problem.controller.close_grace_ms) / 1e3 + LAST_S
 
 
-def require_machine(problems: Sequence[Problem]) -> None:
-    """Refuse cells that this machine cannot run.
+def require_machine(problem: Problem) -> None:
+    """Refuse a cell that this machine cannot run.
 
     Raises
     ------
     LiveError
         With everything that is missing, and what to do about it.
     """
-    missing = [one for one in examine(problems) if one.needed and not one.ok]
+    missing = [one for one in examine([problem]) if one.needed and not one.ok]
     if missing:
         reasons = "; ".join(f"{one.name}: {one.found}; {one.remedy}" for one in missing)
         raise LiveError(f"this machine cannot run the testbed: {reasons}")
@@ -68,7 +68,6 @@ def run_once(
     out: Path,
     name: str,
     jobs: bool = False,
-    rule: Rule | None = None,
     tell: Callable[[str], None] = lambda line: None,
 ) -> Path:
     """Run a cell on a testbed of its own, and return the folder of its run.
@@ -89,8 +88,6 @@ def run_once(
         Name of the testbed, among others on this machine.
     jobs : bool
         Whether the run keeps its jobs.
-    rule : Rule, optional
-        When the machine was under too much pressure.
     tell : callable
         Takes a line on what happens.
 
@@ -112,8 +109,7 @@ def run_once(
     timeline = timeline_of(problem, scenario, seed=seed, seconds=seconds, outages=True)
     arguments = ["--jobs"] if jobs else []
     testbed = NetnsTestbed(problem, out, name=name, seed=seed, more=arguments)
-    require_machine([problem])
-    rule = rule or Rule()
+    require_machine(problem)
     played = Played(problem, scenario, seed, timeline)
     samplers: list[Sampler] = []
     try:
@@ -125,19 +121,18 @@ def run_once(
                 tell("starting the cell")
                 testbed.start()
                 tell(f"playing {scenario} for {seconds:g} s")
-                _play(testbed, seconds, played, samplers, rule)
+                _play(testbed, seconds, played, samplers)
             finally:
-                with undisturbed():
-                    testbed.stop()
+                testbed.stop()
     except KeyboardInterrupt:
         # Before it was played, what is there may be a run of long ago.
         folder = longest_run(out / "runs") if samplers else None
         if folder is not None:
-            _seal(folder, testbed, played, samplers, rule, interrupted=True)
+            _seal(folder, testbed, played, samplers, interrupted=True)
             tell(f"interrupted; run: {folder}")
         raise
     folder = require_run(out)
-    _seal(folder, testbed, played, samplers, rule, interrupted=False)
+    _seal(folder, testbed, played, samplers, interrupted=False)
     shutil.rmtree(out / STARTING, ignore_errors=True)
     return folder
 
@@ -147,16 +142,15 @@ def _play(
     seconds: float,
     played: Played,
     samplers: list[Sampler],
-    rule: Rule,
 ) -> None:
     clock = clock_of(played.problem)
     links = {"-".join(link.nodes): link for link in testbed.links.values()}
     with Sampler(
-        testbed.cpus, testbed.used_ns, testbed.switches, links, clock, rule, testbed.probing
+        testbed.cpus, testbed.used_ns, testbed.switches, links, clock, RULE, testbed.probing
     ) as sampler:
         samplers.append(sampler)
         play_on(testbed, played, seconds)
-    testbed.processes.stop_controllers()
+    testbed.processes.stop_controller()
 
 
 def _seal(
@@ -164,7 +158,6 @@ def _seal(
     testbed: NetnsTestbed,
     played: Played,
     samplers: Sequence[Sampler],
-    rule: Rule,
     *,
     interrupted: bool,
 ) -> None:
@@ -175,9 +168,9 @@ def _seal(
     if samplers:
         sampler = samplers[0]
         spans = spans_of(open_run(folder), played)
-        pressure = judged(sampler.samples, spans, rule)
+        pressure = judged(sampler.samples, spans, RULE)
         more["pressure"] = {**pressure, "trouble": sampler.trouble} if sampler.trouble else pressure
-        more["links"], more["wakes_hz"] = sampler.links(), sampler.wakes_hz()
+        more["links"], more["wakes_hz"] = sampler.links(), sampler.wakes_hz
     played.note(folder, **more)
 
 

@@ -7,7 +7,6 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -57,41 +56,37 @@ class Sampler(Started):
         prefix: Sequence[str] = (),
     ) -> None:
         self.samples: list[Sample] = []
+        super().__init__()
         #: What kept it from going on, if anything did.
         self.trouble = ""
         self._totals: defaultdict[tuple[str, str], Passed] = defaultdict(Passed)
         self._switches = dict(switches)
         self._begun: dict[str, tuple[Mapping[int, int], float]] = {}
-        self._wakes_hz: dict[str, float] = {}
+        #: How often a node's threads have woken, per second, over all of them; once it has stopped.
+        self.wakes_hz: dict[str, float] = {}
         self._cpus, self._used_ns, self._links = sorted(cpus), dict(used_ns), dict(links)
         self._clock = clock
         self._first_late = next((i for i, ms in enumerate(LATE_MS) if ms >= rule.late_ms), 0) + 1
         self._probes = [Probe(cpu, prefix) for cpu in self._cpus]
         self._stopped = threading.Event()
-        self._stack = ExitStack()
-        self._thread = threading.Thread(target=self._run, name="sampler", daemon=True)
 
-    def start(self) -> None:
-        """Start it."""
-        try:
-            for probe in self._probes:
-                self._stack.enter_context(probe)
-        except BaseException:
-            self._stack.close()
-            raise
+    def _start(self) -> None:
+        for probe in self._probes:
+            self._stack.enter_context(probe)
         # A look reads a file per thread, a hundred of them: there is one here and one at the end.
         for node, read in self._switches.items():
             self._begun[node] = read(), time.monotonic()
-        self._thread.start()
+        thread = threading.Thread(target=self._run, name="sampler", daemon=True)
+        thread.start()
+        self._stack.callback(thread.join)
 
     def stop(self) -> None:
         """Take no more samples."""
         self._stopped.set()
-        self._thread.join()
-        self._stack.close()
+        super().stop()
         for node, (before, begun_s) in self._begun.items():
             after, lasted_s = self._switches[node](), time.monotonic() - begun_s
-            self._wakes_hz[node] = round(rate_hz(before, after, lasted_s), 1)
+            self.wakes_hz[node] = round(rate_hz(before, after, lasted_s), 1)
 
     def _run(self) -> None:
         due_s = time.monotonic()
@@ -134,10 +129,6 @@ class Sampler(Started):
                 for name, ways in passed.items()
             },
         )
-
-    def wakes_hz(self) -> dict[str, float]:
-        """Return how often a node's threads have woken, per second, over all of them."""
-        return self._wakes_hz
 
     def links(self) -> dict[str, Any]:
         """Return statistics of the delays drawn for each direction, ready for JSON."""

@@ -8,8 +8,8 @@ belong to nodes and links and not to the scenario, are not played.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 from dwell.errors import LiveError
 from dwell.model import Link, LinkDisturbance, Problem, Scenario
@@ -181,16 +181,5 @@ def _conditions(link: Link, segment: LinkSegment, scenario: Scenario) -> Conditi
         shares=tuple(shares),
         rate_mbps=segment.rate_mbps,
         loss=segment.loss,
-        cut="drop" if segment.down else None,
+        down=segment.down,
     )
-
-
-def differing(before: Conditions, now: Conditions) -> dict[str, Any]:
-    """Return the fields of conditions that are others than before.
-
-    Processes that stay are left out: one with a memory that is set anew begins anew.
-    """
-    pairs = (
-        (item.name, getattr(before, item.name), getattr(now, item.name)) for item in fields(now)
-    )
-    return {name: value for name, was, value in pairs if was is not value and was != value}

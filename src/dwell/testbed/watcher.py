@@ -5,11 +5,11 @@ Whoever makes the testbed is on none of its hosts, and no link leads there.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-from dwell.errors import DwellError, LiveError
 from dwell.testbed.child import Child, Parent
 
 #: Beyond the patience of a question, for the process itself.
@@ -28,8 +28,7 @@ class Watcher(Child):
     """
 
     def __init__(self, cell: Path, prefix: Sequence[str] = ()) -> None:
-        name, settings = f"watcher of {cell}", {"cell": str(cell)}
-        super().__init__("dwell.testbed.watcher", name, settings, prefix=prefix)
+        super().__init__("dwell.testbed.watcher", f"watcher of {cell}", cell, prefix=prefix)
 
     def status(self, patience_s: float) -> Mapping[str, Any]:
         """Return how the cell is.
@@ -39,8 +38,8 @@ class Watcher(Child):
         LiveError
             If nobody answers.
         """
-        answer = self.ask({"patience_s": patience_s}, patience_s + SLACK_S)
-        return cast("Mapping[str, Any]", answer["status"])
+        status: Mapping[str, Any] = self.ask(patience_s, patience_s + SLACK_S)
+        return status
 
 
 def main() -> None:
@@ -50,26 +49,15 @@ def main() -> None:
     from dwell.live.security import INSECURE
     from dwell.testbed.processes import without_keys
 
-    parent = Parent()
-    try:
-        settings = parent.receive()
-        try:
+    with ExitStack() as stack:
+
+        def begin(cell: Path) -> Callable[[float], Mapping[str, Any]]:
             # The testbed's hosts lead nowhere but to each other.
-            environment = {**without_keys(), INSECURE: "1"}
-            visitor = OperatorClient(load(cast("str", settings["cell"])), environment)
-        except DwellError as error:
-            parent.answer({"error": str(error)})
-            return
-        parent.answer({})
-        with visitor:
-            while True:
-                patience_s = cast("float", parent.receive()["patience_s"])
-                try:
-                    parent.answer({"status": visitor.ask("status", patience_s=patience_s)})
-                except LiveError as error:
-                    parent.answer({"error": str(error)})
-    except EOFError:
-        pass
+            client = OperatorClient(load(cell), {**without_keys(), INSECURE: "1"})
+            stack.enter_context(client)
+            return lambda patience_s: client.ask("status", patience_s=patience_s)
+
+        Parent().serve(begin)
 
 
 if __name__ == "__main__":

@@ -56,8 +56,8 @@ def test_the_guard_has_no_reason_to_move_for_an_actuator_that_raises(
 ) -> None:
     problem = from_document(document("LOC"))
     refuses = next(one for one in faults_of(problem) if one.name == name)
-    terms = {1: Term(1, "LOC", 0, 0), 2: Term(2, "SO", 9, 9, ordered=ordered)}
-    judge = Judge(problem, terms=terms)
+    terms = {1: Term(1, "LOC", 0, 0), 2: Term(2, "SO", 9, 9)}
+    judge = Judge(problem, terms=terms, held={2: ordered})
     assert len(moved_in_vain(judge, refuses, 1)) == found
     assert moved_in_vain(judge, refuses, 2) == []
 

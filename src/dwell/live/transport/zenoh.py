@@ -24,8 +24,8 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from dwell.errors import LiveError, installing
-from dwell.live.failures import described, start_thread
+from dwell.errors import LiveError, describe_raised, installing
+from dwell.live.failures import start_thread
 from dwell.live.local_addresses import why_not_listen
 from dwell.live.transport.abandoned import AbandonedConnections
 from dwell.live.transport.forked import SessionDescriptors
@@ -359,7 +359,7 @@ class ZenohTransport:
             try:
                 deliver(sample)
             except Exception as error:
-                what = described(error)
+                what = describe_raised(error)
                 self.failed += 1
                 if what not in self._failures and len(self._failures) < MOST_FAILURES:
                     self._failures.add(what)

@@ -13,9 +13,9 @@ import threading
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import Self
 
 from dwell.errors import LiveError
+from dwell.testbed.child import Started
 
 NAME = "dwell-chaos"
 #: Of a small disk while it is not full.
@@ -30,7 +30,7 @@ def may_mount() -> bool:
     return os.geteuid() == 0 and shutil.which("mount") is not None
 
 
-class SmallDisk:
+class SmallDisk(Started):
     """A file system of its own in place of a folder, which can be made full; a context manager.
 
     When it is taken away, what was on it is in the folder.
@@ -42,9 +42,14 @@ class SmallDisk:
     """
 
     def __init__(self, folder: Path) -> None:
+        super().__init__()
         self.folder = folder
-        folder.mkdir(parents=True, exist_ok=True)
-        _run(["mount", "-t", "tmpfs", "-o", f"size={ROOMY_BYTES},mode=700", NAME, str(folder)])
+
+    def _start(self) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        options = f"size={ROOMY_BYTES},mode=700"
+        _run(["mount", "-t", "tmpfs", "-o", options, NAME, str(self.folder)])
+        self._stack.callback(self._unmount)
 
     def fill(self) -> None:
         """Leave no room: not by filling it, but by making it as small as what is on it."""
@@ -70,11 +75,7 @@ class SmallDisk:
     def _resize(self, size: int) -> None:
         _run(["mount", "-o", f"remount,size={size}", str(self.folder)])
 
-    def __enter__(self) -> Self:
-        """Return itself."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def _unmount(self) -> None:
         """Take it away; its files stay."""
         kept = self.folder.with_name(f"{self.folder.name}.kept")
         shutil.copytree(self.folder, kept, dirs_exist_ok=True)
@@ -115,7 +116,7 @@ def limit_file_size(pid: int, longest: int | None) -> None:
         raise LiveError(f"process {pid}: its files cannot be limited ({error})") from None
 
 
-class DiskHog:
+class DiskHog(Started):
     """Writes to a folder's disk as fast as it takes it, beside everybody else; a context manager.
 
     A disk that is slow by itself cannot be had without a device of its own. What is slowed down is
@@ -130,31 +131,31 @@ class DiskHog:
     """
 
     def __init__(self, folder: Path, writers: int = 4) -> None:
+        super().__init__()
         self._folder, self._count = folder, writers
         self._writers: list[subprocess.Popen[bytes]] = []
         self._path = folder / "hog-probe"
         self._stopped = threading.Event()
-        self._probe = threading.Thread(target=self._measure, daemon=True)
         self.waits_ms: list[float] = []
         self.usual_ms = 0.0
 
-    def __enter__(self) -> Self:
-        """Begin."""
+    def _start(self) -> None:
         with self._path.open("wb", buffering=0) as file:
             self.usual_ms = statistics.median(_page_ms(file) for _ in range(5))
         for number in range(self._count):
             words = [sys.executable, "-S", "-c", _HOG, str(self._folder / f"hog-{number}")]
             self._writers.append(subprocess.Popen(words, stdin=subprocess.PIPE))  # noqa: S603 - ours
-        self._probe.start()
-        return self
+        probe = threading.Thread(target=self._measure, daemon=True)
+        probe.start()
+        self._stack.callback(probe.join, timeout=30.0)
 
-    def __exit__(self, *_: object) -> None:
+    def stop(self) -> None:
         """End, and remove what it has written."""
         self._stopped.set()
         for writer in self._writers:
             writer.kill()
             writer.communicate()  # closes its standard input, too
-        self._probe.join(timeout=30.0)
+        super().stop()
         for path in self._folder.glob("hog-*"):
             path.unlink(missing_ok=True)
 

@@ -7,7 +7,7 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -113,12 +113,12 @@ class Harness(Started):
     def __init__(
         self, testbed: LocalTestbed, *, home: str | None = None, disks: bool = False
     ) -> None:
+        super().__init__()
         self.testbed, self.home, self.disks = testbed, home, disks
         self.folder = testbed.folder
         self.folder.mkdir(parents=True, exist_ok=True)
         self.actuations = Actuations(self.folder / OBSERVED)
         self.starved_cpus: frozenset[int] = frozenset()
-        self._stack = ExitStack()
         self._small: dict[str, SmallDisk] = {}
         self._hog: DiskHog | None = None
         self._burner: Burner | None = None
@@ -136,32 +136,22 @@ class Harness(Started):
         """P."""
         return round(self.problem.pipeline.period_ms * 1e6)
 
-    def start(self) -> None:
+    def _start(self) -> None:
         """Start everything, and wait until the cell is at home."""
-        try:
-            nodes = list(self.problem.fabric.nodes)
-            if self.disks:
-                for name in ("runs", *nodes):
-                    small = SmallDisk(self.folder / name)
-                    self._stack.enter_context(small)
-                    self._small[name] = small
-            clocks = ClockFile(self.folder / CLOCK_FILE, nodes, clock_of(self.problem))
-            self._clocks = self._stack.enter_context(clocks)
-            self._stack.callback(self._end_all)
-            self.testbed.start()
-            self.wait_for("the whole cell at home", self.at_home, 60.0)
-        except BaseException:
-            self.stop()
-            raise
-
-    def stop(self) -> None:
-        """End everything, also what is frozen or has no parent any more; safe to call twice."""
-        self._stack.close()
+        nodes = list(self.problem.fabric.nodes)
+        for name in ("runs", *nodes) if self.disks else ():
+            self._small[name] = self._stack.enter_context(SmallDisk(self.folder / name))
+        self._clocks = ClockFile(self.folder / CLOCK_FILE, nodes, clock_of(self.problem))
+        self._stack.callback(self._clocks.close)
+        self._stack.callback(self._end_all)
+        self.testbed.start()
+        self.wait_for("the whole cell at home", self.at_home, 60.0)
 
     def _end_all(self) -> None:
+        """End everything, also what is frozen or has no parent any more."""
         self._feed()
         if self._hog is not None:
-            self._hog.__exit__()
+            self._hog.stop()
             self._hog = None
         running = self.testbed.processes.running.values()
         for pid in [*self._marked(), *(p.pid for p in running if p.poll() is None)]:
@@ -235,11 +225,11 @@ class Harness(Started):
         if kind == "agent":
             self.testbed.processes.start_agent(node)
         else:
-            self.testbed.processes.start_controllers()
+            self.testbed.processes.start_controller()
 
     def stop_controller(self) -> None:
         """End the controller and wait until it has written its run."""
-        self.testbed.processes.stop_controllers()
+        self.testbed.processes.stop_controller()
 
     def _all_of(self, node: str) -> list[str]:
         """Return the processes of a node, its controller included."""
@@ -346,7 +336,8 @@ class Harness(Started):
                 case "fill":
                     self._fill(what)
                 case "hog":
-                    self._hog = DiskHog(self.folder).__enter__()
+                    self._hog = DiskHog(self.folder)
+                    self._hog.start()
         return begin_ns
 
     def end(self, fault: Fault) -> str:
@@ -375,7 +366,7 @@ class Harness(Started):
                 for what in fault.whom:
                     self._clear(what)
             case "hog" if self._hog is not None:
-                self._hog.__exit__()
+                self._hog.stop()
                 hog, self._hog = self._hog, None
                 return f"a page took {hog.wait_ms:.1f} ms to the disk, {hog.usual_ms:.1f} before"
         return ""

@@ -41,24 +41,24 @@ class Term:
     ----------
     cycle : int
         First that was heard to be stamped with it.
-    ordered : bool, optional
-        Whether the controller holds it there, and not the guard; None until the stamper was heard
-        to say so.
-    moved : bool
-        Whether an order was heard to be accepted that brought it about.
     """
 
     term: int
     placement: str
     cycle: int
     at_ns: int
-    ordered: bool | None = None
-    moved: bool = False
 
 
 @dataclass(slots=True)
 class Judge:
-    """Hears all messages in the order of their arrival, and finds violations."""
+    """Hears all messages in the order of their arrival, and finds violations.
+
+    Parameters
+    ----------
+    held : dict of int to bool
+        Whether the controller holds the cell where it is in a term, and not the guard, as the
+        stamper was heard to say.
+    """
 
     problem: Problem
     counts: Counter[str] = field(default_factory=Counter)
@@ -68,7 +68,8 @@ class Judge:
     _last: tuple[int, int, int] = (-1, -1, -1)
     _orders: dict[tuple[str, int], Order] = field(default_factory=dict)
     _early: dict[tuple[str, int], Accepted] = field(default_factory=dict)
-    _held: dict[int, bool] = field(default_factory=dict)
+    held: dict[int, bool] = field(default_factory=dict)
+    # Terms that an order has brought about which was heard to be accepted.
     _moved: set[int] = field(default_factory=set)
     _looked: int = -1
 
@@ -112,10 +113,7 @@ class Judge:
         _remember(self.stamped_ns, stamp.cycle, at_ns)
         known = self.terms.get(stamp.term)
         if known is None:
-            known = Term(stamp.term, stamp.placement, stamp.cycle, at_ns)
-            known.ordered = self._held.get(stamp.term)
-            known.moved = stamp.term in self._moved
-            self.terms[stamp.term] = known
+            self.terms[stamp.term] = Term(stamp.term, stamp.placement, stamp.cycle, at_ns)
         elif known.placement != stamp.placement:
             violations.append(
                 f"term {stamp.term} has two placements: {known.placement}, {stamp.placement}"
@@ -132,9 +130,7 @@ class Judge:
         return [] if answer is None else self._weigh(order, answer)
 
     def _accepted(self, answer: Accepted) -> list[str]:
-        self._held[answer.term] = not answer.fallback
-        if answer.term in self.terms:
-            self.terms[answer.term].ordered = not answer.fallback
+        self.held[answer.term] = not answer.fallback
         if answer.refused:
             return []
         who = answer.controller, answer.number
@@ -163,8 +159,6 @@ class Judge:
                 violations.append(f"{what} to {order.placement!r}, no candidate, is accepted")
         if answer.term == order.term + 1:
             self._moved.add(answer.term)
-            if answer.term in self.terms:
-                self.terms[answer.term].moved = True
         return violations
 
     def migrations(self) -> list[str]:
@@ -178,8 +172,8 @@ class Judge:
         previous: Term | None = None
         for term in sorted(self.terms):
             one = self.terms[term]
-            moved = one.moved and previous is not None and one.placement != previous.placement
-            if moved:
+            elsewhere = previous is not None and one.placement != previous.placement
+            if elsewhere and term in self._moved:
                 if before is not None and term > self._looked and one.cycle - before.cycle < apart:
                     violations.append(
                         f"migrations at cycles {before.cycle} (to {before.placement}) and "
@@ -192,7 +186,7 @@ class Judge:
 
     def moved_by_guard(self, after: int) -> bool:
         """Whether a term later than one is the guard's."""
-        return any(term > after and one.ordered is False for term, one in self.terms.items())
+        return any(term > after and self.held.get(term) is False for term in self.terms)
 
     def ordered_since(self, at_ns: int) -> int | None:
         """Return the instant of the first stamp from `at_ns` on that an order stands behind.
@@ -202,7 +196,7 @@ class Judge:
         instants = [
             self.stamped_ns[cycle]
             for _, cycle, term in self._stamps
-            if self.stamped_ns.get(cycle, -1) >= at_ns and self._held.get(term, term <= 1)
+            if self.stamped_ns.get(cycle, -1) >= at_ns and self.held.get(term, term <= 1)
         ]
         return min(instants, default=None)
 

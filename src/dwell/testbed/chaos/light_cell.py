@@ -7,7 +7,6 @@ from typing import Any
 from dwell.testbed.chaos.stages import FRAME_BYTES, NODES
 
 PERIOD_MS = 40
-P_NS = PERIOD_MS * 1_000_000
 GUARD_CYCLES = 3
 MAX_AGE_MS = 120
 MIN_DWELL = 2

@@ -7,8 +7,10 @@ import threading
 import time
 from collections.abc import Collection
 
+from dwell.testbed.child import Started
 
-class StallDetector:
+
+class StallDetector(Started):
     """Threads, one pinned to each CPU, that note when they were not scheduled: the machine's doing.
 
     The cell's processes have the same priority: where a thread that only sleeps comes too late,
@@ -18,6 +20,7 @@ class StallDetector:
     STEP_S = 0.004
 
     def __init__(self) -> None:
+        super().__init__()
         self.stalls: list[tuple[int, int, int]] = []
         self._stopped = threading.Event()
         self._threads = [
@@ -25,17 +28,11 @@ class StallDetector:
             for cpu in sorted(os.sched_getaffinity(0))
         ]
 
-    def __enter__(self) -> StallDetector:
-        """Begin to watch."""
+    def _start(self) -> None:
         for thread in self._threads:
             thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """End."""
-        self._stopped.set()
-        for thread in self._threads:
-            thread.join()
+            self._stack.callback(thread.join)
+        self._stack.callback(self._stopped.set)
 
     def _watch(self, cpu: int) -> None:
         os.sched_setaffinity(0, {cpu})

@@ -10,17 +10,17 @@ import os
 import struct
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any
 
-from dwell.errors import DwellError, LiveError
+from dwell.errors import LiveError
 from dwell.live.keys import Keys
 from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import SESSIONS, Role, Session, Wiring, WiringEntry
 from dwell.testbed.chaos.invariants import Judge
-from dwell.testbed.child import Child, Parent
+from dwell.testbed.child import Child, Parent, Started
 from dwell.testbed.testbed import LocalTestbed
 
 _HEAD = struct.Struct("<QIII")
@@ -61,12 +61,13 @@ class Wiretap(Child):
         self, cell: Path, nodes: Sequence[str], out: Path, prefix: Sequence[str] = ()
     ) -> None:
         name = f"tap at {','.join(nodes)}"
-        settings = {"cell": str(cell), "nodes": list(nodes), "out": str(out)}
+        settings = cell, nodes, out
         super().__init__("dwell.testbed.chaos.wiretap", name, settings, prefix=prefix)
 
     def peers(self) -> int:
         """Return how many sessions it is connected to now."""
-        return cast("int", self.ask({})["peers"])
+        count: int = self.ask(None)
+        return count
 
 
 class Records:
@@ -96,44 +97,29 @@ class Records:
         self._read += at
 
 
-class ActuatorObserver:
+class ActuatorObserver(Started):
     """Hears a cell by wiretaps on all its nodes, and judges what it hears; a context manager."""
 
     def __init__(self, testbed: LocalTestbed, cell: Path) -> None:
+        super().__init__()
         self.judge = Judge(testbed.problem)
         self._taps: list[Wiretap] = []
         self._records: list[Records] = []
-        self._stack = ExitStack()
         for nodes, prefix in testbed.taps().items():
             out = testbed.folder / f"heard-{'-'.join(nodes)}"
             self._taps.append(Wiretap(cell, nodes, out, prefix))
             self._records.append(Records(out))
 
-    def __enter__(self) -> Self:
-        """Begin to listen; returns when something has been heard.
-
-        Raises
-        ------
-        LiveError
-            If nothing is.
-        """
-        try:
-            for tap in self._taps:
-                self._stack.enter_context(tap)
-            until = time.monotonic() + HEARD_S
-            while not {"stamped", "done", "in"} <= self.judge.counts.keys():
-                if time.monotonic() > until:
-                    raise LiveError(f"of the cell only {sorted(self.judge.counts)} is heard")
-                time.sleep(0.05)
-                self.look()
-        except BaseException:
-            self._stack.close()
-            raise
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """End."""
-        self._stack.close()
+    def _start(self) -> None:
+        """Listen until something has been heard."""
+        for tap in self._taps:
+            self._stack.enter_context(tap)
+        until = time.monotonic() + HEARD_S
+        while not {"stamped", "done", "in"} <= self.judge.counts.keys():
+            if time.monotonic() > until:
+                raise LiveError(f"of the cell only {sorted(self.judge.counts)} is heard")
+            time.sleep(0.05)
+            self.look()
 
     def look(self) -> list[str]:
         """Return the faults of the messages heard since the last call."""
@@ -151,41 +137,32 @@ def main() -> None:
     from dwell.live.wiring import wire
     from dwell.testbed.linked_transport import without_source
 
-    parent = Parent()
-    try:
-        settings = parent.receive()
-        os.environ[INSECURE] = "1"
-        try:
-            problem = load(cast("str", settings["cell"]))
-            entry = entry_for(wire(problem), cast("list[str]", settings["nodes"]))
-            transport = ZenohTransport(entry)
-        except DwellError as error:
-            parent.answer({"error": str(error)})
-            return
-        file = Path(cast("str", settings["out"])).open("ab", buffering=0)  # noqa: SIM115
-        lock = threading.Lock()
-        inputs = Keys(problem.name).inputs("", "", "").rstrip("/")
+    with ExitStack() as stack:
 
-        def write(sample: Arrival) -> None:
-            at_ns = time.monotonic_ns()
-            payload = b"" if sample.key.startswith(inputs) else sample.payload
-            key = sample.key.encode()
-            _, header = without_source(sample.header)
-            lengths = len(key), len(payload), len(header)
-            with lock:
-                file.write(_HEAD.pack(at_ns, *lengths) + key + payload + header)
+        def begin(settings: tuple[Path, Sequence[str], Path]) -> Callable[[None], int]:
+            cell, nodes, out = settings
+            os.environ[INSECURE] = "1"
+            problem = load(cell)
+            file = stack.enter_context(out.open("ab", buffering=0))
+            transport = ZenohTransport(entry_for(wire(problem), nodes))
+            stack.callback(transport.close)
+            lock = threading.Lock()
+            inputs = Keys(problem.name).inputs("", "", "").rstrip("/")
 
-        for key in heard(Keys(problem.name)):
-            transport.subscribe(key, write)
-        parent.answer({})
-        try:
-            while True:
-                parent.receive()
-                parent.answer({"peers": sum(transport.peers.values())})
-        finally:
-            transport.close()
-    except EOFError:
-        pass
+            def write(sample: Arrival) -> None:
+                at_ns = time.monotonic_ns()
+                payload = b"" if sample.key.startswith(inputs) else sample.payload
+                key = sample.key.encode()
+                _, header = without_source(sample.header)
+                lengths = len(key), len(payload), len(header)
+                with lock:
+                    file.write(_HEAD.pack(at_ns, *lengths) + key + payload + header)
+
+            for key in heard(Keys(problem.name)):
+                transport.subscribe(key, write)
+            return lambda _: sum(transport.peers.values())
+
+        Parent().serve(begin)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from dwell.calibration.error_origin import LONGEST, describe_raised
+from dwell.errors import LONGEST, describe_raised
 
 
 def raised(code: str, name: str) -> BaseException:
@@ -29,8 +29,13 @@ def test_the_line_names_error_and_place(code: str, line: str) -> None:
     assert describe_raised(raised(code, "/home/me/stages.py")) == line
 
 
-def test_a_file_that_is_no_python_is_named_with_its_line() -> None:
-    assert describe_raised(raised("def (:", "stages.py")).endswith("(stages.py:1)")
+def test_a_file_that_is_no_python_is_named_once() -> None:
+    assert describe_raised(raised("def (:", "stages.py")).endswith("(stages.py, line 1)")
+
+
+def test_the_place_of_a_call_itself_is_not_named() -> None:
+    error = raised("raise TypeError('no argument')", "/home/me/stages.py")
+    assert describe_raised(error, but="/home/me/stages.py") == "TypeError: no argument"
 
 
 def test_long_messages_are_cut() -> None:
