@@ -54,18 +54,14 @@ def foreign(name: str, result: Any, *arguments: Any) -> Callable[[], Any]:
     return loaded
 
 
-_digest = foreign("dwell_digest", ctypes.c_char_p)
-_compiler = foreign("dwell_compiler", ctypes.c_char_p)
-
-
 def digest() -> str:
     """Return the SHA-256 of the sources that the library was built of."""
-    return str(_digest()(), "ascii")
+    return str(foreign("dwell_digest", ctypes.c_char_p)()(), "ascii")
 
 
 def compiler() -> str:
     """Return the name and version of the compiler that built the library."""
-    return str(_compiler()(), "utf-8")
+    return str(foreign("dwell_compiler", ctypes.c_char_p)()(), "utf-8")
 
 
 def load(folder: Traversable) -> ctypes.CDLL:

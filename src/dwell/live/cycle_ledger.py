@@ -207,6 +207,11 @@ def told(cycles: Sequence[LiveCycle]) -> Sequence[LiveCycle]:
     return [cycle for cycle in cycles if not cycle.untold] or cycles
 
 
+def violation_rate(cycles: Sequence[LiveCycle], deadline_ns: int) -> float:
+    """V_D: share of cycles that missed."""
+    return sum(cycle.missed(deadline_ns) for cycle in cycles) / len(cycles)
+
+
 class Ledger:
     """Puts what messages say of cycles on the stamper's clock, and adds it up."""
 

@@ -24,7 +24,7 @@ import numpy as np
 
 from dwell.control import ClosedWindow, Controller
 from dwell.errors import LiveError
-from dwell.live.cycle_ledger import Ledger, LiveCycle, told
+from dwell.live.cycle_ledger import Ledger, LiveCycle, told, violation_rate
 from dwell.live.loads import ProcessLoads
 from dwell.live.messages import Completion, Load, Stamp, Stamped
 from dwell.live.offsets import UNBOUNDED_NS, Offsets
@@ -82,7 +82,8 @@ class LiveWindows:
         self._keeps_jobs = resume.jobs
         self._size = problem.window_cycles
         self._period_ns = round(problem.pipeline.period_ms * 1e6)
-        self._proven_ns = int(PROVEN_SHARE * round(problem.pipeline.deadline_ms * 1e6))
+        self._deadline_ns = round(problem.pipeline.deadline_ms * 1e6)
+        self._proven_ns = int(PROVEN_SHARE * self._deadline_ns)
         self._longest = 8 * self._size + KEPT_CYCLES
         #: What is recorded.
         self.record = RunRows(
@@ -381,6 +382,7 @@ class LiveWindows:
             heard=sum(cycle.heard for cycle in cycles),
             bound_ns=bound_ns,
             unproven=bound_ns > self._proven_ns or any(cycle.untold for cycle in cycles),
+            rate_at_close=violation_rate(known, self._deadline_ns),
             used=self._controller.utilisation(closed),
             closed_unix_ns=unix_ns,
         )

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.control import Controller, Proposal, final_l95_ms
-from dwell.live.cycle_ledger import Ledger, LiveCycle, told
+from dwell.live.cycle_ledger import Ledger, LiveCycle, told, violation_rate
 from dwell.live.loads import ProcessLoads
 from dwell.live.messages import NOT_APPLIED
 from dwell.live.offsets import UNBOUNDED_NS
@@ -65,6 +65,8 @@ class LiveWindow:
         Bound of the error of its latencies, by the clocks; `UNBOUNDED_NS` where it is not known.
     unproven : bool
         Whether that is more than 20 % of D, or nobody knows of a cycle whether it has completed.
+    rate_at_close : float
+        V_D by what was known when it closed.
     used : float64 array, shape (3, nodes)
         Busy, own and shadow share of the cores.
     seen : tuple of float or None
@@ -78,6 +80,7 @@ class LiveWindow:
     heard: int
     bound_ns: int
     unproven: bool
+    rate_at_close: float
     used: NDArray[np.float64]
     closed_unix_ns: int | None
     seen: tuple[float | None, ...] = (None, None, None)
@@ -85,14 +88,14 @@ class LiveWindow:
     def shown(self, proposal: Proposal, controller: Controller) -> dict[str, Any]:
         """Return the window, and what was proposed on it, as people look at it."""
         decision, names = proposal.decision, controller.problem.candidates
-        l95_ms, violation_rate, cost = proposal.seen
+        l95_ms, _, cost = proposal.seen
         columns = controller.decision_columns[-len(proposal.priced) :]
         priced = dict(zip(columns, proposal.priced, strict=True))
         return {
             "number": self.number,
             "placement": self.cycles[0].placement,
             "l95_ms": l95_ms,
-            "violation_rate": violation_rate,
+            "violation_rate": self.rate_at_close,
             "cost": cost,
             "reason": decision.reason,
             "decided": decision.name,
@@ -108,9 +111,8 @@ class LiveWindow:
         }
 
     def violation_rate(self, deadline_ns: int) -> float:
-        """V_D: share of its cycles that missed, of those whose end is known."""
-        known = told(self.cycles)
-        return sum(cycle.missed(deadline_ns) for cycle in known) / len(known)
+        """V_D: share of its cycles that missed, of those whose end is known by now."""
+        return violation_rate(told(self.cycles), deadline_ns)
 
 
 def sends_shadows(controller: Controller) -> bool:
