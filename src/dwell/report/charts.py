@@ -362,7 +362,10 @@ def curves(
         # Values at even distances, as numbers of robots are, stand at even distances.
         wide = min(values) > 0 and is_wide(values) and np.ptp(np.diff(values)) > 0
         scale = "log" if wide else "linear"
-        across |= {"scale": {"type": scale, "zero": False}, "axis": {**axis, "format": ".6~g"}}
+        across |= {
+            "scale": {"type": scale, "zero": False, "padding": 6},
+            "axis": {**axis, "format": ".6~g"},
+        }
     up = quantity("mean", measure.heading, axis={"tickCount": 5})
     about = [*names("policy"), at, *_mean_and_ends(measure)]
 
