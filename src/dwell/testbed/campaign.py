@@ -130,7 +130,7 @@ class Campaign:
     @property
     def window_s(self) -> float:
         """Length of a window."""
-        return self.problem.window_cycles * self.problem.pipeline.period_ms / 1e3
+        return self.problem.window_ms / 1e3
 
     def plan(self) -> tuple[Planned, ...]:
         """Return all runs in their order: blocks of one repetition, each shuffled by itself."""

@@ -252,9 +252,7 @@ def _fifo() -> Finding:
 def _standstill(problems: Sequence[Problem], watch_s: float) -> Finding:
     """Watch idle CPUs for standstills, which would stop a run of a testbed, too."""
     name, rule = "no standstills", Rule()
-    window_s = min(
-        (one.window_cycles * one.pipeline.period_ms / 1e3 for one in problems), default=WINDOW_S
-    )
+    window_s = min((one.window_ms / 1e3 for one in problems), default=WINDOW_S)
     try:
         late_ms = _lateness(watch_s)
     except LiveError as error:

@@ -141,7 +141,7 @@ def crowded(run: Run, problem: Problem) -> list[str]:
     """
     import polars as pl
 
-    span_s = problem.window_cycles * problem.pipeline.period_ms / 1e3
+    span_s = problem.window_ms / 1e3
     # A window whose first cycle is missing from the record is left out.
     begun = run.cycles.select(pl.col("release_ns") / 1e9, first_cycle="cycle")
     windows = run.windows.filter(~pl.col("warmup")).join(begun, on="first_cycle")

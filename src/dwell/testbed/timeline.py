@@ -98,7 +98,7 @@ def timeline_of(
         return Timeline()
     from dwell.sim import draw_changes
 
-    window_s = problem.window_cycles * problem.pipeline.period_ms / 1e3
+    window_s = problem.window_ms / 1e3
     windows = math.floor(seconds / window_s) + 1
     period_ms = problem.pipeline.period_ms
     require_length(windows, problem.window_cycles, period_ms, f"seconds = {seconds:g}")
