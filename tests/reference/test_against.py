@@ -65,11 +65,11 @@ from tests.reference.simulator import (
     simulate,
 )
 
-EXAMPLES = int(os.environ.get("DWELL_EXAMPLES", "60"))
+EXAMPLES = int(os.environ.get("DWELL_EXAMPLES", "80"))
 # Of the problems that take longer: those with shadows, and those in which orders take time.
-LONGER = int(os.environ.get("DWELL_EXAMPLES", "30"))
+LONGER = int(os.environ.get("DWELL_EXAMPLES", "40"))
 #: One in so many is among the few; `make test-all` tries the others.
-ONE_IN = 3
+ONE_IN = 4
 FAIR_TOLERANCE_NS = NEAR_NS
 # Core time of a job that foreign threads interfered with is a sum of floats.
 WORK_TOLERANCE_NS = 1

@@ -23,12 +23,10 @@ from dwell.model import (
     Task,
 )
 from tests.cells.generated import make_problem
-from tests.reference.test_against import LONGER, ONE_IN, Case, examine
+from tests.reference.test_against import EXAMPLES, LONGER, ONE_IN, Case, examine
 
 NODES = ("R", "E", "F")
 CANDIDATES = ("LOC", "ONE", "TWO", "ALL")
-#: Cells that are tried: they are small, and there are more of them than of other problems.
-CELLS = 80
 
 
 class _Maker:
@@ -153,9 +151,9 @@ class _Maker:
 
 @pytest.fixture(params=["few", "the others"])
 def seeds(request: pytest.FixtureRequest) -> range:
-    """Seeds of the cells that are tried; they are small, and there are more of them."""
+    """Seeds of the cells that are tried."""
     few = -(-LONGER // ONE_IN)
-    return range(few) if request.param == "few" else range(few, CELLS)
+    return range(few) if request.param == "few" else range(few, EXAMPLES)
 
 
 def test_the_guard_of_failing_cells_equal_to_the_nanosecond(seeds: range) -> None:
