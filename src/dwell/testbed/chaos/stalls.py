@@ -32,7 +32,7 @@ class StallDetector(Started):
         for thread in self._threads:
             thread.start()
             self._stack.callback(thread.join)
-        self._stack.callback(self._stopped.set)
+            self._stack.callback(self._stopped.set)
 
     def _watch(self, cpu: int) -> None:
         os.sched_setaffinity(0, {cpu})
