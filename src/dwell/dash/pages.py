@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,12 +30,13 @@ def recorded_page(folder: Path, beside: Path | None) -> Dash:
     RunError
         If a folder is neither, or damaged, or no run of a fleet is whole.
     """
-    fleet = is_fleet(folder)
-    for one in () if fleet else (folder, beside):
-        if one is not None:
+    read: Callable[[], dict[str, Any]] = partial(_fleet, folder)
+    if not is_fleet(folder):
+        for one in filter(None, (folder, beside)):
             _require_run(one)
+        read = partial(_on_one_line, folder, beside)
     with ThreadPoolExecutor(1) as reader:
-        reading = reader.submit(_fleet if fleet else _on_one_line, folder, beside)
+        reading = reader.submit(read)
         # Meanwhile: both take as long.
         from dwell.dash.server import Dash
 
@@ -61,7 +63,7 @@ def _runs_in(folder: Path) -> list[Path]:
     return [path for path in (*folder.glob("*"), *folder.glob("runs/*")) if is_run(path)]
 
 
-def _fleet(folder: Path, _: Path | None) -> dict[str, Any]:
+def _fleet(folder: Path) -> dict[str, Any]:
     from dwell.dash.recorded_fleet import RecordedFleet
 
     return {"fleet": RecordedFleet(folder)}
