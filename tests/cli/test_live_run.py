@@ -29,6 +29,7 @@ from dwell.model.document import to_document
 from dwell.testbed.playing import crowded, make_folder
 from dwell.testbed.timeline import timeline_of
 from tests.cli.small_cell import ROOT, assert_refused, call
+from tests.processes import lives
 from tests.report.live_runs import PERIOD_NS, live_run
 
 CELL = ROOT / "examples" / "visual_servoing" / "cell.yaml"
@@ -148,7 +149,7 @@ def test_interrupted_it_seals_its_run_and_ends_everything(
     # No window may have closed.
     assert run.meta.get("played", []) == []
     # Everything had ended before it told so.
-    assert not [process for process in of_it if process.is_running()]
+    assert not [process for process in of_it if process.is_running() and lives(process.pid)]
 
 
 @TWO_CPUS

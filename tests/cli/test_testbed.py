@@ -21,6 +21,7 @@ from dwell.testbed.groups import group_name
 from dwell.testbed.hosts import namespace_name, namespace_path
 from tests.cells.light import QUOTAS, document, write_cell
 from tests.cli.small_cell import assert_refused, call
+from tests.processes import lives
 from tests.testbed.machine import no_groups, no_hosts, own_name
 
 PATIENCE_S = 240.0
@@ -199,4 +200,4 @@ def test_interrupted_it_takes_everything_down(number: signal.Signals, tmp_path: 
         process.send_signal(number)
         assert process.wait(PATIENCE_S) == 130
     assert left(name) == []
-    assert not [process for process in of_it if process.is_running()]
+    assert not [process for process in of_it if process.is_running() and lives(process.pid)]

@@ -177,6 +177,31 @@ def test_whom_the_stamper_tells_that_no_guard_moved_needs_no_proof(problem: Prob
     assert len(world.stamper.moves) >= before + 6
 
 
+def test_an_order_that_comes_after_the_guards_move_has_not_brought_it_about(
+    problem: Problem,
+) -> None:
+    """Only stamps are heard, and the placement is the one that is ordered a little later."""
+    twin, ordered_ns = alternating(problem), list[int]()
+
+    def hear(sample: Arrival) -> None:
+        if sample.key == twin.keys.order() and decode(sample.payload, Order).placement == "LOC":
+            ordered_ns.append(twin.network.now_ns)
+
+    twin.network.taps.append(hear)
+    twin.run(6_000)
+    world = alternating(problem)
+    world.network.advance(ordered_ns[0] - world.stamper.place.period_ns // 2)
+    assert world.stamper.placement == "SO"
+    world.network.cut("stamper@R1", "*", key="dwell/*/accepted")
+    world.network.cut("agent@E", "*", key="dwell/*/gathered")
+    world.stamper._move("LOC", by_guard=True)
+    world.run(400)
+    cell = world.cell
+    assert (cell.course.term, cell.course.placement) == (world.stamper.term, "LOC")
+    assert cell.course.by_guard
+    assert cell.guard_moves == 1
+
+
 def test_what_nobody_wants_any_more_is_probed_no_longer(problem: Problem) -> None:
     world = alternating(problem)
     world.run(2_000)

@@ -9,13 +9,13 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import psutil
 import pytest
 import yaml
 
 from dwell.live.supervision import survivor
 from dwell.testbed.processes import without_keys
 from tests.cli.live_cell import RealCell
+from tests.processes import lives
 from tests.waiting import wait_until
 
 WORKER = "planning@R2"
@@ -68,14 +68,6 @@ class Forking:
         process = survivor(self._state / f"{WORKER}.pid")
         assert process is not None
         process.kill()
-
-
-def lives(pid: int) -> bool:
-    """Whether a process runs; what has ended may wait for its parent."""
-    try:
-        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
-    except psutil.NoSuchProcess:
-        return False
 
 
 @pytest.fixture

@@ -20,6 +20,7 @@ from dwell.live import supervision
 from dwell.live.state_files import InFlight
 from dwell.live.supervision import SupervisedProcess, Supervisor, claim
 from dwell.testbed.chaos.disk import SmallDisk, may_mount
+from tests.processes import lives
 from tests.waiting import wait_until
 
 PATIENCE_S = 20.0
@@ -224,7 +225,7 @@ def test_what_does_not_listen_is_killed(tmp_path: Path, said: list[str]) -> None
     supervisor.stop(patience_s=0.5)
     for pid in pids:
         assert pid is not None
-        assert not psutil.pid_exists(pid) or psutil.Process(pid).status() == psutil.STATUS_ZOMBIE
+        assert not lives(pid)
 
 
 @pytest.mark.skipif(not may_mount(), reason="nobody but root mounts a disk")
@@ -329,13 +330,6 @@ def helpers(tmp_path: Path) -> Iterator[Callable[[], list[int]]]:
             os.kill(pid, signal.SIGKILL)
 
 
-def runs(pid: int) -> bool:
-    try:
-        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
-    except psutil.NoSuchProcess:
-        return False
-
-
 def test_what_a_dead_process_leaves_is_ended_before_it_is_started_again(
     supervisor: Supervisor, tmp_path: Path, helpers: Callable[[], list[int]]
 ) -> None:
@@ -349,12 +343,12 @@ def test_what_a_dead_process_leaves_is_ended_before_it_is_started_again(
 
     def started_again() -> bool:
         if child.starts == 2 and not left_at_start:
-            left_at_start.extend(pid for pid in near if runs(pid))
+            left_at_start.extend(pid for pid in near if lives(pid))
         return child.starts == 2
 
     until(supervisor, started_again)
     assert not left_at_start
-    assert runs(apart)
+    assert lives(apart)
 
 
 def test_the_next_agent_ends_what_a_worker_has_left_that_died_without_one(
@@ -365,7 +359,7 @@ def test_the_next_agent_ends_what_a_worker_has_left_that_died_without_one(
     first.step()
     *near, apart = helpers()
     # The agent's death alone ends nothing.
-    assert all(runs(pid) for pid in (*near, apart))
+    assert all(lives(pid) for pid in (*near, apart))
     assert child.process is not None
     os.kill(child.process.pid, signal.SIGKILL)
     child.process.wait()
@@ -373,8 +367,8 @@ def test_the_next_agent_ends_what_a_worker_has_left_that_died_without_one(
     again = keep(second, "worker@E", "import time; time.sleep(60)")
     try:
         until(second, lambda: again.starts == 1)
-        assert not any(runs(pid) for pid in near)
-        assert runs(apart)
+        assert not any(lives(pid) for pid in near)
+        assert lives(apart)
     finally:
         second.stop()
 
@@ -387,8 +381,8 @@ def test_helpers_end_with_their_process_at_an_orderly_end(
     supervisor.step()
     *near, apart = helpers()
     supervisor.stop()
-    assert not any(runs(pid) for pid in near)
-    assert runs(apart)
+    assert not any(lives(pid) for pid in near)
+    assert lives(apart)
 
 
 def test_the_last_words_are_those_of_the_life_that_has_ended(

@@ -116,8 +116,9 @@ class ControlledCell:
         # newest cycle, and before the term that holds, were heard of.
         self.continuity = Continuity(place.period_ns)
         self._cycle_asked = self._term_asked = 0
-        # What a stamp says of a term that nobody has confirmed, and how many in a row.
-        self._unconfirmed: tuple[tuple[int, int, str], int] | None = None
+        # What a stamp says of a term that nobody has confirmed, whether the order under way asks
+        # for it, and how many stamps in a row say so.
+        self._unconfirmed: tuple[tuple[int, int, str], bool, int] | None = None
         self._doubted_until_ns: int | None = None
         self.refused = ""
         self.pinned = ""
@@ -274,25 +275,27 @@ class ControlledCell:
         if (stamp.run, stamp.term) <= (course.run, course.term):
             self._unconfirmed = None
             return
+        reported = stamp.run, stamp.term, stamp.placement
+        known, ordered, count = self._unconfirmed or (None, False, 0)
+        if known != reported:
+            # An order that is sent later has not brought it about.
+            ordered, count = self._has_ordered(stamp), 0
+            # The answer says who has moved the cell, too.
+            self._ask_ns = now_ns
+        count += 1
+        self._unconfirmed = reported, ordered, count
+        if count == CONFIRMATIONS:
+            self._now_at(*reported, by_guard=not ordered)
+
+    def _has_ordered(self, stamp: Stamp) -> bool:
+        """Whether a stamp's term is what the order that has no answer yet asks for."""
         move = self._move
-        ours = (
+        return (
             move is not None
             and move.order is not None
-            and stamp.run == course.run
-            and stamp.term == move.order.term + 1
+            and (stamp.run, stamp.term) == (self.course.run, move.order.term + 1)
             and stamp.placement == move.name
         )
-        reported = stamp.run, stamp.term, stamp.placement
-        if not ours:
-            known, count = self._unconfirmed or (None, 0)
-            count = count + 1 if known == reported else 1
-            self._unconfirmed = reported, count
-            if count < CONFIRMATIONS:
-                if count == 1:
-                    # The answer says who has moved the cell, too.
-                    self._ask_ns = now_ns
-                return
-        self._now_at(*reported, by_guard=not ours)
 
     def _now_at(self, run: int, term: int, placement: str, *, by_guard: bool) -> None:
         """Take note of the placement that holds since a term began."""
