@@ -8,10 +8,12 @@ import signal
 import subprocess
 import sys
 import threading
+from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 
-from dwell.live.parent_death import end_with_owner
+from dwell.live.parent_death import OPTION, end_those_of, end_with_owner
 from dwell.live.transport.orphans import SHARED_MEMORY
 
 PATIENCE_S = 60.0
@@ -51,6 +53,24 @@ def test_an_owner_that_has_gone_already_is_noticed() -> None:
     stopped = threading.Event()
     end_with_owner(stopped, gone.pid)
     assert stopped.is_set()
+
+
+def test_those_of_a_cell_are_ended_and_no_others(tmp_path: Path) -> None:
+    """By owner and cell file; those of another cell, or of another owner, go on."""
+    waits = [sys.executable, "-c", "import time; print('waits', flush=True); time.sleep(3600)"]
+    mine, other, me = tmp_path / "cell.yaml", tmp_path / "other.yaml", str(os.getpid())
+    with ExitStack() as stack:
+        started = []
+        for cell, owner in ((mine, me), (mine, me), (other, me), (mine, "1")):
+            words = ["--cell", str(cell), "--serve", OPTION, owner]
+            one = subprocess.Popen([*waits, *words], stdout=subprocess.PIPE)
+            stack.enter_context(one)
+            stack.callback(one.kill)
+            assert one.stdout is not None
+            assert one.stdout.readline() == b"waits\n"
+            started.append(one)
+        end_those_of(me, mine, PATIENCE_S)
+        assert [one.poll() for one in started] == [-signal.SIGKILL, -signal.SIGKILL, None, None]
 
 
 #: As above; the process holds a file as Zenoh holds a segment, and a sweeper waits as well.

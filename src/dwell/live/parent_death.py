@@ -14,10 +14,12 @@ from __future__ import annotations
 
 import os
 import select
+import signal
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -72,6 +74,20 @@ def start_sweeper() -> subprocess.Popen[bytes]:
     )
 
 
+def end_those_of(owner: str, cell: Path, patience_s: float) -> None:
+    """Kill those of a cell that end with an owner, and wait until they have ended.
+
+    Parameters
+    ----------
+    owner : str
+        What follows `OPTION` on their command lines.
+    cell : Path
+        Cell file there.
+    """
+    words = (OPTION, owner), ("--cell", str(cell.resolve()))
+    _await(words, patience_s, signal.SIGKILL)
+
+
 def _sweep(owner: int) -> None:
     try:
         select.select([os.pidfd_open(owner)], [], [])
@@ -79,24 +95,33 @@ def _sweep(owner: int) -> None:
         pass  # it has ended already
     except OSError:
         return  # a kernel without them: nobody ends with an owner
-    deadline = time.monotonic() + SWEEP_S
+    _await([(OPTION, str(owner))], SWEEP_S)
+    remove_orphans()
+
+
+def _await(words: Iterable[Iterable[str]], patience_s: float, number: int = 0) -> None:
+    """Wait until those have ended that have such words; a signal goes to each, if not 0."""
+    deadline = time.monotonic() + patience_s
     # Whoever is waited for may have started another one meanwhile.
-    while (left_s := deadline - time.monotonic()) > 0 and (left := _those_of(owner)):
+    while (left_s := deadline - time.monotonic()) > 0 and (left := _with_words(words)):
+        for process in left:
+            with suppress(OSError):
+                signal.pidfd_send_signal(process, number)
         for process in left:
             # Readable when it has let go of all its files.
             select.select([process], [], [], left_s)
             os.close(process)
-    remove_orphans()
 
 
-def _those_of(owner: int) -> list[int]:
-    """Return a descriptor of every process that ends with an owner."""
-    words = b"\0%b\0%d\0" % (OPTION.encode(), owner)
+def _with_words(words: Iterable[Iterable[str]]) -> list[int]:
+    """Return a descriptor of every process whose command line has words one after another."""
+    parts = [os.fsencode("\0".join(("", *part, ""))) for part in words]
     found = []
     for file in Path("/proc").glob("[0-9]*/cmdline"):
         # Some have just ended, and some are other users'.
         with suppress(OSError):
-            if words in file.read_bytes():
+            read = file.read_bytes()
+            if all(part in read for part in parts):
                 found.append(os.pidfd_open(int(file.parent.name)))
     return found
 

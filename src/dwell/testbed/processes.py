@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from dwell.cellfile.yaml_text import yaml_of
-from dwell.live.parent_death import OPTION, start_sweeper
+from dwell.live.parent_death import OPTION, end_those_of, start_sweeper
 from dwell.live.transport.orphans import remove_orphans
 from dwell.live.trust import KEYS
 from dwell.live.wiring import PORTS_PER_ROLE, roles
@@ -192,6 +192,8 @@ class Processes:
         """End all processes, the agents after the controller, and remove their shared memory."""
         self.stop_controller()
         self._end("", STOP_S)
+        # On a full machine those of the lowest class outlive an agent that is killed.
+        end_those_of(self._owner, self.file, KILL_S)
         if self._sweeper is not None:
             self._sweeper.kill()
             self._sweeper.wait()
