@@ -95,8 +95,7 @@ class RealCell:
         document["nodes"]["E"]["accelerators"] = {"gpu": 1}
         document["live"] |= {"release": "frames", "max_age_ms": 400}
         # Other work on this machine shall not look like a fault.
-        document["controller"] |= {"guard_cycles": 10, "policy": "LOC"}
-        document |= {"period_ms": 100, "window_cycles": 10}
+        document["controller"] |= {"guard_cycles": 20, "policy": "LOC"}
         nodes = list(document["nodes"])
         first = free_ports(3 * 40)
         for i, node in enumerate(nodes):

@@ -86,9 +86,10 @@ def test_a_table_and_a_figure_say_what_they_average_over(folder: Path) -> None:
     row = next(one for one in rows if at.items() <= one.items())
     # Seed by seed, and then over the seeds.
     assert row["4"] == pytest.approx(mine["violation_rate"].to_numpy().mean() / 2)
-    two = {name for name, _ in figure_files(study_page(saved)) if name.endswith("-0.csv")}
+    of_two = study_page(saved)
+    two = {name for name, _ in figure_files(of_two) if name.endswith("-0.csv")}
     assert two == set(files)
-    assert "averaged" not in table_tex(table_of(study_page(saved), "pivot-violation_rate-0"))
+    assert "averaged" not in table_tex(table_of(of_two, "pivot-violation_rate-0"))
 
 
 def test_parameters_that_go_together_are_one_axis_with_its_label(tmp_path: Path) -> None:
