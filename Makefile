@@ -19,7 +19,7 @@ COMPILE := $(UV) pip compile --quiet --python $(BIN)/python --universal --python
 	--generate-hashes --custom-compile-command "make lock" $(if $(UPGRADE),--upgrade)
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test test-all check bench paper deadlines planted faults seeds chaos soak fuzz audit sbom lock clean again
+.PHONY: help env demo test test-all check types tidy bench paper deadlines planted faults seeds chaos soak fuzz audit sbom lock clean again
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' Makefile
@@ -72,13 +72,18 @@ test-all: env ## Run the tests that `make test` leaves out (tests/conftest.py)
 	$(TESTS) $(BESIDE) -m "exhaustive and not alone" $(ARGS) || [ $$? -eq 5 ]
 	$(TESTS) -m "exhaustive and alone" $(ARGS) || [ $$? -eq 5 ]
 
-# clang-tidy reads the headers of the system's own C++ library.
+# What takes longest runs side by side. clang-tidy reads the headers of the system's own C++ library.
 check: env ## Lint, formatting, types and the borders between packages
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy $(CODE) hatch_build.py
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/clang-format --dry-run -Werror $(filter %.cpp %.h,$(SOURCES)) tests/kernels/*.cpp
+	@$(MAKE) --no-print-directory --jobs --output-sync types tidy
+
+types:
+	$(BIN)/mypy $(CODE) hatch_build.py
+
+tidy:
 	$(BIN)/clang-tidy --quiet $(filter %.cpp,$(SOURCES))
 
 bench: env ## Run the benchmarks
