@@ -302,7 +302,7 @@ class FaultyWorld(World):
     @property
     def period_ns(self) -> int:
         """P."""
-        return round(self.problem.pipeline.period_ms * MS)
+        return self.problem.pipeline.period_ns
 
     # ------------------------------------------------------------------------------- faults
 

@@ -181,7 +181,7 @@ class Controller:
         self._none: list[float | bool | None] = [None] * len(self._names)
         self._capacity = np.array([one.capacity for one in resources], float)
         self._pricing = Pricing(problem.candidates, problem.objective)
-        self._deadline_ns = round(problem.pipeline.deadline_ms * 1e6)
+        self._deadline_ns = problem.pipeline.deadline_ns
         self._censor_ms = problem.censor_ms
         #: By which caps candidates are eligible: the policy's own, where it has any.
         self.objective: Objective = self._policy.objective or problem.objective

@@ -418,7 +418,7 @@ class Guard:
 
 def _patience_ns(problem: Problem) -> int:
     """Longest wait of a cell for a cycle: g periods."""
-    return problem.controller.guard_cycles * round(problem.pipeline.period_ms * 1e6)
+    return problem.controller.guard_cycles * problem.pipeline.period_ns
 
 
 def parts_of(problem: Problem, candidate: str) -> frozenset[str]:
@@ -466,7 +466,7 @@ class Presence:
         cycle that it cost. The guard looks g periods after that release: of what it takes for
         whole, the last sign of life has to be younger than that.
         """
-        period_ns = round(problem.pipeline.period_ms * 1e6)
+        period_ns = problem.pipeline.period_ns
         parts = {name: parts_of(problem, name) for name in problem.candidates}
         return cls(parts, max(problem.controller.guard_cycles - 1, 1) * period_ns)
 
@@ -712,7 +712,7 @@ class CellGuard(Guard):
         super().__init__(
             settings.fallbacks,
             guard_cycles=settings.guard_cycles,
-            period_ns=round(problem.pipeline.period_ms * 1e6),
+            period_ns=problem.pipeline.period_ns,
             probe_cycles=settings.probe_cycles,
             placement=placement or problem.initial,
         )

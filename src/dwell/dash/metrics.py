@@ -86,7 +86,7 @@ class CellMetrics(Collector):
     def __init__(self, observer: Observer) -> None:
         self._observer, self._problem = observer, observer.problem
         self._members = [role.who for role in roles(self._problem) if role.kind != "controller"]
-        self._deadline_s = round(self._problem.pipeline.deadline_ms * 1e6) / 1e9
+        self._deadline_s = self._problem.pipeline.deadline_ns / 1e9
         self._latency = Histogram(
             "dwell_cycle_latency_seconds",
             "Time from the release of a cycle to the completion of its last sink.",

@@ -196,7 +196,7 @@ class Observer:
         self._pulse = Pulse(self._place, lambda: (True, ""), hears=[("*", "*")])
         self._offsets = self._place.offsets()
         self._ledger = Ledger(problem, self._offsets)
-        self._deadline_ns = round(problem.pipeline.deadline_ms * 1e6)
+        self._deadline_ns = problem.pipeline.deadline_ns
         # First release of the run, on the stamper's clock.
         self._origin_ns = 0
         # Cycles that are not settled, by run and number, in the order of their stamps.

@@ -81,8 +81,8 @@ class LiveWindows:
         self._processes = ProcessLoads()
         self._keeps_jobs = resume.jobs
         self._size = problem.window_cycles
-        self._period_ns = round(problem.pipeline.period_ms * 1e6)
-        self._deadline_ns = round(problem.pipeline.deadline_ms * 1e6)
+        self._period_ns = problem.pipeline.period_ns
+        self._deadline_ns = problem.pipeline.deadline_ns
         self._proven_ns = int(PROVEN_SHARE * self._deadline_ns)
         self._longest = 8 * self._size + KEPT_CYCLES
         #: What is recorded.

@@ -105,7 +105,7 @@ class RolePlace:
         phase_ms = self.problem.pipeline.phase_ms
         require(phase_ms == 0, "phase_ms", phase_ms, "0 in a live cell, which begins when it is up")
         self.keys = Keys(self.problem.name)
-        self.period_ns = round(self.problem.pipeline.period_ms * 1e6)
+        self.period_ns = self.problem.pipeline.period_ns
 
     @property
     def patience_ns(self) -> int:

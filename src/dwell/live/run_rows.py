@@ -159,7 +159,7 @@ class RunRows:
         problem = controller.problem
         self._nodes, self._size = tuple(problem.fabric.nodes), problem.window_cycles
         self._warmup_windows, self._kept = problem.warmup_windows, kept
-        self._deadline_ns = round(problem.pipeline.deadline_ms * 1e6)
+        self._deadline_ns = problem.pipeline.deadline_ns
         self._sends_shadows = sends_shadows(controller)
         self._jobs = resume.jobs
         self._columns = columns_of(controller, jobs=resume.jobs)

@@ -29,7 +29,7 @@ class Symptoms:
         self._ledger, self._size = ledger, problem.window_cycles
         self._guard_cycles = problem.controller.guard_cycles
         self._failures = problem.controller.failures_in_a_row
-        self._deadline_ns = round(problem.pipeline.deadline_ms * 1e6)
+        self._deadline_ns = problem.pipeline.deadline_ns
         self._begun_ns: int | None = None
         self._recent: deque[LiveWindow] = deque(maxlen=RECENT_WINDOWS)
         # By sink: when a command was heard to be applied last, and what came of the last command.

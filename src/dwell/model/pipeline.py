@@ -162,6 +162,16 @@ class Pipeline:
         """Return its flows as chains: ``a → b → d; c → b``."""
         return "; ".join(" → ".join(chain) for chain in self.chains())
 
+    @property
+    def period_ns(self) -> int:
+        """P in whole nanoseconds."""
+        return round(self.period_ms * 1e6)
+
+    @property
+    def deadline_ns(self) -> int:
+        """D in whole nanoseconds."""
+        return round(self.deadline_ms * 1e6)
+
     def inputs(self, task: str) -> tuple[Flow, ...]:
         """Flows into a task."""
         return tuple(flow for flow in self.flows if flow.target == task)

@@ -104,7 +104,7 @@ class PlayedRealisation:
     def missed(self) -> NDArray[np.bool_]:
         """Whether each cycle missed: later than D, or unfinished when its window closed."""
         latency_ns = self.arrays.tables.latency_ns[0, : self.released]
-        missed: NDArray[np.bool_] = latency_ns > round(self.problem.pipeline.deadline_ms * 1e6)
+        missed: NDArray[np.bool_] = latency_ns > self.problem.pipeline.deadline_ns
         age_ns = self.close_ns[:, None] - self.by_window(self.realisation.release_ns)
         late = self.by_window(latency_ns) > age_ns
         if self.whole:

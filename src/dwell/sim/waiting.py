@@ -30,7 +30,7 @@ def waiting_of(problem: Problem, real: Realisation, arrays: CellArrays) -> Waiti
     """
     tables, pipeline = arrays.tables, problem.pipeline
     first, last = problem.warmup_windows * problem.window_cycles, real.cycles
-    late_ns = tables.latency_ns[0, :last] > round(pipeline.deadline_ms * 1e6)
+    late_ns = tables.latency_ns[0, :last] > pipeline.deadline_ns
     cycles = first + np.flatnonzero(late_ns[first:])
     logs, _, arrivals = arrays.logs()
     log, arrived = logs[0, cycles], arrivals[0, cycles][:, flow_rows(pipeline)]

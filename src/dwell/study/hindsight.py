@@ -105,7 +105,7 @@ class Hindsight:
                 f"hindsight knows no run of {', '.join(missing)} alone; a study gives it those, "
                 "and elsewhere `Hindsight(statics)` does"
             )
-        self._deadline_ns = round(problem.pipeline.deadline_ms * 1e6)
+        self._deadline_ns = problem.pipeline.deadline_ns
         self._censor_ms = problem.censor_ms
         self._candidates = tuple(problem.candidates)
 

@@ -262,7 +262,7 @@ def _actuator(cycles: TableArrays, counted: slice, problem: Problem) -> dict[str
     release_ns = cycles["release_ns"][: counted.stop]
     actuated = actuations(release_ns, cycles["latency_ns"][: counted.stop])
     begin_ns = int(release_ns[counted.start])
-    end_ns = int(release_ns[-1]) + round(problem.pipeline.period_ms * 1e6)
+    end_ns = int(release_ns[-1]) + problem.pipeline.period_ns
     age = age_of_information(actuated, begin_ns, end_ns)
     row = {f"aoi_{name}": value for name, value in age._asdict().items()}
     if problem.servo is not None:

@@ -181,7 +181,7 @@ def spans_of(run: Run, played: Played) -> list[Span]:
         return []
     origin_ns, _ = span
     problem = played.problem
-    period_ns = round(problem.pipeline.period_ms * 1e6)
+    period_ns = problem.pipeline.period_ns
     release_ns = run.cycles["release_ns"].to_list()
     first = run.cycles["cycle"][0]
     spans = []

@@ -134,7 +134,7 @@ class Harness(Started):
     @property
     def period_ns(self) -> int:
         """P."""
-        return round(self.problem.pipeline.period_ms * 1e6)
+        return self.problem.pipeline.period_ns
 
     def _start(self) -> None:
         """Start everything, and wait until the cell is at home."""
