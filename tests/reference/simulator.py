@@ -14,19 +14,14 @@ import itertools
 import math
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from fractions import Fraction
+from typing import Any
 
 import simpy
 
 from dwell.kernels.realisation import LinkSegment, NodeChange, Realisation
 from dwell.model import Execution, Flow, Node, Pipeline, Placement, Problem, Quota, Task
 from tests.reference.guard import NEVER, Guard, Proof
-
-if TYPE_CHECKING:
-    from fractions import Fraction
-else:
-    # The same numbers, in a third of the time.
-    from quicktions import Fraction
 
 #: Of the changes of one instant, the place of what quotas do then.
 LAST_CHANGE = 900_000
@@ -215,7 +210,7 @@ class Job:
     ready: int
     left: Fraction
     senders: tuple[Job, ...]
-    core: Fraction = ZERO
+    core: Fraction = Fraction(0)
     start: int | None = None
     started_by: int = -1
     end: int | None = None
@@ -333,9 +328,9 @@ class NodeState:
         self.down = False
         self.jobs: list[Job] = []
         self.served: dict[str, list[Job]] = {kind: [] for kind in node.accelerators}
-        self.busy = ZERO
-        self.work = {ITSELF: ZERO, SHADOW: ZERO}
-        self.places = {kind: [ZERO] * 3 for kind in node.accelerators}
+        self.busy = Fraction(0)
+        self.work = {ITSELF: Fraction(0), SHADOW: Fraction(0)}
+        self.places = {kind: [Fraction(0)] * 3 for kind in node.accelerators}
         self.since = 0
         self.stressed = 0
         self.period = self.quota = self.left = self.pool = self.slack = self.periods = 0
@@ -558,7 +553,7 @@ class NodeState:
     def speed(self, cell: int) -> Fraction:
         """Speed of own jobs, or of shadow jobs."""
         if self.stopped:
-            return ZERO
+            return Fraction(0)
         share = (self.share if cell == ITSELF else self.share_of_shadows) * self.pace
         return share / self.slowness
 
@@ -580,7 +575,7 @@ class NodeState:
         left = self.free_of_background
         if self.tick:
             job = self.turn.job if self.turn else None
-            return Fraction(1, job.execution.threads) if job else ZERO
+            return Fraction(1, job.execution.threads) if job else Fraction(0)
         if self.node.scheduler == "fair":
             return min(Fraction(1), left / max(1, self.threads_of(self.own) + s))
         return left / (c + s)
@@ -630,7 +625,7 @@ class NodeState:
             for job in jobs:
                 if job.cores == 0:
                     continue
-                received = min(Fraction(elapsed), max(job.left, ZERO))
+                received = min(Fraction(elapsed), max(job.left, Fraction(0)))
                 job.left -= elapsed
                 places[1 + job.cell] += received
                 job.core += received
