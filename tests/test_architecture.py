@@ -8,10 +8,12 @@ import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
+from graphlib import TopologicalSorter
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
+import grimp
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -142,6 +144,18 @@ def test_only_the_command_imports_the_facade() -> None:
         or (isinstance(node, ast.ImportFrom) and node.module == "dwell")
     }
     assert found == {"cli"}
+
+
+def test_no_file_stands_on_itself() -> None:
+    """However many files lie between, and where types alone are imported, too; façades aside."""
+    graph = grimp.build_graph("dwell", cache_dir=None)
+    facades = {one for one in graph.modules if graph.find_children(one)}
+    below = {
+        one: graph.find_modules_directly_imported_by(one) - facades
+        for one in graph.modules - facades
+    }
+    assert len(below) > 300
+    assert list(TopologicalSorter(below).static_order())
 
 
 def test_what_shows_itself_does_after_an_import_of_the_package_alone() -> None:

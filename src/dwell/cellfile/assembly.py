@@ -36,7 +36,7 @@ from dwell.model import (
     Trace,
     Weights,
 )
-from dwell.model.bounds import require
+from dwell.model.bounds import CLASS_PATH, require
 from dwell.model.declaration import declared_fields, made_at
 from dwell.model.fabric import accelerator_tiers
 from dwell.model.frozen import FrozenDict
@@ -49,7 +49,6 @@ from dwell.model.semantics import (
     nearest,
     nearest_of,
 )
-from dwell.model.user_classes import is_class_path
 from dwell.policies import registry as policies
 
 T = TypeVar("T")
@@ -357,7 +356,7 @@ class Assembly:
 def unknown_names(policy: str | None, estimator: str | None, cell: Problem) -> Iterator[Fault]:
     """Yield a fault, at ``policy`` or ``estimator``, for each that a cell could not run with."""
     known = [*policies.names(), *cell.candidates]
-    if policy is not None and policy not in known and not is_class_path(policy):
+    if policy is not None and policy not in known and not CLASS_PATH.holds(policy):
         hint = nearest_of(policy, known, "policies")
         yield Fault("policy", f"unknown policy {policy!r}; {hint}")
     if estimator is not None and not is_estimator(estimator):
@@ -367,7 +366,7 @@ def unknown_names(policy: str | None, estimator: str | None, cell: Problem) -> I
 
 def is_estimator(name: str) -> bool:
     """Whether a name is that of an estimator, or of a class that may be one."""
-    return name in estimators.names() or is_class_path(name)
+    return name in estimators.names() or CLASS_PATH.holds(name)
 
 
 def unregistered(parts: CellParts, name: str) -> list[Fault]:

@@ -167,14 +167,17 @@ def read_problem(
     from dwell.cellfile.assembly import Assembly
     from dwell.cellfile.cell_form import CELL
     from dwell.cellfile.structure import read_structure
-    from dwell.cellfile.traces import declared_traces, read_traces
+    from dwell.cellfile.traces import declared_traces
 
     entry = read_structure(document, faults, CELL)
     tables: Tables | None = None
     if folder is not None:
         known = {} if known is None else known
+        known.setdefault((), {})
         declared = tuple((path, *trace.values.items()) for path, trace in declared_traces(entry))
         if declared not in known:
+            from dwell.cellfile.trace_files import read_traces
+
             known[declared] = read_traces(entry, folder, faults)
         tables = known[declared]
     return Assembly(entry, tables, faults, anchored, home).problem(name)

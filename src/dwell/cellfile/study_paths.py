@@ -10,7 +10,6 @@ from dwell.errors import ProblemError
 from dwell.model import Problem, evolve
 from dwell.model.dotted_paths import Step
 from dwell.model.fabric import accelerator_tiers
-from dwell.model.semantics import CellParts
 
 #: Where the settings of a policy are: what they change is drawn nowhere.
 SETTINGS = ("controller.", "objective.")
@@ -77,7 +76,7 @@ def _registered(problem: Problem) -> Problem:
     """Return a problem whose policy and estimator are known."""
     from dwell.cellfile.assembly import unregistered
 
-    faults = unregistered(CellParts.of(problem), problem.name)
+    faults = unregistered(problem.parts, problem.name)
     if faults:
         raise ProblemError(faults)
     return problem

@@ -22,7 +22,7 @@ from dwell.cellfile.columns import (
 )
 from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.forms import Entry
-from dwell.cellfile.traces import Source
+from dwell.cellfile.traces import Source, Tables, declared_traces
 from dwell.errors import TraceError
 from dwell.model import Trace, TraceTable
 from dwell.model.bounds import VALUE
@@ -38,6 +38,42 @@ RELATIVE = (
     "(`--traces FOLDER`)"
 )
 RECORD_AGAIN = "no row could stay; record it again, or name another column"
+
+
+def read_traces(entry: Entry, folder: Path, faults: Faults) -> Tables:
+    """Read every trace that a cell names.
+
+    Parameters
+    ----------
+    folder : Path
+        Where relative file names start.
+    faults : Faults
+        Takes what is wrong with the files.
+
+    Returns
+    -------
+    dict of Source to TraceTable
+        Less the sources at fault.
+    """
+    uses: dict[Source, list[tuple[str, Entry]]] = {}
+    doubtful: set[Source] = set()
+    for path, trace in declared_traces(entry):
+        source = Source.of(trace)
+        uses.setdefault(source, []).append((path, trace))
+        if faults.touches(path):
+            doubtful.add(source)
+        if trace.time is not None and trace.by != "time":
+            faults.add(f"{path}.time", "has no effect without `by: time`; add that, or remove it")
+    tables: Tables = {}
+    for source, declarations in uses.items():
+        reading = Reading(source, declarations, folder, faults)
+        frame = reading.frame()
+        # How a declaration at fault would have its data read is not known.
+        if frame is not None and source not in doubtful:
+            table = reading.table(frame)
+            if table is not None:
+                tables[source] = table
+    return tables
 
 
 @dataclass(slots=True)

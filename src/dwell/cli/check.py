@@ -81,17 +81,17 @@ def _refuse(faults: Iterable[Fault], text: str, *, as_json: bool) -> NoReturn:
 def _class_faults(problem: Problem) -> Iterator[Fault]:
     """Yield the faults of the policy and the estimator where these are a user's classes."""
     from dwell.estimators import by_name as make_estimator
-    from dwell.model.user_classes import is_class_path
+    from dwell.model.bounds import CLASS_PATH
     from dwell.policies import by_name as make_policy
 
     settings = problem.controller
     try:
-        if is_class_path(settings.policy) and settings.policy not in problem.candidates:
+        if CLASS_PATH.holds(settings.policy) and settings.policy not in problem.candidates:
             make_policy(settings.policy, problem)
     except PolicyError as error:
         yield Fault("controller.policy", str(error))
     try:
-        if is_class_path(settings.estimator):
+        if CLASS_PATH.holds(settings.estimator):
             make_estimator(settings.estimator, problem)
     except ProblemError as error:
         yield Fault("controller.estimator", str(error))

@@ -23,11 +23,11 @@ from dwell.estimators import by_name as estimator_by_name
 from dwell.estimators.protocol import CellEstimator
 from dwell.estimators.user_estimator import as_started
 from dwell.model import Caps, Decision, FrozenDict, Objective, Problem, QoS
-from dwell.model.problem import SHADOW_FRACTION
+from dwell.model.bounds import CLASS_PATH
+from dwell.model.controller_settings import SHADOW_FRACTION
 from dwell.model.qos import NO_ERROR
 from dwell.model.semantics import too_many_shadows
 from dwell.model.table_columns import DECISIONS, Feature, columns_of, those_with
-from dwell.model.user_classes import is_class_path
 from dwell.policies import MinimalPolicy, parameters_of
 from dwell.policies import by_name as policy_by_name
 from dwell.policies.pricing import Pricing
@@ -150,7 +150,7 @@ class Controller:
         named = (policy or problem.controller.policy, estimator or problem.controller.estimator)
         #: Names of the policy and the estimator where these are classes of a user's own, else None.
         self._own = tuple(
-            name if isinstance(name, str) and is_class_path(name) else None for name in named
+            name if isinstance(name, str) and CLASS_PATH.holds(name) else None for name in named
         )
         self._policy = _prepared_policy(policy, problem)
         if estimator is None or isinstance(estimator, str):

@@ -17,8 +17,8 @@ from typing import TypeAlias
 from dwell.control.course import Course
 from dwell.model import FrozenDict, Problem
 from dwell.model.bounds import require
+from dwell.model.controller_settings import GUARD_CYCLES, PROBE_CYCLES
 from dwell.model.instants import EVIDENCE_NS
-from dwell.model.problem import GUARD_CYCLES, PROBE_CYCLES
 
 #: However often a cell relapses, no more than this many times as many.
 MOST_DOUBLINGS = 5

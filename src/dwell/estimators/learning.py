@@ -15,7 +15,8 @@ from dwell.estimators.online import Online
 from dwell.estimators.pool import Pool
 from dwell.estimators.prices import SEED, unseen_error
 from dwell.estimators.protocol import Support
-from dwell.model.problem import HALF_LIFE_WINDOWS, Problem
+from dwell.model.controller_settings import HALF_LIFE_WINDOWS
+from dwell.model.problem import Problem
 
 Floats: TypeAlias = NDArray[np.float64]
 

@@ -14,9 +14,10 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
 from dwell.errors import ProblemError, RunError
+from dwell.model.bounds import CLASS_PATH
 from dwell.model.entry_points import class_named, names_with
 from dwell.model.semantics import nearest_of
-from dwell.model.user_classes import is_class_path, make_user_class
+from dwell.model.user_classes import make_user_class
 
 if TYPE_CHECKING:
     from dwell.estimators.protocol import Estimator
@@ -109,7 +110,7 @@ def by_name(name: str, problem: Problem) -> Estimator:
         If there is none of that name (the message lists the known ones), or the package that
         declares it, or the class that is named, cannot be imported or made.
     """
-    if is_class_path(name):
+    if CLASS_PATH.holds(name):
         own = make_user_class(name, problem, "estimate", "estimator", ProblemError)
         return cast("Estimator", own)
     path = REGISTRY[name].path if name in REGISTRY else None
@@ -136,6 +137,6 @@ def name_in_run(meta: Mapping[str, Any]) -> str:
     told = str(meta.get("estimator") or "profile")
     classes = {entry.path.partition(":")[2]: name for name, entry in REGISTRY.items()}
     name = classes.get(told, told)
-    if name not in REGISTRY and not is_class_path(name):
+    if name not in REGISTRY and not CLASS_PATH.holds(name):
         raise RunError(f"estimator {told!r} is not known (here: {', '.join(REGISTRY)})")
     return name

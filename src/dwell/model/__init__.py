@@ -1,5 +1,6 @@
 """The frozen domain objects: a pipeline on a fabric, its candidates, and what a window shows."""
 
+from dwell.model.controller_settings import ControllerSettings
 from dwell.model.evolve import evolve
 from dwell.model.fabric import Bursts, Fabric, Link, Node, Quota
 from dwell.model.frozen import FrozenDict
@@ -7,7 +8,7 @@ from dwell.model.live import Endpoint, Host, LiveSettings
 from dwell.model.objective import Caps, Objective, Targets, Tier, Weights
 from dwell.model.pipeline import Execution, Flow, Pipeline, Task
 from dwell.model.placement import Placement
-from dwell.model.problem import ControllerSettings, Problem
+from dwell.model.problem import Problem
 from dwell.model.process import (
     AR1,
     Constant,

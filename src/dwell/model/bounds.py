@@ -154,3 +154,5 @@ LENGTH_S = Bound(0, 9.2e9)
 
 # Seeds of a study are 1 to N.
 SEEDS = Bound(1, 100_000, whole=True)
+#: Classes of a user's own.
+CLASS_PATH = Pattern(r"[^\W\d]\w*(?:\.[^\W\d]\w*)*:[^\W\d]\w*", "package.module:Class")

@@ -5,19 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import field, replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 from dwell.display import Displayed
 from dwell.errors import Fault, ProblemError
-from dwell.model.bounds import (
-    MAX_COUNT,
-    MIN_DWELL,
-    MIN_IMPROVEMENT,
-    TIME_MS,
-    Bound,
-    counted,
-    require,
-)
+from dwell.model.bounds import MAX_COUNT, Bound, counted, require
+from dwell.model.controller_settings import ControllerSettings
 from dwell.model.declaration import declared, key
 from dwell.model.fabric import Fabric
 from dwell.model.frozen import FrozenDict, shortened
@@ -30,86 +23,8 @@ from dwell.model.scenario import Scenario
 from dwell.model.semantics import CellParts, find_faults, nearest_of
 from dwell.model.servo import Servo
 
-GUARD_CYCLES = Bound(2, MAX_COUNT, whole=True)
-PROBE_CYCLES = Bound(1, MAX_COUNT, whole=True)
-HALF_LIFE_WINDOWS = Bound(0, MAX_COUNT, above=True)
-SHADOW_FRACTION = Bound(0, 1)
 #: Share of the cycles for each alternative where none is given, and not all together are too many.
 SHADOWED = 0.05
-
-
-@declared()
-class ControllerSettings:
-    """The controller: where it sits, what it runs, and how its orders travel."""
-
-    on: str | None = key(
-        "Node it sits on.", default=None, usual="the first edge node, else the first node"
-    )
-    policy: str = key(
-        "A policy, `package.module:Class` of your own, or a candidate: the placement that never "
-        "moves.",
-        default="dtp",
-    )
-    initial: str | None = key("Candidate to start with.", default=None, usual="the first")
-    min_dwell: int = key("Windows that a placement stays at least (N_min).", MIN_DWELL, default=3)
-    min_improvement: float = key(
-        "Improvement of J that a migration must promise (Delta_min).",
-        MIN_IMPROVEMENT,
-        default=0.05,
-    )
-    escape: bool = key(
-        "Whether an incumbent over a cap may leave before the hysteresis is met.", default=False
-    )
-    estimator: str = key(
-        "How the QoS of candidates is estimated; also `package.module:Class` of your own.",
-        default="profile",
-    )
-    shadow_fraction: float | None = key(
-        "Share of cycles that are also sent through each alternative, where the estimator uses "
-        "shadow jobs.",
-        SHADOW_FRACTION,
-        default=None,
-        usual="0.05, or 1/(alternatives) where that is less",
-    )
-    half_life_windows: float = key(
-        "Windows after which a measurement counts half.", HALF_LIFE_WINDOWS, default=2.0
-    )
-    migration: Literal["warm", "cold"] = key(
-        "`warm`: a moved task is ready at once; `cold`: after its `start_ms` and the transfer of "
-        "its `state_bytes`.",
-        default="warm",
-    )
-    guard_cycles: int = key(
-        "Periods without a completion after which the guard on the robot moves to a fallback.",
-        GUARD_CYCLES,
-        default=3,
-    )
-    probe_cycles: int = key(
-        "Cycles that must complete through another placement, too, before the guard's is left for "
-        "it, and that the guard rests for after its own move.",
-        PROBE_CYCLES,
-        default=30,
-    )
-    fallbacks: tuple[str, ...] = key(
-        "Candidates that the guard may move to, best first; none: no guard.", default=()
-    )
-    order_delay_ms: float = key("Time that an order travels, ms.", TIME_MS, default=0.0)
-    order_lead_cycles: int = key(
-        "Cycles between a window's close and the first one its order may stamp.",
-        Bound(0, MAX_COUNT, whole=True),
-        default=0,
-    )
-    close_grace_ms: float = key(
-        "Time that a window stays open for stragglers after the release of the first cycle beyond "
-        "it, ms. No window closes before the last deadline of its cycles.",
-        TIME_MS,
-        default=0.0,
-    )
-
-    @property
-    def failures_in_a_row(self) -> int:
-        """Failures in a row that count as a fault of a worker, or of a candidate: g + 1."""
-        return self.guard_cycles + 1
 
 
 class Drawn(NamedTuple):
@@ -171,7 +86,7 @@ class Problem(Displayed):
         declared = {name: tuple(items) for name, items in self.scenarios.items()}
         scenarios = {"baseline": (), **declared}
         object.__setattr__(self, "scenarios", FrozenDict(scenarios))
-        faults = [*find_faults(CellParts.of(self)), *self._unplaced()]
+        faults = [*find_faults(self.parts), *self._unplaced()]
         if faults:
             raise ProblemError(faults)
 
@@ -201,6 +116,27 @@ class Problem(Displayed):
             for task, on in ((task.name, task.on) for task in self.pipeline.tasks.values())
             if task not in placement and len(on) == 1
         ]
+
+    @property
+    def parts(self) -> CellParts:
+        """Its parts, with the path that each has in a cell file."""
+        pipeline, fabric = self.pipeline, self.fabric
+        return CellParts(
+            nodes=fabric.nodes,
+            links=[(f"links[{i}]", link) for i, link in enumerate(fabric.links.values())],
+            tasks=pipeline.tasks,
+            flows=[(f"flows[{i}]", flow) for i, flow in enumerate(pipeline.flows)],
+            scales=pipeline.scales,
+            candidates=self.candidates,
+            scenarios={
+                name: [(f"scenarios.{name}[{i}]", item) for i, item in enumerate(items)]
+                for name, items in self.scenarios.items()
+            },
+            controller=self.controller,
+            tiers=self.objective.tiers,
+            accelerators=self.objective.accelerators,
+            live=self.live,
+        )
 
     @property
     def drawn(self) -> Drawn:

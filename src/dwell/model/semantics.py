@@ -12,11 +12,11 @@ import unicodedata
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from graphlib import CycleError, TopologicalSorter
-from typing import TYPE_CHECKING
 
 from dwell.errors import Fault
 from dwell.model import table_columns
-from dwell.model.bounds import shown
+from dwell.model.bounds import CLASS_PATH, shown
+from dwell.model.controller_settings import ControllerSettings
 from dwell.model.fabric import Link, Node, accelerator_tiers, resources_of
 from dwell.model.live import LiveSettings
 from dwell.model.objective import Tier
@@ -28,10 +28,6 @@ from dwell.model.scenario import (
     LinkDisturbance,
     NodeDisturbance,
 )
-from dwell.model.user_classes import is_class_path
-
-if TYPE_CHECKING:
-    from dwell.model.problem import ControllerSettings, Problem
 
 # Names become columns, file names and keys of messages.
 NAME = re.compile(r"\w[\w.+:-]*(?: [\w.+:-]+)*")
@@ -75,27 +71,6 @@ class CellParts:
     tiers: Mapping[str, Tier] = field(default_factory=dict)
     accelerators: Mapping[str, Tier] = field(default_factory=dict)
     live: LiveSettings | None = None
-
-    @classmethod
-    def of(cls, problem: Problem) -> CellParts:
-        """Return the parts of a problem."""
-        pipeline, fabric = problem.pipeline, problem.fabric
-        return cls(
-            nodes=fabric.nodes,
-            links=[(f"links[{i}]", link) for i, link in enumerate(fabric.links.values())],
-            tasks=pipeline.tasks,
-            flows=[(f"flows[{i}]", flow) for i, flow in enumerate(pipeline.flows)],
-            scales=pipeline.scales,
-            candidates=problem.candidates,
-            scenarios={
-                name: [(f"scenarios.{name}[{i}]", item) for i, item in enumerate(items)]
-                for name, items in problem.scenarios.items()
-            },
-            controller=problem.controller,
-            tiers=problem.objective.tiers,
-            accelerators=problem.objective.accelerators,
-            live=problem.live,
-        )
 
 
 def closest(word: str, known: Iterable[str], likeness: float = 0.6) -> str:
@@ -436,10 +411,10 @@ def _registered(
     if settings is None:
         return
     names = [*parts.candidates, *parts.broken_candidates]
-    if settings.policy not in parts.candidates and not is_class_path(settings.policy):
+    if settings.policy not in parts.candidates and not CLASS_PATH.holds(settings.policy):
         known = [*policies, *names]
         yield from _unknown("controller.policy", "policy", settings.policy, known)
-    if not is_class_path(settings.estimator):
+    if not CLASS_PATH.holds(settings.estimator):
         path = "controller.estimator"
         yield from _unknown(path, "estimator", settings.estimator, estimators)
     given = settings.shadow_fraction if settings.estimator in shadowing else None

@@ -7,7 +7,6 @@ import hashlib
 import importlib
 import inspect
 import pkgutil
-import re
 import sys
 import threading
 from collections.abc import Iterator, Mapping
@@ -20,16 +19,9 @@ from dwell.errors import DwellError, describe_raised
 if TYPE_CHECKING:
     from dwell.model.problem import Problem
 
-CLASS_PATH = re.compile(r"[^\W\d]\w*(?:\.[^\W\d]\w*)*:[^\W\d]\w*")
-
 #: Modules that were found beside a cell file, by its folder and their name.
 _beside: dict[tuple[str, str], ModuleType] = {}
 _importing = threading.RLock()
-
-
-def is_class_path(name: str) -> bool:
-    """Return whether a name has the form ``package.module:Class``."""
-    return CLASS_PATH.fullmatch(name) is not None
 
 
 def make_user_class(

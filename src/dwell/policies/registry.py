@@ -14,9 +14,10 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, cast
 
 from dwell.errors import PolicyError
+from dwell.model.bounds import CLASS_PATH
 from dwell.model.entry_points import class_at, class_named, names_with
 from dwell.model.semantics import nearest_of
-from dwell.model.user_classes import is_class_path, make_user_class
+from dwell.model.user_classes import make_user_class
 
 if TYPE_CHECKING:
     from dwell.model.problem import Problem
@@ -138,7 +139,7 @@ def by_name(name: str, problem: Problem) -> Policy:
             "Policy",
             static(candidates=problem.candidates, initial=name, objective=problem.objective),
         )
-    if is_class_path(name):
+    if CLASS_PATH.holds(name):
         return cast("Policy", make_user_class(name, problem, "decide", "policy", PolicyError))
     path = REGISTRY[name].path if name in REGISTRY else None
     kind = class_named(name, path, GROUP, "policy", PolicyError)

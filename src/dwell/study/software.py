@@ -13,8 +13,9 @@ from typing import Any
 from dwell.cellfile.sources import digest_of
 from dwell.errors import SimulationError
 from dwell.model import FrozenDict
+from dwell.model.bounds import CLASS_PATH
 from dwell.model.document import to_document
-from dwell.model.user_classes import is_class_path, source_digest
+from dwell.model.user_classes import source_digest
 from dwell.record.fleet_run import fleet_document
 from dwell.study.study import Contender, Study
 
@@ -90,7 +91,7 @@ def _own_sources(study: Study) -> dict[str, str | None]:
     used = [part for one in study.contenders for part in (one.policy, one.estimator)]
     folder = study.points[0].problem.folder
     given = [settings.estimator, *(part for part in used if isinstance(part, str))]
-    names = sorted(filter(is_class_path, given))
+    names = sorted(filter(CLASS_PATH.holds, given))
     return {name: source_digest(name, folder) for name in names}
 
 

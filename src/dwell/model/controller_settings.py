@@ -1,0 +1,87 @@
+"""Settings of a cell's controller, and the bounds that others keep to as well."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from dwell.model.bounds import MAX_COUNT, MIN_DWELL, MIN_IMPROVEMENT, TIME_MS, Bound
+from dwell.model.declaration import declared, key
+
+GUARD_CYCLES = Bound(2, MAX_COUNT, whole=True)
+PROBE_CYCLES = Bound(1, MAX_COUNT, whole=True)
+HALF_LIFE_WINDOWS = Bound(0, MAX_COUNT, above=True)
+SHADOW_FRACTION = Bound(0, 1)
+
+
+@declared()
+class ControllerSettings:
+    """The controller: where it sits, what it runs, and how its orders travel."""
+
+    on: str | None = key(
+        "Node it sits on.", default=None, usual="the first edge node, else the first node"
+    )
+    policy: str = key(
+        "A policy, `package.module:Class` of your own, or a candidate: the placement that never "
+        "moves.",
+        default="dtp",
+    )
+    initial: str | None = key("Candidate to start with.", default=None, usual="the first")
+    min_dwell: int = key("Windows that a placement stays at least (N_min).", MIN_DWELL, default=3)
+    min_improvement: float = key(
+        "Improvement of J that a migration must promise (Delta_min).",
+        MIN_IMPROVEMENT,
+        default=0.05,
+    )
+    escape: bool = key(
+        "Whether an incumbent over a cap may leave before the hysteresis is met.", default=False
+    )
+    estimator: str = key(
+        "How the QoS of candidates is estimated; also `package.module:Class` of your own.",
+        default="profile",
+    )
+    shadow_fraction: float | None = key(
+        "Share of cycles that are also sent through each alternative, where the estimator uses "
+        "shadow jobs.",
+        SHADOW_FRACTION,
+        default=None,
+        usual="0.05, or 1/(alternatives) where that is less",
+    )
+    half_life_windows: float = key(
+        "Windows after which a measurement counts half.", HALF_LIFE_WINDOWS, default=2.0
+    )
+    migration: Literal["warm", "cold"] = key(
+        "`warm`: a moved task is ready at once; `cold`: after its `start_ms` and the transfer of "
+        "its `state_bytes`.",
+        default="warm",
+    )
+    guard_cycles: int = key(
+        "Periods without a completion after which the guard on the robot moves to a fallback.",
+        GUARD_CYCLES,
+        default=3,
+    )
+    probe_cycles: int = key(
+        "Cycles that must complete through another placement, too, before the guard's is left for "
+        "it, and that the guard rests for after its own move.",
+        PROBE_CYCLES,
+        default=30,
+    )
+    fallbacks: tuple[str, ...] = key(
+        "Candidates that the guard may move to, best first; none: no guard.", default=()
+    )
+    order_delay_ms: float = key("Time that an order travels, ms.", TIME_MS, default=0.0)
+    order_lead_cycles: int = key(
+        "Cycles between a window's close and the first one its order may stamp.",
+        Bound(0, MAX_COUNT, whole=True),
+        default=0,
+    )
+    close_grace_ms: float = key(
+        "Time that a window stays open for stragglers after the release of the first cycle beyond "
+        "it, ms. No window closes before the last deadline of its cycles.",
+        TIME_MS,
+        default=0.0,
+    )
+
+    @property
+    def failures_in_a_row(self) -> int:
+        """Failures in a row that count as a fault of a worker, or of a candidate: g + 1."""
+        return self.guard_cycles + 1
