@@ -583,7 +583,7 @@ def test_a_candidate_is_whole_while_all_of_it_is_heard_within_g_periods() -> Non
     assert presence.missing("SO", 3 * P) == {"E"}
     problem = cell()
     assert not Presence.of(problem).whole("LOC", 10**12)
-    period_ns = problem.pipeline.period_ns
+    period_ns = round(problem.pipeline.period_ms * 1e6)
     assert Presence.of(problem).within_ns == (problem.controller.guard_cycles - 1) * period_ns
 
 

@@ -34,7 +34,7 @@ def test_windows_are_measured_as_in_python(window_cycles: int, scenario: str) ->
     run = dwell.simulate(problem, scenario=scenario, policy="SO", seed=1, windows=30)
     release_ns = run.cycles["release_ns"].to_numpy()
     latency_ns = run.cycles["latency_ns"].fill_null(NEVER_NS).to_numpy()
-    deadline_ns = problem.pipeline.deadline_ns
+    deadline_ns = round(problem.pipeline.deadline_ms * 1e6)
     lost = run.decisions["excess_SO"].is_infinite().to_list()
     found = run.windows.select("first_cycle", "seen_violation_rate", "seen_l95_ms").rows()
     for (first, missed, l95_ms), is_lost in list(zip(found, lost, strict=True))[:-1]:

@@ -92,7 +92,7 @@ def test_a_simulated_run_counts_from_its_beginning(run: Run, tmp_path: Path) -> 
     for topic, at_ns, content in read(file):
         if topic == "/cycles":
             assert at_ns == content["release_ns"]
-            close_ns[content["cycle"]] = at_ns + problem.pipeline.period_ns
+            close_ns[content["cycle"]] = at_ns + round(problem.pipeline.period_ms * 1e6)
         elif topic == "/windows":
             last = content["first_cycle"] + problem.window_cycles - 1
             assert at_ns == close_ns[last]

@@ -37,7 +37,7 @@ def test_every_cycle_is_done_lost_or_in_flight(cells: Mapping[str, Problem]) -> 
         done = cycles["outcome"] == "done"
         assert (cycles["latency_ns"].is_not_null() == done).all()
         assert cycles.filter(~done)["missed"].all()
-        deadline_ns = problem.pipeline.deadline_ns
+        deadline_ns = round(problem.pipeline.deadline_ms * MS)
         assert cycles.filter(pl.col("latency_ns") > deadline_ns)["missed"].all()
         # Nothing hangs: what is in flight was released near the end.
         flying = cycles.filter(pl.col("outcome") == "in_flight")["cycle"]

@@ -173,6 +173,7 @@ def read_problem(
     tables: Tables | None = None
     if folder is not None:
         known = {} if known is None else known
+        # Nothing is imported to read none.
         known.setdefault((), {})
         declared = tuple((path, *trace.values.items()) for path, trace in declared_traces(entry))
         if declared not in known:

@@ -149,9 +149,7 @@ class Controller:
             policy, estimator = _without_estimator(policy, estimator, problem)
         named = (policy or problem.controller.policy, estimator or problem.controller.estimator)
         #: Names of the policy and the estimator where these are classes of a user's own, else None.
-        self._own = tuple(
-            name if isinstance(name, str) and CLASS_PATH.holds(name) else None for name in named
-        )
+        self._own = tuple(name if CLASS_PATH.holds(name) else None for name in named)
         self._policy = _prepared_policy(policy, problem)
         if estimator is None or isinstance(estimator, str):
             name = estimator or problem.controller.estimator

@@ -50,8 +50,7 @@ def window_late_ns(problem: Problem) -> int:
 
     A window that a move interrupts begins anew.
     """
-    window_ms = problem.window_ms
-    return round((2 * window_ms + problem.controller.close_grace_ms) * 1e6) + PATIENCE_NS
+    return round((2 * problem.window_ms + problem.controller.close_grace_ms) * 1e6) + PATIENCE_NS
 
 
 def diagnose(problem: Problem, status: Mapping[str, Any]) -> tuple[Health, str | None]:
@@ -120,8 +119,7 @@ def _window_was_due(problem: Problem, status: Mapping[str, Any]) -> bool:
     """Whether the first window has closed, or ought to have."""
     if status["window"]:
         return True
-    window_ms = problem.window_ms
-    due_ms = window_ms + problem.controller.close_grace_ms
+    due_ms = problem.window_ms + problem.controller.close_grace_ms
     return bool((status.get("begun_ms") or 0.0) > due_ms)
 
 

@@ -19,7 +19,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -84,8 +84,7 @@ def end_those_of(owner: str, cell: Path, patience_s: float) -> None:
     cell : Path
         Cell file there.
     """
-    words = (OPTION, owner), ("--cell", str(cell.resolve()))
-    _await(words, patience_s, signal.SIGKILL)
+    _await({OPTION: owner, "--cell": str(cell.resolve())}, patience_s, signal.SIGKILL)
 
 
 def _sweep(owner: int) -> None:
@@ -95,15 +94,15 @@ def _sweep(owner: int) -> None:
         pass  # it has ended already
     except OSError:
         return  # a kernel without them: nobody ends with an owner
-    _await([(OPTION, str(owner))], SWEEP_S)
+    _await({OPTION: str(owner)}, SWEEP_S)
     remove_orphans()
 
 
-def _await(words: Iterable[Iterable[str]], patience_s: float, number: int = 0) -> None:
-    """Wait until those have ended that have such words; a signal goes to each, if not 0."""
+def _await(options: Mapping[str, str], patience_s: float, number: int = 0) -> None:
+    """Wait until those have ended that have such options; a signal goes to each, if not 0."""
     deadline = time.monotonic() + patience_s
     # Whoever is waited for may have started another one meanwhile.
-    while (left_s := deadline - time.monotonic()) > 0 and (left := _with_words(words)):
+    while (left_s := deadline - time.monotonic()) > 0 and (left := _with_options(options)):
         for process in left:
             with suppress(OSError):
                 signal.pidfd_send_signal(process, number)
@@ -113,9 +112,9 @@ def _await(words: Iterable[Iterable[str]], patience_s: float, number: int = 0) -
             os.close(process)
 
 
-def _with_words(words: Iterable[Iterable[str]]) -> list[int]:
-    """Return a descriptor of every process whose command line has words one after another."""
-    parts = [os.fsencode("\0".join(("", *part, ""))) for part in words]
+def _with_options(options: Mapping[str, str]) -> list[int]:
+    """Return a descriptor of every process whose command line has some options."""
+    parts = [os.fsencode(f"\0{name}\0{value}\0") for name, value in options.items()]
     found = []
     for file in Path("/proc").glob("[0-9]*/cmdline"):
         # Some have just ended, and some are other users'.
