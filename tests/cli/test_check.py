@@ -28,8 +28,34 @@ def test_check_as_json(cell: Path) -> None:
     found = read_json(call("check", cell, "--json"))
     assert found["valid"] is True
     assert found["warnings"] == []
-    assert found["candidates"]["OFF"]["l95_ms"] == 4.0
+    assert found["candidates"]["OFF"]["l95_ms"] == found["candidates"]["OFF"]["uncut_l95_ms"] == 4.0
+    assert found["candidates"]["OFF"]["is_settled"] is True
     assert found["candidates"]["OFF"]["own_work"] == pytest.approx({"R": 0.05, "E": 0.025})
+
+
+def test_l95_of_a_cell_that_loses_cycles_is_a_number(cell: Path) -> None:
+    # Three of four messages are lost.
+    lossy = SMALL.replace(
+        "both_ways: true, delay_ms: 1", "both_ways: true, delay_ms: 1, loss: 0.75"
+    )
+    cell.write_text(lossy, encoding="utf-8")
+    result = call("check", cell)
+    assert "OFF: lost in 100 % of windows" in result.stdout
+    assert "OFF 80.0" in " ".join(result.stdout.split())
+    found = read_json(call("check", cell, "--json"))["candidates"]["OFF"]
+    assert (found["l95_ms"], found["uncut_l95_ms"]) == (pytest.approx(80.0, abs=0.1), None)
+    assert found["lost_windows"] > 0.99
+
+
+def test_check_of_a_scenario_beyond_the_bound_says_so(cell: Path) -> None:
+    late = SMALL.replace("stress_threads: 3", "stress_threads: 3, at_s: 600")
+    cell.write_text(late, encoding="utf-8")
+    assert "simulate" not in call("check", cell, "--scenario", "stress").stderr
+    cell.write_text(late.replace("600", "6000"), encoding="utf-8")
+    result = call("check", cell, "--scenario", "stress")
+    assert "scenarios.stress: the disturbance of R begins at 6000 s, and prices simulate" in (
+        result.stderr
+    )
 
 
 def test_check_prints_every_fault_with_its_line(cell: Path) -> None:

@@ -16,7 +16,6 @@ from dwell.estimators.prices import (
     MOST_CYCLES,
     SETTLING,
     Price,
-    mean_and_error,
     price_of,
     prices_of,
 )
@@ -295,22 +294,6 @@ def test_a_scenario_has_prices_of_its_own() -> None:
     problem = dwell.load(EXAMPLES / "canonical.yaml")
     stressed = prices_of(problem, "robot-cpu-stress")
     assert stressed["LOC"].violation_rate > prices_of(problem)["LOC"].violation_rate + 0.5
-
-
-def test_windows_that_are_equal_have_no_error_and_one_alone_any() -> None:
-    assert mean_and_error(np.full(9, 0.1)) == (0.1, 0.0)
-    assert mean_and_error(np.array([3.0])) == (3.0, math.inf)
-
-
-def test_the_error_of_windows_that_depend_on_each_other_is_that_of_their_stretches() -> None:
-    rng = np.random.default_rng(5)
-    found = []
-    for _ in range(200):
-        walk = np.convolve(rng.standard_normal(1_009), np.ones(10) / 10, mode="valid")
-        mean, error = mean_and_error(walk)
-        found.append(abs(mean) / error)
-    # Of 20 stretches: beyond twice the error are as many as of Student's t.
-    assert 0.01 < np.mean(np.array(found) > 2.0) < 0.12
 
 
 def test_a_play_is_a_fixed_number() -> None:

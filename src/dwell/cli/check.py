@@ -54,11 +54,17 @@ def check(
     if faults := tuple(_class_faults(problem)):
         _refuse(faults, "\n".join(f"{cell}: {fault}" for fault in faults), as_json=as_json)
     from dwell.estimators import Profile, warnings_of
+    from dwell.estimators.cell_warnings import unpriced
     from dwell.estimators.prices import prices_of
     from dwell.live.lint import lint
 
     prices = prices_of(problem, scenario)
-    warnings = (*warnings_of(problem, Profile(problem)), *lint(problem))
+    cycles = min(price.cycles for price in prices.values())
+    warnings = (
+        *warnings_of(problem, Profile(problem)),
+        *unpriced(problem, scenario, cycles),
+        *lint(problem),
+    )
     if as_json:
         rows = [_fault(warning) for warning in warnings]
         contents = {"valid": True, **_contents(problem), "priced_under": scenario}
@@ -121,12 +127,15 @@ def _priced(problem: Problem, prices: Mapping[str, Price]) -> dict[str, Any]:
     return {
         name: {
             "placement": dict(placement),
-            "l95_ms": prices[name].uncut_l95_ms,
+            "l95_ms": prices[name].l95_ms,
             "l95_error_ms": prices[name].l95_error_ms,
+            "uncut_l95_ms": prices[name].uncut_l95_ms,
+            "lost_windows": prices[name].lost_windows,
             "violation_rate": prices[name].violation_rate,
             "violation_error": prices[name].violation_error,
             "own_work": dict(prices[name].own),
             "cycles": prices[name].cycles,
+            "is_settled": prices[name].is_settled,
         }
         for name, placement in problem.candidates.items()
     }
@@ -145,12 +154,14 @@ def _summary(problem: Problem, prices: Mapping[str, Price], scenario: str) -> st
     rows = [
         [
             name,
-            _with_error(milliseconds(price.uncut_l95_ms), price.l95_error_ms),
+            _with_error(milliseconds(price.l95_ms), price.l95_error_ms),
             _with_error(f"{price.violation_rate * 100:.1f}", price.violation_error * 100),
             *(f"{price.own[one] * 100:.0f}" for one in resources),
         ]
         for name, price in prices.items()
     ]
+    span_s = min(price.cycles for price in prices.values()) * pipeline.period_ms / 1e3
+    disturbed = f" for {span_s:.4g} s" if problem.scenario(scenario) else ""
     return "\n".join(
         (
             f"{problem.name}: no faults",
@@ -161,11 +172,22 @@ def _summary(problem: Problem, prices: Mapping[str, Price], scenario: str) -> st
             f"can move: {', '.join(movable) or 'nothing'}",
             f"scenarios: {', '.join(problem.scenarios)}",
             "",
-            f"{scenario[0].upper()}{scenario[1:]}, each played alone: L95 and V_D of a window with "
-            f"standard errors, and the cell's own work on each {what}",
+            f"{scenario[0].upper()}{scenario[1:]}, each simulated alone{disturbed}: L95 (at most "
+            f"{milliseconds(problem.censor_ms)} ms) and V_D of a window with standard errors, and "
+            f"the cell's own work on each {what}",
             aligned(head, rows),
+            *(f"{name}: {note}" for name, price in prices.items() for note in _notes(price)),
         )
     )
+
+
+def _notes(price: Price) -> Iterator[str]:
+    """Yield the reasons for which a price says less than its numbers."""
+    if price.lost_windows:
+        share = f"{price.lost_windows * 100:.3g} % of windows"
+        yield f"lost in {share}: more than 5 % of their cycles never complete"
+    if not price.is_settled:
+        yield f"not settled after {price.cycles} cycles: the means of the two halves differ"
 
 
 def _with_error(mean: str, error: float) -> str:

@@ -73,6 +73,21 @@ def unplayed(problem: Problem, scenario: str, windows: int) -> Iterator[Fault]:
     )
 
 
+def unpriced(problem: Problem, scenario: str, cycles: int) -> Iterator[Fault]:
+    """Yield a warning if prices simulate less than a scenario needs to show all it does."""
+    until_s = cycles * problem.pipeline.period_ms / 1e3
+    for item in problem.scenario(scenario):
+        if item.at_s >= until_s or until_s < item.end_s < math.inf:
+            when = f"begins at {item.at_s:g} s"
+            if item.at_s < until_s:
+                when = f"ends at {item.end_s:g} s"
+            yield Fault(
+                f"scenarios.{scenario}",
+                f"the disturbance of {item.place} {when}, and prices simulate {until_s:.4g} s at "
+                "most: `dwell run --windows` simulates more",
+            )
+
+
 # ------------------------------------------------------------------------------- keeping pace
 
 

@@ -13,8 +13,9 @@ from dwell.estimators.evidence import Evidence
 from dwell.estimators.measured import Message, Part
 from dwell.estimators.online import Online
 from dwell.estimators.pool import Pool
-from dwell.estimators.prices import SEED, unseen_error
+from dwell.estimators.prices import SEED
 from dwell.estimators.protocol import Support
+from dwell.estimators.slow_processes import unseen_error
 from dwell.model.controller_settings import HALF_LIFE_WINDOWS
 from dwell.model.problem import Problem
 

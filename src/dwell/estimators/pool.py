@@ -42,11 +42,13 @@ class Reference:
         In the order of cycles, `block` of them from each stretch; infinite where lost.
     block : int
         Cycles of a stretch, whose values may be alike.
+    kept : int, optional
+        Number of first values that are kept as `values`; all where None.
 
     Attributes
     ----------
     ordered : float64 array
-        Ascending.
+        All values, ascending.
     usual : float
         Median of those that are not lost; infinite where all are.
     likeness : float
@@ -55,8 +57,8 @@ class Reference:
 
     __slots__ = ("likeness", "ordered", "usual", "values")
 
-    def __init__(self, values: Floats, block: int) -> None:
-        self.values = values
+    def __init__(self, values: Floats, block: int, kept: int | None = None) -> None:
+        self.values = values[:kept]
         self.ordered = np.sort(values)
         self.usual = middle(values)
         self.likeness = _likeness(self.ordered, values, block)
@@ -119,7 +121,7 @@ class Pool:
     @property
     def lost(self) -> float:
         """Share of the values that are lost."""
-        held = self.reference.values if self.is_declared else self.held
+        held = self.reference.ordered if self.is_declared else self.held
         return float(np.isinf(held).mean()) if len(held) else 0.0
 
     @property
@@ -338,7 +340,7 @@ def newest(values: Floats) -> int:
 def _likeness(ordered: Floats, values: Floats, block: int) -> float:
     """Mean correlation of two values of a stretch: by how much their mean place varies more."""
     stretches = len(values) // block
-    if stretches < 2 or block < 2:
+    if stretches < 2 or block < 2 or ordered[0] == ordered[-1]:
         return 0.0
     left, right = ordered.searchsorted(values, "left"), ordered.searchsorted(values, "right")
     logs = -np.log1p(-(left + right + 1) / (2 * len(ordered) + 2))

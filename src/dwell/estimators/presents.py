@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from dwell.estimators.evidence import Evidence, Instants
 from dwell.estimators.measured import Message, Meter, Part, Site, cores_of, parts_of
 from dwell.estimators.pool import Reference
-from dwell.estimators.prices import SEED, Question, prices_of, unseen_error
+from dwell.estimators.prices import SEED, Question, most_windows, prices_of
 from dwell.estimators.sent_shadows import SentShadows, hindered, stamps_of
+from dwell.estimators.slow_processes import slow_processes, unseen_error
 from dwell.kernels.advance import logged_instants, play
 from dwell.kernels.arrays import Arrays, CellArrays, flow_rows, lay_out
 from dwell.kernels.codes import LAST_NS
@@ -561,24 +562,52 @@ REMEMBERED = 64
 
 def _played_as_declared(problem: Problem, seed: int) -> Declared:
     windows = max(-(-DRAWN // problem.window_cycles), FEWEST)
-    drawing = Drawing(problem, "baseline", seed=seed, windows=windows, wraps=True)
-    real = drawing.take(windows)
-    meter, block = Meter(problem), min(problem.window_cycles, STEP)
-    logged, plain = (lay_out([(problem, real)], log_jobs=keeps) for keeps in (True, False))
-    references: dict[Part, Reference] = {}
+    real = _drawn_as_declared(problem, seed, windows)
+    first = lay_out([(problem, real)])
     l95_ms, violation_rate = {}, {}
-    for index, (name, placement) in enumerate(problem.candidates.items()):
-        missing = [part for part in parts_of(problem.pipeline, placement) if part not in references]
-        arrays = (logged if missing else plain).copy()
-        arrays.replace(stamps=np.full_like(arrays.tables.stamps, index))
-        play(arrays)
+    for index, name in enumerate(problem.candidates):
+        arrays = _played(first, index)
         l95_ms[name], violation_rate[name] = _shown(problem, arrays)
+    references = _references(problem, seed, windows)
+    return Declared(real, FrozenDict(references), FrozenDict(l95_ms), FrozenDict(violation_rate))
+
+
+def _references(problem: Problem, seed: int, windows: int) -> dict[Part, Reference]:
+    """Return the demands of every part, from windows in which slow processes show all they do.
+
+    Parameters
+    ----------
+    windows : int
+        The fewest windows.
+    """
+    least = slow_processes(problem, "baseline").least_cycles(problem.pipeline.period_ms)
+    most = max(most_windows(problem), windows)
+    real = _drawn_as_declared(
+        problem, seed, min(max(windows, math.ceil(least / problem.window_cycles)), most)
+    )
+    first, meter = lay_out([(problem, real)], log_jobs=True), Meter(problem)
+    references: dict[Part, Reference] = {}
+    for index, placement in enumerate(problem.candidates.values()):
+        missing = [part for part in parts_of(problem.pipeline, placement) if part not in references]
         if missing:
-            demands = meter.demands(_evidence_of(problem, real, arrays, index))
+            demands = meter.demands(_evidence_of(problem, real, _played(first, index), index))
             for part in missing:
                 values = np.round(demands.get(part, np.empty(0)), 6)
-                references[part] = Reference(values, block)
-    return Declared(real, FrozenDict(references), FrozenDict(l95_ms), FrozenDict(violation_rate))
+                block = min(problem.window_cycles, STEP)
+                references[part] = Reference(values, block, windows * problem.window_cycles)
+    return references
+
+
+def _drawn_as_declared(problem: Problem, seed: int, windows: int) -> Realisation:
+    return Drawing(problem, "baseline", seed=seed, windows=windows, wraps=True).take(windows)
+
+
+def _played(first: Arrays, index: int) -> Arrays:
+    """Simulate all cycles on one candidate, in a copy of the tables."""
+    arrays = first.copy()
+    arrays.replace(stamps=np.full_like(arrays.tables.stamps, index))
+    play(arrays)
+    return arrays
 
 
 def _with_shadows(problem: Problem, plain: Declared, shadow_fraction: float) -> Declared:

@@ -2,10 +2,11 @@
 
 The kernel plays every candidate alone, as `simulate` does with a policy that never moves: with
 contention, queues, links and cycles that overlap. All candidates meet the same draws, so that they
-differ by where their tasks run and not by luck. More is played until the means are known well
-enough (`L95_SHARE`, `RATE`), or `MOST_CYCLES` or `MOST_EVENTS` are reached; how much that is
-depends on counts and values alone, so that a price is a fixed number. Traces begin anew where they
-end. Shadow jobs are played where they are asked for and matter (`dwell.estimators.sent_shadows`).
+differ by where their tasks run and not by luck. More is simulated until the means are known well
+enough (`L95_SHARE`, `RATE`) and every slow process has shown all that it does
+(`dwell.estimators.slow_processes`), or until `MOST_CYCLES` or `MOST_EVENTS` are reached. How much
+that is depends on counts and values alone, so that a price is a fixed number. Traces wrap. Shadow
+jobs are simulated where they matter (`dwell.estimators.sent_shadows`).
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 
 from dwell.estimators.paths import l95_rank
 from dwell.estimators.sent_shadows import SentShadows, hindered, stamps_of
+from dwell.estimators.slow_processes import mean_and_error, slow_processes, unseen_error
 from dwell.kernels.advance import play
 from dwell.kernels.arrays import lay_out
 from dwell.kernels.codes import CycleOutcome
@@ -46,8 +48,8 @@ MOST_CYCLES, MOST_EVENTS = 100_000, 10_000_000
 #: Windows that are played first: those in which queues settle, which do not count, and others; of a
 #: scenario as many as a run has if nothing else is asked for.
 SETTLING, FIRST, DISTURBED = 5, 20, 300
-#: Means of so many stretches of windows, whose windows may depend on each other, have the error.
-STRETCHES = 20
+#: Errors by which the means of the two halves of the windows may differ.
+UNSETTLED = 3.0
 #: How much more is played than seems to be needed, since the error is itself an estimate.
 AMPLE = 1.2
 #: Of how many questions the answers are kept.
@@ -78,6 +80,10 @@ class Price:
         from window to window.
     cycles : int
         How many cycles were played, those at the begin that do not count included.
+    lost_windows : float
+        Share of the windows that lose more than 5 % of their cycles.
+    is_settled : bool
+        Whether the halves of the windows have the same means, to three of their errors.
     """
 
     l95_ms: float
@@ -90,6 +96,8 @@ class Price:
     foreign: Mapping[str, float]
     foreign_deviation: Mapping[str, float]
     cycles: int
+    lost_windows: float
+    is_settled: bool
 
     @property
     def qos(self) -> QoS:
@@ -208,10 +216,18 @@ def _answer(question: Question) -> Mapping[str, Price]:
     problem = question.problem
     if problem.window_cycles > LONGEST_WINDOW:
         problem = replace(problem, window_cycles=LONGEST_WINDOW)
-    most = _most_windows(problem, question.cycles)
-    windows = min(DISTURBED if question.scenario else SETTLING + FIRST, most)
+    most = most_windows(problem, question.cycles)
+    slow = slow_processes(problem, question.name)
+    loop = slow.whole_loops(problem.window_cycles, most - SETTLING)
+    least_cycles = slow.least_cycles(problem.pipeline.period_ms)
+    least = SETTLING + math.ceil(least_cycles / problem.window_cycles)
+    windows = min(_first_windows(problem, question.scenario), most)
     if question.cycles is not None:
         windows = most
+    elif loop is not None and (whole := SETTLING + math.ceil(FIRST / loop) * loop) <= most:
+        windows = most = whole
+    elif slow.is_timed:
+        most = windows  # more would change the share of the time that is disturbed
     found: dict[str, Price] = {}
     left = list(problem.candidates)
     if question.shadow_fraction:
@@ -223,17 +239,33 @@ def _answer(question: Question) -> Mapping[str, Price]:
         shadows = None
         if question.shadow_fraction:
             shadows = SentShadows(problem, realisation, question.shadow_fraction)
-        found |= {name: price_of(problem, realisation, name, shadows) for name in left}
-        left = [name for name in left if not found[name].is_good_enough]
+        is_last = windows == most
+        found |= {
+            name: price_of(problem, realisation, name, shadows, is_last=is_last) for name in left
+        }
+        if windows >= least:
+            left = [name for name in left if not found[name].is_good_enough]
         if not left or windows == most:
             break
         counted = windows - min(SETTLING, windows - 1)
         wanted = AMPLE * max(found[name].wanted for name in left) * counted
-        windows = min(SETTLING + math.ceil(min(wanted, most)), most)
+        windows = min(max(SETTLING + math.ceil(min(wanted, most)), least), most)
     return FrozenDict({name: found[name] for name in problem.candidates})
 
 
-def _most_windows(problem: Problem, cycles: int | None) -> int:
+def _first_windows(problem: Problem, scenario: Scenario) -> int:
+    """How many windows are played first: those in which a scenario shows all that it does."""
+    if not scenario:
+        return SETTLING + FIRST
+    window_s = problem.window_ms / 1e3
+    ends = [
+        item.end_s / window_s if math.isfinite(item.end_s) else item.at_s / window_s + DISTURBED
+        for item in scenario
+    ]
+    return max(DISTURBED, math.ceil(max(ends)))
+
+
+def most_windows(problem: Problem, cycles: int | None = None) -> int:
     """How many windows are played of a candidate: so that `cycles` count, or at most; one or more.
 
     An event is a release, a completion or a message.
@@ -247,9 +279,20 @@ def _most_windows(problem: Problem, cycles: int | None) -> int:
 
 
 def price_of(
-    problem: Problem, realisation: Realisation, name: str, shadows: SentShadows | None = None
+    problem: Problem,
+    realisation: Realisation,
+    name: str,
+    shadows: SentShadows | None = None,
+    *,
+    is_last: bool = True,
 ) -> Price:
-    """Price a candidate by its windows on one realisation."""
+    """Price a candidate by its windows on one realisation.
+
+    Parameters
+    ----------
+    is_last : bool
+        Whether no more may be simulated, and errors have to take account of slow processes.
+    """
     sent = shadows.realisation if shadows else None
     arrays = lay_out([(problem, realisation)], shadows=[sent])
     index = list(problem.candidates).index(name)
@@ -258,12 +301,17 @@ def price_of(
     tables = arrays.tables  # those that had to grow are others
     first = min(SETTLING, realisation.windows - 1)
     seen = tables.seen[0, first:]
-    l95_ms, l95_error_ms = mean_and_error(seen["l95_ms"])
-    rates = seen["missed"] / problem.window_cycles
-    violation_rate, violation_error = mean_and_error(rates)
+    slow = slow_processes(problem, realisation.scenario)
+    windows_ms, rates = seen["l95_ms"], seen["missed"] / problem.window_cycles
+    l95_ms, violation_rate = float(windows_ms.mean()), float(rates.mean())
+    (_, l95_error_ms), (_, violation_error) = mean_and_error(windows_ms), mean_and_error(rates)
     if l95_error_ms and not violation_error:
         # It is random, and still every window misses as many: none, or all, as a rule.
         violation_error = unseen_error(violation_rate, len(seen) * problem.window_cycles)
+    if is_last:
+        l95_error_ms, violation_error = slow.errors(
+            problem, realisation, name, windows_ms, rates, (l95_error_ms, violation_error)
+        )
     since = first * problem.window_cycles
     latency_ns, outcome = tables.latency_ns[0, since:], tables.outcome[0, since:]
     done = outcome == CycleOutcome.DONE
@@ -273,10 +321,10 @@ def price_of(
     age_ms = (realisation.release_ns[-1] - realisation.release_ns[since:-1]) / 1e6
     is_young = (outcome == CycleOutcome.IN_FLIGHT) & (age_ms <= max(problem.censor_ms, usual_ms))
     lost = int(np.count_nonzero(~done & ~is_young))
-    uncut_ms = _known_later(latency_ns.reshape(len(seen), -1), seen["l95_ms"])
+    uncut_ms, is_lost = _known_later(latency_ns.reshape(len(seen), -1), windows_ms)
     open_windows = is_young.reshape(len(seen), -1).any(axis=1)
     if not open_windows.all():
-        uncut_ms = uncut_ms[~open_windows]
+        uncut_ms, is_lost = uncut_ms[~open_windows], is_lost[~open_windows]
     busy, own, shadow, _ = np.moveaxis(tables.shares[0, first:], 1, 0)
     foreign = np.maximum(busy - own - shadow, 0.0)
     by_resource = partial(_by_resource, problem)
@@ -291,7 +339,23 @@ def price_of(
         foreign=by_resource(foreign.mean(axis=0)),
         foreign_deviation=by_resource(foreign.std(axis=0)),
         cycles=realisation.cycles,
+        lost_windows=float(is_lost.mean()),
+        is_settled=bool(slow.loops)
+        or slow.is_timed
+        or (_is_settled(windows_ms, l95_error_ms) and _is_settled(rates, violation_error)),
     )
+
+
+def _is_settled(by_window: Floats, error: float) -> bool:
+    """Whether the halves of the windows have the same mean."""
+    half = len(by_window) // 2
+    if half < 2:
+        return True
+    (first, error_1), (last, error_2) = map(mean_and_error, (by_window[:half], by_window[half:]))
+    # Of half as many windows the error is larger by a factor of sqrt(2) at least.
+    least = math.sqrt(2) * error
+    off = abs(first - last) - UNSETTLED * math.hypot(max(error_1, least), max(error_2, least))
+    return off <= 1e-9  # more than sums are rounded by
 
 
 def _by_resource(problem: Problem, shares: Floats) -> Mapping[str, float]:
@@ -299,29 +363,10 @@ def _by_resource(problem: Problem, shares: Floats) -> Mapping[str, float]:
     return FrozenDict(zip(problem.fabric.resources, shares.round(12).tolist(), strict=True))
 
 
-def mean_and_error(by_window: Floats) -> tuple[float, float]:
-    """Mean of windows, and its standard error by the means of stretches of them.
+def _known_later(latency_ns: Ints, seen_ms: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return L95 of every window by the final latencies, milliseconds, and whether it is lost.
 
-    Windows that are all equal have no error; of a single one it is infinite.
-    """
-    mean = float(by_window.mean())
-    if len(by_window) < 2:
-        return mean, math.inf
-    if (by_window == by_window[0]).all():
-        return mean, 0.0
-    stretches = np.array_split(by_window, min(STRETCHES, len(by_window)))
-    means = np.array([stretch.mean() for stretch in stretches])
-    return mean, float(means.std(ddof=1) / math.sqrt(len(means)))
-
-
-def unseen_error(rate: float, cycles: int) -> float:
-    """Standard error of a rate, had one cycle more been missed and one more not (Laplace)."""
-    rate = (rate * cycles + 1) / (cycles + 2)
-    return math.sqrt(rate * (1 - rate) / cycles)
-
-
-def _known_later(latency_ns: Ints, seen_ms: Floats) -> Floats:
-    """L95 of every window by what its cycles took in the end, milliseconds, or what was seen.
+    L95 of a lost window is the value at its close.
 
     Parameters
     ----------
@@ -330,4 +375,5 @@ def _known_later(latency_ns: Ints, seen_ms: Floats) -> Floats:
     """
     rank = l95_rank(latency_ns.shape[1])
     l95_ns = np.partition(latency_ns, rank - 1, axis=1)[:, rank - 1]
-    return np.where(l95_ns < NEVER_NS, np.maximum(l95_ns / 1e6, seen_ms), seen_ms)
+    is_lost = l95_ns >= NEVER_NS
+    return np.where(is_lost, seen_ms, np.maximum(l95_ns / 1e6, seen_ms)), is_lost

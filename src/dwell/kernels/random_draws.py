@@ -187,6 +187,33 @@ def draw_shadows(
     return drawing(sent).take_sent(realisation, whole)
 
 
+def draw_on_off(
+    seed: int,
+    name: str,
+    every: Process,
+    length: Process,
+    unit_ns: float,
+    begin_ns: int,
+    horizon_ns: int,
+) -> OnOffIntervals:
+    """Draw the intervals of an on/off process from its two streams (see `drawn_intervals`).
+
+    Parameters
+    ----------
+    name : str
+        What the names of the streams begin with: ``bursts/R1->E``, after the prefix of the run.
+    """
+    rngs = (
+        _generator(stream(seed, f"{name}/every")),
+        _generator(stream(seed, f"{name}/for")),
+    )
+    return drawn_intervals(every, length, unit_ns, rngs, begin_ns, horizon_ns)
+
+
+def _generator(sequence: np.random.SeedSequence) -> np.random.Generator:
+    return np.random.Generator(np.random.SFC64(sequence))
+
+
 class Drawing:
     """A realisation that is drawn some windows at a time: every stream goes on where it was left.
 
@@ -338,7 +365,7 @@ class Drawing:
         return phases
 
     def _rng(self, name: str) -> np.random.Generator:
-        return np.random.Generator(np.random.SFC64(self._stream(name)))
+        return _generator(self._stream(name))
 
     def _key(self, name: str) -> int:
         return int(self._stream(name).generate_state(1, np.uint64)[0])
@@ -461,9 +488,10 @@ class Drawing:
 
     def _bursts(self, bursts: Bursts, name: str) -> OnOffIntervals:
         """Draw the bursts of the node or link of this name, up to the end of the run."""
-        rngs = self._rng(f"bursts/{name}/every"), self._rng(f"bursts/{name}/for")
-        horizon_ns = int(self.release_ns[-1])
-        return drawn_intervals(bursts.every_ms, bursts.for_ms, NS_PER_MS, rngs, 0, horizon_ns)
+        horizon_ns, name = int(self.release_ns[-1]), f"{self.streams}bursts/{name}"
+        return draw_on_off(
+            self.seed, name, bursts.every_ms, bursts.for_ms, NS_PER_MS, 0, horizon_ns
+        )
 
     def _intervals(self, item: Disturbance) -> OnOffIntervals:
         """Return the times at which a disturbance is on, up to the end of the run."""
@@ -476,8 +504,8 @@ class Drawing:
         episodes, horizon_ns = item.episodes, min(end_ns, int(self.release_ns[-1]))
         # The stream has the name of the episodes alone: what shares it comes and goes together.
         name, every, length = episodes.name, episodes.every_s, episodes.for_s
-        rngs = self._rng(f"episodes/{name}/every"), self._rng(f"episodes/{name}/for")
-        drawn = drawn_intervals(every, length, NS_PER_S, rngs, begin_ns, horizon_ns)
+        name = f"{self.streams}episodes/{name}"
+        drawn = draw_on_off(self.seed, name, every, length, NS_PER_S, begin_ns, horizon_ns)
         return drawn.until(end_ns)
 
     def _episodes_of(self, item: Disturbance) -> Iterator[Disturbance]:

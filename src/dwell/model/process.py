@@ -380,10 +380,7 @@ class TraceTable:
     ) -> NDArray[np.int64]:
         import numpy as np
 
-        # A group lasts one mean row spacing (its own, or that of all) beyond its last row.
-        gaps = counts - 1
-        usual = spans.sum() / max(int(gaps.sum()), 1)
-        lengths = spans + np.where(gaps > 0, spans / np.maximum(gaps, 1), usual)
+        lengths = _lasting_ms(spans, counts)
         total = float(lengths.sum())
         if total == 0:  # every row has the same instant: their order is all there is
             return self._replay_rows(rng, len(elapsed_ms), np.array([self.rows]), True)
@@ -391,6 +388,16 @@ class TraceTable:
         instants = np.repeat(begin, counts) + time_ms
         phase = (rng.uniform(0, total) + elapsed_ms) % total
         return np.asarray(np.searchsorted(instants, phase, side="right") - 1, np.int64)
+
+    def loop_cycles(self, period_ms: float) -> float:
+        """Return the number of cycles after which a replay that wraps is back at its start."""
+        import numpy as np
+
+        if self.by == "row" or self.time_ms is None:
+            return float(self.rows)
+        ends = np.append(self.starts[1:], self.rows)
+        total_ms = float(_lasting_ms(self.time_ms[ends - 1], ends - self.starts).sum())
+        return total_ms / period_ms if total_ms else float(self.rows)
 
     def _too_short(self, has: str, needs: str) -> TraceError:
         where = "longest group" if len(self.starts) > 1 else "trace"
@@ -403,6 +410,23 @@ class TraceTable:
                 )
             ]
         )
+
+
+def _lasting_ms(spans: Floats, counts: NDArray[np.int64]) -> Floats:
+    """Return how long groups last: one mean row spacing more than to the last row.
+
+    The spacing is the group's own, or the table's where the group has one row.
+
+    Parameters
+    ----------
+    spans, counts : array, shape (groups,)
+        Instant of each group's last row since its first, milliseconds, and its number of rows.
+    """
+    import numpy as np
+
+    gaps = counts - 1
+    usual = spans.sum() / max(int(gaps.sum()), 1)
+    return spans + np.where(gaps > 0, spans / np.maximum(gaps, 1), usual)
 
 
 @dataclass(frozen=True, slots=True)

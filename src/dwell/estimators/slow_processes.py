@@ -1,0 +1,353 @@
+"""Slow processes: what is random in a cell and stays as it is for many windows.
+
+The windows of a candidate tell its mean only after every slow process has shown all that it does:
+an on/off process (bursts, episodes) after `RENEWALS` times off and on, an AR(1) process after
+`RENEWALS` correlation times, a trace after one loop. A price that is made from less states an error
+from the number of times that each process was seen, since single cycles are then not independent.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.estimators.measured import Message, parts_of
+from dwell.kernels.random_draws import NS_PER_MS, NS_PER_S, draw_on_off
+from dwell.kernels.realisation import Realisation
+from dwell.model.fabric import Bursts
+from dwell.model.problem import Problem
+from dwell.model.process import AR1, Constant, Process, Trace
+from dwell.model.scenario import LinkDisturbance, NodeDisturbance, Scenario
+
+Floats: TypeAlias = NDArray[np.float64]
+
+#: Times off and on, or correlation times, after which a mean is known.
+RENEWALS = 30
+#: Renewals or correlation times below which windows alone do not tell the error.
+FEW = 300
+#: Share of the time below which an on/off process does not matter.
+RARE = 0.0025
+#: Parts of a run whose means have the error of the mean.
+STRETCHES = 20
+
+
+class OnOff(NamedTuple):
+    """An on/off process: bursts of a node or a link, or the episodes of a scenario.
+
+    Parameters
+    ----------
+    stream : str
+        Name of its random streams.
+    places : frozenset of str
+        Nodes and links that it acts on.
+    every, length : Process
+        Times off and on, in units of `unit_ns`.
+    begin_ns : int
+        Begin of the first time off.
+    """
+
+    stream: str
+    places: frozenset[str]
+    every: Process
+    length: Process
+    unit_ns: float
+    begin_ns: int = 0
+
+    @property
+    def on_ms(self) -> float:
+        """Mean time on."""
+        return self.length.expectation * self.unit_ns / NS_PER_MS
+
+    @property
+    def renewal_ms(self) -> float:
+        """Mean time off and on."""
+        return self.every.expectation * self.unit_ns / NS_PER_MS + self.on_ms
+
+    def seen(self, realisation: Realisation, edges_ns: NDArray[np.int64]) -> tuple[int, Floats]:
+        """Return how often it is on in a realisation, and its share of each window.
+
+        Parameters
+        ----------
+        edges_ns : int64 array, shape (windows + 1,)
+            Begins of the windows, and the end of the last.
+        """
+        name = f"{realisation.streams}{self.stream}"
+        horizon_ns, seed = int(edges_ns[-1]), realisation.seed or 0
+        on = draw_on_off(
+            seed, name, self.every, self.length, self.unit_ns, self.begin_ns, horizon_ns
+        )
+        begins = int(np.count_nonzero(on.end > edges_ns[0]))
+        if not len(on.begin):
+            return 0, np.zeros(len(edges_ns) - 1)
+        before_ns = np.cumsum(on.end - on.begin) - (on.end - on.begin)
+        instants = np.column_stack((on.begin, on.end)).ravel()
+        elapsed = np.column_stack((before_ns, before_ns + on.end - on.begin)).ravel()
+        on_ns = np.diff(np.interp(edges_ns, instants, elapsed, left=0.0))
+        return begins, on_ns / np.diff(edges_ns)
+
+
+class Memory(NamedTuple):
+    """An AR(1) process.
+
+    Parameters
+    ----------
+    places : frozenset of str
+        Nodes and links that have it.
+    cycles : float
+        Correlation time: cycles that tell as much of the mean as one independent value.
+    """
+
+    places: frozenset[str]
+    cycles: float
+
+
+@dataclass(frozen=True, slots=True)
+class SlowProcesses:
+    """The slow processes of a cell under a scenario.
+
+    Parameters
+    ----------
+    on_off : tuple of OnOff
+        Those with a share of the time above `RARE`.
+    memories : tuple of Memory
+    loops : tuple of float
+        Cycles after which each replayed trace is back at its start.
+    has_one_loop : bool
+        Whether a single trace is all that is random.
+    is_timed : bool
+        Whether disturbances begin or end at set times, for which a run has no stationary mean.
+    """
+
+    on_off: tuple[OnOff, ...]
+    memories: tuple[Memory, ...]
+    loops: tuple[float, ...]
+    has_one_loop: bool
+    is_timed: bool
+
+    def least_cycles(self, period_ms: float) -> float:
+        """Return the number of cycles after which each of them has shown all that it does."""
+        renewals = [RENEWALS * one.renewal_ms / period_ms for one in self.on_off]
+        return max((*renewals, *(RENEWALS * one.cycles for one in self.memories), *self.loops, 0.0))
+
+    def errors(
+        self,
+        problem: Problem,
+        realisation: Realisation,
+        name: str,
+        l95_ms: Floats,
+        rates: Floats,
+        errors: tuple[float, float],
+    ) -> tuple[float, float]:
+        """Return the standard errors of a candidate's L95 (ms) and V_D by all that was seen.
+
+        Parameters
+        ----------
+        l95_ms, rates : float64 array, shape (windows,)
+            L95 and V_D of the last windows of the realisation.
+        errors : pair of float
+            Their standard errors by the windows alone, which hold if nothing is slow.
+        """
+        counted = len(rates) * problem.window_cycles
+        if self.has_one_loop and counted >= self.loops[0]:
+            return errors[0], self._loop_error(float(rates.mean()), counted)
+        places, columns = _places(problem, name), np.column_stack((l95_ms, rates))
+        rest, by_times = self._by_times(problem, realisation, places, columns)
+        squares = np.square(errors)
+        if rest is not columns:
+            by_rest = [mean_and_error(column)[1] for column in rest.T]
+            squares = np.minimum(np.square(by_rest), squares)
+        for memory in self.memories:
+            known = max(counted / memory.cycles, 1.0)
+            if memory.places & places and known < FEW:
+                least = columns[:, 0].std() / math.sqrt(known), unseen_error(rates.mean(), known)
+                squares = np.maximum(squares, np.square(least))
+        if any(counted < cycles for cycles in self.loops):
+            squares = np.maximum(squares, self._unseen_loops(problem, counted, l95_ms))
+        l95_error_ms, rate_error = np.sqrt(squares + by_times).tolist()
+        return l95_error_ms, rate_error
+
+    def _by_times(
+        self, problem: Problem, realisation: Realisation, places: frozenset[str], columns: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return windows without the effect of rare on/off processes, and the squared errors of it.
+
+        The effect comes from a regression on the share of each window in which a process is on.
+
+        Parameters
+        ----------
+        places : frozenset of str
+            Nodes and links that the candidate uses.
+        columns : float64 array, shape (windows, 2)
+            L95 and V_D.
+        """
+        width = problem.window_cycles
+        edges_ns = realisation.release_ns[-1 - len(columns) * width :: width]
+        counted_ms = float(edges_ns[-1] - edges_ns[0]) / NS_PER_MS
+        most = np.array([problem.censor_ms, 1.0]) - columns.mean(axis=0)
+        squares = np.zeros(2)
+        for one in self.on_off:
+            if one.places.isdisjoint(places) or counted_ms >= FEW * one.renewal_ms:
+                continue
+            seen, shares = one.seen(realisation, edges_ns)
+            spread = shares - shares.mean()
+            variance, effect = float(spread @ spread), most
+            if variance:
+                slope = spread @ columns / variance
+                columns = columns - np.outer(spread, slope)
+                effect = np.minimum(np.abs(slope), most)
+            # A sum of n exponential times on, where n has a Poisson distribution.
+            share_error = min(math.sqrt(2 * (seen + 1)) * one.on_ms / counted_ms, 1.0)
+            squares += np.square(effect * share_error)
+        return columns, squares
+
+    def _loop_error(self, rate: float, cycles: int) -> float:
+        """Return the standard error of V_D if a single trace is all that is random.
+
+        Cycles beyond whole loops count some rows once more than others.
+        """
+        return math.fmod(cycles, self.loops[0]) / cycles * math.sqrt(rate * (1 - rate))
+
+    def _unseen_loops(self, problem: Problem, cycles: int, l95_ms: Floats) -> Floats:
+        """Return the squared errors of L95 and V_D by the parts of traces that were not replayed.
+
+        Each of `STRETCHES` parts counts as one value.
+        """
+        share = unseen_error(0.0, STRETCHES) * math.sqrt(1 - cycles / max(self.loops))
+        most_ms = problem.censor_ms - float(l95_ms.mean())
+        return np.square((share * most_ms, share))
+
+    def whole_loops(self, width: int, most: int) -> int | None:
+        """Return after how many windows a single trace that is all that is random was replayed.
+
+        Parameters
+        ----------
+        width : int
+            Cycles of a window.
+        most : int
+            Largest number of windows: if whole loops end with a window beyond it, or never, the
+            last window ends in the second loop.
+
+        Returns
+        -------
+        int or None
+            None if there is no such trace.
+        """
+        if not self.has_one_loop:
+            return None
+        (cycles,) = self.loops
+        if cycles.is_integer() and (whole := int(cycles) // math.gcd(int(cycles), width)) <= most:
+            return whole
+        return math.ceil(cycles / width)
+
+
+@lru_cache(maxsize=64)
+def slow_processes(problem: Problem, scenario: str) -> SlowProcesses:
+    """Return the slow processes of a cell under a scenario."""
+    items, fabric = problem.scenario(scenario), problem.fabric
+    processes = list(_processes(problem, items))
+    tables = {id(one.table): one.table for _, one in processes if isinstance(one, Trace)}
+    loops = tuple(table.loop_cycles(problem.pipeline.period_ms) for table in tables.values())
+    # Where instants of rows are closer than releases, a loop does not replay each of them.
+    replayed = [loop >= table.rows for loop, table in zip(loops, tables.values(), strict=True)]
+    random = any(not isinstance(one, Constant | Trace) for _, one in processes)
+    lossy = any(link.loss for link in fabric.links.values()) or any(
+        isinstance(item, LinkDisturbance) and item.loss for item in items
+    )
+    ticks = any(node.quota and node.quota.tick_ms for node in fabric.nodes.values())
+    on_off: dict[str, OnOff] = {}
+    for one in _on_off(problem, items):
+        known = on_off.setdefault(one.stream, one)
+        on_off[one.stream] = known._replace(places=known.places | one.places)
+    timed = any(item.at_s or math.isfinite(item.for_s) for item in items)
+    return SlowProcesses(
+        on_off=tuple(one for one in on_off.values() if one.on_ms > RARE * one.renewal_ms),
+        memories=tuple(
+            Memory(places, (1 + one.rho) / (1 - one.rho))
+            for places, one in processes
+            if isinstance(one, AR1) and one.cv and one.rho > 0
+        ),
+        loops=loops,
+        has_one_loop=replayed == [True] and not (random or lossy or ticks or on_off or timed),
+        is_timed=timed,
+    )
+
+
+def _processes(problem: Problem, scenario: Scenario) -> Iterator[tuple[frozenset[str], Process]]:
+    """Yield the processes that have a value for each cycle, and the nodes and links they act on."""
+    pipeline, fabric = problem.pipeline, problem.fabric
+    yield frozenset(fabric.nodes), pipeline.release_jitter_ms
+    for name, scale in pipeline.scales.items():
+        scaled = [task.on for task in pipeline.tasks.values() if task.scale == name]
+        yield frozenset(node for on in scaled for node in on), scale
+    for task in pipeline.tasks.values():
+        for node, execution in task.on.items():
+            yield frozenset((node,)), execution.exec_ms
+    for name, link in fabric.links.items():
+        yield frozenset((name,)), link.delay_ms
+        if link.bursts is not None:
+            yield frozenset((name,)), link.bursts.add_delay_ms
+    for item in scenario:
+        if isinstance(item, LinkDisturbance) and item.add_delay_ms is not None:
+            yield frozenset((item.link,)), item.add_delay_ms
+
+
+def _on_off(problem: Problem, scenario: Scenario) -> Iterator[OnOff]:
+    """Yield the on/off processes that have an effect, and no end."""
+    fabric = problem.fabric
+    for name, node in fabric.nodes.items():
+        if node.bursts is not None and node.bursts.threads:
+            yield _bursts(name, node.bursts)
+    for name, link in fabric.links.items():
+        if link.bursts is not None and link.bursts.add_delay_ms != Constant(0.0):
+            yield _bursts(name, link.bursts)
+    for item in scenario:
+        episodes = item.episodes
+        if episodes is not None and math.isinf(item.for_s) and _acts(item):
+            begin_ns = round(item.at_s * NS_PER_S)
+            stream, times = f"episodes/{episodes.name}", (episodes.every_s, episodes.for_s)
+            yield OnOff(stream, frozenset((item.place,)), *times, NS_PER_S, begin_ns)
+
+
+def _bursts(place: str, bursts: Bursts) -> OnOff:
+    times = bursts.every_ms, bursts.for_ms
+    return OnOff(f"bursts/{place}", frozenset((place,)), *times, NS_PER_MS)
+
+
+def _acts(item: NodeDisturbance | LinkDisturbance) -> bool:
+    if isinstance(item, NodeDisturbance):
+        return item.down or item.stress_threads > 0
+    slows = item.loss > 0 or math.isfinite(item.rate_mbps)
+    return item.down or slows or item.add_delay_ms is not None
+
+
+def _places(problem: Problem, name: str) -> frozenset[str]:
+    """Return the nodes and links that a candidate's jobs and messages use."""
+    parts = parts_of(problem.pipeline, problem.candidates[name])
+    return frozenset(part.link if isinstance(part, Message) else part.node for part in parts)
+
+
+def mean_and_error(by_window: Floats) -> tuple[float, float]:
+    """Mean of windows, and its standard error by the means of stretches of them.
+
+    Windows that are all equal have no error; of a single one it is infinite.
+    """
+    mean = float(by_window.mean())
+    if len(by_window) < 2:
+        return mean, math.inf
+    if (by_window == by_window[0]).all():
+        return mean, 0.0
+    stretches = np.array_split(by_window, min(STRETCHES, len(by_window)))
+    means = np.array([stretch.mean() for stretch in stretches])
+    return mean, float(means.std(ddof=1) / math.sqrt(len(means)))
+
+
+def unseen_error(rate: float, values: float) -> float:
+    """Return the standard error of a rate, had one value more been missed and one not (Laplace)."""
+    rate = (rate * values + 1) / (values + 2)
+    return math.sqrt(rate * (1 - rate) / values)
