@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from random import Random
 
-import numpy as np
 import pytest
 
 import dwell
