@@ -214,7 +214,7 @@ def long_run(cells: int, name: str, size: int, seed: int) -> tuple[float, float]
     fleet = fleet_of(cells, [])
     first = next(iter(phased(fleet, 1)))
     # The phases of the table's cells, other draws.
-    phases = [problem.pipeline.phase_ms for problem in phased(fleet, 1)][:size]
+    phases = [problem.pipeline.first_release_ms for problem in phased(fleet, 1)][:size]
     (entry,) = fleet.entries
     fleet = replace(
         fleet,

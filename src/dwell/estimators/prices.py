@@ -145,8 +145,8 @@ class Question:
         shadow_fraction: float = 0.0,
     ) -> Question:
         """Ask for the prices of a problem (see `prices_of`), whose phase is nothing to it alone."""
-        if problem.pipeline.phase_ms:
-            problem = problem.at_phase(0.0)
+        if problem.pipeline.phase_ms is not None:
+            problem = problem.at_phase(None)
         return cls(
             pipeline=problem.pipeline,
             fabric=problem.fabric,

@@ -174,7 +174,7 @@ struct Crossing;  // of meter.cpp
   field(i64, policy) field(i64, is_priced)                                                       \
   field(i64, incumbent) field(i64, previous) field(i64, dwell) field(i64, stamped)               \
   field(i64, min_dwell) field(i64, escape) field(f64, min_improvement)                           \
-  field(f64, threshold) field(f64, slack) field(f64, memory)                                     \
+  field(f64, threshold) field(f64, slack) field(f64, memory) field(f64, gain_tolerance)          \
   field(i64, local) field(i64, offload) field(i64, every_windows) field(i64, outside_is_cloud)   \
   field(f64, most_ms) field(f64, most_robot) field(f64, most_outside)                            \
   field(i64, n_shown) field(f64, shown_ms) field(f64, shown_robot) field(f64, shown_edge)        \

@@ -80,7 +80,7 @@ class Problem(Displayed):
         require_length(1, self.window_cycles, self.pipeline.period_ms, "window_cycles")
         if self.servo is not None:
             self.servo.require_seen(self.pipeline.period_ms)
-        phased = self.pipeline.phase_ms and self.live.release == "frames"
+        phased = self.pipeline.first_release_ms > 0 and self.live.release == "frames"
         bound = "timer in a cell with a phase_ms, which a camera's frames do not keep"
         require(not phased, "live.release", self.live.release, bound)
         declared = {name: tuple(items) for name, items in self.scenarios.items()}
@@ -143,7 +143,7 @@ class Problem(Displayed):
         """What its realisations depend on."""
         return Drawn(*(getattr(self, name) for name in Drawn._fields))
 
-    def at_phase(self, phase_ms: float) -> Problem:
+    def at_phase(self, phase_ms: float | None) -> Problem:
         """Return the problem with another offset of all its releases."""
         return replace(self, pipeline=replace(self.pipeline, phase_ms=phase_ms))
 

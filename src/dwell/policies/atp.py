@@ -37,7 +37,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from dwell.cost import TierUtilisation, cost_error, margin, price
+from dwell.cost import TierUtilisation, cost_error, exceeds, margin, price
 from dwell.errors import MetricError
 from dwell.model.bounds import EVERY_MS
 from dwell.model.objective import Objective
@@ -170,7 +170,7 @@ class ATP(ATPThresholds):
             moved = self._pricing.switching(now)[other]
             saved = self._cost(here, 0.0) - self._cost(there, moved)
             least = margin(self._error(here), self._error(there))
-        if over and saved > least:
+        if over and exceeds(saved, least):
             return self._move(other, "migrate", costs, saved), ()
         return self._stay("hold", costs, saved), ()
 

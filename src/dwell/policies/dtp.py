@@ -3,12 +3,12 @@
 Window k ran under the incumbent, placement k - 1. The lines of the algorithm, with its corner
 cases decided:
 
-* J of the incumbent is that of its entry in the estimates, with the switching term of its own last
-  decision (placement k - 1 against k - 2); J of every candidate, the incumbent included, is that of
+* J of the incumbent comes from its entry in the estimates, with the switching term of its own last
+  decision (placement k - 1 against k - 2). J of every candidate, the incumbent included, comes from
   its entry against the incumbent. The incumbent's entry is what was measured, as in the paper,
   unless the estimator learns: both sides of Delta J are then its predictions.
 * Delta J must exceed Delta_min and the `dwell.cost.margin` of the two estimates, which is 0 where
-  they say no errors.
+  they say no errors, by more than `dwell.cost.GAIN_TOLERANCE`.
 * n_d counts windows since the last migration and blocks while n_d < N_min. Two migrations are
   therefore at least N_min + 1 windows apart, and K windows hold at most
   floor(K / (N_min + 1)) of them, whatever the metrics do.
@@ -28,7 +28,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
-from dwell.cost import excess
+from dwell.cost import exceeds, excess
 from dwell.errors import MetricError
 from dwell.model.bounds import MIN_DWELL, MIN_IMPROVEMENT
 from dwell.model.objective import Objective
@@ -110,7 +110,7 @@ class DTP(PricingPolicy):
         best = cheapest(costs, eligible, now)
         delta_j = self._stays(estimates) - costs[best]
         least = self.min_improvement + pricing.margin(estimates[best], estimates[now])
-        if best != now and delta_j > least:
+        if best != now and exceeds(delta_j, least):
             reason = pricing.reason(best, costs, eligible, within_caps=within_caps)
             return self._move(best, reason, costs, delta_j), None
         return self._stay("hold" if within_caps else "infeasible", costs, delta_j), None

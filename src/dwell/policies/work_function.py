@@ -43,6 +43,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from operator import add
 
+from dwell.cost import exceeds
 from dwell.model.frozen import FrozenDict
 from dwell.model.objective import Objective
 from dwell.model.placement import Placement
@@ -133,8 +134,9 @@ class WorkFunction(PricingPolicy):
         now = self.incumbent
         least = self._pricing.margin(estimates[best], estimates[now])
         here, there = self._index[now], self._index[best]
+        saved = served[here] - served[there] - self._distances[here][there]
         # Without errors a tie is a move.
-        return least > 0 and served[here] - served[there] - self._distances[here][there] <= least
+        return least > 0 and not exceeds(saved, least)
 
     def _choose(self, served: list[float], eligible: list[str]) -> str:
         """Return the eligible candidate with the least ``served + distance``; ties move.
