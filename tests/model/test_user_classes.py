@@ -15,9 +15,12 @@ import dwell
 from dwell.cellfile import load_without_traces
 from dwell.control import Controller
 from dwell.errors import PolicyError
-from tests.cli.small_cell import SMALL, call, read_json
+from tests.cli.small_cell import SMALL, assert_refused, call, read_json
 
 POLICY = """\
+from dataclasses import replace
+
+
 class Fastest:
     def __init__(self, names):
         self.names = names
@@ -52,6 +55,37 @@ class Fails:
         raise ValueError("no table")
 
     def decide(self, *, observed, estimates):
+        return "LOC"
+
+
+class Rewrites:
+    # Writes what it believes into the estimates.
+    def decide(self, *, observed, estimates):
+        estimates["OFF"] = replace(estimates["OFF"], l95_ms=1.0)
+        return "OFF"
+
+
+class Forgets:
+    # Drops the placement that is active, then takes the best of the others.
+    def decide(self, *, observed, estimates):
+        estimates.pop("LOC")
+        return min(estimates, key=lambda name: estimates[name].l95_ms)
+
+
+class OddError(Exception):
+    # Pickles, and cannot be made again.
+    def __init__(self, what, where):
+        super().__init__(what)
+
+
+class Late:
+    # Fails after a rehearsal of one window.
+    windows = 0
+
+    def decide(self, *, observed, estimates):
+        self.windows += 1
+        if self.windows == 3:
+            raise OddError("lost", "here")
         return "LOC"
 
 
@@ -150,6 +184,27 @@ def test_bad_classes(cell: Path, name: str, told: str) -> None:
     assert told in checked.stderr
     known = json.loads(call("check", cell, "--json").stdout)
     assert [fault["path"] for fault in known["faults"]] == ["controller.policy"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "told"),
+    [
+        ("Rewrites", "decide at window 0 failed: TypeError: FrozenDict cannot be changed; "),
+        ("Forgets", "decide at window 0 failed: TypeError: FrozenDict cannot be changed; "),
+        ("Late", "decide at window 2 failed: OddError: lost (choice.py:"),
+    ],
+)
+def test_a_policy_that_fails_in_a_run_is_named(cell: Path, kind: str, told: str) -> None:
+    found = call("run", cell, "--policy", f"own.choice:{kind}", "--windows", "5")
+    assert_refused(found, f"error: {kind}: {told}", "(choice.py:")
+
+
+def test_a_policy_that_fails_in_a_worker_process_is_named(cell: Path) -> None:
+    study = cell.parent / "study.yaml"
+    text = "dwell-study: 1\ncell: small.yaml\nwindows: 5\npolicies: {late: 'own.choice:Late'}\n"
+    study.write_text(text, encoding="utf-8")
+    found = call("study", study, "--processes", "2")
+    assert_refused(found, "error: Late: decide at window 2 failed: OddError: lost (choice.py:")
 
 
 @pytest.mark.parametrize("name", ["own.choice:", ":Last", "own choice:Last", "own:choice:Last"])

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -19,7 +20,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import TypeVar, cast
 
-from dwell.errors import SimulationError
+from dwell.errors import PolicyError, SimulationError, describe_raised, user_note
 
 Unit = TypeVar("Unit")
 Result = TypeVar("Result")
@@ -111,7 +112,15 @@ def _end_with_parent() -> None:
 
 def _work(unit: object) -> object:
     """Do the task on a unit, in a worker process."""
-    return _Worker.task(unit)
+    try:
+        return _Worker.task(unit)
+    except Exception as error:
+        try:
+            pickle.loads(pickle.dumps(error))  # noqa: S301 - made here
+        except Exception:
+            # The process that waits could not read it.
+            raise PolicyError(user_note(error) or describe_raised(error)) from None
+        raise
 
 
 @contextmanager
