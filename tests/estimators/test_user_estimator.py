@@ -66,6 +66,18 @@ class Answers(Own):
         return self.answer  # type: ignore[no-any-return]
 
 
+class Listens(Profile):
+    """One of ours that learns, too, and knows what supports it."""
+
+    windows = 0
+
+    def learn(self, evidence: Evidence) -> None:
+        self.windows += 1
+
+    def support(self) -> dict[str, Support]:
+        return dict.fromkeys(PROBLEM.candidates, Support(float(self.windows), 0.0))
+
+
 class First:
     def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
         return next(iter(estimates))
@@ -78,6 +90,13 @@ def test_an_error_of_an_estimator_has_its_name(method: str) -> None:
     origin = str(user_note(caught.value))
     assert origin.startswith(f"Own: {method}")
     assert "failed: KeyError: 'SO' (test_user_estimator.py:" in origin
+
+
+@pytest.mark.parametrize("estimator", [Own(), Listens(PROBLEM)])
+def test_a_method_that_a_class_adds_is_used(estimator: Own | Listens) -> None:
+    run = dwell.simulate(PROBLEM, policy="dtp", estimator=estimator, seed=1, windows=4)
+    expected = [1.0, 2.0, 3.0, 4.0] if isinstance(estimator, Listens) else [1.0] * 4
+    assert run.decisions["est_samples_SO"].to_list() == expected
 
 
 def test_evidence_that_is_written_to_changes_no_realisation() -> None:

@@ -93,11 +93,28 @@ made = Last()
 """
 
 ESTIMATOR = """\
-from dwell.estimators import Profile
+from dwell.estimators import Corrected, Profile, Scaling, Shadow
 
 
-class Twice(Profile):
+class MyProfile(Profile):
     pass
+
+
+class MyShadow(Shadow):
+    pass
+
+
+class MyScaling(Scaling):
+    pass
+
+
+class MyCorrected(Corrected):
+    pass
+
+
+class Wants(Corrected):
+    def __init__(self, problem, table):
+        super().__init__(problem)
 
 
 class Bare:
@@ -136,18 +153,30 @@ def test_a_run_records_the_name_and_opens_without_the_module(cell: Path, name: s
     assert set(kept.windows["placement"][1:]) == {"OFF"}
 
 
-@pytest.mark.parametrize("name", ["guess:Bare", "guess:Twice"])
-def test_an_estimator_is_made_and_started(cell: Path, name: str) -> None:
-    found = call("run", cell, "--estimator", name, "--windows", "6", "--out", "mine")
-    if name == "guess:Twice":
-        assert found.exit_code == 2
-        assert "the class wants arguments (problem)" in found.stderr
-        return
+@pytest.mark.parametrize(
+    ("name", "same"),
+    [
+        ("guess:Bare", "profile"),
+        ("guess:MyProfile", "profile"),
+        ("guess:MyShadow", "shadow"),
+        ("guess:MyScaling", "scaling"),
+        ("guess:MyCorrected", "corrected"),
+    ],
+)
+def test_an_estimator_is_made_and_started(cell: Path, name: str, same: str) -> None:
+    stress = ("--scenario", "stress", "--windows", "12")
+    found = call("run", cell, "--estimator", name, *stress, "--out", "mine")
     assert found.exit_code == 0, found.output
-    call("run", cell, "--estimator", "profile", "--windows", "6", "--out", "ours")
+    call("run", cell, "--estimator", same, *stress, "--out", "ours")
     mine, ours = dwell.open_run("mine"), dwell.open_run("ours")
     assert mine.meta["estimator"] == name
     assert mine.decisions.equals(ours.decisions)
+
+
+def test_a_subclass_of_ours_that_wants_more_is_refused(cell: Path) -> None:
+    found = call("run", cell, "--estimator", "guess:Wants")
+    told = "estimator 'guess:Wants': Wants.from_problem(problem) failed: TypeError: "
+    assert_refused(found, told, "missing 1 required positional argument: 'table'")
 
 
 def test_a_policy_and_an_estimator_in_one_name(cell: Path) -> None:
@@ -221,6 +250,26 @@ def test_a_cell_file_names_classes(cell: Path) -> None:
     live = Controller(load_without_traces(cell))
     assert live.described()["policy"] == "own.choice:Last"
     assert live.described()["estimator"] == "guess:Bare"
+
+
+def test_a_study_and_a_live_cell_name_a_subclass_of_ours(cell: Path) -> None:
+    study = cell.parent / "study.yaml"
+    study.write_text(
+        "dwell-study: 1\nname: own\ncell: small.yaml\nwindows: 5\nseeds: 1\npolicies:\n"
+        "  ours: {policy: dtp, estimator: corrected}\n"
+        "  mine: {policy: dtp, estimator: 'guess:MyCorrected'}\n",
+        encoding="utf-8",
+    )
+    assert call("study", study, "--processes", "1").exit_code == 0
+    runs = pl.read_parquet("studies/own/runs.parquet")
+    ours, mine = (runs.filter(policy=name).drop("policy") for name in ("ours", "mine"))
+    assert ours.equals(mine)
+    cell.write_text(f"{SMALL}controller: {{estimator: 'guess:MyCorrected'}}\n", encoding="utf-8")
+    assert call("check", cell).exit_code == 0
+    live = Controller(load_without_traces(cell))
+    assert live.described()["estimator"] == "guess:MyCorrected"
+    assert (live.learns, live.supports) == (True, True)
+    assert live.shadow_fraction == Controller(dwell.load(cell), None, "corrected").shadow_fraction
 
 
 def test_two_folders_have_modules_of_one_name(cell: Path, tmp_path: Path) -> None:
