@@ -9,16 +9,18 @@ began them, even where that is killed.
 
 from __future__ import annotations
 
+import io
 import multiprocessing
 import os
 import pickle
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from typing import TypeVar, cast
+from types import FunctionType
+from typing import Any, TypeVar, cast
 
 from dwell.errors import PolicyError, SimulationError, describe_raised, user_note
 
@@ -86,6 +88,41 @@ def spread(
     finally:
         # On an interrupt or an error: drop what waits, let what runs end, leave no process behind.
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+def require_importable(objects: Mapping[str, object]) -> None:
+    """Refuse objects that worker processes cannot get.
+
+    Parameters
+    ----------
+    objects : mapping of str to object
+        By their names for messages.
+
+    Raises
+    ------
+    SimulationError
+        If an object does not pickle, or its class is in no module.
+    """
+    for name, given in objects.items():
+        try:
+            _Sender(io.BytesIO()).dump(given)
+        except (pickle.PicklingError, AttributeError, TypeError) as error:
+            raise SimulationError(
+                f"{name} cannot be sent to worker processes: it does not pickle ({error}); change "
+                "that, or processes=1"
+            ) from None
+
+
+class _Sender(pickle.Pickler):
+    """A pickler that refuses classes and functions of a notebook or script."""
+
+    def reducer_override(self, one: object) -> Any:
+        if isinstance(one, type | FunctionType) and one.__module__ == "__main__":
+            raise SimulationError(
+                f"{one.__qualname__} is defined in a notebook or script (__main__); put it into a "
+                "module, or processes=1"
+            )
+        return NotImplemented
 
 
 class _Worker:
