@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, TypeAlias
+from typing import ClassVar, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +44,6 @@ class Learning(Online):
         If `half_life_windows` is out of its range.
     """
 
-    supports = True
     #: Half-lives after which a measured value gives way to newer ones, and after which a part that
     #: was not measured any more is as declared again.
     MEMORY: ClassVar[float]
@@ -65,6 +64,11 @@ class Learning(Online):
         self.memory, self.unseen = self.MEMORY * half_life, self.UNSEEN * half_life
         self.seed = seed
         self.start(problem)
+
+    @classmethod
+    def from_problem(cls, problem: Problem) -> Self:
+        """Make the estimator with the settings of ``problem.controller``."""
+        return cls(problem)
 
     def __repr__(self) -> str:
         return (

@@ -56,7 +56,6 @@ class Online(CellEstimator):
         Seed of what is played.
     """
 
-    learns = True
     seed = SEED
 
     def start(self, problem: Problem) -> None:
@@ -121,10 +120,6 @@ class Online(CellEstimator):
         """Take in a window: what it showed of each part, once it is known of its nodes."""
         self._take_in_pending()
         self._evidence = self._pending = evidence
-
-    def look(self, evidence: Evidence) -> None:
-        """Learn from a window."""
-        self.learn(evidence)
 
     def _take_in_pending(self) -> None:
         """Take in the demands of the last window, if they have not been; its nodes come first."""

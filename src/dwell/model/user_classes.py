@@ -12,13 +12,15 @@ import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from dwell.errors import DwellError, describe_raised
+from dwell.errors import DwellError, KernelError, UserNote, describe_raised
 
 if TYPE_CHECKING:
     from dwell.model.problem import Problem
 
+#: Modules of this package begin with it.
+OURS = f"{__name__.partition('.')[0]}."
 #: Modules that were found beside a cell file, by its folder and their name.
 _beside: dict[tuple[str, str], ModuleType] = {}
 _importing = threading.RLock()
@@ -72,7 +74,36 @@ def make_user_class(
         raise
     except Exception as fault:
         call = f"{attribute}()" if from_problem is None else f"{attribute}.from_problem(problem)"
-        raise error(f"{who}: {call} failed: {describe_raised(fault)}") from fault
+        raise error(f"{who}: {call} failed: {describe_raised(fault, users=True)}") from fault
+
+
+class UserCall(NamedTuple):
+    """A call of an object that may be a user's: the errors that it raises get a `UserNote`.
+
+    Parameters
+    ----------
+    method : str
+        Which is called.
+    window : int, optional
+        At whose close, where it is at a close.
+    """
+
+    given: object
+    method: str
+    window: int | None = None
+
+    def __enter__(self) -> None:
+        """Begin the call."""
+
+    def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
+        """End it; an error passes."""
+        if not isinstance(error, Exception) or isinstance(error, KernelError):
+            return
+        kind = type(self.given)
+        if not kind.__module__.startswith(OURS):
+            when = "" if self.window is None else f" at window {self.window}"
+            raised = describe_raised(error, users=True)
+            error.add_note(UserNote(f"{kind.__name__}: {self.method}{when} failed: {raised}"))
 
 
 def source_digest(name: str, folder: str | None) -> str | None:

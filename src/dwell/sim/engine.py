@@ -519,7 +519,7 @@ def _evidence(
         instants = [Instants(*of) for of in logged_instants(arrays, first, last, flows)]
         return Evidence(
             close_ns=close_ns,
-            release_ns=realisation.release_ns[first:last],
+            release_ns=realisation.release_ns[first:last].copy(),
             placement=stamps[0, first:last].copy(),
             cycles=instants[0],
             shadow_placement=(

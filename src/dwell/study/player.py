@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -121,25 +122,27 @@ class Player:
         return PlayedItem(tuple(summaries), examples)
 
     def rehearse(self) -> None:
-        """Play one window of everything at the first point.
+        """Play one window of everything at the first point of each estimator.
 
-        What is named wrongly is found before the work begins.
+        Wrong names are found before the work begins.
         """
         from dwell.sim import draw
         from dwell.sim.fleet import simulate_fleet
 
-        first = self.study.points[0]
-        problem = first.problem
-        for scenario in self.study.scenarios:
+        points = self.study.points
+        # The last assignment of a key stays, so the first point of each estimator.
+        firsts = {points[i].problem.controller.estimator: i for i in reversed(range(len(points)))}
+        for index, scenario in product(firsts.values(), self.study.scenarios):
+            first = points[index]
             if first.fleet is not None:
                 fleet = replace(first.fleet, coordination="none")
                 for contender in self.study.contenders:
                     simulate_fleet(contender.fleet(fleet, scenario), seed=0, windows=1)
                 continue
-            realisation = draw(problem, scenario=scenario, seed=0, windows=1)
-            alone = play_alone(problem, realisation) if self._in_hindsight else None
+            realisation = draw(first.problem, scenario=scenario, seed=0, windows=1)
+            alone = play_alone(first.problem, realisation) if self._in_hindsight else None
             for contender in self.study.contenders:
-                self._simulate(contender, 0, realisation, alone)
+                self._simulate(contender, index, realisation, alone)
         self.prices.update(known_prices())
 
     def _play_fleets(self, item: Item) -> Iterator[tuple[int, Summary]]:

@@ -24,7 +24,7 @@ from dwell.study.software import describe, versions
 from dwell.study.study import Item, Study
 from dwell.study.study_folder import PARTS, STUDY, TABLES, finished, read_parts, write_table
 from dwell.study.summary import latency_grid_ms
-from dwell.study.workers import available_processes, spread
+from dwell.study.workers import available_processes, require_importable, spread
 
 if TYPE_CHECKING:
     import polars as pl
@@ -116,6 +116,7 @@ def play_in_memory(
     """
     import polars as pl
 
+    _prepare(player, player.study.items(), processes, dask)
     count = _counter(player.study, progress)
     frames: list[pl.DataFrame] = []
     examples: dict[tuple[Item, int, str], Example] = {}
@@ -146,6 +147,7 @@ def _play_in_folder(
         write_table(folder, f"{PARTS}/{item.name}", _frame(played))
         count([item])
 
+    _prepare(player, [one for one in items if one.name not in finished(folder)], processes, dask)
     notes = {"labels": dict(study.labels)} if study.labels else {}
     with open_work_folder(folder, STUDY, describe(study), notes):
         known = finished(folder)
@@ -181,6 +183,18 @@ def _counter(study: Study, progress: Progress | None) -> Callable[[Sequence[Item
     return count
 
 
+def _prepare(
+    player: Player, items: Sequence[Item], processes: int | None, dask: str | None
+) -> None:
+    """Refuse a study that cannot be played before a process or a folder is made for it."""
+    if not items:
+        return
+    if dask is None and min(processes or available_processes(), len(items)) > 1:
+        named = {one.name: (one.policy, one.estimator) for one in player.study.contenders}
+        require_importable(named)
+    player.rehearse()
+
+
 def _play(
     player: Player,
     items: Sequence[Item],
@@ -191,10 +205,8 @@ def _play(
     """Do items, and hand over what came of each as soon as it is ready."""
     if not items:
         return
-    player.rehearse()
     if dask is None:
-        workers = available_processes() if processes is None else processes
-        spread(player, items, processes=workers, take=take)
+        spread(player, items, processes=processes or available_processes(), take=take)
     else:
         from dwell.study.cluster import spread_on_dask
 

@@ -187,7 +187,8 @@ class Study:
         names = tuple(contender.name for contender in self.contenders)
         _require_each_once("points", [dict(point.values) for point in self.points])
         _require_each_once("scenarios", self.scenarios)
-        _require_each_once("policies", names)
+        remedy = "name each once; policies={'first': ..., 'second': ...} names objects"
+        _require_each_once("policies", names, remedy)
         _require_each_once("seeds", self.seeds)
         for point in self.points:
             self._check(point)
@@ -198,6 +199,9 @@ class Study:
         objects = [one.name for one in self.contenders if not isinstance(one.policy, str)]
         if objects and any(point.fleet is not None for point in self.points):
             raise SimulationError(f"{objects[0]}: the policies of a fleet have to be named")
+        moving = [one.name for one in self.contenders if one.policy != one.name]
+        if taken := [name for name in moving if name in self.points[0].problem.candidates]:
+            raise SimulationError(f"{taken[0]!r} is a candidate's name; choose another")
         reserved = [name for name in names if self.references and name in REFERENCES]
         if reserved:
             raise SimulationError(f"{reserved[0]!r} is a reference's name; choose another")
@@ -280,7 +284,7 @@ class Study:
         yield from (tuple(group) for group in groups.values())
 
 
-def _require_each_once(what: str, given: Sequence[object]) -> None:
+def _require_each_once(what: str, given: Sequence[object], remedy: str = "name each once") -> None:
     """Refuse nothing at all, and anything twice."""
     if not given:
         raise SimulationError(f"{what} is empty; name at least one")
@@ -288,7 +292,7 @@ def _require_each_once(what: str, given: Sequence[object]) -> None:
     for one in given:
         text = repr(one)
         if text in seen:
-            raise SimulationError(f"{what} holds {text} twice; name each once")
+            raise SimulationError(f"{what} holds {text} twice; {remedy}")
         seen.add(text)
 
 

@@ -9,17 +9,20 @@ began them, even where that is killed.
 
 from __future__ import annotations
 
+import io
 import multiprocessing
 import os
+import pickle
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from typing import TypeVar, cast
+from types import FunctionType
+from typing import Any, TypeVar, cast
 
-from dwell.errors import SimulationError
+from dwell.errors import PolicyError, SimulationError, describe_raised, user_note
 
 Unit = TypeVar("Unit")
 Result = TypeVar("Result")
@@ -87,6 +90,41 @@ def spread(
         pool.shutdown(wait=True, cancel_futures=True)
 
 
+def require_importable(objects: Mapping[str, object]) -> None:
+    """Refuse objects that worker processes cannot get.
+
+    Parameters
+    ----------
+    objects : mapping of str to object
+        By their names for messages.
+
+    Raises
+    ------
+    SimulationError
+        If an object does not pickle, or its class is in no module.
+    """
+    for name, given in objects.items():
+        try:
+            _Sender(io.BytesIO()).dump(given)
+        except (pickle.PicklingError, AttributeError, TypeError) as error:
+            raise SimulationError(
+                f"{name} cannot be sent to worker processes: it does not pickle ({error}); change "
+                "that, or processes=1"
+            ) from None
+
+
+class _Sender(pickle.Pickler):
+    """A pickler that refuses classes and functions of a notebook or script."""
+
+    def reducer_override(self, one: object) -> Any:
+        if isinstance(one, type | FunctionType) and one.__module__ == "__main__":
+            raise SimulationError(
+                f"{one.__qualname__} is defined in a notebook or script (__main__); put it into a "
+                "module, or processes=1"
+            )
+        return NotImplemented
+
+
 class _Worker:
     """Settings that a worker process was started with; their types end at the pickle."""
 
@@ -111,7 +149,15 @@ def _end_with_parent() -> None:
 
 def _work(unit: object) -> object:
     """Do the task on a unit, in a worker process."""
-    return _Worker.task(unit)
+    try:
+        return _Worker.task(unit)
+    except Exception as error:
+        try:
+            pickle.loads(pickle.dumps(error))  # noqa: S301 - made here
+        except Exception:
+            # The process that waits could not read it.
+            raise PolicyError(user_note(error) or describe_raised(error)) from None
+        raise
 
 
 @contextmanager
