@@ -159,6 +159,12 @@ class Run(Displayed):
         return self._table("cycles")
 
     @property
+    def last_window_end(self) -> int:
+        """Number of rows of `cycles` up to the end of the last window; statistics end there."""
+        (within,) = (~self.arrays("cycles")["lead"]).nonzero()
+        return int(within[-1]) + 1 if len(within) else 0
+
+    @property
     def windows(self) -> pl.DataFrame:
         """One row a window: what it showed, and what the controller saw of it."""
         return self._table("windows")
