@@ -16,7 +16,6 @@ from tests.cells.fleets import fleet_of, one_job
 from tests.cells.small import make_problem
 from tests.cli.small_cell import assert_refused, call, read_json
 
-OLD_RUNS = Path(__file__).parents[1] / "regression/data/old-runs"
 RECOVERED = {"sealed": False, "opened": 2, "torn_bytes": 17, "damaged_bytes": 0}
 
 
@@ -118,9 +117,9 @@ def test_a_disk_that_is_full_leaves_no_half_mcap_file(cell: Path) -> None:
     assert {path.name for path in Path.cwd().iterdir()} == {"small.yaml", "kept", "run.mcap"}
 
 
-def test_a_study_is_no_run_of_which_there_is_an_mcap_file() -> None:
-    study = OLD_RUNS / "study"
-    assert_refused(call("report", study, "--mcap", "x.mcap"), "is a study; name one of its runs")
+def test_a_study_is_no_run_of_which_there_is_an_mcap_file(tmp_path: Path) -> None:
+    (tmp_path / "study.json").touch()
+    assert_refused(call("report", tmp_path, "--mcap", "x.mcap"), "is a study; name one of its runs")
 
 
 def fleet_in(folder: Path) -> Path:

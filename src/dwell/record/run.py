@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import re
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
@@ -20,7 +19,7 @@ from dwell.model import Problem, Scenario
 from dwell.model.table_columns import TABLES
 from dwell.record.journal import JOURNAL, Journal, read_journal
 from dwell.record.json_documents import read_document
-from dwell.record.schema import SCHEMA_VERSION
+from dwell.record.schema import SCHEMA_VERSION, require_version
 from dwell.record.table_arrays import TableArrays, arrays_of
 
 if TYPE_CHECKING:
@@ -81,7 +80,7 @@ class Run(Displayed):
     def meta(self) -> dict[str, Any]:
         """What it is the record of, ready for JSON."""
         meta = self._meta() if callable(self._meta) else self._meta
-        return {**_in_todays_words(meta), "schema_version": SCHEMA_VERSION}
+        return {**meta, "schema_version": SCHEMA_VERSION}
 
     def _table(self, name: str) -> pl.DataFrame:
         table = self._tables[name]
@@ -344,7 +343,7 @@ def open_run(path: str | os.PathLike[str]) -> Run:
     Raises
     ------
     RunError
-        If the folder is missing, is not a run, lacks a table, or has a newer schema.
+        If the folder is missing, is not a run, lacks a table, or has another version of the schema.
     """
     folder = Path(path)
     if not folder.is_dir():
@@ -361,28 +360,13 @@ def open_run(path: str | os.PathLike[str]) -> Run:
             raise RunError(f"{folder} is a fleet's folder; name the run of a cell in it")
         raise RunError(f"{folder}: not a run (it has no run.json)")
     meta = read_document(file)
-    version = meta.get("schema_version")
-    if not isinstance(version, int) or version > SCHEMA_VERSION:
-        raise RunError(
-            f"{file}: schema_version is {version!r}; this version reads up to {SCHEMA_VERSION}"
-        )
+    require_version(meta, f"{file}: ")
     missing = [name for name in ALWAYS if not (folder / f"{name}.parquet").is_file()]
     if missing:
         raise RunError(f"{folder}: incomplete run, without {', '.join(missing)}")
     more = [name for name in ON_REQUEST if (folder / f"{name}.parquet").is_file()]
     names = [*ALWAYS, *more]
     return Run(meta, {name: read_table(folder / f"{name}.parquet") for name in names})
-
-
-def _in_todays_words(meta: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return what a run says of itself in today's words.
-
-    The class ``ATP`` of runs without ``every_ms`` is today's ``ATPThresholds``.
-    """
-    policy = meta.get("policy")
-    if isinstance(policy, str) and re.match(r"ATP(\(|$)", policy) and "every_ms=" not in policy:
-        return {**meta, "policy": f"ATPThresholds{policy.removeprefix('ATP')}"}
-    return meta
 
 
 def seal_run(path: str | os.PathLike[str], **meta: object) -> Run:

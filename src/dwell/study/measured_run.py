@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
@@ -154,9 +154,7 @@ def excluded_windows(meta: Mapping[str, Any]) -> frozenset[int]:
     Parameters
     ----------
     meta : mapping
-        ``excluded_windows``, or ``excluded`` of ``pressure``: numbers, mappings with ``window``
-        and ``reason``, pairs of these, or a mapping of number to reason. None where both are
-        missing.
+        ``excluded_windows``, or ``excluded`` of ``pressure``: numbers. None where both are missing.
 
     Raises
     ------
@@ -171,18 +169,10 @@ def excluded_windows(meta: Mapping[str, Any]) -> frozenset[int]:
     numbers: set[int] = set()
     for field, windows in named.items():
         try:
-            numbers.update(map(_number_of, windows or ()))
+            numbers.update(map(int, windows or ()))
         except (TypeError, ValueError):
             raise RunError(f"{field} is {windows!r}; numbers of windows are wanted") from None
     return frozenset(numbers)
-
-
-def _number_of(window: Any) -> int:
-    if isinstance(window, Mapping):
-        window = window.get("window")
-    elif isinstance(window, Sequence) and not isinstance(window, str) and len(window) == 2:
-        window = window[0]
-    return int(window)
 
 
 # ------------------------------------------------------------------------------------- the cell
