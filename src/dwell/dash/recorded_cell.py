@@ -107,7 +107,7 @@ class RecordedCell:
 
 def same_realisation(one: Run, other: Run) -> bool:
     """Whether two runs met the same draws, cycle by cycle."""
-    simulated = all(run.meta.get("kind", "simulated") == "simulated" for run in (one, other))
+    simulated = one.is_simulated and other.is_simulated
     drawn = [(run.meta.get("seed"), run.meta.get("scenario")) for run in (one, other)]
     return simulated and drawn[0] == drawn[1] and one.problem.drawn == other.problem.drawn
 

@@ -40,6 +40,9 @@ LOSSES = {
     "missing_windows": "Windows missing from the run: {}.",
 }
 
+#: Why a measured run has no jobs.
+NO_JOBS = "this run kept no jobs; `dwell controller --jobs` keeps them"
+
 Table: TypeAlias = "pl.DataFrame | Callable[[], pl.DataFrame]"
 
 
@@ -183,7 +186,8 @@ class Run(Displayed):
             If the run was made without them.
         """
         if "jobs" not in self._tables:
-            raise RunError("this run kept no jobs; simulate with jobs=True (`dwell run --jobs`)")
+            how = "simulate with jobs=True (`dwell run --jobs`)"
+            raise RunError(f"this run kept no jobs; {how}" if self.is_simulated else NO_JOBS)
         return self._table("jobs")
 
     @property
@@ -210,6 +214,11 @@ class Run(Displayed):
         if "run" not in self.cycles.columns or self.cycles.is_empty():
             return None
         return str(self.cycles["run"][0])
+
+    @property
+    def is_simulated(self) -> bool:
+        """Whether a simulator made it; a live run was measured."""
+        return str(self.meta.get("kind", "simulated")) == "simulated"
 
     @property
     def has_jobs(self) -> bool:

@@ -133,8 +133,7 @@ def read_measured(name: str, run: Run, problem: Problem, usual: Usual | None = N
             }
     except DwellError as error:
         raise RunError(f"{name}: {error}") from None
-    live = meta.get("kind", "simulated") != "simulated"
-    guard = bool(problem.controller.fallbacks) if live else bool(meta.get("guard", False))
+    guard = bool(meta.get("guard") if run.is_simulated else problem.controller.fallbacks)
     return MeasuredRun(
         name=name,
         problem=problem,
