@@ -265,7 +265,7 @@ def _gone(
     run = simulate_fleet(
         fleet, seed=seed, windows=round(END_S / window_s), estimator="corrected", guard=True
     )
-    cycles = pl.concat([one.cycles for one in run.cells.values()])
+    cycles = pl.concat([one.cycles[: one.last_window_end] for one in run.cells.values()])
     cycles = cycles.with_columns(pl.col("release_ns") / 1e9)
     moved = run.decisions.filter((pl.col("reason") == "guard") & pl.col("migrated"))
     late, there, guards = [], [], []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -16,7 +17,8 @@ from tests.cells.fleets import fleet_of, one_job
 from tests.cells.small import make_problem
 from tests.cli.small_cell import assert_refused, call, read_json
 
-OLD_RUNS = Path(__file__).parents[1] / "regression/data/old-runs"
+#: A measured run that kept no jobs.
+LIVE_RUN = Path(__file__).parents[1] / "regression/data/old-runs/live-sealed"
 RECOVERED = {"sealed": False, "opened": 2, "torn_bytes": 17, "damaged_bytes": 0}
 
 
@@ -93,6 +95,39 @@ def test_report_writes_an_mcap_file_beside_the_page(cell: Path) -> None:
     assert found == {"report": "kept/report.html", "trace": None, "mcap": "run.mcap"}
 
 
+def test_of_a_measured_run_without_jobs_the_rest_is_written(tmp_path: Path) -> None:
+    folder = shutil.copytree(LIVE_RUN, tmp_path / "run")
+    words = ("report", folder, "--trace", tmp_path / "t.json", "--mcap", tmp_path / "run.mcap")
+    result = call(*words)
+    assert (result.exit_code, "note: " in result.stdout) == (0, False)
+    assert result.stderr == (
+        f"note: no {tmp_path / 't.json'}: this run kept no jobs; "
+        "`dwell controller --jobs` keeps them\n"
+    )
+    assert {path.name for path in tmp_path.iterdir()} == {"run", "run.mcap"}
+    assert (folder / "report.html").is_file()
+    assert read_json(call(*words, "--json"))["trace"] is None
+
+
+def test_a_page_of_something_else_is_not_replaced(tmp_path: Path) -> None:
+    one, page = kept(tmp_path / "one"), tmp_path / "page.html"
+    other = kept(tmp_path / "other", seed=2)
+    again = kept(tmp_path / "again")
+    for folder in (one, one, again):
+        assert call("report", folder, "--out", page, "--static").exit_code == 0
+    before = page.read_bytes()
+    notes = tmp_path / "notes.txt"
+    notes.write_text("mine")
+    for target in (page, notes):
+        refused = call("report", other, "--out", target, "--mcap", tmp_path / "x.mcap")
+        assert_refused(refused, f"{target} was made from something else; name another place")
+    assert (page.read_bytes(), notes.read_text()) == (before, "mine")
+    assert not (tmp_path / "x.mcap").exists()
+    # A folder's own page is made again, whatever is there.
+    (other / "report.html").write_text("older")
+    assert call("report", other, "--static").exit_code == 0
+
+
 def test_without_its_package_no_mcap_file_and_no_page_is_written(
     cell: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -118,9 +153,9 @@ def test_a_disk_that_is_full_leaves_no_half_mcap_file(cell: Path) -> None:
     assert {path.name for path in Path.cwd().iterdir()} == {"small.yaml", "kept", "run.mcap"}
 
 
-def test_a_study_is_no_run_of_which_there_is_an_mcap_file() -> None:
-    study = OLD_RUNS / "study"
-    assert_refused(call("report", study, "--mcap", "x.mcap"), "is a study; name one of its runs")
+def test_a_study_is_no_run_of_which_there_is_an_mcap_file(tmp_path: Path) -> None:
+    (tmp_path / "study.json").touch()
+    assert_refused(call("report", tmp_path, "--mcap", "x.mcap"), "is a study; name one of its runs")
 
 
 def fleet_in(folder: Path) -> Path:

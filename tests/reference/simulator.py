@@ -124,8 +124,8 @@ class Decision:
 class Result:
     """The record of a run.
 
-    `cycles` are those up to the last close. `jobs` and `shadow_jobs` are by cycle and task;
-    `arrived` is when a message was handed to its target, by cell, cycle, source and target.
+    `cycles` are those released before the run ended. `jobs` and `shadow_jobs` are by cycle and
+    task; `arrived` is when a message was handed to its target, by cell, cycle, source and target.
     `stamps` are the candidates that every released cycle runs under, and is also sent through.
     `decisions` are those of the controller, and the moves of the guard.
     `closest_ns` is the least distance, below a microsecond, of two events that have nothing to do
@@ -980,9 +980,8 @@ class Simulation:
         self.open_window(0)
         while not self.over and self.env.peek() <= self.end:
             self.env.step()
-        played = self.windows[-1].first_cycle + self.problem.window_cycles if self.windows else 0
         return Result(
-            cycles=tuple(self.cycle_result(k) for k in range(played)),
+            cycles=tuple(self.cycle_result(k) for k in range(len(self.stamps))),
             jobs=self.results(ITSELF),
             shadow_jobs=self.results(SHADOW),
             arrived=self.arrived,

@@ -274,6 +274,7 @@ def reference(case: Case) -> Result:
 def differences(case: Case, found: Played, result: Result, tolerance_ns: int) -> Iterator[str]:
     """Say in what a run differs from the reference."""
     yield from cycle_differences(found.cycles, result, tolerance_ns)
+    yield from lead_differences(case, found.cycles, result)
     yield from job_differences(found.jobs, result, tolerance_ns)
     yield from window_differences(case, found.windows, result)
     if found.decisions is not None:
@@ -310,6 +311,18 @@ def cycle_differences(cycles: pl.DataFrame, result: Result, tolerance_ns: int) -
         parts = [row[column] for column in ("compute_ns", "queue_ns", "network_ns")]
         if not is_split(parts, expected, tolerance_ns):
             yield f"{where}: split into {parts}, expected {set(expected.splits)}"
+
+
+def lead_differences(case: Case, cycles: pl.DataFrame, result: Result) -> Iterator[str]:
+    width = case.problem.window_cycles
+    firsts = [window.first_cycle for window in result.windows]
+    within = {cycle for first in firsts for cycle in range(first, first + width)}
+    end = max(within, default=-1)
+    for cycle, lead, missed in cycles.select("cycle", "lead", "missed").rows():
+        if lead != (cycle not in within):
+            yield f"cycle {cycle}: lead is {lead}"
+        if missed and cycle > end:
+            yield f"cycle {cycle}: missed after the last window"
 
 
 def is_split(parts: Sequence[int | None], expected: CycleResult, tolerance_ns: int) -> bool:

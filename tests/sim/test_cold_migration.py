@@ -264,8 +264,8 @@ def test_waiting_for_the_end_of_an_outage_is_no_attempt() -> None:
 def test_over_a_link_that_stays_down_a_cell_never_migrates(retransmit_ms: float | None) -> None:
     found = play(cell(link={"retransmit_ms": retransmit_ms}), segments=outage(20.5, math.inf))
     assert windows_of(found) == [(0, "LOC")]
-    # What is released after the last close is in no table of cycles.
-    assert found.cycles["cycle"].to_list() == [0, 1]
+    # All cycles are released while it migrates, and none of these is in a window.
+    assert found.cycles["lead"].to_list() == [False] * 2 + [True] * 18
 
 
 def test_a_run_that_ends_first_never_migrates() -> None:

@@ -38,6 +38,7 @@ from dwell.study.reference import (
 )
 from dwell.study.script import Script
 from dwell.study.summary import summarise
+from tests.cells.late_cycles import DRAWN, late_problem, late_run, without_late_cycles
 from tests.cells.small import make_problem
 
 W = 10
@@ -275,5 +276,9 @@ def test_what_is_kept_is_counted_where_the_reference_keeps_it() -> None:
     alone = found.statics["A"].windows["violation_rate"].to_numpy()[2:] <= 0.05
     assert 0 < alone[reference].mean() < 1
     assert kept(found.statics["A"], found, problem) == pytest.approx(alone[reference].mean())
+    # Cycles after the last window count for neither run.
+    late, run = late_problem(), late_run()
+    others = references(late, draw(late, seed=1, scenario="baseline", windows=DRAWN))
+    assert kept(run, others, late) == kept(without_late_cycles(run), others, late) == 0.0
     # Nothing is asked where the reference keeps nothing.
     assert kept(found.statics["A"], found, problem, limit=-1.0) == 1.0

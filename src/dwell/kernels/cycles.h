@@ -357,10 +357,8 @@ void begin_cycle(S& s, i64 cell, i64 cycle, i64 active, bool is_shadow, i64 now)
 template <class S>
 void release(S& s, i64 cell, i64 cycle, i64 now) {
   const i64 active = s.stamp(cell, cycle);
-  if (!S::kPlain) {
-    s.cell(cell).released = cycle + 1;
-    give_up_before(s, cell, cycle, now);
-  }
+  s.cell(cell).released = cycle + 1;
+  if (!S::kPlain) give_up_before(s, cell, cycle, now);
   clear_log(s, cell, cycle);
   begin_cycle(s, cell, cycle, active, false, now);
   if (!S::kPlain) {

@@ -208,7 +208,8 @@ def kept(run: Run, references: References, problem: Problem, limit: float = 0.05
         windows begin; 1 where the reference misses more in all of them: nothing was asked.
     """
     width, first = problem.window_cycles, problem.warmup_windows * problem.window_cycles
-    missed = [one.arrays("cycles")["missed"][first:] for one in (references.run, run)]
+    runs = references.run, run
+    missed = [one.arrays("cycles")["missed"][first : one.last_window_end] for one in runs]
     count = min(map(len, missed)) // width
     theirs, mine = (one[: count * width].reshape(count, width).mean(axis=1) for one in missed)
     asked = theirs <= limit

@@ -332,12 +332,8 @@ def _percentiles(latencies: Latencies) -> dict[str, float]:
 
 
 def used_in(windows: TableArrays, problem: Problem) -> dict[str, Floats]:
-    """Utilisation of every resource in every window.
-
-    Runs that were made before accelerators were counted say nothing of those.
-    """
-    names = {name: f"u_{name}" for name in problem.fabric.resources}
-    return {name: windows[column] for name, column in names.items() if column in windows}
+    """Utilisation of every resource in every window."""
+    return {name: windows[f"u_{name}"] for name in problem.fabric.resources}
 
 
 def busiest(used: Mapping[str, Floats], problem: Problem) -> tuple[Floats, Floats, Floats]:
@@ -346,12 +342,11 @@ def busiest(used: Mapping[str, Floats], problem: Problem) -> tuple[Floats, Float
     Parameters
     ----------
     used : mapping of str to float64 array, shape (windows,)
-        Utilisation of every node, and of the accelerators that are known; NaN where one was not
-        measured. A tier without nodes has 0.
+        Utilisation of every resource; NaN where it was not measured. A tier without nodes has 0.
     """
     none = np.zeros(len(next(iter(used.values()))))
     robot, edge, cloud = (
-        np.fmax.reduce([used[name] for name in names if name in used]) if names else none
+        np.fmax.reduce([used[name] for name in names]) if names else none
         for names in tier_nodes(problem.objective)
     )
     return robot, edge, cloud
