@@ -199,7 +199,7 @@ class AR1(_ByMean):
 
     def __post_init__(self) -> None:
         # As r > -1, where r is the correlation of the logarithm.
-        reachable = 1 + self.rho * (1 + self.cv**2) > 0
+        reachable = 1 + self.rho * (1 + self.cv * self.cv) > 0
         require(
             reachable, "ar1.rho", self.rho, f"reachable by a positive process of cv {self.cv:g}"
         )
