@@ -64,6 +64,28 @@ def test_report_writes_the_page_and_the_trace(cell: Path) -> None:
     assert json.loads(Path("t.json").read_text(encoding="utf-8"))["traceEvents"]
 
 
+@pytest.mark.parametrize(
+    ("kind", "unwanted"),
+    [
+        ("run", "'scipy', 'dwell.study.runner', 'dwell.report.study_page'"),
+        ("study", "'scipy', 'dwell.report.run_page'"),
+    ],
+)
+def test_a_page_imports_nothing_heavy_that_it_has_no_use_for(
+    kind: str, unwanted: str, tmp_path: Path
+) -> None:
+    folder = kept(tmp_path / "run") if kind == "run" else OLD_RUNS / "study"
+    script = (
+        "import sys; from dwell.cli import main\n"
+        f"try: main(['report', {str(folder)!r}, '--out', {str(tmp_path / 'page.html')!r}])\n"
+        f"finally: print(sorted({{{unwanted}}} & sys.modules.keys()))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], check=True, capture_output=True, text=True
+    )
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
 def test_report_of_what_is_not_there(cell: Path) -> None:
     call("run", cell, "--windows", "12", "--out", "kept")
     assert_refused(call("report", "kept", "--trace", "t.json"), "dwell run --jobs")

@@ -138,7 +138,7 @@ class Learning(Online):
         measured = [pool for pool in pools if not pool.is_declared]
         if not measured:
             return 0.0, 0.0
-        l95_ms = math.sqrt(sum(pool.error_ms**2 for pool in measured))
+        l95_ms = math.hypot(*(pool.error_ms for pool in measured))
         widened = max(map(self._widening, measured)) * self._playing.played(name).l95_ms
         count = max(min(pool.measured for pool in measured), 1)
         return math.hypot(l95_ms, widened), unseen_error(rate, count)

@@ -115,7 +115,8 @@ class Price:
     def wanted(self) -> float:
         """How many times as much must be played."""
         l95 = self.l95_error_ms / (L95_SHARE * self.l95_ms) if self.l95_error_ms else 0.0
-        return max(l95, self.violation_error / RATE) ** 2
+        errors = max(l95, self.violation_error / RATE)
+        return errors * errors
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,9 +22,6 @@ if TYPE_CHECKING:
 
 Contenders: TypeAlias = "Mapping[str, MinimalPolicy | str]"
 
-#: Share of missed deadlines that a cell should stay under (the paper's 5 %).
-AIM = 0.05
-
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False, kw_only=True)
 class Comparison(StudyRuns):

@@ -17,10 +17,11 @@ from dwell.cellfile import from_record
 from dwell.cellfile.work_folder import FolderMark, unwritable
 from dwell.errors import DwellError, RunError
 from dwell.files import write_whole
-from dwell.study.results import StudyRuns
 
 if TYPE_CHECKING:
     import polars as pl
+
+    from dwell.study.results import StudyRuns
 
 PARTS = "parts"
 STUDY = FolderMark("study", "study.json", 1, (PARTS,))
@@ -78,6 +79,8 @@ def open_study(folder: str | Path) -> StudyRuns:
     RunError
         If it is none, its runs are not finished, or a file of it cannot be read.
     """
+    from dwell.study.results import StudyRuns
+
     folder = Path(folder)
     path = folder / STUDY.file
     if not is_study(folder):
