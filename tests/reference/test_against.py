@@ -919,6 +919,24 @@ def test_equal_on_cases_made_by_hand(name: str) -> None:
     assert examine(BY_HAND[name], 0) == []
 
 
+def test_an_own_job_begins_where_a_shadow_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sim_arrays, "GIVEN_UP_AFTER", 0)
+    monkeypatch.setattr(reference_simulator, "GIVEN_UP_AFTER", 0)
+    both = {"E": Execution(Constant(1)), "R": Execution(Constant(250))}
+    problem = make_problem(
+        [FIFO, EDGE],
+        [task("A", 10), Task("B", both), Task("C", {"E": Execution(Constant(1))})],
+        [Flow("A", "B"), Flow("B", "C")],
+        links=[UP],
+        candidates={"OFF": {}, "LOC": {"B": "R"}},
+    )
+    case = Case(problem, make_realisation(problem, windows=6), ("OFF",) * 6)
+    stamps, others = ["OFF"] * 6, ["LOC"] * 6
+    found = play_stamped(case, case.real, stamps, others)
+    result = simulate(problem, case.real, stamps, shadows=case.real, shadow_stamps=others)
+    assert list(differences(case, found, result, 0)) == []
+
+
 def test_attempts_draw_the_same_numbers() -> None:
     rng = Random(1)
     for _ in range(200):
