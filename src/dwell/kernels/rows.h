@@ -241,12 +241,12 @@ struct Crossing;  // of meter.cpp
 
 // The times found: up to `most` of each part, and the parts in the order in which they were found.
 // Where demands are asked for, and not times, there is a `cost` of each part: of a job its time
-// alone over its core time, of a message the nanoseconds that its link takes to send it; and a
-// `link` that has a rate, -1 for none.
+// alone over its core time, of a message the nanoseconds that its link takes to send it; a `link`
+// on which messages wait, -1 for none; and whether it `repeats` messages and keeps their order.
 #define DWELL_FOUND(field)                                                                       \
   field(f64*, ms) field(i64*, count) field(i64*, order) field(i64, most) field(i64, n_parts)     \
-  field(const f64*, cost) field(const i64*, link) field(Crossing*, crossings)                    \
-  field(i64, n_crossings)
+  field(const f64*, cost) field(const i64*, link) field(const i64*, repeats)                     \
+  field(Crossing*, crossings) field(i64, n_crossings)
 
 #define DWELL_ROWS(row)                                                                          \
   row(Clock, DWELL_CLOCK) row(Cell, DWELL_CELL) row(Task, DWELL_TASK) row(Flow, DWELL_FLOW)      \
