@@ -122,14 +122,6 @@ bool is_discarded(const S& s, i64 cell, i64 cycle, i64 task) {
   return s.shadow_parts[s.slot(cell, cycle).pair * s.n_tasks + task] == kDiscarded;
 }
 
-// Whether a cycle is that of a shadow that has been given up.
-template <class S>
-bool is_given_up(const S& s, i64 cell, i64 cycle) {
-  if (S::kPlain || s.cell(cell).parent < 0) return false;
-  const Cell& parent = s.cell(s.cell(cell).parent);
-  return cycle + parent.given_up_after < parent.released;
-}
-
 // Shadow that shares a task with a cycle, -1 for none.
 template <class S>
 i64 shared_by(const S& s, i64 cell, i64 cycle, i64 task) {
