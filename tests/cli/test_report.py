@@ -13,6 +13,7 @@ import pytest
 from mcap.reader import make_reader
 
 import dwell
+from dwell.study import Contender, Point, Study, run_study
 from tests.cells.fleets import fleet_of, one_job
 from tests.cells.small import make_problem
 from tests.cli.small_cell import assert_refused, call, read_json
@@ -28,6 +29,20 @@ def kept(folder: Path, **meta: Any) -> Path:
     run.save(folder)
     file = folder / "run.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), **meta}))
+    return folder
+
+
+def studied(folder: Path) -> Path:
+    """Run a short study."""
+    study = Study(
+        name="short",
+        points=(Point({}, make_problem()),),
+        scenarios=("baseline",),
+        contenders=(Contender("SO", "SO"), Contender("LOC", "LOC")),
+        seeds=(1, 2),
+        windows=6,
+    )
+    run_study(study, folder=folder, processes=1)
     return folder
 
 
@@ -74,7 +89,7 @@ def test_report_writes_the_page_and_the_trace(cell: Path) -> None:
 def test_a_page_imports_nothing_heavy_that_it_has_no_use_for(
     kind: str, unwanted: str, tmp_path: Path
 ) -> None:
-    folder = kept(tmp_path / "run") if kind == "run" else OLD_RUNS / "study"
+    folder = kept(tmp_path / "run") if kind == "run" else studied(tmp_path / "study")
     script = (
         "import sys; from dwell.cli import main\n"
         f"try: main(['report', {str(folder)!r}, '--out', {str(tmp_path / 'page.html')!r}])\n"
