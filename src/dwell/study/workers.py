@@ -13,16 +13,21 @@ import multiprocessing
 import os
 import signal
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from queue import SimpleQueue
 from typing import TypeVar, cast
 
 from dwell.errors import SimulationError
 
 Unit = TypeVar("Unit")
 Result = TypeVar("Result")
+
+#: One process per CPU: threads of libraries inside would only compete with each other.
+SINGLE_THREADED = {"OPENBLAS_NUM_THREADS": "1", "POLARS_MAX_THREADS": "1"}
 
 
 def available_processes() -> int:
@@ -38,6 +43,7 @@ def spread(
     *,
     processes: int,
     take: Callable[[Unit, Result], bool | None],
+    rest: Callable[[Result], Unit | None] = lambda _: None,
 ) -> None:
     """Do a task on every unit, or until there is enough.
 
@@ -53,6 +59,8 @@ def spread(
     take : callable
         Called in this process with each unit and its result, as soon as that is ready. Where it
         returns True, the units that are left are not done.
+    rest : callable
+        Returns the part of a unit that its result leaves open, which is then a further unit.
 
     Raises
     ------
@@ -60,9 +68,14 @@ def spread(
         If a process ended before its work was done.
     """
     if min(processes, len(units)) <= 1:
-        for unit in units:
-            if take(unit, task(unit)):
+        queue = deque(units)
+        while queue:
+            unit = queue.popleft()
+            result = task(unit)
+            if take(unit, result):
                 break
+            if (left := rest(result)) is not None:
+                queue.appendleft(left)
         return
     pool = ProcessPoolExecutor(
         max_workers=min(processes, len(units)),
@@ -70,13 +83,26 @@ def spread(
         initializer=_begin,
         initargs=(task,),
     )
+    waiting: dict[Future[object], Unit] = {}
+    ready: SimpleQueue[Future[object]] = SimpleQueue()
+
+    def submit(those: Sequence[Unit]) -> None:
+        with _as_for_workers():
+            for unit in those:
+                future = pool.submit(_work, unit)
+                waiting[future] = unit
+                future.add_done_callback(ready.put)
+
     try:
-        with _interrupts_ignored():
-            waiting = {pool.submit(_work, unit): unit for unit in units}
-        for future in as_completed(waiting):
+        submit(units)
+        while waiting:
+            future = ready.get()
             # A future keeps its result: it is let go, so that only what is taken is kept.
-            if take(waiting.pop(future), cast("Result", future.result())):
+            unit, result = waiting.pop(future), cast("Result", future.result())
+            if take(unit, result):
                 break
+            if (left := rest(result)) is not None:
+                submit([left])
     except BrokenProcessPool:
         raise SimulationError(
             "a worker process ended before its work was done: out of memory, killed, or a script "
@@ -95,8 +121,6 @@ class _Worker:
 
 def _begin(task: Callable[..., object]) -> None:
     """Prepare a worker process."""
-    # One process a CPU: threads inside would only get into each other's way.
-    os.environ["POLARS_MAX_THREADS"] = "1"
     _Worker.task = task
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
@@ -115,13 +139,22 @@ def _work(unit: object) -> object:
 
 
 @contextmanager
-def _interrupts_ignored() -> Iterator[None]:
-    """Let processes that begin here ignore Ctrl-C; this one, which it reaches too, ends them."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _as_for_workers() -> Iterator[None]:
+    """Have processes that begin here ignore Ctrl-C, which this one handles, and use one thread.
+
+    NumPy reads its variable when it is imported, which is before a worker runs any line of ours.
+    """
+    before = {name: os.environ.get(name) for name in SINGLE_THREADED}
+    os.environ.update(SINGLE_THREADED)
+    is_main = threading.current_thread() is threading.main_thread()
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if is_main else None
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        if is_main:
+            signal.signal(signal.SIGINT, handler)
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
