@@ -44,7 +44,7 @@ def stopped_and_resumed(study: Study, cluster: Any, out: Path) -> StudyResult:
     with pytest.raises(KeyboardInterrupt):
         run_study(study, folder=out, dask=cluster.scheduler_address, progress=stop)
     known = parts_in(out)
-    assert len(known) == 2
+    assert len(known) == 2 * len(study.players)
     result = run_study(study, folder=out, dask=cluster.scheduler_address)
     assert parts_in(out).items() >= known.items(), "a finished item was repeated"
     return result

@@ -1,4 +1,4 @@
-"""Classes of a user's own, named ``package.module:Class``: beside the cell file or installed."""
+"""A user's own classes and functions, named ``package.module:name``, from a folder or installed."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import inspect
 import pkgutil
 import sys
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from dwell.errors import DwellError, describe_raised
 
@@ -48,12 +48,7 @@ def make_user_class(
     """
     who = f"{what} {name!r}"
     module_name, _, attribute = name.partition(":")
-    module = import_user_module(module_name, problem.folder, who, error)
-    kind = getattr(module, attribute, None)
-    if kind is None:
-        near = difflib.get_close_matches(attribute, dir(module), n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise error(f"{who}: {module_name} has no class {attribute!r}{hint}")
+    kind = _named(name, problem.folder, "class", who, error)
     if not isinstance(kind, type):
         raise error(f"{who}: {attribute!r} in {module_name} is no class")
     if not callable(getattr(kind, method, None)):
@@ -75,6 +70,46 @@ def make_user_class(
         raise error(f"{who}: {call} failed: {describe_raised(fault)}") from fault
 
 
+def user_function(
+    name: str, folder: str | None, what: str, error: type[DwellError]
+) -> Callable[..., object]:
+    """Return a function of a user's own.
+
+    Parameters
+    ----------
+    name : str
+        ``package.module:function``.
+    folder : str, optional
+        Whose modules go before installed ones.
+    what : str
+        Kind of the function, for messages: ``metric``.
+
+    Raises
+    ------
+    DwellError
+        An `error`, if there is no such module or function, or the module raises when it is
+        imported.
+    """
+    who = f"{what} {name!r}"
+    function = _named(name, folder, "function", who, error)
+    if not callable(function):
+        module_name, _, attribute = name.partition(":")
+        raise error(f"{who}: {attribute!r} in {module_name} is not a function")
+    return cast("Callable[..., object]", function)
+
+
+def _named(name: str, folder: str | None, kind: str, who: str, error: type[DwellError]) -> object:
+    """Return the class or function that ``package.module:name`` names."""
+    module_name, _, attribute = name.partition(":")
+    module = import_user_module(module_name, folder, who, error)
+    found: object = getattr(module, attribute, None)
+    if found is None:
+        near = difflib.get_close_matches(attribute, dir(module), n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise error(f"{who}: {module_name} has no {kind} {attribute!r}{hint}")
+    return found
+
+
 def source_digest(name: str, folder: str | None) -> str | None:
     """Return a digest of the source of the module that ``package.module:Class`` names.
 
@@ -83,10 +118,23 @@ def source_digest(name: str, folder: str | None) -> str | None:
     str or None
         None where the module cannot be imported, or has no source.
     """
-    module_name = name.partition(":")[0]
     try:
-        source = inspect.getsource(import_user_module(module_name, folder, name, DwellError))
-    except (DwellError, OSError, TypeError):
+        module = import_user_module(name.partition(":")[0], folder, name, DwellError)
+    except DwellError:
+        return None
+    return _digest(module)
+
+
+def object_digest(given: object) -> str | None:
+    """Return a digest of the source of the module of an object's class, None without source."""
+    module = sys.modules.get(type(given).__module__)
+    return None if module is None else _digest(module)
+
+
+def _digest(module: ModuleType) -> str | None:
+    try:
+        source = inspect.getsource(module)
+    except (OSError, TypeError):
         return None
     return hashlib.sha256(source.encode()).hexdigest()[:16]
 
@@ -113,7 +161,7 @@ def import_user_module(
     except (Exception, SystemExit) as fault:
         missing = fault.name if isinstance(fault, ModuleNotFoundError) else None
         if missing is not None and f"{name}.".startswith(f"{missing}."):
-            place = "" if folder is None else f"neither beside the cell file ({folder}) nor "
+            place = "" if folder is None else f"neither in {folder} nor "
             raise error(f"{who}: there is no module {missing!r}, {place}installed") from None
         raise error(f"{who}: importing {name} failed: {describe_raised(fault)}") from fault
 

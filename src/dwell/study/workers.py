@@ -144,7 +144,7 @@ def _as_for_workers() -> Iterator[None]:
 
     NumPy reads its variable when it is imported, which is before a worker runs any line of ours.
     """
-    before = {name: os.environ.get(name) for name in SINGLE_THREADED}
+    before = {name: os.environ[name] for name in SINGLE_THREADED if name in os.environ}
     os.environ.update(SINGLE_THREADED)
     is_main = threading.current_thread() is threading.main_thread()
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if is_main else None
@@ -153,8 +153,6 @@ def _as_for_workers() -> Iterator[None]:
     finally:
         if is_main:
             signal.signal(signal.SIGINT, handler)
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        for name in SINGLE_THREADED:
+            del os.environ[name]
+        os.environ.update(before)
