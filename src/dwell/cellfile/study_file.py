@@ -179,9 +179,9 @@ class _Reading:
         for name, function in metrics.items():
             place = f"metrics.{name}"
             self._check_name(place, name)
-            self.faults.attempt(
-                place, user_function, function, self._folder, "metric", ProblemError
-            )
+            if function is not None:  # that is a fault already
+                what = (self._folder, "metric", ProblemError)
+                self.faults.attempt(place, user_function, function, *what)
         return metrics
 
     def _check_name(self, path: str, name: str) -> None:

@@ -140,7 +140,7 @@ STUDY = FileKind.of(
     ),
     optional(
         "metrics",
-        MappingForm(TextForm(FUNCTION_PATH)),
+        MappingForm(TextForm(FUNCTION_PATH), keeps=True),
         "Numbers of your own: name → function of a Run that returns a number.",
         "none",
     ),

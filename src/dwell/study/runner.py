@@ -1,8 +1,7 @@
 """Run a study: batches over processes or a cluster, parts as they are ready, tables at the end.
 
-A run depends on nothing but the study, its scenario, its seed and its contender. So the tables are
-the same, byte for byte, however the batches are played: by which process, in which order, and in
-how many attempts.
+A run depends only on the study, its scenario, its seed and its contender. So the tables have the
+same bytes, however the batches are played: by which process, in which order, in how many attempts.
 """
 
 from __future__ import annotations
@@ -69,9 +68,8 @@ def run_study(
     Parameters
     ----------
     folder : Path, optional
-        Where the parts and the tables go (``runs.parquet``, ``costs.parquet``,
-        ``latencies.parquet``); a study that was stopped there goes on. Nothing is written where
-        None.
+        For the parts and the tables (``runs.parquet``, ``costs.parquet``, ``latencies.parquet``);
+        a study that was stopped there continues. Nothing is written if None.
     processes : int, optional
         Over which the batches are spread; one per CPU where None (see `dwell.study.workers`).
     dask : str, optional

@@ -101,6 +101,8 @@ def _complete(study: Study, folder: Path) -> dict[Shard, Path]:
             if places.setdefault(item, place) != place:
                 raise RunError(f"{places[item]} and {place} hold the same runs; remove one of them")
         found[shard], of = place, max(of, shard.of)
+    if not found:
+        raise RunError(f"{folder / SHARDS} holds no shard; play each of them with `--shard i/n`")
     absent = {*range(items)}.difference(places)
     shards = (Shard(i + 1, of) for i in range(of))
     missing = [str(one) for one in shards if absent.intersection(one.span(items))]

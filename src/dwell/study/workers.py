@@ -97,7 +97,7 @@ def spread(
         submit(units)
         while waiting:
             future = ready.get()
-            # A future keeps its result: it is let go, so that only what is taken is kept.
+            # A future keeps its result, and `waiting` would keep the future.
             unit, result = waiting.pop(future), cast("Result", future.result())
             if take(unit, result):
                 break
