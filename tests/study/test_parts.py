@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,13 +13,16 @@ import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
 
+import dwell
 from dwell.errors import SimulationError
-from dwell.study import Study, open_study, run_study
+from dwell.study import Contender, Point, Study, open_study, run_study
 from dwell.study.parts import BATCH_RUNS, batches_of, play_and_write
 from dwell.study.player import Batch, Player
 from dwell.study.runner import open_parts
+from tests.cli.small_cell import SMALL
 from tests.study.test_study import make_study
 
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
 TINY = make_study(
     contenders=make_study().contenders[:1], scenarios=("baseline",), seeds=tuple(range(1, 601))
 )
@@ -137,3 +143,68 @@ def test_a_digest_is_that_of_a_contender_and_the_study(tmp_path: Path) -> None:
     changes: list[dict[str, Any]] = [{"windows": 7}, {"seeds": (1, 2)}, {"references": True}]
     for number, change in enumerate(changes):
         assert digests(make_study(**change), str(number))["LOC"] != one["LOC"]
+
+
+POLICY = """\
+class Last:
+    def decide(self, *, observed, estimates):
+        return list(estimates)[-1]
+"""
+
+
+def test_an_edit_that_this_process_has_not_imported_is_refused(tmp_path: Path) -> None:
+    """A notebook would play the old code, and keep its runs as those of the new one."""
+    (tmp_path / "small.yaml").write_text(SMALL)
+    module = tmp_path / "hall_edited.py"
+    module.write_text(POLICY)
+    problem = dwell.load(tmp_path / "small.yaml")
+    study = make_study(
+        points=(Point({}, problem),),
+        scenarios=("baseline",),
+        contenders=(Contender("mine", "hall_edited:Last"),),
+    )
+    run_study(study, folder=tmp_path / "out", processes=1)
+    known = parts_in(tmp_path / "out")
+    module.write_text(POLICY.replace("[-1]", "[0]"))
+    with pytest.raises(SimulationError, match="hall_edited: its source has changed since this"):
+        run_study(study, folder=tmp_path / "out", processes=1)
+    assert parts_in(tmp_path / "out") == known
+    module.write_text(POLICY)
+    assert resumed(study, tmp_path / "out") == (3,)
+
+
+def test_the_source_of_an_objects_class_is_in_its_digest(tmp_path: Path) -> None:
+    """As of a class that is named: an edit plays its contender again."""
+    script = tmp_path / "script.py"
+    policy = POLICY.replace("Last", "Mine")
+    (tmp_path / "hall_object.py").write_text(policy)
+    script.write_text(SCRIPT)
+    before = subprocess.run(
+        [sys.executable, script], check=True, capture_output=True, text=True, env=ENVIRONMENT
+    )
+    (tmp_path / "hall_object.py").write_text(policy.replace("[-1]", "[0]"))
+    after = subprocess.run(
+        [sys.executable, script], check=True, capture_output=True, text=True, env=ENVIRONMENT
+    )
+    first, second = (one.stdout.splitlines()[0] for one in (before, after))
+    assert (first, second) == ("[0, 2, 4]", "[2, 3, 4]")
+
+
+SCRIPT = """\
+from pathlib import Path
+
+import hall_object
+
+from dwell.study import Contender, run_study
+from tests.study.test_study import make_study
+
+study = make_study(
+    scenarios=("baseline",),
+    seeds=(1, 2),
+    contenders=(Contender("LOC", "LOC"), Contender("mine", hall_object.Mine())),
+)
+seen = []
+folder = Path(__file__).parent / "out"
+run_study(study, folder=folder, processes=1, progress=lambda done, _: seen.append(done))
+print(seen)
+"""

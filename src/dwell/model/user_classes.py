@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, cast
 
-from dwell.errors import DwellError, describe_raised
+from dwell.errors import DwellError, SimulationError, describe_raised
 
 if TYPE_CHECKING:
     from dwell.model.problem import Problem
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 #: Modules that were found beside a cell file, by its folder and their name.
 _beside: dict[tuple[str, str], ModuleType] = {}
 _importing = threading.RLock()
+#: Digests of sources, as they were first needed.
+_digests: dict[ModuleType, str] = {}
 
 
 def make_user_class(
@@ -117,6 +119,11 @@ def source_digest(name: str, folder: str | None) -> str | None:
     -------
     str or None
         None where the module cannot be imported, or has no source.
+
+    Raises
+    ------
+    SimulationError
+        If the source has changed since this process imported it.
     """
     try:
         module = import_user_module(name.partition(":")[0], folder, name, DwellError)
@@ -132,11 +139,18 @@ def object_digest(given: object) -> str | None:
 
 
 def _digest(module: ModuleType) -> str | None:
+    """Return a digest of a module's source, which must stay as this process plays it."""
     try:
         source = inspect.getsource(module)
     except (OSError, TypeError):
         return None
-    return hashlib.sha256(source.encode()).hexdigest()[:16]
+    digest = hashlib.sha256(source.encode()).hexdigest()[:16]
+    if _digests.setdefault(module, digest) != digest:
+        raise SimulationError(
+            f"{module.__name__}: its source has changed since this process imported it; start a "
+            "new process (in a notebook, restart the kernel)"
+        )
+    return digest
 
 
 def _arguments(kind: type) -> list[str]:

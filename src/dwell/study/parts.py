@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import itertools
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -114,17 +114,6 @@ class Parts:
             there = {place for part in parts for place in range(part.first, part.end)}
             left |= {place: (*left[place], name) for place in self.span if place not in there}
         return batches_of(self.study, {place: who for place, who in left.items() if who}, processes)
-
-    def frames(self) -> Iterator[pl.DataFrame]:
-        """Yield the runs of every part.
-
-        Raises
-        ------
-        RunError
-            If one cannot be read.
-        """
-        for file in self.files:
-            yield read_parquet(file, "; remove it and run the study again")
 
     def clear(self) -> None:
         """Remove the parts of other versions of a user's own code."""

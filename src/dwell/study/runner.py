@@ -22,6 +22,7 @@ from dwell.study.parts import (
     batches_of,
     frame_of,
     play_and_write,
+    read_parquet,
     runs_of,
     write_parquet,
     write_parts,
@@ -161,7 +162,18 @@ def open_parts(study: Study, folder: Path, shard: Shard | None = None) -> Iterat
     if shard is not None:
         span, description = shard.span(len(span)), {**description, "shard": [*shard]}
     with open_work_folder(folder, STUDY, description, notes):
-        yield Parts(folder, study, digests, span)
+        parts = Parts(folder, study, digests, span)
+        try:
+            yield parts
+        except SimulationError as error:
+            # This process may not know yet what the others have written.
+            parts.look()
+            if not parts.done:
+                raise
+            raise SimulationError(
+                f"{error}\n{parts.done} of {parts.total} runs are finished and stay in {folder}: "
+                "remove the cause, and run the same command again"
+            ) from None
 
 
 def play_parts(
@@ -197,10 +209,7 @@ def play_parts(
     # Workers of a cluster have no file system in common.
     writer = partial(play_and_write, player, folder, parts.digests)
     task = writer if dask is None else player
-    try:
-        _spread(task, missing, workers, dask, take)
-    except SimulationError as error:
-        raise _unfinished(parts, error) from None
+    _spread(task, missing, workers, dask, take)
     parts.clear()
 
 
@@ -215,25 +224,11 @@ def write_tables(parts: Parts) -> Tables:
         If a table cannot be written.
     """
     # From the files in any case: a study that was stopped makes its tables of the same.
-    tables = tables_of(parts.study, parts.frames())
-    try:
-        for name, table in tables.items():
-            write_parquet(parts.folder / f"{name}.parquet", table)
-    except SimulationError as error:
-        raise _unfinished(parts, error) from None
+    remedy = "; remove it and run the study again"
+    tables = tables_of(parts.study, (read_parquet(file, remedy) for file in parts.files))
+    for name, table in tables.items():
+        write_parquet(parts.folder / f"{name}.parquet", table)
     return tables
-
-
-def _unfinished(parts: Parts, error: SimulationError) -> SimulationError:
-    """Return an error that also says how much is finished."""
-    # This process may not know yet what the others have written.
-    parts.look()
-    if not parts.done:
-        return error
-    return SimulationError(
-        f"{error}\n{parts.done} of {parts.total} runs are finished and stay in "
-        f"{parts.folder}: remove the cause, and run the same command again"
-    )
 
 
 def _workers(processes: int | None, dask: str | None) -> int:
