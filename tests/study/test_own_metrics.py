@@ -185,7 +185,7 @@ def test_a_metric_that_fails_is_named_with_its_run(
     "name", ["cost", "violation_rate", "share_of_luck", "tracking_x", "seed", "regret", "lost"]
 )
 def test_a_name_that_a_column_has_is_refused(study: Path, name: str) -> None:
-    with pytest.raises(SimulationError, match=f"metrics.{name}: the tables have columns of such"):
+    with pytest.raises(SimulationError, match=f"metrics.{name}: the tables have such a column"):
         run_study(load_study(with_metric(study, "hall_metrics:moves", name)), processes=1)
 
 

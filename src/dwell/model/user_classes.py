@@ -82,7 +82,7 @@ def user_function(
     name : str
         ``package.module:function``.
     folder : str, optional
-        Whose modules go before installed ones.
+        Its modules are preferred to installed modules.
     what : str
         Kind of the function, for messages: ``metric``.
 
@@ -133,7 +133,7 @@ def source_digest(name: str, folder: str | None) -> str | None:
 
 
 def object_digest(given: object) -> str | None:
-    """Return a digest of the source of the module of an object's class, None without source."""
+    """Return a digest of the source of the module of an object's class, or None."""
     module = sys.modules.get(type(given).__module__)
     return None if module is None else _digest(module)
 

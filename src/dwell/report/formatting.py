@@ -73,7 +73,7 @@ REGRET = Measure("regret", "regret", "%", 100.0)
 
 
 def own_measures(metrics: Iterable[str]) -> list[Measure]:
-    """Return the measures of metrics of a user's own, whose units are not known."""
+    """Return the measures of a user's own metrics, without units."""
     return [Measure(name, name, decimals=2) for name in metrics]
 
 

@@ -113,7 +113,7 @@ def interval_of(column: str, windows: int | None = None) -> Callable[[Floats], I
 
 
 def is_plain(column: str) -> bool:
-    """Whether nothing is known of a column but that it has a mean."""
+    """Whether a column's name gives no other interval than that of a mean."""
     return interval_of(column) is mean_interval
 
 

@@ -22,7 +22,7 @@ def own_metric(path: str, folder: str | None, run: Run, who: str) -> float:
     Parameters
     ----------
     folder : str, optional
-        Whose modules go before installed ones.
+        Its modules are preferred to installed modules.
     who : str
         The metric and the run, for messages.
 

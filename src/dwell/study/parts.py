@@ -1,8 +1,8 @@
 """Parts of a study: the runs of one player in a batch of items, each part a Parquet file.
 
-A part's name has a digest of all that its runs depend on and the places of its items. It appears
-complete or not at all: whoever plays a batch writes its parts under other names, brings them to the
-disk, and renames them. After a stop, the items without a part are played again.
+A part's name has a digest of all that its runs depend on, and the places of its items. A process
+writes a part under another name, brings it to the disk, and renames it, so each part is complete.
+After a stop, the items without a part are played.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ PARTS = "parts"
 LABELS = ("scenario", "policy", "seed")
 #: Runs of a batch at most: enough that a file's fixed size does not count.
 BATCH_RUNS = 512
-#: Batches per process: so many that all processes end at about the same time.
+#: Batches per process, so that all processes end at about the same time.
 BATCHES = 4
 NAME = re.compile(r"([0-9a-f]{16})-(\d+)-(\d+)\.parquet")
 
@@ -56,7 +56,7 @@ class Parts:
     Parameters
     ----------
     folder : Path
-        Of the study, or of a shard.
+        Folder of the study, or of a shard.
     digests : mapping of str to str
         A digest of all that a player's runs depend on, by the player.
     span : range
@@ -133,7 +133,7 @@ def batches_of(study: Study, left: Mapping[int, tuple[str, ...]], processes: int
     Parameters
     ----------
     left : mapping of int to tuple of str
-        Who has to play an item, by its place, in order.
+        The players of an item that have no part with it, by the item's place, in order.
     processes : int
         How many share the batches.
     """

@@ -140,7 +140,7 @@ class Player:
         Raises
         ------
         SimulationError
-            If this process has other software than the one that sends the batch, or a metric fails.
+            If this process and the sender of the batch differ in their software, or a metric fails.
         """
         mine = software()
         differing = [name for name in mine if mine[name] != self.software.get(name)]
@@ -243,7 +243,7 @@ class Player:
     def _play_fleets(
         self, item: Item, contenders: Sequence[Contender]
     ) -> Iterator[tuple[str, int, None, Summary]]:
-        """Yield what the fleet of every point comes to under every contender."""
+        """Yield the summary of the fleet's run at every point under every contender."""
         from dwell.sim.fleet import simulate_fleet
         from dwell.study.fleet_summary import summarise_fleet
 
@@ -304,7 +304,7 @@ class Player:
     def _is_static(self, contender: Contender, point: int) -> bool:
         """Whether a contender's run is a candidate's alone.
 
-        Those are played with the estimator ``profile``; shadow jobs of another one would be load.
+        Those are played with the estimator ``profile``: shadow jobs would be load.
         """
         problem = self._problem(contender, point)
         return contender.is_candidate(problem) and problem.controller.estimator == "profile"

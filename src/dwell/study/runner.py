@@ -70,14 +70,14 @@ def run_study(
     ----------
     folder : Path, optional
         For the parts and the tables (``runs.parquet``, ``costs.parquet``, ``latencies.parquet``);
-        a study that was stopped there continues. Nothing is written if None.
+        a study that was stopped there continues. If None, the tables stay in memory.
     processes : int, optional
         Over which the batches are spread; one per CPU where None (see `dwell.study.workers`).
     dask : str, optional
         Address of a Dask scheduler, whose workers play the batches instead.
     progress : callable, optional
-        Called with the number of runs done and of all runs after each batch; in a folder also at
-        the begin, with what is done already.
+        Called with the number of runs done and of all runs after each batch; in a folder also
+        once before.
 
     Raises
     ------
@@ -245,7 +245,7 @@ def _spread(
     dask: str | None,
     take: Callable[[Batch, PlayedBatch], None],
 ) -> None:
-    """Play batches, and hand over what came of each as soon as it is ready."""
+    """Play batches, and hand over each result as soon as it is ready."""
     rest = operator.attrgetter("rest")
     if dask is None:
         spread(task, batches, processes=processes, take=take, rest=rest)

@@ -32,9 +32,9 @@ def run_shard(
     Parameters
     ----------
     folder : Path
-        Of the study; the shard has a folder in it.
+        Folder of the study; the shard has a folder in it.
     processes, dask, progress
-        See `dwell.study.run_study`, which also says what is raised.
+        See `dwell.study.run_study`, also for the exceptions.
     """
     with open_parts(study, shard.folder(folder), shard) as parts:
         play_parts(parts, processes=processes, dask=dask, progress=progress)
@@ -47,7 +47,7 @@ def merge_shards(study: Study, folder: Path) -> StudyResult:
     Parameters
     ----------
     folder : Path
-        Of the study; all its shards are in it.
+        Folder of the study, with all its shards.
 
     Raises
     ------

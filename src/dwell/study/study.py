@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 ITEM_RUNS = 64
 
 REFERENCES = (CLAIRVOYANT, CLAIRVOYANT_DWELL)
-TAKEN = "the tables have columns of such a name; choose another"
+TAKEN = "the tables have such a column already; choose another name"
 
 
 @dataclass(frozen=True, slots=True)

@@ -93,8 +93,8 @@ def open_study(folder: str | Path) -> StudyRuns:
         table = folder / f"{name}.parquet"
         if not table.is_file():
             raise RunError(
-                f"{folder}: the study is not finished: there is no {table.name}; `dwell study` "
-                "with its file goes on with it"
+                f"{folder}: the study is not finished: there is no {table.name}; run "
+                "`dwell study` with its file again"
             )
         tables[name] = read_parquet(table)
     software = {name: one for name, one in known.get("software", {}).items() if name != "sources"}

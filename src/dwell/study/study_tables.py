@@ -1,6 +1,6 @@
 """Tables of a study, put together from its parts in the order of the study.
 
-They are the same, byte for byte, whoever played the parts, in whatever batches and order.
+Their bytes do not depend on the order of the parts, nor on their sizes.
 """
 
 from __future__ import annotations

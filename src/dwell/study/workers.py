@@ -140,9 +140,9 @@ def _work(unit: object) -> object:
 
 @contextmanager
 def _as_for_workers() -> Iterator[None]:
-    """Have processes that begin here ignore Ctrl-C, which this one handles, and use one thread.
+    """Let processes that begin here ignore Ctrl-C, which this process handles, and use one thread.
 
-    NumPy reads its variable when it is imported, which is before a worker runs any line of ours.
+    NumPy reads its variable when it is imported, before a worker runs any line of ours.
     """
     before = {name: os.environ[name] for name in SINGLE_THREADED if name in os.environ}
     os.environ.update(SINGLE_THREADED)
