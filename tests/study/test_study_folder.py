@@ -132,6 +132,23 @@ def test_a_study_that_is_killed_again_and_again_ends_with_the_same_bytes(
     assert_same_files(out, whole / "whole")
 
 
+def test_an_interrupt_counts_what_workers_have_finished_since(whole: Path, tmp_path: Path) -> None:
+    seen: list[int] = []
+
+    def interrupt(done: int, _: int) -> None:
+        seen.append(done)
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+
+    study = load_study(whole / "study.yaml")
+    with pytest.raises(KeyboardInterrupt):
+        run_study(study, folder=tmp_path / "out", processes=2, progress=interrupt)
+    there = [
+        pl.read_parquet(tmp_path / "out" / "parts" / name) for name in parts_in(tmp_path / "out")
+    ]
+    assert seen[-1] == sum(map(len, there)) >= seen[1] > 0
+
+
 def test_what_a_kill_may_leave_is_cleared(small: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     shutil.copytree(small, out)

@@ -209,7 +209,14 @@ def play_parts(
     # Workers of a cluster have no file system in common.
     writer = partial(play_and_write, player, folder, parts.digests)
     task = writer if dask is None else player
-    _spread(task, missing, workers, dask, take)
+    try:
+        _spread(task, missing, workers, dask, take)
+    except KeyboardInterrupt:
+        # Workers have finished the batches that they had begun.
+        parts.look()
+        done = parts.done
+        count()
+        raise
     parts.clear()
 
 
