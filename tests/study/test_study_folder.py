@@ -398,3 +398,14 @@ def test_a_folder_that_goes_away_ends_the_study(tmp_path: Path) -> None:
 
     with pytest.raises(SimulationError, match="cannot be written"):
         run_study(make_study(), folder=out, processes=1, progress=remove)
+
+
+def test_a_folder_of_another_version_is_refused_by_name(small: Path, tmp_path: Path) -> None:
+    out = shutil.copytree(small, tmp_path / "out")
+    path = out / "study.json"
+    described = json.loads(path.read_text(encoding="utf-8"))
+    path.write_text(json.dumps({**described, "dwell-study-folder": 1, "digest": "another"}))
+    with pytest.raises(RunError, match=r"study\.json: version 1 of a study's folder, and this"):
+        open_study(out)
+    with pytest.raises(RunError, match=r"dwell-study-folder: 1 there, 2 now"):
+        run_study(make_study(), folder=out, processes=1)
