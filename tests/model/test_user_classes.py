@@ -189,8 +189,8 @@ def test_a_policy_and_an_estimator_in_one_name(cell: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "told"),
     [
-        ("absent:Last", "there is no module 'absent', neither beside the cell file ("),
-        ("own.absent:Last", "there is no module 'own.absent', neither beside the cell file ("),
+        ("absent:Last", "there is no module 'absent', neither in "),
+        ("own.absent:Last", "there is no module 'own.absent', neither in "),
         ("raises:Last", "importing raises failed: RuntimeError: no camera (raises.py:1)"),
         ("syntax:Last", "importing syntax failed: SyntaxError: "),
         ("own.choice:Lost", "own.choice has no class 'Lost'; did you mean 'Last'?"),
@@ -296,10 +296,10 @@ def test_a_folder_without_a_module_does_not_get_the_one_of_another(
         dwell.simulate(dwell.load(bare / cell.name), policy="own.choice:Last", seed=1, windows=4)
 
 
-def test_a_study_over_processes_knows_a_changed_module(cell: Path) -> None:
+def test_a_study_over_processes_plays_a_changed_module_again_and_nothing_else(cell: Path) -> None:
     study = cell.parent / "study.yaml"
     text = (
-        "dwell-study: 1\nname: own\ncell: small.yaml\nwindows: 5\nseeds: 2\n"
+        "dwell-study: 1\nname: own\ncell: small.yaml\nwindows: 5\nseeds: 2\nreferences: true\n"
         "policies: {LOC: LOC, 'own.choice:Last': 'own.choice:Last', mine: 'own.choice:Last'}\n"
     )
     study.write_text(text, encoding="utf-8")
@@ -309,8 +309,20 @@ def test_a_study_over_processes_knows_a_changed_module(cell: Path) -> None:
     runs = pl.read_parquet("studies/own/runs.parquet")
     costs = {name: table["cost"].to_list() for (name,), table in runs.group_by("policy")}
     assert costs["own.choice:Last"] == costs["mine"] != costs["LOC"]
+    parts = {part.name: part.stat().st_ino for part in Path("studies/own/parts").iterdir()}
     module = cell.parent / "own" / "choice.py"
-    module.write_text(f"{POLICY}\n# another\n", encoding="utf-8")
+    module.write_text(POLICY.replace("[-1]", "[0]"), encoding="utf-8")
     again = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert again.returncode == 2
-    assert "another" in again.stderr
+    assert (again.returncode, again.stderr) == (0, "")
+    changed = pl.read_parquet("studies/own/runs.parquet")
+    own = pl.col("policy").is_in(["own.choice:Last", "mine"])
+    assert changed.filter(~own).equals(runs.filter(~own))
+    assert changed.filter(policy="mine")["cost"].to_list() == costs["LOC"] != costs["mine"]
+    left = {part.name: part.stat().st_ino for part in Path("studies/own/parts").iterdir()}
+    kept = left.items() & parts.items()
+    assert {one["policy"][0] for one in map(part_named, kept)} == {"LOC", "clairvoyant"}
+    assert len(left) == len(parts) == 2 * len(kept)
+
+
+def part_named(named: tuple[str, int]) -> pl.DataFrame:
+    return pl.read_parquet(Path("studies/own/parts") / named[0])

@@ -34,10 +34,13 @@ from .predictions import paper_predictions as paper_predictions
 from .results import StudyRuns as StudyRuns
 from .runner import StudyResult as StudyResult
 from .runner import run_study as run_study
+from .shards import merge_shards as merge_shards
+from .shards import run_shard as run_shard
 from .study import Contender as Contender
 from .study import Point as Point
 from .study import Study as Study
 from .study import load_study as load_study
+from .study_folder import Shard as Shard
 from .study_folder import open_study as open_study
 from .validation import Validation as Validation
 from .validation import validate as validate

@@ -17,6 +17,7 @@ from dwell.model.bounds import counted
 from dwell.model.fleet import Fleet
 from dwell.model.problem import Drawn
 from dwell.model.semantics import nearest
+from dwell.study.over_seeds import is_plain
 from dwell.study.reference import CLAIRVOYANT, CLAIRVOYANT_DWELL
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 ITEM_RUNS = 64
 
 REFERENCES = (CLAIRVOYANT, CLAIRVOYANT_DWELL)
+TAKEN = "the tables have such a column already; choose another name"
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +134,7 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """Unit of work: one realisation, played by every contender, and kept as a whole.
+    """One realisation, which every contender plays.
 
     Parameters
     ----------
@@ -143,11 +145,6 @@ class Item:
     points: tuple[int, ...]
     scenario: str
     seed: int
-
-    @property
-    def name(self) -> str:
-        """Name among the items of its study."""
-        return f"{self.points[0]:05d}-{self.scenario}-{self.seed}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,6 +161,11 @@ class Study:
         Whether the references in hindsight play as well.
     labels : mapping of str to str
         Names of parameters in figures and tables, by their paths; a path where there is none.
+    metrics : mapping of str to str
+        Functions of a Run that return a number, as ``package.module:function``, by the names of
+        their columns.
+    folder : str, optional
+        Where modules of metrics are looked for first.
 
     Raises
     ------
@@ -181,9 +183,12 @@ class Study:
     windows: int
     references: bool = False
     labels: Mapping[str, str] = field(default_factory=FrozenDict)
+    metrics: Mapping[str, str] = field(default_factory=FrozenDict)
+    folder: str | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "labels", FrozenDict(self.labels))
+        object.__setattr__(self, "metrics", FrozenDict(self.metrics))
         names = tuple(contender.name for contender in self.contenders)
         _require_each_once("points", [dict(point.values) for point in self.points])
         _require_each_once("scenarios", self.scenarios)
@@ -196,6 +201,9 @@ class Study:
             if path not in self.parameters:
                 hint = nearest(path, self.parameters)
                 raise SimulationError(f"labels: {path!r} is none of the parameters; {hint}")
+        for name in self.metrics:
+            if not is_plain(name):
+                raise SimulationError(f"metrics.{name}: {TAKEN}")
         objects = [one.name for one in self.contenders if not isinstance(one.policy, str)]
         if objects and any(point.fleet is not None for point in self.points):
             raise SimulationError(f"{objects[0]}: the policies of a fleet have to be named")
@@ -238,6 +246,12 @@ class Study:
         """Names in the tables, the references' last."""
         names = tuple(contender.name for contender in self.contenders)
         return (*names, *REFERENCES) if self.references else names
+
+    @property
+    def players(self) -> tuple[str, ...]:
+        """Names of all that have parts of their own: the contenders, and the references."""
+        names = tuple(contender.name for contender in self.contenders)
+        return (*names, CLAIRVOYANT) if self.references else names
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -317,4 +331,6 @@ def load_study(path: str | PathLike[str]) -> Study:
         windows=declared.windows,
         references=declared.references,
         labels=declared.labels,
+        metrics=declared.metrics,
+        folder=declared.folder,
     )

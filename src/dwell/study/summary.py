@@ -22,7 +22,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from dwell.cost import tier_nodes
 from dwell.errors import SimulationError
-from dwell.model import Problem
+from dwell.model import FrozenDict, Problem
 from dwell.model.instants import NEVER_NS
 from dwell.model.table_columns import SHARE_OF, USE_OF
 from dwell.study.quality import actuations, age_of_information, misses_in, track
@@ -79,11 +79,14 @@ class Summary:
         One a candidate: mean estimated J while it was not active, mean measured J while it was.
     within : int64 array
         Cycles that finished within each point of the latency grid.
+    compared : mapping
+        What tables need of it to compare runs with the references (see `dwell.study.player`).
     """
 
     row: Row
     costs: list[Row]
     within: Ints
+    compared: Mapping[str, float | str | bytes] = field(default_factory=FrozenDict)
 
 
 def latency_grid_ms(deadline_ms: float) -> Floats:
