@@ -21,6 +21,7 @@ BENCHMARKS = {
     "closing": ("closing", "measure"),
     "deciding": ("deciding", "measure"),
     "pricing": ("pricing", "measure"),
+    "regimes": ("regimes", "measure"),
     "clairvoyant": ("clairvoyant", "measure"),
     "fleet": ("fleet", "measure"),
     "ledger": ("fleet_ledger", "measure"),

@@ -459,3 +459,48 @@ def test_another_regime_begins_with_the_newest_of_a_window() -> None:
 def test_the_middle_is_that_of_what_is_not_lost() -> None:
     assert middle(np.array([1.0, 3.0, math.inf, math.inf, math.inf])) == 2.0
     assert middle(np.array([math.inf])) == math.inf
+
+
+# ------------------------------------------------------------------- a recording with stalls
+
+
+def stalls(seed: int = 1, cycles: int = 12_000) -> Floats:
+    """A recording of delays whose stalls last for 20 to 150 cycles."""
+    rng = np.random.default_rng(seed)
+    values = drawn(rng, cycles)
+    for begin in np.cumsum(rng.integers(1000, 4000, cycles // 1000)):
+        length = int(rng.integers(20, 150))
+        values[begin : begin + length] += rng.uniform(10.0, 80.0)
+    return values
+
+
+def of_windows(values: Floats, cycles: int, every: int) -> Iterator[Floats]:
+    """Yield what windows of a recording measure, in every cycle or by a shadow in some."""
+    for first in range(0, len(values) - cycles + 1, cycles):
+        yield values[first : first + cycles : every]
+
+
+@pytest.mark.parametrize("cycles", [100, 25, 10])
+@pytest.mark.parametrize("every", [1, 5])
+def test_stalls_of_a_recording_are_no_other_regime(cycles: int, every: int) -> None:
+    one, windows = Pool(Reference(stalls(), BLOCK), additive=True), 0
+    disturbed = 0
+    for window, values in enumerate(of_windows(np.tile(stalls(), 3), cycles, every), 1):
+        one.learn(values, window, MEMORY * 100 / cycles, cycles, 100 / cycles)
+        windows, disturbed = window, disturbed + (not one.is_declared)
+    assert disturbed <= 0.01 * windows
+
+
+@pytest.mark.parametrize("more_ms", [60.0, math.inf])
+@pytest.mark.parametrize("every", [1, 5])
+def test_what_lasts_longer_than_any_stall_is_another_regime(every: int, more_ms: float) -> None:
+    one = Pool(Reference(stalls(), BLOCK), additive=True)
+    windows = of_windows(stalls()[:1000] + more_ms, 100, every)
+    changes = [one.learn(values, i, MEMORY, 100) for i, values in enumerate(windows, 1)]
+    assert sum(changes) == 1
+    assert not one.is_declared
+
+
+def test_a_delay_that_no_stall_has_is_another_regime_at_once() -> None:
+    one = Pool(Reference(stalls(), BLOCK), additive=True)
+    assert one.learn(drawn(np.random.default_rng(1), 100) + 500.0, 1, MEMORY, 100)

@@ -88,10 +88,13 @@ class Learning(Online):
     def _take_in(self, demands: Mapping[Part, Floats], evidence: Evidence) -> None:
         self._window += 1
         changed: list[Part] = []
+        cycles = len(evidence.release_ns)
+        # How often any part is compared with its reference in a window of the cell.
+        tests = len(self._pools) * max(self.problem.window_cycles / cycles, 1.0)
         for part, values in demands.items():
             pool = self._pools[part]
             # To whole nanoseconds, as everything is measured: equal values must be ties.
-            if pool.learn(np.round(values, 6), self._window, self.memory):
+            if pool.learn(np.round(values, 6), self._window, self.memory, cycles, tests):
                 changed.append(part)
             self._has_grown |= not pool.is_declared
         for pool in self._pools.values():

@@ -30,6 +30,8 @@ ENOUGH = 12
 SHIFTED, ALIKE, APART = 4.0, 2.0, 2.0
 #: Mean place of a window's values that is another regime; of all that is held, any is.
 MOVED = 0.75
+#: How much more than any stretch of the undisturbed cell another regime must deviate.
+MARGIN = 1.2
 #: Deviations that are a change within a window, of at least so many values.
 CHANGED, LEAST = 5.0, 36
 
@@ -45,27 +47,112 @@ class Reference:
         Cycles of a stretch, whose values may be alike.
     kept : int, optional
         Number of first values that are kept as `values`; all where None.
+    patience_ms : float
+        A value beyond counts as lost: at the end of a window it may be.
 
     Attributes
     ----------
     ordered : float64 array
-        All values, ascending.
+        All values, ascending; infinite where beyond `patience_ms`.
     usual : float
         Median of those that are not lost; infinite where all are.
+    lost : float
+        Share of the values that are lost.
     likeness : float
         Mean correlation of two values of a stretch, by their places.
     """
 
-    __slots__ = ("likeness", "ordered", "usual", "values")
+    __slots__ = (
+        "_block",
+        "_extremes",
+        "_in_order",
+        "_patience_ms",
+        "likeness",
+        "lost",
+        "ordered",
+        "usual",
+        "values",
+    )
 
-    def __init__(self, values: Floats, block: int, kept: int | None = None) -> None:
-        self.values = values[:kept]
-        self.ordered = np.sort(values)
+    def __init__(
+        self,
+        values: Floats,
+        block: int,
+        kept: int | None = None,
+        patience_ms: float = math.inf,
+    ) -> None:
+        self.values, self._block = values[:kept], block
         self.usual = middle(values)
-        self.likeness = _likeness(self.ordered, values, block)
+        self.lost = float(np.isinf(values).mean()) if len(values) else 0.0
+        is_late = ((values > patience_ms) & np.isfinite(values)).any()
+        self._patience_ms = patience_ms if is_late else math.inf
+        self._in_order = self._in_time(values)
+        self.ordered = np.sort(self._in_order)
+        self.likeness = _likeness(self.ordered, self._in_order, block)
+        self._extremes: dict[tuple[int, int, float], tuple[float, int]] = {}
 
     def __repr__(self) -> str:
         return f"<Reference of {len(self.values)} values, usually {self.usual:g} ms>"
+
+    def places(self, values: Floats) -> PlaceSums:
+        """Compare values with those of the undisturbed cell."""
+        return PlaceSums.among(self._in_time(values), self.ordered)
+
+    def deviations(self, shift: PlaceSums, cycles: int) -> float:
+        """Deviations from chance of values that are from a stretch of so many cycles."""
+        return shift.deviations(self.likeness, self._together(shift.size, cycles))
+
+    def extremes(self, size: int, cycles: int, deviations: float) -> tuple[float, int]:
+        """Return how far the undisturbed cell deviates by so many deviations and more.
+
+        Parameters
+        ----------
+        size : int
+            How many values of each stretch of `cycles` are compared.
+
+        Returns
+        -------
+        largest : float
+            Largest `PlaceSums.largest` of any stretch; 0 where none deviates so.
+        longest : int
+            Cycles for which stretches go on deviating so, at most.
+        """
+        # Steps of √2, so that few stretches are looked at.
+        count = int(2 ** (math.floor(2 * math.log2(size)) / 2))
+        key = count, max(cycles // size, 1), deviations
+        if key not in self._extremes:
+            self._extremes[key] = self._search(*key)
+        return self._extremes[key]
+
+    def _search(self, count: int, every: int, deviations: float) -> tuple[float, int]:
+        values = self._in_order[: len(self._in_order) // every * every]
+        largest, longest, span = 0.0, 0, count * every
+        if len(values) < span:
+            return largest, longest
+        # Of the most values that this stands for, which need deviate least.
+        size = math.ceil(count * math.sqrt(2.0))
+        together = self._together(size, size * every)
+        least = _mean_log(size, deviations * _inflation(self.likeness, together))
+        for logs in _logs(self.ordered, values):
+            sums = np.cumsum(np.vstack((np.zeros(every), logs.reshape(-1, every))), axis=0)
+            means = (sums[count:] - sums[:-count]).ravel() / count
+            off = np.flatnonzero(means >= least)
+            if len(off):
+                # Stretches that overlap, or touch each other, are one.
+                ends = np.flatnonzero(np.diff(off) > span)
+                lengths = off[np.append(ends, -1)] - off[np.append(0, ends + 1)]
+                largest = max(largest, float(means.max()))
+                longest = max(longest, int(lengths.max()) + span)
+        return largest, longest
+
+    def _together(self, size: int, cycles: int) -> float:
+        """How many values of a longer stretch may be alike."""
+        return size * min(self._block / cycles, 1.0)
+
+    def _in_time(self, values: Floats) -> Floats:
+        if self._patience_ms == math.inf:
+            return values
+        return np.where(values > self._patience_ms, math.inf, values)
 
 
 class Pool:
@@ -95,6 +182,7 @@ class Pool:
 
     __slots__ = (
         "_chunks",
+        "_lasting",
         "_shift",
         "additive",
         "held",
@@ -122,8 +210,9 @@ class Pool:
     @property
     def lost(self) -> float:
         """Share of the values that are lost."""
-        held = self.reference.ordered if self.is_declared else self.held
-        return float(np.isinf(held).mean()) if len(held) else 0.0
+        if self.is_declared:
+            return self.reference.lost
+        return float(np.isinf(self.held).mean()) if len(self.held) else 0.0
 
     @property
     def error_ms(self) -> float:
@@ -144,7 +233,14 @@ class Pool:
         self.is_declared = False
         self._begin(values, window)
 
-    def learn(self, values: Floats, window: int, memory: float) -> bool:
+    def learn(
+        self,
+        values: Floats,
+        window: int,
+        memory: float,
+        cycles: int | None = None,
+        tests: float = 1.0,
+    ) -> bool:
         """Take in the values that a window measured; returns whether another regime has begun.
 
         Parameters
@@ -153,39 +249,65 @@ class Pool:
             At least one, infinite where it was lost.
         memory : float
             Windows after which a value is forgotten.
+        cycles : int, optional
+            Cycles of the window; as many as values where None.
+        tests : float
+            How often any part is compared so in a window of the cell.
         """
         self.last = window
+        cycles = len(values) if cycles is None else cycles
         # A copy: they are overwritten by the next window's.
         values = values[:: -(-len(values) // LARGEST)].copy()
         reference = self.reference
-        declared = PlaceSums.among(values, reference.ordered)
+        declared = reference.places(values)
         if not len(reference.values):
             # Never came to an end where it is as declared, so that nothing can be told from it.
             is_first, self.is_declared = self.is_declared, False
-            self._add(values, declared, window, memory)
+            self._add(values, declared, window, memory, cycles)
             return is_first
-        off = declared.deviations(reference.likeness)
         if self.is_declared:
-            if off >= SHIFTED and declared.is_large:
-                self._begin_anew(values, window)
-                return True
-            self._add(values, declared, window, memory)
-            if self._off_declared() < SHIFTED:
-                return False
-            self.is_declared, self.touched = False, window
-            return True
+            return self._leave_declared(values, declared, window, memory, cycles, tests)
         apart = PlaceSums.among(values, np.sort(self.held))
-        if off < ALIKE and (
+        if reference.deviations(declared, cycles) < ALIKE and (
             apart.deviations(reference.likeness) >= APART or self._off_declared() < ALIKE
         ):
             self.reset()
             return True
         is_another = apart.is_large and apart.deviations(reference.likeness) >= SHIFTED
         if is_another and len(self.held) >= ENOUGH:
-            self._begin_anew(values, window)
+            self._begin_anew(values, window, cycles)
             return True
-        self._add(values, declared, window, memory)
+        self._add(values, declared, window, memory, cycles)
         return False
+
+    def _leave_declared(
+        self,
+        values: Floats,
+        declared: PlaceSums,
+        window: int,
+        memory: float,
+        cycles: int,
+        tests: float,
+    ) -> bool:
+        """Whether a window, or all that is held with it, is of another regime."""
+        reference = self.reference
+        # The chance of a deviation beyond x falls with exp(-x²/2).
+        least = math.sqrt(SHIFTED**2 + 2.0 * math.log(tests))
+        if declared.is_large and reference.deviations(declared, cycles) >= least:
+            largest, _ = reference.extremes(declared.size, cycles, least)
+            if declared.largest > MARGIN * largest:
+                self._begin_anew(values, window, cycles)
+                return True
+        self._add(values, declared, window, memory, cycles)
+        if self._off_declared() < least:
+            self._lasting = 0
+            return False
+        self._lasting += cycles
+        largest, longest = reference.extremes(self._shift.size, self._span, least)
+        if self._shift.largest <= MARGIN * largest and self._lasting <= MARGIN * longest:
+            return False
+        self.is_declared, self.touched = False, window
+        return True
 
     def follow(self, witness: Pool, window: int) -> None:
         """Be otherwise as another part is: so many times its usual values, or so much more."""
@@ -217,28 +339,36 @@ class Pool:
 
     def _off_declared(self) -> float:
         """Deviations by which all that is held is not as declared."""
-        together = max(chunk.shift.size for chunk in self._chunks)
-        return self._shift.deviations(self.reference.likeness, together)
+        return self.reference.deviations(self._shift, self._span)
 
-    def _begin_anew(self, values: Floats, window: int) -> None:
+    @property
+    def _span(self) -> int:
+        """Cycles of the windows that what is held is from."""
+        return max(sum(chunk.cycles for chunk in self._chunks), 1)
+
+    def _begin_anew(self, values: Floats, window: int, cycles: int) -> None:
         """Begin another regime; where its values are few, with the declared shape."""
         values = values[newest(values) :]
         new = middle(values)
         few = len(values) < ENOUGH and max(new, self.reference.usual) < math.inf
         shape = self.moved(new) if few else np.empty(0)
         self.replace(shape[:: max(len(shape) // ENOUGH, 1)][:ENOUGH], window)
-        self._add(values, PlaceSums.among(values, self.reference.ordered), window, math.inf)
+        shift = self.reference.places(values)
+        self._add(values, shift, window, math.inf, cycles)
 
     def _begin(self, values: Floats, window: int) -> None:
         self.held = values
-        self._shift = PlaceSums.among(values, self.reference.ordered)
-        self._chunks = deque([_Chunk(window, self._shift)])
+        self._shift = self.reference.places(values)
+        self._chunks = deque([_Chunk(window, self._shift, 0)])
         self.measured, self.touched = 0, window
+        self._lasting = 0
 
-    def _add(self, values: Floats, shift: PlaceSums, window: int, memory: float) -> None:
+    def _add(
+        self, values: Floats, shift: PlaceSums, window: int, memory: float, cycles: int
+    ) -> None:
         """Add values, and drop the oldest: what is forgotten, and what is beyond `LARGEST`."""
         chunks = self._chunks
-        chunks.append(_Chunk(window, shift))
+        chunks.append(_Chunk(window, shift, cycles))
         total = self._shift + shift
         while (
             chunks[0].window <= window - memory and total.size - chunks[0].shift.size >= ENOUGH
@@ -288,28 +418,43 @@ class PlaceSums:
         )
 
     @property
+    def largest(self) -> float:
+        """Mean of -log(1 - p), or of -log(p) where it is larger."""
+        return max(self.larger, self.smaller, 0.0) / self.size
+
+    @property
     def is_large(self) -> bool:
         """Whether most of the values are larger, or smaller, than most known ones."""
         return not 1 - MOVED <= self.places / self.size <= MOVED
 
-    def deviations(self, likeness: float, together: int | None = None) -> float:
+    def deviations(self, likeness: float, together: float | None = None) -> float:
         """Deviations from chance by which the values are larger, or smaller, than the known ones.
 
         Parameters
         ----------
         likeness : float
             Mean correlation of two values of a window.
-        together : int, optional
-            How many of them are of one window at most; all where None.
+        together : float, optional
+            How many of them are of one stretch; all where None.
         """
         size = self.size
         if not size:
             return 0.0
         # Of a sum of exponential values, by the cube root of its mean (Wilson and Hilferty).
         part = 1.0 / (9.0 * size)
-        largest = max(self.larger, self.smaller, 0.0) / size
-        off: float = (cube_root(largest) - (1.0 - part)) / math.sqrt(part)
-        return off / math.sqrt(1.0 + ((together or size) - 1) * likeness)
+        off: float = (cube_root(self.largest) - (1.0 - part)) / math.sqrt(part)
+        return off / _inflation(likeness, together or size)
+
+
+def _inflation(likeness: float, together: float) -> float:
+    """By how much the mean of so many values deviates more than that of independent ones."""
+    return math.sqrt(1.0 + max(together - 1.0, 0.0) * likeness)
+
+
+def _mean_log(size: int, deviations: float) -> float:
+    """Return the `PlaceSums.largest` of so many independent values with so many deviations."""
+    part = 1.0 / (9.0 * size)
+    return float((1.0 - part + deviations * math.sqrt(part)) ** 3)
 
 
 class _Chunk(NamedTuple):
@@ -317,6 +462,7 @@ class _Chunk(NamedTuple):
 
     window: int
     shift: PlaceSums
+    cycles: int
 
 
 def newest(values: Floats) -> int:
@@ -343,14 +489,20 @@ def _likeness(ordered: Floats, values: Floats, block: int) -> float:
     stretches = len(values) // block
     if stretches < 2 or block < 2 or ordered[0] == ordered[-1]:
         return 0.0
-    left, right = ordered.searchsorted(values, "left"), ordered.searchsorted(values, "right")
-    logs = -logarithms(1.0 - (left + right + 1) / (2 * len(ordered) + 2))
+    logs, _ = _logs(ordered, values)
     variance = float(logs.var())
     if variance == 0.0:
         return 0.0
     means = logs[: stretches * block].reshape(stretches, block).mean(axis=1)
     inflated = float(means.var(ddof=1)) * block / variance
     return max((inflated - 1.0) / (block - 1), 0.0)
+
+
+def _logs(ordered: Floats, values: Floats) -> tuple[Floats, Floats]:
+    """-log(1 - p) and -log(p) of values, by their places p among known ones."""
+    left, right = ordered.searchsorted(values, "left"), ordered.searchsorted(values, "right")
+    places = (left + right + 1) / (2 * len(ordered) + 2)
+    return -logarithms(1.0 - places), -logarithms(places)
 
 
 def middle(values: Floats) -> float:

@@ -24,6 +24,7 @@ from dwell.estimators.pool import Reference
 from dwell.estimators.prices import SEED, Question, most_windows, prices_of
 from dwell.estimators.sent_shadows import SentShadows, hindered, stamps_of
 from dwell.estimators.slow_processes import slow_processes, unseen_error
+from dwell.estimators.spans import patience_ns
 from dwell.kernels.advance import logged_instants, play
 from dwell.kernels.arrays import Arrays, CellArrays, flow_rows, lay_out
 from dwell.kernels.codes import LAST_NS
@@ -586,6 +587,7 @@ def _references(problem: Problem, seed: int, windows: int) -> dict[Part, Referen
         problem, seed, min(max(windows, math.ceil(least / problem.window_cycles)), most)
     )
     first, meter = lay_out([(problem, real)], log_jobs=True), Meter(problem)
+    patience_ms = max(patience_ns(problem) / 1e6, problem.pipeline.deadline_ms)
     references: dict[Part, Reference] = {}
     for index, placement in enumerate(problem.candidates.values()):
         missing = [part for part in parts_of(problem.pipeline, placement) if part not in references]
@@ -594,7 +596,8 @@ def _references(problem: Problem, seed: int, windows: int) -> dict[Part, Referen
             for part in missing:
                 values = np.round(demands.get(part, np.empty(0)), 6)
                 block = min(problem.window_cycles, STEP)
-                references[part] = Reference(values, block, windows * problem.window_cycles)
+                kept = windows * problem.window_cycles
+                references[part] = Reference(values, block, kept, patience_ms)
     return references
 
 
