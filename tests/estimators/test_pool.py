@@ -247,6 +247,19 @@ def test_a_part_of_which_nothing_is_declared_is_what_is_measured() -> None:
     assert (one.held.tolist(), one.touched) == ([2.0, 1.0, 9.0], 2)
 
 
+def test_a_few_usual_values_end_no_regime_that_has_such_values() -> None:
+    rng = np.random.default_rng(3)
+    one = fresh()
+    late = np.where(rng.random(4000) < 0.7, 90.0, 0.0)
+    values = about(10.0, 4000) + late
+    assert one.learn(values[:100], 1, MEMORY)
+    for window, value in enumerate(values[100:], 2):
+        assert one.learn(np.array([value]), window, 240.0) is False
+    # Where the cause is gone, they do.
+    back = [one.learn(about(10.0, 5, w), w, 240.0) for w in range(4000, 4006)]
+    assert True in back
+
+
 # ------------------------------------------------------------------------------------- losses
 
 

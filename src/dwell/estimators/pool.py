@@ -25,9 +25,8 @@ Floats: TypeAlias = NDArray[np.float64]
 #: Most values that a pool holds, and fewest that it keeps however old they are.
 LARGEST = 200
 ENOUGH = 12
-#: Deviations from chance that are another regime; that are none, where what is declared is taken
-#: back; and that tell new values from measured ones there.
-SHIFTED, ALIKE, APART = 4.0, 2.0, 2.0
+#: Deviations from chance that are another regime, and that are none.
+SHIFTED, ALIKE = 4.0, 2.0
 #: Mean place of a window's values that is another regime; of all that is held, any is.
 MOVED = 0.75
 #: How much more than any stretch of the undisturbed cell another regime must deviate.
@@ -97,6 +96,11 @@ class Reference:
     def places(self, values: Floats) -> PlaceSums:
         """Compare values with those of the undisturbed cell."""
         return PlaceSums.among(self._in_time(values), self.ordered)
+
+    def has_any(self, ordered: Floats) -> bool:
+        """Whether any of some ascending values is between its smallest and its largest."""
+        low, high = self.ordered[0], self.ordered[-1]
+        return bool(ordered.searchsorted(low, "left") < ordered.searchsorted(high, "right"))
 
     def deviations(self, shift: PlaceSums, cycles: int) -> float:
         """Deviations from chance of values that are from a stretch of so many cycles."""
@@ -182,6 +186,7 @@ class Pool:
 
     __slots__ = (
         "_chunks",
+        "_doubt",
         "_lasting",
         "_shift",
         "additive",
@@ -192,6 +197,8 @@ class Pool:
         "reference",
         "touched",
     )
+
+    _doubt: _Doubt | None
 
     def __init__(self, reference: Reference, additive: bool) -> None:
         self.reference, self.additive = reference, additive
@@ -268,9 +275,7 @@ class Pool:
         if self.is_declared:
             return self._leave_declared(values, declared, window, memory, cycles, tests)
         apart = PlaceSums.among(values, np.sort(self.held))
-        if reference.deviations(declared, cycles) < ALIKE and (
-            apart.deviations(reference.likeness) >= APART or self._off_declared() < ALIKE
-        ):
+        if self._is_over(values, declared, cycles):
             self.reset()
             return True
         is_another = apart.is_large and apart.deviations(reference.likeness) >= SHIFTED
@@ -279,6 +284,20 @@ class Pool:
             return True
         self._add(values, declared, window, memory, cycles)
         return False
+
+    def _is_over(self, values: Floats, declared: PlaceSums, cycles: int) -> bool:
+        """Whether the regime is over: by all windows since its last value, where few came."""
+        reference = self.reference
+        if reference.deviations(declared, cycles) >= ALIKE:
+            self._doubt = None
+            return False
+        doubt = self._doubt or _Doubt(np.sort(self.held), PlaceSums(0, 0.0, 0.0, 0.0), 0)
+        apart = doubt.apart + PlaceSums.among(values, doubt.before)
+        self._doubt = _Doubt(doubt.before, apart, doubt.cycles + cycles)
+        # Where the regime has usual values, too, a few more of them do not end it.
+        least = SHIFTED if reference.has_any(doubt.before) else ALIKE
+        off = reference.deviations(apart, self._doubt.cycles)
+        return off >= least or self._off_declared() < ALIKE
 
     def _leave_declared(
         self,
@@ -361,7 +380,7 @@ class Pool:
         self._shift = self.reference.places(values)
         self._chunks = deque([_Chunk(window, self._shift, 0)])
         self.measured, self.touched = 0, window
-        self._lasting = 0
+        self._lasting, self._doubt = 0, None
 
     def _add(
         self, values: Floats, shift: PlaceSums, window: int, memory: float, cycles: int
@@ -455,6 +474,22 @@ def _mean_log(size: int, deviations: float) -> float:
     """Return the `PlaceSums.largest` of so many independent values with so many deviations."""
     part = 1.0 / (9.0 * size)
     return float((1.0 - part + deviations * math.sqrt(part)) ** 3)
+
+
+class _Doubt(NamedTuple):
+    """Successive windows under a regime whose values are as declared.
+
+    Parameters
+    ----------
+    before : float64 array
+        What was held before them, ascending.
+    apart : PlaceSums
+        Their values among those.
+    """
+
+    before: Floats
+    apart: PlaceSums
+    cycles: int
 
 
 class _Chunk(NamedTuple):
