@@ -112,3 +112,8 @@ def test_a_device_that_a_job_waits_for_is_part_of_its_demand() -> None:
     site = Site("planning", "R2")
     whole = meter.demands(kept[0])[site].copy()
     np.testing.assert_allclose(meter.demands(halved)[site], whole, rtol=1e-6)
+
+
+def test_where_there_are_no_others_they_used_nothing() -> None:
+    nothing = np.empty(0), np.empty(0), np.empty(0)
+    assert beside(np.array([0.0, 5.0]), np.array([10.0, 15.0]), nothing).tolist() == [0.0, 0.0]

@@ -30,6 +30,8 @@ def beside(start_ns: Floats, end_ns: Floats, others: tuple[Floats, Floats, Float
     others : tuple of float64 array, shape (m,)
         Start, end and cores of jobs.
     """
+    if not len(others[0]):
+        return np.zeros(len(start_ns))
     at_ns, used = _used(others)
     mean: Floats = _during(start_ns, end_ns, at_ns, used) / np.maximum(end_ns - start_ns, 1.0)
     return mean
