@@ -53,8 +53,9 @@ def estimate(
     return estimator.estimate(observed=QoS(1.0, 0.0, used), incumbent="LOC", own=own)
 
 
-def without_error(qos: QoS) -> tuple[float, float, float]:
-    assert qos.error is None
+def of_price(qos: QoS) -> tuple[float, float, float]:
+    # That of the price alone: nothing was measured.
+    assert qos.error is not None
     return qos.l95_ms, qos.violation_rate, qos.uncut_l95_ms
 
 
@@ -73,7 +74,7 @@ def test_before_any_window_prices_are_those_of_the_profile(problem: Problem, kin
     shown = estimate(estimator, idle, idle)
     assert list(shown) == list(problem.candidates)
     for name in problem.candidates:
-        assert without_error(shown[name]) == declared(profile, name)
+        assert of_price(shown[name]) == declared(profile, name)
 
 
 @every
@@ -88,7 +89,7 @@ def test_what_has_nothing_that_is_otherwise_keeps_the_price_of_the_profile(
     shown = estimate(estimator, {"R": 0.0, "E": 1.0})
     for name in MOVES:
         if name in ("LOC", "TWIN"):
-            assert without_error(shown[name]) == declared(profile, name)
+            assert of_price(shown[name]) == declared(profile, name)
         else:
             assert shown[name].error is not None
             assert shown[name].l95_ms > profile.l95_ms[name]
@@ -204,8 +205,8 @@ def test_a_node_on_which_jobs_do_not_end_is_down_until_they_do(kind: Kind) -> No
             if is_down:
                 assert shown[name].l95_ms == problem.censor_ms
             else:
-                assert without_error(shown[name]) == declared(profile, name)
-        assert without_error(shown["LOC"]) == declared(profile, "LOC")
+                assert of_price(shown[name]) == declared(profile, name)
+        assert of_price(shown["LOC"]) == declared(profile, "LOC")
 
 
 @every
@@ -245,7 +246,7 @@ def test_a_window_that_is_not_learnt_from_changes_no_price(kind: Kind) -> None:
     estimator, profile = kind(problem), Profile(problem)
     shown = estimate(estimator, {"R": 0.0, "E": 0.9})
     assert shown["OFF"].utilisation["E"] >= 0.9
-    assert without_error(shown["OFF"]) == declared(profile, "OFF")
+    assert of_price(shown["OFF"]) == declared(profile, "OFF")
 
 
 @every
@@ -323,7 +324,7 @@ def test_a_window_in_which_nothing_was_seen(kind: Kind) -> None:
     estimator.learn(window([GONE] * 10, close_ms=400.0, release_ms=starts))
     shown = estimate(estimator)
     for name in MOVES:
-        assert without_error(shown[name]) == declared(profile, name)
+        assert of_price(shown[name]) == declared(profile, name)
 
 
 @pytest.mark.parametrize("kind", [Shadow, Corrected])

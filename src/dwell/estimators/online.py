@@ -182,13 +182,13 @@ class Online(CellEstimator):
         estimates = {}
         for name in self.problem.candidates:
             price: PlayedPrice | Price = played.get(name, prices[name])
-            error = None
+            known = (0.0, 0.0)
             if name in played:
-                l95_error_ms, rate_error = self._known_error(name, price.violation_rate)
-                error = (
-                    math.hypot(price.l95_error_ms, l95_error_ms),
-                    math.hypot(price.violation_error, rate_error),
-                )
+                known = self._known_error(name, price.violation_rate)
+            error = (
+                math.hypot(price.l95_error_ms, known[0]),
+                math.hypot(price.violation_error, known[1]),
+            )
             l95_ms, rate, uncut_ms = price.l95_ms, price.violation_rate, price.uncut_l95_ms
             estimates[name] = QoS(l95_ms, rate, shares[name], uncut_ms, error)
         return estimates

@@ -186,6 +186,7 @@ class Pool:
 
     __slots__ = (
         "_chunks",
+        "_cycles",
         "_doubt",
         "_lasting",
         "_shift",
@@ -363,7 +364,7 @@ class Pool:
     @property
     def _span(self) -> int:
         """Cycles of the windows that what is held is from."""
-        return max(sum(chunk.cycles for chunk in self._chunks), 1)
+        return max(self._cycles, 1)
 
     def _begin_anew(self, values: Floats, window: int, cycles: int) -> None:
         """Begin another regime; where its values are few, with the declared shape."""
@@ -380,7 +381,7 @@ class Pool:
         self._shift = self.reference.places(values)
         self._chunks = deque([_Chunk(window, self._shift, 0)])
         self.measured, self.touched = 0, window
-        self._lasting, self._doubt = 0, None
+        self._cycles, self._lasting, self._doubt = 0, 0, None
 
     def _add(
         self, values: Floats, shift: PlaceSums, window: int, memory: float, cycles: int
@@ -388,11 +389,14 @@ class Pool:
         """Add values, and drop the oldest: what is forgotten, and what is beyond `LARGEST`."""
         chunks = self._chunks
         chunks.append(_Chunk(window, shift, cycles))
+        self._cycles += cycles
         total = self._shift + shift
         while (
             chunks[0].window <= window - memory and total.size - chunks[0].shift.size >= ENOUGH
         ) or total.size > LARGEST:
-            total = total - chunks.popleft().shift
+            oldest = chunks.popleft()
+            total = total - oldest.shift
+            self._cycles -= oldest.cycles
         self._shift = total
         self.held = np.concatenate((self.held, values))[-total.size :]
         self.measured = min(self.measured + len(values), total.size)

@@ -12,6 +12,7 @@ import math
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from operator import sub
 from typing import NamedTuple, TypeAlias
 
@@ -44,6 +45,8 @@ LONGEST_WINDOW, STEP = 1000, 100
 DRAWN, FEWEST = 2400, 4
 #: Steps that a candidate's price is of at most; and while demands of the present change.
 KEPT, RECENT = 24, 6
+#: Largest correlation of successive steps; more would be a drift.
+MOST_ALIKE = 0.9
 #: Cycles after those of a step that may have been released when it ends.
 BEYOND = 64
 #: Of a fraction of a thread, what is neither none nor a whole one.
@@ -466,7 +469,21 @@ def _mean_and_error(values: Sequence[float]) -> tuple[float, float]:
     squares = sum((value - mean) * (value - mean) for value in values)
     # Of few values the deviation is itself hardly known: about Student's t over 2.
     few = (count + 1) / (count - 1)
-    return mean, few * math.sqrt(squares / (count * (count - 1)))
+    error = few * math.sqrt(squares / (count * (count - 1)))
+    return mean, error * math.sqrt(_correlation_factor(values, mean, squares))
+
+
+def _correlation_factor(values: Sequence[float], mean: float, squares: float) -> float:
+    """Return by how much the variance of a mean is larger, since steps of a queue are alike.
+
+    It is (1 + r) / (1 - r) of an AR(1) process, r being the correlation of successive steps, of
+    which few show 1 / n too little.
+    """
+    if not squares:
+        return 1.0
+    products = sum((value - mean) * (after - mean) for value, after in pairwise(values))
+    r = min(max(products / squares + 1.0 / len(values), 0.0), MOST_ALIKE)
+    return (1.0 + r) / (1.0 - r)
 
 
 def _with_own_demands(real: Realisation) -> Realisation:
