@@ -197,6 +197,12 @@ class Problem(Displayed):
         return self.window_cycles * self.pipeline.period_ms
 
     @property
+    def decide_cycles(self) -> int:
+        """Cycles between two decisions."""
+        given = self.controller.decide_cycles
+        return self.window_cycles if given is None else given
+
+    @property
     def censor_ms(self) -> float:
         """Latency that stands for any longer one in J: max(4 D, 2 P), and no less than L_max.
 
