@@ -1,6 +1,6 @@
 """The Controller: windows, estimator, policy and order, the same in both engines."""
 
-from dwell.control.controller import ClosedWindow, Controller, Proposal
+from dwell.control.controller import ClosedWindow, Controller, LookedAt, Proposal
 from dwell.control.course import Course
 from dwell.control.guard import (
     CellGuard,
@@ -28,6 +28,7 @@ __all__ = [
     "FallbackRound",
     "Guard",
     "Instants",
+    "LookedAt",
     "MinimalPolicy",
     "Presence",
     "Probation",

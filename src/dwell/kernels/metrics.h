@@ -43,7 +43,7 @@ Seen measure(S& s, i64 cell, i64 first, i64 n, i64 now) {
   const i64 l95_ns = ages[rank - 1];
   const f64 l95_ms = static_cast<f64>(l95_ns) / 1e6;
   const bool lost = unfinished > n - rank && is_age(s, cell, first, n, l95_ns, now);
-  return Seen{first, missed, std::min(l95_ms, of.longest_ms),
+  return Seen{first, n, missed, std::min(l95_ms, of.longest_ms),
               lost ? std::numeric_limits<f64>::infinity() : l95_ms};
 }
 

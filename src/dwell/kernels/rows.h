@@ -168,9 +168,11 @@ struct Crossing;  // of meter.cpp
 #define DWELL_LOG(field)                                                                         \
   field(i64, ready_ns) field(i64, start_ns) field(i64, end_ns) field(i64, work_ns)
 
-// A closed window as it could be known then: `uncut_ms` is L95 without the cell's `longest_ms`.
+// Cycles as they could be known when a window closed, or a decision was due: `uncut_ms` is L95
+// without the cell's `longest_ms`.
 #define DWELL_SEEN(field)                                                                        \
-  field(i64, first_cycle) field(i64, missed) field(f64, l95_ms) field(f64, uncut_ms)
+  field(i64, first_cycle) field(i64, cycles) field(i64, missed)                                  \
+  field(f64, l95_ms) field(f64, uncut_ms)
 
 // What a built-in policy with the estimator `profile` decides by (rules.h): its own numbers, the
 // objective's, where the cell is, and what `ATP` has added up since its last decision. Of two

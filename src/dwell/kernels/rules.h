@@ -289,9 +289,7 @@ bool decide(S& s, i64 decision) {
   const f64* recent = is_window ? &s.shares[snapshot_row(s, 0, decision)]
                                 : &s.look_shares[look_row(s, 0, decision, 0)];
   estimate(priced, recent, is_window ? recent : &s.look_shares[look_row(s, 0, decision, 1)]);
-  const i64 looked_at = is_window ? cell.window_cycles
-                                  : cell.look_cycle - cell.decide_cycles - priced.seen.first_cycle;
-  const f64 n_cycles = static_cast<f64>(looked_at);
+  const f64 n_cycles = static_cast<f64>(priced.seen.cycles);
   priced.l95_ms(incumbent) = priced.seen.l95_ms;
   priced.violation_rate(incumbent) = static_cast<f64>(priced.seen.missed) / n_cycles;
   for (i64 c = 0; c < n; ++c) {
