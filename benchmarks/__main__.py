@@ -25,6 +25,7 @@ BENCHMARKS = {
     "fleet": ("fleet", "measure"),
     "ledger": ("fleet_ledger", "measure"),
     "study": ("study", "measure"),
+    "parts": ("parts", "measure"),
     "memory": ("memory", "measure"),
     "draw": ("drawing", "measure"),
     "start": ("starting", "measure"),

@@ -214,7 +214,7 @@ def long_run(cells: int, name: str, size: int, seed: int) -> tuple[float, float]
     fleet = fleet_of(cells, [])
     first = next(iter(phased(fleet, 1)))
     # The phases of the table's cells, other draws.
-    phases = [problem.pipeline.phase_ms for problem in phased(fleet, 1)][:size]
+    phases = [problem.pipeline.first_release_ms for problem in phased(fleet, 1)][:size]
     (entry,) = fleet.entries
     fleet = replace(
         fleet,
@@ -265,7 +265,7 @@ def _gone(
     run = simulate_fleet(
         fleet, seed=seed, windows=round(END_S / window_s), estimator="corrected", guard=True
     )
-    cycles = pl.concat([one.cycles for one in run.cells.values()])
+    cycles = pl.concat([one.cycles[: one.last_window_end] for one in run.cells.values()])
     cycles = cycles.with_columns(pl.col("release_ns") / 1e9)
     moved = run.decisions.filter((pl.col("reason") == "guard") & pl.col("migrated"))
     late, there, guards = [], [], []

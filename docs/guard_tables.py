@@ -50,12 +50,13 @@ def with_faults(problem: Problem) -> Problem:
 
 def longest_loss(run: dwell.Run) -> int:
     """Most cycles in a row that were lost."""
-    rows = groupby(run.cycles["outcome"].to_list())
+    rows = groupby(run.cycles["outcome"][: run.last_window_end].to_list())
     return max((len(list(group)) for outcome, group in rows if outcome != "done"), default=0)
 
 
 def lost_share(run: dwell.Run) -> float:
-    return float(np.mean((run.cycles["outcome"] != "done").to_numpy()))
+    outcomes = run.cycles["outcome"][: run.last_window_end]
+    return float(np.mean((outcomes != "done").to_numpy()))
 
 
 def moves(run: dwell.Run, *, guard: bool) -> int:

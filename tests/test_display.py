@@ -44,6 +44,7 @@ from dwell.record import Journal
 from dwell.study import (
     Hindsight,
     Limiting,
+    Shard,
     StudyResult,
     capacity_of,
     compare,
@@ -174,6 +175,7 @@ def objects(
             processes=1,
         ),
         Limiting("node", "E", 0.9),
+        Shard(2, 4),
         mean_interval([1.0, 2.0, 3.0]),
         *(run.arrays("cycles"), run.arrays("cycles").names("placement")),
         Journal(tmp_path_factory.mktemp("journal"), run="r", meta={}, columns={}),

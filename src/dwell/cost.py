@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ERRORS",
+    "GAIN_TOLERANCE",
     "SATURATED",
     "TierNodes",
     "TierUtilisation",
@@ -41,6 +42,7 @@ __all__ = [
     "censored",
     "cost",
     "cost_error",
+    "exceeds",
     "excess",
     "hamming",
     "margin",
@@ -55,6 +57,8 @@ Metric = TypeVar("Metric", float, "NDArray[np.float64]")
 SATURATED = 0.995
 #: How many standard errors a difference of two estimates must exceed, beside a rule's threshold.
 ERRORS = 1.0
+#: A gain within this distance of a threshold does not exceed it: rounding decides no move.
+GAIN_TOLERANCE = 1e-9
 
 
 class TierNodes(NamedTuple):
@@ -240,6 +244,11 @@ def margin(one: float, other: float) -> float:
         Standard error of each.
     """
     return ERRORS * math.sqrt(one * one + other * other)
+
+
+def exceeds(gain: float, threshold: float) -> bool:
+    """Whether a gain exceeds a threshold by more than `GAIN_TOLERANCE`."""
+    return gain > threshold + GAIN_TOLERANCE
 
 
 def censored(used: Metric, own: Metric) -> bool | NDArray[np.bool_]:

@@ -5,6 +5,7 @@ With what a command says of them, and the code that it exits with.
 
 from __future__ import annotations
 
+import os
 import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,15 +29,19 @@ __all__ = [
     "TraceError",
     "TrustError",
     "UnwritableError",
+    "UserNote",
     "describe_raised",
     "installing",
     "line_and_code",
     "missing_package",
     "not_installed",
+    "user_note",
 ]
 
 #: Characters of what foreign code has raised.
 LONGEST = 300
+#: Folder of this package.
+PACKAGE = os.path.join(os.path.dirname(__file__), "")
 #: Name of the distribution: `dwell` on the package index is somebody else's.
 DISTRIBUTION = "dwell-placement"
 
@@ -195,23 +200,38 @@ class TrustError(DwellError, ValueError):
     """A key, a certificate or a list of them is missing, not valid, or not who it should be."""
 
 
-def describe_raised(error: BaseException, *, but: str = "") -> str:
+class UserNote(str):
+    """Note on an exception that a user's code raised: the class, the call, the error, its line."""
+
+    __slots__ = ()
+
+
+def user_note(error: BaseException) -> UserNote | None:
+    """Return the note of an error that a user's code raised."""
+    notes = vars(error).get("__notes__", ())
+    return next((note for note in notes if isinstance(note, UserNote)), None)
+
+
+def describe_raised(error: BaseException, *, users: bool = False) -> str:
     """Return ``ValueError: no frame (stages.py:12)``, of an error that foreign code has raised.
 
     Parameters
     ----------
-    but : str
-        File that is not named: that of the caller, where the error may be of the call itself.
+    users : bool
+        Whether to name the last line in the file that Dwell called, not the last line of all; no
+        line if the call itself failed.
     """
     lines = str(error).strip().splitlines()
     raised = f"{type(error).__name__}: {lines[0][:LONGEST]}" if lines else type(error).__name__
-    frames = traceback.extract_tb(error.__traceback__)
+    frames = list(traceback.extract_tb(error.__traceback__))
+    if users:
+        outside = [one for one in frames if not one.filename.startswith(PACKAGE)]
+        frames = [one for one in outside if one.filename == outside[0].filename]
     # A SyntaxError says by itself where it is.
     if isinstance(error, SyntaxError) or not frames:
         return raised
     file, line = frames[-1].filename, frames[-1].lineno
-    hidden = file == but or "importlib" in file
-    return raised if hidden else f"{raised} ({file.rpartition('/')[2]}:{line})"
+    return raised if "importlib" in file else f"{raised} ({file.rpartition('/')[2]}:{line})"
 
 
 def installing(extra: str) -> str:
@@ -245,20 +265,24 @@ def missing_package(error: ModuleNotFoundError) -> DwellError | None:
     return None
 
 
-def line_and_code(error: DwellError | OSError | ModuleNotFoundError) -> tuple[str, ExitCode] | None:
-    """Return what a command prints of an error, and its exit code.
+def line_and_code(error: Exception) -> tuple[str, ExitCode] | None:
+    """Return the line that a command prints for an error, and its exit code.
 
     Returns
     -------
     tuple of str and ExitCode, or None
-        None of a module that is none of an optional package of Dwell's.
+        None for errors of other kinds.
     """
+    if note := user_note(error):
+        return f"error: {note}", ExitCode.WRONG
     if isinstance(error, ModuleNotFoundError):
         missing = missing_package(error)
         return None if missing is None else (f"error: {missing}", ExitCode.FAILED)
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
         return f"error: {where}{error.strerror or error}", ExitCode.FAILED
+    if not isinstance(error, DwellError):
+        return None
     located = isinstance(error, ProblemError) and error.source is not None
     # Of the errors, those of what was given are ValueErrors.
     code = ExitCode.WRONG if isinstance(error, ValueError) else ExitCode.FAILED

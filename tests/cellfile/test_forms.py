@@ -77,12 +77,6 @@ VALUES: list[tuple[tuple[str | int, ...], object, str, tuple[str, ...]]] = [
     ),
     (("nodes", "R1", "background_hz"), 1e6, "nodes.R1.background_hz", ("from 0 to 100000",)),
     (
-        ("nodes", "R1", "contention_stressed"),
-        {"E": 0.5},
-        "nodes.R1.contention_stressed",
-        ("'contention_stressed' has gone; delete the line",),
-    ),
-    (
         ("nodes", "R1", "bursts"),
         {"every_ms": 0, "for_ms": 1},
         "nodes.R1.bursts.every_ms",

@@ -196,6 +196,11 @@ def test_a_capacity_on_a_terminal_with_what_would_change_it(crowd: Path) -> None
     assert {path.name for path in Path("figures").iterdir()} >= {"capacity.svg", "capacity.pdf"}
     page = Path("capacity/pair-OFF-sync.html").read_text(encoding="utf-8")
     assert "all cells begin their cycles at one instant" in page
+    # The same question is answered again; the answer to another does not replace the page.
+    other = call(*command, "--limit", "0.3")
+    assert (other.exit_code, "was made from something else" in other.stderr) == (2, True)
+    assert Path("capacity/pair-OFF-sync.html").read_text(encoding="utf-8") == page
+    assert call(*command, "--what-if").exit_code == 0
 
 
 @pytest.mark.parametrize(

@@ -283,6 +283,14 @@ class Looking:
             {"run": "nowhere:Camera"},
             "tasks.camera.run (nowhere:Camera): there is no module 'nowhere'",
         ),
+        (
+            {"controller": {"policy": "nowhere:Mine"}},
+            "controller.policy: policy 'nowhere:Mine': there is no module 'nowhere'",
+        ),
+        (
+            {"controller": {"estimator": "nowhere:Mine"}},
+            "controller.estimator: estimator 'nowhere:Mine': there is no module 'nowhere'",
+        ),
     ],
 )
 def test_what_cannot_be_run_is_said(change: dict[str, Any], said: str, tmp_path: Path) -> None:
@@ -291,7 +299,8 @@ def test_what_cannot_be_run_is_said(change: dict[str, Any], said: str, tmp_path:
         del document["tasks"][task]["run"]
     if "run" in change:
         document["tasks"]["camera"]["run"] = change["run"]
-    document["live"] = {**document.get("live", {}), **change.get("live", {})}
+    for section in ("live", "controller"):
+        document[section] = {**document.get(section, {}), **change.get(section, {})}
     cell = tmp_path / "cell.yaml"
     cell.write_text(yaml.safe_dump(document))
     scenario = ["--scenario", change["scenario"]] if "scenario" in change else []

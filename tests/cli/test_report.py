@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,11 +13,13 @@ import pytest
 from mcap.reader import make_reader
 
 import dwell
+from dwell.study import Contender, Point, Study, run_study
 from tests.cells.fleets import fleet_of, one_job
 from tests.cells.small import make_problem
 from tests.cli.small_cell import assert_refused, call, read_json
 
-OLD_RUNS = Path(__file__).parents[1] / "regression/data/old-runs"
+#: A measured run that kept no jobs.
+LIVE_RUN = Path(__file__).parents[1] / "regression/data/old-runs/live-sealed"
 RECOVERED = {"sealed": False, "opened": 2, "torn_bytes": 17, "damaged_bytes": 0}
 
 
@@ -26,6 +29,20 @@ def kept(folder: Path, **meta: Any) -> Path:
     run.save(folder)
     file = folder / "run.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), **meta}))
+    return folder
+
+
+def studied(folder: Path) -> Path:
+    """Run a short study."""
+    study = Study(
+        name="short",
+        points=(Point({}, make_problem()),),
+        scenarios=("baseline",),
+        contenders=(Contender("SO", "SO"), Contender("LOC", "LOC")),
+        seeds=(1, 2),
+        windows=6,
+    )
+    run_study(study, folder=folder, processes=1)
     return folder
 
 
@@ -62,6 +79,28 @@ def test_report_writes_the_page_and_the_trace(cell: Path) -> None:
     assert json.loads(Path("t.json").read_text(encoding="utf-8"))["traceEvents"]
 
 
+@pytest.mark.parametrize(
+    ("kind", "unwanted"),
+    [
+        ("run", "'scipy', 'dwell.study.runner', 'dwell.report.study_page'"),
+        ("study", "'scipy', 'dwell.report.run_page'"),
+    ],
+)
+def test_a_page_imports_nothing_heavy_that_it_has_no_use_for(
+    kind: str, unwanted: str, tmp_path: Path
+) -> None:
+    folder = kept(tmp_path / "run") if kind == "run" else studied(tmp_path / "study")
+    script = (
+        "import sys; from dwell.cli import main\n"
+        f"try: main(['report', {str(folder)!r}, '--out', {str(tmp_path / 'page.html')!r}])\n"
+        f"finally: print(sorted({{{unwanted}}} & sys.modules.keys()))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], check=True, capture_output=True, text=True
+    )
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
 def test_report_of_what_is_not_there(cell: Path) -> None:
     call("run", cell, "--windows", "12", "--out", "kept")
     assert_refused(call("report", "kept", "--trace", "t.json"), "dwell run --jobs")
@@ -93,6 +132,39 @@ def test_report_writes_an_mcap_file_beside_the_page(cell: Path) -> None:
     assert found == {"report": "kept/report.html", "trace": None, "mcap": "run.mcap"}
 
 
+def test_of_a_measured_run_without_jobs_the_rest_is_written(tmp_path: Path) -> None:
+    folder = shutil.copytree(LIVE_RUN, tmp_path / "run")
+    words = ("report", folder, "--trace", tmp_path / "t.json", "--mcap", tmp_path / "run.mcap")
+    result = call(*words)
+    assert (result.exit_code, "note: " in result.stdout) == (0, False)
+    assert result.stderr == (
+        f"note: no {tmp_path / 't.json'}: this run kept no jobs; "
+        "`dwell controller --jobs` keeps them\n"
+    )
+    assert {path.name for path in tmp_path.iterdir()} == {"run", "run.mcap"}
+    assert (folder / "report.html").is_file()
+    assert read_json(call(*words, "--json"))["trace"] is None
+
+
+def test_a_page_of_something_else_is_not_replaced(tmp_path: Path) -> None:
+    one, page = kept(tmp_path / "one"), tmp_path / "page.html"
+    other = kept(tmp_path / "other", seed=2)
+    again = kept(tmp_path / "again")
+    for folder in (one, one, again):
+        assert call("report", folder, "--out", page, "--static").exit_code == 0
+    before = page.read_bytes()
+    notes = tmp_path / "notes.txt"
+    notes.write_text("mine")
+    for target in (page, notes):
+        refused = call("report", other, "--out", target, "--mcap", tmp_path / "x.mcap")
+        assert_refused(refused, f"{target} was made from something else; name another place")
+    assert (page.read_bytes(), notes.read_text()) == (before, "mine")
+    assert not (tmp_path / "x.mcap").exists()
+    # A folder's own page is made again, whatever is there.
+    (other / "report.html").write_text("older")
+    assert call("report", other, "--static").exit_code == 0
+
+
 def test_without_its_package_no_mcap_file_and_no_page_is_written(
     cell: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -118,9 +190,9 @@ def test_a_disk_that_is_full_leaves_no_half_mcap_file(cell: Path) -> None:
     assert {path.name for path in Path.cwd().iterdir()} == {"small.yaml", "kept", "run.mcap"}
 
 
-def test_a_study_is_no_run_of_which_there_is_an_mcap_file() -> None:
-    study = OLD_RUNS / "study"
-    assert_refused(call("report", study, "--mcap", "x.mcap"), "is a study; name one of its runs")
+def test_a_study_is_no_run_of_which_there_is_an_mcap_file(tmp_path: Path) -> None:
+    (tmp_path / "study.json").touch()
+    assert_refused(call("report", tmp_path, "--mcap", "x.mcap"), "is a study; name one of its runs")
 
 
 def fleet_in(folder: Path) -> Path:

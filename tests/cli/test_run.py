@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 from pathlib import Path
@@ -199,6 +200,11 @@ def test_another_run_is_not_replaced_unless_asked_for(cell: Path) -> None:
     other = call(*words, "--seed", "2")
     assert_refused(other, "kept holds another run")
     assert dwell.open_run("kept").meta["seed"] == 1
+    file = Path("kept/run.json")
+    earlier = {**json.loads(file.read_text(encoding="utf-8")), "schema_version": 1}
+    file.write_text(json.dumps(earlier), encoding="utf-8")
+    assert_refused(call(*words), "kept holds another run")
+    assert call(*words, "--force").exit_code == 0
     # So many windows can not be drawn: the folder is looked at before.
     more = call("run", cell, "--windows", str(1 << 32), "--out", "kept")
     assert_refused(more, "kept holds another run")

@@ -49,6 +49,16 @@ def test_json(folder: Path) -> None:
     assert told["moves"] == []
 
 
+def test_a_validation_of_other_runs_is_not_replaced(folder: Path) -> None:
+    words = ("--cell", CALIBRATED, "--seeds", "2")
+    assert call("validate", "LOC", *words).exit_code == 0
+    kept = {file: file.read_bytes() for file in (folder / "validations/small").iterdir()}
+    other = call("validate", "OFF", *words)
+    assert (other.exit_code, "was made from something else" in other.stderr) == (2, True)
+    assert {file: file.read_bytes() for file in kept} == kept
+    assert call("validate", "LOC", *words).exit_code == 0
+
+
 @pytest.mark.usefixtures("folder")
 def test_json_has_the_predicted_moves() -> None:
     problem = dwell.load(CALIBRATED)

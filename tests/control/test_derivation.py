@@ -31,6 +31,8 @@ CAPS = {
     "all": Caps(latency_ms=1.0, utilisation=0.01),
 }
 TOLERANCE = 1e-6
+#: What a gain must be more than the threshold by.
+GAIN_TOLERANCE = 1e-9
 
 
 @pytest.fixture(scope="module")
@@ -178,7 +180,8 @@ class Hysteresis(Rule):
         if self.dwelt < self.parameters["min_dwell"]:
             return now, "dwell"
         gain = record.cost(row, now, self.before) - row[f"j_{best}"]
-        if best != now and gain > self.parameters["min_improvement"] + record.margin(row, best):
+        least = self.parameters["min_improvement"] + record.margin(row, best)
+        if best != now and gain > least + GAIN_TOLERANCE:
             return best, record.reason(row, best, names, within=within)
         return now, "hold" if within else "infeasible"
 
@@ -197,9 +200,10 @@ class Sums(Rule):
             grown = max(0.0, set_to["memory"] * self.sums[name] + gain)
             self.sums[name] = 0.0 if name == now else grown
         names, within = record.choosable(row)
-        due = {n: row[f"j_{n}"] for n in names if self.sums[n] > set_to["threshold"]}
+        least = set_to["threshold"] + GAIN_TOLERANCE
+        due = {n: row[f"j_{n}"] for n in names if self.sums[n] > least}
         best = cheapest(due, now) if due else now
-        if best == now or row[f"j_{best}"] >= stays:
+        if best == now or stays - row[f"j_{best}"] <= GAIN_TOLERANCE:
             return now, "hold" if within else "infeasible"
         return best, record.reason(row, best, names, within=within)
 
@@ -235,7 +239,7 @@ class Hindsight(Rule):
         best = away[0] if away else now
         margin = record.margin(row, best)
         saved = served[now] - least - totals[best]
-        if best == now or (now in names and margin > 0 and saved <= margin):
+        if best == now or (now in names and margin > 0 and saved <= margin + GAIN_TOLERANCE):
             return now, "hold" if within else "infeasible"
         return best, record.reason(row, best, names, within=within)
 
@@ -247,7 +251,8 @@ class Quickest(Rule):
         l95_ms = {name: row[f"est_l95_ms_{name}"] for name in self.record.names}
         best = cheapest(l95_ms, self.now)
         errors = (row[f"est_l95_error_ms_{name}"] for name in (best, self.now))
-        if best == self.now or l95_ms[self.now] - l95_ms[best] <= math.hypot(*errors):
+        least = math.hypot(*errors) + GAIN_TOLERANCE
+        if best == self.now or l95_ms[self.now] - l95_ms[best] <= least:
             return self.now, "hold"
         return best, "migrate"
 
@@ -313,7 +318,7 @@ class Thresholds(Rule):
         asked = l95_ms > set_to["latency_ms"] or busy
         moved = self.record.moved(now, other)
         saved = self.total(self.expected(now), 0.0) - self.total(self.expected(other), moved)
-        cheaper = saved > self.margin(now, other)
+        cheaper = saved > self.margin(now, other) + GAIN_TOLERANCE
         self.begin()
         if stays == "hold" and asked and (cheaper or not self.cost_answers):
             return other, "migrate"

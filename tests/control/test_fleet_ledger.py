@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import dwell
+from dwell.cellfile import from_document
 from dwell.control import Controller
 from dwell.control.coordination import Coordination, Verdict, Wish
 from dwell.control.ledger import FleetLedger, Loads, PricedCell, Seat
@@ -196,6 +197,45 @@ def test_a_policy_without_prices_is_let_through_or_refused() -> None:
     assert verdict.name == "LOC"
     assert str(verdict.why).startswith("ledger: Φ would rise by ")
     assert ledger.consider(2, wishes("SO"), by_price=False).why == verdict.why
+
+
+def of_two_latencies(here_ms: float, there_ms: float, least: float) -> Problem:
+    """Return a cell whose J is L95 / 100 ms."""
+    return from_document(
+        {
+            "dwell": 1,
+            "period_ms": 200,
+            "window_cycles": 2,
+            "nodes": {"R": {"tier": "robot"}, "E": {"tier": "edge"}},
+            "tasks": {"a": {"on": {"R": {"exec_ms": here_ms}, "E": {"exec_ms": there_ms}}}},
+            "candidates": {"LOC": {"a": "R"}, "SO": {"a": "E"}},
+            "objective": {
+                "weights": {
+                    "latency": 1, "violations": 1, "robot": 0, "edge": 0, "switching": 0,
+                },
+                "targets": {"latency_ms": 100},
+            },
+            "controller": {"min_improvement": least},
+        }
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("here_ms", range(10, 100, 5))
+def test_a_fall_of_phi_equal_to_what_is_owed_moves_nothing(here_ms: int) -> None:
+    for least, name in ((0.05, "LOC"), (0.05 - 1e-8, "SO")):
+        problem = of_two_latencies(here_ms, here_ms - 5, least)
+        wished = Decision(problem.candidates["SO"], "SO", True, "migrate")
+        ledger = FleetLedger([PricedCell("one", problem, "")], ["E"])
+        assert ledger.consider(0, wished, by_price=False).name == name
+
+
+@pytest.mark.parametrize("steps", [10, 12, 14, 16])
+def test_rounding_does_not_lift_the_worst_cost_to_the_next_multiple(steps: int) -> None:
+    """A cost of 9 steps of 0.03 is a little more than 9 steps in floats."""
+    problem = of_two_latencies(3 * steps, 3 * (steps - 1), 0.03)
+    wished = Decision(problem.candidates["SO"], "SO", True, "migrate")
+    ledger = FleetLedger([PricedCell("one", problem, "")], ["E"], "worst")
+    assert ledger.consider(0, wished, by_price=False).name == "SO"
 
 
 class Says(Coordination):

@@ -11,6 +11,7 @@ import pytest
 import dwell
 from dwell.dash.recorded_cell import RecordedCell, same_realisation
 from dwell.errors import RunError
+from tests.cells.late_cycles import late_run, without_late_cycles
 from tests.dash.recorded import small_run
 
 
@@ -32,6 +33,18 @@ def test_the_whole_line_has_all_cycles_misses_and_moves(cell: RecordedCell, run:
     moves = [event for event in view["events"] if event["kind"] == "move"]
     assert len(moves) == run.decisions["migrated"].sum() > 0
     json.dumps([whole, view], allow_nan=False)
+
+
+def test_cycles_after_the_last_window_are_not_shown(tmp_path: Path) -> None:
+    run = late_run()
+    both = {"cut": without_late_cycles(run), "whole": run}
+    cells = [RecordedCell(one.save(tmp_path / name)) for name, one in both.items()]
+    found, expected = (
+        [cell.described() | {"source": ""}, cell.view(0.0, 2.0, 50), cell.state(1.5)]
+        for cell in cells
+    )
+    assert found == expected
+    assert found[0]["missed"] == found[0]["cycles"] == 20
 
 
 def test_a_state_is_what_was_known_then(cell: RecordedCell, run: dwell.Run) -> None:

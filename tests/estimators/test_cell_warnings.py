@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from random import Random
 from typing import Any
 
 import numpy as np
@@ -106,6 +109,24 @@ def disturbed(*items: Mapping[str, Any]) -> dict[str, Any]:
     return cell(scenarios={"s": list(items)})
 
 
+def prioritised(scheduler: str = "fair", **on: Any) -> dict[str, Any]:
+    """Return two stages with different priorities on one node."""
+    node = {"scheduler": scheduler, "cores": 4, "accelerators": {"gpu": 1}}
+    return on_one(node, {"big": stage(2, **on), "rt": stage(1, priority=10, **on)})
+
+
+def side_by_side(
+    *jobs: tuple[float, int], scheduler: str = "fifo", cores: int = 8, **more: Any
+) -> dict[str, Any]:
+    """Return stages with a time and a number of threads each; P is 10 ms."""
+    tasks = {f"t{i}": stage(ms, threads=threads) for i, (ms, threads) in enumerate(jobs)}
+    return on_one({"scheduler": scheduler, "cores": cores, **more}, tasks)
+
+
+def linked(**link: Any) -> dict[str, Any]:
+    return cell(links=[{**LINKS[0], **link}])
+
+
 LINK = {"link": "R->E"}
 
 
@@ -169,6 +190,40 @@ LINK = {"link": "R->E"}
             "controller.fallbacks",
             ("no fallback without E", "add LOC"),
         ),
+        (prioritised(), "tasks.rt.priority", ("no effect on E", "shares with big")),
+        (prioritised("fifo"), "tasks.rt.priority", ("scheduler: priority",)),
+        (
+            prioritised("priority", accelerator="gpu"),
+            "tasks.rt.priority",
+            ("no effect on E.gpu", "shares with big"),
+        ),
+        (side_by_side((6, 5), (6, 5)), "candidates.SO", ("8 cores of E (t0: 5, t1: 5)", "12 ms")),
+        (side_by_side((6, 5), (6, 5), scheduler="priority"), "candidates.SO", ("12 ms",)),
+        # Only two of three fit.
+        (side_by_side((7, 3), (7, 3), (7, 3)), "candidates.SO", ("at least 10.5 ms",)),
+        # A wide one next to a narrow one: each task has one worker.
+        (side_by_side((6, 7), (6, 2)), "candidates.SO", ("at least 12 ms",)),
+        # Half of the node or more.
+        (side_by_side((6, 5), (5, 4), (5, 4)), "candidates.SO", ("at least 11 ms",)),
+        # More workers do not make room for a second job.
+        (
+            on_one({"scheduler": "fifo", "cores": 8}, {"a": stage(11, threads=5, workers=2)}),
+            "candidates.SO",
+            ("at least 11 ms",),
+        ),
+        (side_by_side((4, 5), (4, 5), background=2), "candidates.SO", ("at least 10.67 ms",)),
+        (linked(rate_mbps=1e9), "links[0].rate_mbps", ("1000 instead of 1e+09",)),
+        (
+            disturbed({**LINK, "rate_mbps": 5e6}),
+            "scenarios.s[0].rate_mbps",
+            ("5 instead of 5e+06",),
+        ),
+        (cell(live={"max_age_ms": 13.9}), "live.max_age_ms", ("13.9 is less", "of SO, 14 ms")),
+        (
+            linked(delay_ms={"uniform": {"low": 8, "high": 20}}) | {"live": {"max_age_ms": 27}},
+            "live.max_age_ms",
+            ("27 is less", "of SO, 28 ms"),
+        ),
     ],
 )  # fmt: skip
 def test_what_is_never_meant_is_said(
@@ -202,6 +257,25 @@ def test_what_is_never_meant_is_said(
         servo(5),
         guarded(fallbacks=["SO", "LOC"], initial="SO"),
         guarded(),
+        prioritised("priority"),
+        # It shares the accelerator with nobody, or the other one has the same priority.
+        on_one(
+            {"cores": 4, "accelerators": {"gpu": 1}},
+            {"big": stage(2), "rt": stage(1, priority=10, accelerator="gpu")},
+        ),
+        on_one({}, {"a": stage(2, priority=3), "b": stage(1, priority=3)}),
+        # It orders jobs on one of its nodes.
+        cell(
+            nodes={"R": {"tier": "robot", "scheduler": "priority"}, "E": {"tier": "edge"}},
+            tasks={**cell()["tasks"], "act": {**cell()["tasks"]["act"], "priority": 1}},
+        ),
+        side_by_side((5, 5), (5, 5)),
+        side_by_side((6, 5), (6, 5), scheduler="fair"),
+        side_by_side((6, 5), (6, 5), cores=10),
+        side_by_side((6, 3), (6, 3), (6, 3)),
+        linked(rate_mbps=1e6),
+        disturbed({**LINK, "rate_mbps": 1e5}),
+        cell(live={"max_age_ms": 32}),
     ],
 )
 def test_what_is_near_it_is_not(document: Mapping[str, Any]) -> None:
@@ -279,3 +353,104 @@ def test_a_scenario_that_a_run_does_not_reach_is_said(
 def test_one_disturbance_that_falls_into_a_run_is_enough() -> None:
     items = ({"node": "R", "at_s": at_s, "stress_threads": 1} for at_s in (5, 1000))
     assert not list(itertools.chain(unplayed(from_document(disturbed(*items)), "s", 10)))
+
+
+def replayed(folder: Path, instants: Sequence[float], **trace: Any) -> list[str]:
+    """Return the warnings of a cell with a period of 10 ms that replays a trace by time."""
+    rows = "".join(f"{i // 4},{instant!r},1\n" for i, instant in enumerate(instants))
+    (folder / "t.csv").write_text(f"g,t,ms\n{rows}")
+    file = str(folder / "t.csv")
+    delay = {"file": file, "column": "ms", "by": "time", "time": "t", "wrap": True, **trace}
+    document = {**linked(delay_ms={"trace": delay}), "period_ms": 10}
+    document["tasks"]["see"]["on"] = {"R": {"exec_ms": 2}, "E": {"exec_ms": 3}}
+    return [str(fault) for fault in warnings_of(from_document(document))]
+
+
+@pytest.mark.parametrize(
+    ("instants", "words"),
+    [
+        # Nanoseconds.
+        ([1.7e18 + i * 1e7 for i in range(10)], "its rows last 9e+04 s, more than 1e+06 periods"),
+        # The last instant stands for none.
+        ([0.0, 10.0, 20.0, float(2**63 - 1)], "one row lasts 9.223e+15 s, the median row 0.01 s"),
+        ([0.0, 10.0, 20_000.0], "one row lasts 19.99 s, the median row 0.01 s"),
+        ([0.0, 1e-3, 1.0, 2.0, 3.0, 3e3 + 1], "one row lasts 2.998 s, the median row 0.001 s"),
+    ],
+)
+def test_instants_of_a_trace_that_cannot_be_meant_are_said(
+    tmp_path: Path, instants: list[float], words: str
+) -> None:
+    (message,) = replayed(tmp_path, instants)
+    assert f"t.csv: {words}" in message
+
+
+@pytest.mark.parametrize(
+    ("instants", "group"),
+    [
+        ([0.0, 10.0, 20.0, 10_000.0], None),
+        ([10.0 * i for i in range(1000)], None),
+        ([0.0], None),
+        ([5.0, 5.0, 5.0], None),
+        # Each of two recordings, a year apart, is short.
+        ([0.0, 10.0, 20.0, 30.0, 3.2e10, 3.2e10 + 10, 3.2e10 + 20], "g"),
+    ],
+)
+def test_instants_of_a_trace_that_may_be_meant_are_not(
+    tmp_path: Path, instants: list[float], group: str | None
+) -> None:
+    assert replayed(tmp_path, instants, **({"group": group} if group else {})) == []
+
+
+def crowded(rng: Random) -> dict[str, Any]:
+    """Return a random cell whose stages, on one node, take 60 to 95 % of its cores."""
+    cores = rng.choice([2, 4, 6, 8])
+    node: dict[str, Any] = {"tier": "edge", "cores": cores}
+    node["scheduler"] = rng.choice(["fifo", "priority"])
+    if rng.random() < 0.3:
+        node["background"] = rng.uniform(0, cores / 4)
+    if rng.random() < 0.3:
+        node["bursts"] = {"every_ms": 40, "for_ms": 10, "threads": rng.randint(1, 8)}
+    if rng.random() < 0.2:
+        node["quota"] = {"cpu": rng.uniform(0.8, 1) * cores, "period_ms": 5}
+    names = [f"t{i}" for i in range(rng.randint(2, 4))]
+    shares = [rng.uniform(0.2, 1) for _ in names]
+    share = rng.uniform(0.6, 0.95) * cores / sum(shares)
+    tasks: dict[str, Any] = {"cam": {"on": {"R": {"exec_ms": 0}}}}
+    flows = []
+    for i, name in enumerate(names):
+        threads = rng.randint(1, cores)
+        execution = {
+            "exec_ms": 10 * share * shares[i] / threads,
+            "threads": threads,
+            "workers": rng.choice([1, 1, 2, 3]),
+        }
+        tasks[name] = {"priority": rng.randint(0, 2), "on": {"E": execution}}
+        flows.append({"from": rng.choice(["cam", *names[:i]]), "to": name})
+    return {
+        "dwell": 1,
+        "period_ms": 10,
+        "window_cycles": 1000,
+        "nodes": {"R": {"tier": "robot"}, "E": node},
+        "links": [{"from": "R", "to": "E", "delay_ms": 1, "loss": rng.choice([0, 0, 0.15])}],
+        "tasks": tasks,
+        "flows": flows,
+        "candidates": {"SO": {}},
+    }
+
+
+@pytest.mark.parametrize("begin", range(0, 200, 50))
+def test_jobs_that_do_not_fit_side_by_side_really_fall_behind(begin: int) -> None:
+    """Of the cycles of a run at least the share that the warning implies is unfinished."""
+    falling = 0
+    for seed in range(begin, begin + 50):
+        problem = from_document(crowded(Random(seed)))
+        messages = [fault.message for fault in warnings_of(problem) if "side" in fault.message]
+        if not messages:
+            continue
+        (needed,) = re.findall(r"at least ([\d.]+) ms", messages[0])
+        late = 1 - 10 / float(needed)
+        cycles = dwell.simulate(problem, seed=1, windows=2).cycles
+        unfinished = int((cycles["outcome"] == "in_flight").sum())
+        assert unfinished >= 0.95 * late * cycles.height - 2, (seed, needed, unfinished)
+        falling += late > 0.02
+    assert falling >= 3

@@ -123,6 +123,46 @@ def test_losses_are_a_share_and_age() -> None:
     assert set(shown["est_violation_rate_LOC"]) == {0.0}
 
 
+def over_wifi(loss: float, window_cycles: int = 100) -> Problem:
+    """Return a cell whose link keeps order, and loses more than the 2 % that it declares."""
+    nothing = Execution(Constant(0.0))
+    link = Link("R", "E", Constant(5.0), loss=0.02, retransmit_ms=200.0, in_order=True)
+    return make_problem(
+        [Node("R", "robot"), Node("E", "edge")],
+        [Task("a", {"R": nothing}), Task("b", {"R": nothing, "E": nothing})],
+        [Flow("a", "b")],
+        links=[link],
+        candidates={"LOC": {}, "SO": {"b": "E"}},
+        period_ms=100 / 3,
+        window_cycles=window_cycles,
+        scenario=[LinkDisturbance("R", "E", loss=loss)],
+        controller=ControllerSettings(shadow_fraction=0.2),
+    )
+
+
+def test_what_waits_for_a_repeated_message_takes_no_longer() -> None:
+    delays = Corrected(over_wifi(0.0))._pools[Message("a", "b", "R->E")].reference.values
+    assert set(delays) <= {5.0 + 200.0 * lost for lost in range(4)}
+    assert (delays > 5.0).mean() == pytest.approx(0.02, abs=0.005)
+
+
+@pytest.mark.parametrize(
+    ("active", "window_cycles", "within"),
+    [("SO", 100, 0.05), ("SO", 1000, 0.12), ("LOC", 100, 0.1)],
+)
+def test_a_price_has_the_wait_for_repeated_messages_once(
+    active: str, window_cycles: int, within: float
+) -> None:
+    # Measured are all messages, or every fifth one, or shadows in every fifth cycle.
+    problem = over_wifi(0.2, window_cycles)
+    windows = 20_000 // window_cycles
+    played = dwell.simulate(problem, scenario="disturbed", policy="SO", seed=1, windows=windows)
+    missed = mean(played.windows["violation_rate"])
+    assert missed > 0.8
+    shown = decide(problem, active, windows, Corrected(problem))
+    assert mean(shown["est_violation_rate_SO"][windows // 2 :]) == pytest.approx(missed, abs=within)
+
+
 def truth_of_losses(bound_ms: float) -> float:
     """Expected 48th of 50 where each is lost with 0.3 and counts with its age, 1 to 50 periods.
 

@@ -214,6 +214,14 @@ def test_a_link_that_loses_a_share_and_sends_again() -> None:
     assert (found.l95_ms, found.violation_rate) == (24.0, 0.0)
 
 
+def test_messages_wait_once_for_one_that_is_repeated() -> None:
+    # The first of every ten is repeated; the next one waits for it, and misses its deadline.
+    link = Link("R", "E", Constant(2.0), retransmit_ms=250.0, in_order=True)
+    values = [252.0, *[2.0] * 9]
+    found = only(across(link), present({TO_B: values, TO_C: values}))
+    assert found.violation_rate == pytest.approx(0.2)
+
+
 @pytest.mark.parametrize("retransmit_ms", [None, 20.0])
 @pytest.mark.parametrize("width", WIDTHS)
 def test_a_link_that_loses_everything(width: int, retransmit_ms: float | None) -> None:

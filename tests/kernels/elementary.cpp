@@ -20,3 +20,7 @@ DWELL_EXPORT void exponentials(const double* x, int64_t n, double* out) noexcept
 DWELL_EXPORT void logarithms(const double* x, int64_t n, double* out) noexcept {
   for (int64_t i = 0; i < n; ++i) out[i] = dwell::log(x[i]);
 }
+
+DWELL_EXPORT void cube_roots(const double* x, int64_t n, double* out) noexcept {
+  for (int64_t i = 0; i < n; ++i) out[i] = dwell::cube_root(x[i]);
+}

@@ -86,11 +86,14 @@ needs_longer_floats = pytest.mark.skipif(
 
 @needs_longer_floats
 @with_every_compiler
-def test_exponential_and_logarithm_are_exact_to_one_ulp(compiler: str, tmp_path: Path) -> None:
+def test_exponential_logarithm_and_cube_root_are_exact_to_one_ulp(
+    compiler: str, tmp_path: Path
+) -> None:
     library = compile_one(compiler, SOURCE, tmp_path / "elementary.so")
     for name, function, x, most in (
         ("exponentials", np.exp, some_exponents(), 0.52),
         ("logarithms", np.log, some_positive_numbers(), 1.0),
+        ("cube_roots", np.cbrt, some_positive_numbers()[:-1], 0.67),
     ):
         exact = function(x.astype(np.longdouble))
         found = applied(library, name, x)
@@ -98,6 +101,8 @@ def test_exponential_and_logarithm_are_exact_to_one_ulp(compiler: str, tmp_path:
         assert np.abs((found - exact) / ulp).max() < most, name
     assert applied(library, "exponentials", np.zeros(1)) == 1
     assert applied(library, "logarithms", np.ones(1)) == 0
+    cubes = np.arange(10_000.0)
+    assert np.array_equal(applied(library, "cube_roots", cubes**3), cubes)
 
 
 @needs_longer_floats
@@ -129,5 +134,9 @@ def test_the_bits_are_the_same_by_every_compiler(tmp_path: Path) -> None:
         compile_one(compiler, SOURCE, tmp_path / f"{compiler}.so") for compiler in ("gcc", "clang")
     )
     assert np.array_equal(sines_and_cosines(by_gcc, angles), sines_and_cosines(by_clang, angles))
-    for name, x in (("exponentials", some_exponents()), ("logarithms", some_positive_numbers())):
+    for name, x in (
+        ("exponentials", some_exponents()),
+        ("logarithms", some_positive_numbers()),
+        ("cube_roots", some_positive_numbers()[:-1]),
+    ):
         assert np.array_equal(applied(by_gcc, name, x), applied(by_clang, name, x))

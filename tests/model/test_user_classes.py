@@ -15,9 +15,12 @@ import dwell
 from dwell.cellfile import load_without_traces
 from dwell.control import Controller
 from dwell.errors import PolicyError
-from tests.cli.small_cell import SMALL, call, read_json
+from tests.cli.small_cell import SMALL, assert_refused, call, read_json
 
 POLICY = """\
+from dataclasses import replace
+
+
 class Fastest:
     def __init__(self, names):
         self.names = names
@@ -55,15 +58,63 @@ class Fails:
         return "LOC"
 
 
+class Rewrites:
+    # Writes what it believes into the estimates.
+    def decide(self, *, observed, estimates):
+        estimates["OFF"] = replace(estimates["OFF"], l95_ms=1.0)
+        return "OFF"
+
+
+class Forgets:
+    # Drops the placement that is active, then takes the best of the others.
+    def decide(self, *, observed, estimates):
+        estimates.pop("LOC")
+        return min(estimates, key=lambda name: estimates[name].l95_ms)
+
+
+class OddError(Exception):
+    # Pickles, and cannot be made again.
+    def __init__(self, what, where):
+        super().__init__(what)
+
+
+class Late:
+    # Fails after a rehearsal of one window.
+    windows = 0
+
+    def decide(self, *, observed, estimates):
+        self.windows += 1
+        if self.windows == 3:
+            raise OddError("lost", "here")
+        return "LOC"
+
+
 made = Last()
 """
 
 ESTIMATOR = """\
-from dwell.estimators import Profile
+from dwell.estimators import Corrected, Profile, Scaling, Shadow
 
 
-class Twice(Profile):
+class MyProfile(Profile):
     pass
+
+
+class MyShadow(Shadow):
+    pass
+
+
+class MyScaling(Scaling):
+    pass
+
+
+class MyCorrected(Corrected):
+    pass
+
+
+class Wants(Corrected):
+    def __init__(self, problem, table):
+        super().__init__(problem)
 
 
 class Bare:
@@ -102,18 +153,30 @@ def test_a_run_records_the_name_and_opens_without_the_module(cell: Path, name: s
     assert set(kept.windows["placement"][1:]) == {"OFF"}
 
 
-@pytest.mark.parametrize("name", ["guess:Bare", "guess:Twice"])
-def test_an_estimator_is_made_and_started(cell: Path, name: str) -> None:
-    found = call("run", cell, "--estimator", name, "--windows", "6", "--out", "mine")
-    if name == "guess:Twice":
-        assert found.exit_code == 2
-        assert "the class wants arguments (problem)" in found.stderr
-        return
+@pytest.mark.parametrize(
+    ("name", "same"),
+    [
+        ("guess:Bare", "profile"),
+        ("guess:MyProfile", "profile"),
+        ("guess:MyShadow", "shadow"),
+        ("guess:MyScaling", "scaling"),
+        ("guess:MyCorrected", "corrected"),
+    ],
+)
+def test_an_estimator_is_made_and_started(cell: Path, name: str, same: str) -> None:
+    stress = ("--scenario", "stress", "--windows", "12")
+    found = call("run", cell, "--estimator", name, *stress, "--out", "mine")
     assert found.exit_code == 0, found.output
-    call("run", cell, "--estimator", "profile", "--windows", "6", "--out", "ours")
+    call("run", cell, "--estimator", same, *stress, "--out", "ours")
     mine, ours = dwell.open_run("mine"), dwell.open_run("ours")
     assert mine.meta["estimator"] == name
     assert mine.decisions.equals(ours.decisions)
+
+
+def test_a_subclass_of_ours_that_wants_more_is_refused(cell: Path) -> None:
+    found = call("run", cell, "--estimator", "guess:Wants")
+    told = "estimator 'guess:Wants': Wants.from_problem(problem) failed: TypeError: "
+    assert_refused(found, told, "missing 1 required positional argument: 'table'")
 
 
 def test_a_policy_and_an_estimator_in_one_name(cell: Path) -> None:
@@ -126,8 +189,8 @@ def test_a_policy_and_an_estimator_in_one_name(cell: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "told"),
     [
-        ("absent:Last", "there is no module 'absent', neither beside the cell file ("),
-        ("own.absent:Last", "there is no module 'own.absent', neither beside the cell file ("),
+        ("absent:Last", "there is no module 'absent', neither in "),
+        ("own.absent:Last", "there is no module 'own.absent', neither in "),
         ("raises:Last", "importing raises failed: RuntimeError: no camera (raises.py:1)"),
         ("syntax:Last", "importing syntax failed: SyntaxError: "),
         ("own.choice:Lost", "own.choice has no class 'Lost'; did you mean 'Last'?"),
@@ -152,6 +215,27 @@ def test_bad_classes(cell: Path, name: str, told: str) -> None:
     assert [fault["path"] for fault in known["faults"]] == ["controller.policy"]
 
 
+@pytest.mark.parametrize(
+    ("kind", "told"),
+    [
+        ("Rewrites", "decide at window 0 failed: TypeError: FrozenDict cannot be changed; "),
+        ("Forgets", "decide at window 0 failed: TypeError: FrozenDict cannot be changed; "),
+        ("Late", "decide at window 2 failed: OddError: lost (choice.py:"),
+    ],
+)
+def test_a_policy_that_fails_in_a_run_is_named(cell: Path, kind: str, told: str) -> None:
+    found = call("run", cell, "--policy", f"own.choice:{kind}", "--windows", "5")
+    assert_refused(found, f"error: {kind}: {told}", "(choice.py:")
+
+
+def test_a_policy_that_fails_in_a_worker_process_is_named(cell: Path) -> None:
+    study = cell.parent / "study.yaml"
+    text = "dwell-study: 1\ncell: small.yaml\nwindows: 5\npolicies: {late: 'own.choice:Late'}\n"
+    study.write_text(text, encoding="utf-8")
+    found = call("study", study, "--processes", "2")
+    assert_refused(found, "error: Late: decide at window 2 failed: OddError: lost (choice.py:")
+
+
 @pytest.mark.parametrize("name", ["own.choice:", ":Last", "own choice:Last", "own:choice:Last"])
 def test_what_is_no_class_path_is_an_unknown_policy(cell: Path, name: str) -> None:
     found = call("run", cell, "--policy", name)
@@ -166,6 +250,26 @@ def test_a_cell_file_names_classes(cell: Path) -> None:
     live = Controller(load_without_traces(cell))
     assert live.described()["policy"] == "own.choice:Last"
     assert live.described()["estimator"] == "guess:Bare"
+
+
+def test_a_study_and_a_live_cell_name_a_subclass_of_ours(cell: Path) -> None:
+    study = cell.parent / "study.yaml"
+    study.write_text(
+        "dwell-study: 1\nname: own\ncell: small.yaml\nwindows: 5\nseeds: 1\npolicies:\n"
+        "  ours: {policy: dtp, estimator: corrected}\n"
+        "  mine: {policy: dtp, estimator: 'guess:MyCorrected'}\n",
+        encoding="utf-8",
+    )
+    assert call("study", study, "--processes", "1").exit_code == 0
+    runs = pl.read_parquet("studies/own/runs.parquet")
+    ours, mine = (runs.filter(policy=name).drop("policy") for name in ("ours", "mine"))
+    assert ours.equals(mine)
+    cell.write_text(f"{SMALL}controller: {{estimator: 'guess:MyCorrected'}}\n", encoding="utf-8")
+    assert call("check", cell).exit_code == 0
+    live = Controller(load_without_traces(cell))
+    assert live.described()["estimator"] == "guess:MyCorrected"
+    assert (live.learns, live.supports) == (True, True)
+    assert live.shadow_fraction == Controller(dwell.load(cell), None, "corrected").shadow_fraction
 
 
 def test_two_folders_have_modules_of_one_name(cell: Path, tmp_path: Path) -> None:
@@ -192,10 +296,10 @@ def test_a_folder_without_a_module_does_not_get_the_one_of_another(
         dwell.simulate(dwell.load(bare / cell.name), policy="own.choice:Last", seed=1, windows=4)
 
 
-def test_a_study_over_processes_knows_a_changed_module(cell: Path) -> None:
+def test_a_study_over_processes_plays_a_changed_module_again_and_nothing_else(cell: Path) -> None:
     study = cell.parent / "study.yaml"
     text = (
-        "dwell-study: 1\nname: own\ncell: small.yaml\nwindows: 5\nseeds: 2\n"
+        "dwell-study: 1\nname: own\ncell: small.yaml\nwindows: 5\nseeds: 2\nreferences: true\n"
         "policies: {LOC: LOC, 'own.choice:Last': 'own.choice:Last', mine: 'own.choice:Last'}\n"
     )
     study.write_text(text, encoding="utf-8")
@@ -205,8 +309,20 @@ def test_a_study_over_processes_knows_a_changed_module(cell: Path) -> None:
     runs = pl.read_parquet("studies/own/runs.parquet")
     costs = {name: table["cost"].to_list() for (name,), table in runs.group_by("policy")}
     assert costs["own.choice:Last"] == costs["mine"] != costs["LOC"]
+    parts = {part.name: part.stat().st_ino for part in Path("studies/own/parts").iterdir()}
     module = cell.parent / "own" / "choice.py"
-    module.write_text(f"{POLICY}\n# another\n", encoding="utf-8")
+    module.write_text(POLICY.replace("[-1]", "[0]"), encoding="utf-8")
     again = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert again.returncode == 2
-    assert "another" in again.stderr
+    assert (again.returncode, again.stderr) == (0, "")
+    changed = pl.read_parquet("studies/own/runs.parquet")
+    own = pl.col("policy").is_in(["own.choice:Last", "mine"])
+    assert changed.filter(~own).equals(runs.filter(~own))
+    assert changed.filter(policy="mine")["cost"].to_list() == costs["LOC"] != costs["mine"]
+    left = {part.name: part.stat().st_ino for part in Path("studies/own/parts").iterdir()}
+    kept = left.items() & parts.items()
+    assert {one["policy"][0] for one in map(part_named, kept)} == {"LOC", "clairvoyant"}
+    assert len(left) == len(parts) == 2 * len(kept)
+
+
+def part_named(named: tuple[str, int]) -> pl.DataFrame:
+    return pl.read_parquet(Path("studies/own/parts") / named[0])

@@ -82,6 +82,15 @@ def test_the_switch_has_its_price() -> None:
         assert moved.decide(observed=shown["LOC"], estimates=shown).name == name
 
 
+@pytest.mark.parametrize("l95_ms", range(101, 120))
+def test_a_switch_that_costs_all_that_it_saves_is_not_made(l95_ms: int) -> None:
+    """The switch costs 0.125, or 12.5 ms of 100: in floats sometimes a little less."""
+    objective = replace(OBJECTIVE, targets=replace(OBJECTIVE.targets, latency_ms=100.0))
+    policy = ATP(candidates=CANDIDATES, objective=objective, min_dwell=0)
+    shown = estimates(qos(float(l95_ms)), qos(1.0), qos(l95_ms - 12.5))
+    assert play(policy, [shown]) == [("LOC", "hold")]
+
+
 @pytest.mark.parametrize(("error_ms", "name"), [(9.9, "HYB"), (10.1, "LOC")])
 @pytest.mark.parametrize("of", ["LOC", "HYB"])
 def test_it_must_save_more_than_its_error_in_latency(of: str, error_ms: float, name: str) -> None:

@@ -267,6 +267,16 @@ def test_it_takes_estimates_away() -> None:
             estimates.pop("HYB")  # type: ignore[attr-defined]
             return self.now
 
+    fault = only(check_policy(Takes(), problem()))
+    assert "decide() raised TypeError('FrozenDict cannot be changed; " in fault
+
+
+def test_it_changes_estimates_by_force() -> None:
+    class Takes(Sound):
+        def choose(self, observed: QoS, estimates: Estimates) -> str:
+            dict.pop(estimates, "HYB")  # type: ignore[call-overload]
+            return self.now
+
     assert "changed the metrics it was given" in only(check_policy(Takes(), problem()))
 
 

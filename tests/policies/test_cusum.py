@@ -109,9 +109,9 @@ def test_it_is_the_rule_as_it_is_written_down(
         for s in CANDIDATES:
             gain = stays - J[s] - (slack + doubt(window[s], window[now], OBJECTIVE))
             sums[s] = max(0.0, memory * sums[s] + gain) if s != now else 0.0
-        due = [s for s in allowed if sums[s] > threshold]
+        due = [s for s in allowed if sums[s] > threshold + 1e-9]
         best = min(due, key=J.__getitem__, default=now)
-        moves = best != now and J[best] < stays
+        moves = best != now and stays - J[best] > 1e-9
         assert decision.delta_j == (stays - J[best] if due else 0.0)
         now = best if moves else now
         dwell = 0 if moves else dwell + 1
@@ -193,6 +193,13 @@ def test_small_advantages_add_up_and_fade() -> None:
 
 def test_a_sum_must_exceed_the_threshold() -> None:
     assert names(bare(threshold=4.0), [costs(12, 20, 10)] * 3) == ["LOC", "LOC", "HYB"]
+
+
+@pytest.mark.parametrize("tenths", range(1, 100))
+def test_a_sum_equal_to_the_threshold_never_moves(tenths: int) -> None:
+    """Ten windows with a tenth of the threshold each add up to it, but for rounding."""
+    shown = costs(10 + tenths / 10, 200, 10)
+    assert names(bare(threshold=float(tenths)), [shown] * 11) == ["LOC"] * 10 + ["HYB"]
 
 
 def test_a_large_advantage_moves_at_once_however_late_the_last_move_was() -> None:

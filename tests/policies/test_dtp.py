@@ -164,9 +164,25 @@ def test_an_improvement_must_exceed_the_threshold() -> None:
     shown = estimates(qos(80.0), qos(40.0), qos(80.0))
     still = run(dtp(0, 1.0, objective=free), [shown])[0]
     assert (still.name, still.reason, still.delta_j) == ("LOC", "hold", 1.0)
-    just = math.nextafter(1.0, 0.0)
-    moved = run(dtp(0, just, objective=free), [shown])[0]
+    moved = run(dtp(0, 1.0 - 2e-9, objective=free), [shown])[0]
     assert (moved.name, moved.reason, moved.migrated) == ("SO", "migrate", True)
+
+
+@pytest.mark.parametrize("l95_ms", range(10, 100, 5))
+def test_an_improvement_equal_to_the_threshold_never_moves(l95_ms: int) -> None:
+    """5 ms of 100 are 0.05 of J: in floats sometimes a little more, sometimes a little less."""
+    objective = replace(
+        NO_CAPS,
+        weights=replace(OBJECTIVE.weights, switching=0.0),
+        targets=replace(OBJECTIVE.targets, latency_ms=100.0),
+    )
+    here, there = qos(float(l95_ms)), qos(l95_ms - 5.0)
+    shown = [estimates(here, there, here)]
+    assert run(dtp(0, 0.05, objective=objective), shown)[0].name == "LOC"
+    assert algorithm_1(shown, CANDIDATES, "LOC", objective, 0, 0.05)[0].placement == "LOC"
+    # A gain that is larger by more than rounding moves.
+    assert run(dtp(0, 0.05 - 1e-8, objective=objective), shown)[0].name == "SO"
+    assert algorithm_1(shown, CANDIDATES, "LOC", objective, 0, 0.05 - 1e-8)[0].placement == "SO"
 
 
 def test_an_improvement_must_exceed_the_error_of_the_difference_too() -> None:

@@ -50,6 +50,15 @@ def test_ties_go_to_the_incumbent(initial: str) -> None:
     assert latency_first(initial).decide(observed=qos(), estimates=shown).name == initial
 
 
+def test_rounding_makes_no_latency_lower() -> None:
+    # The mean of three windows of 0.1 ms is not 0.1 in floats.
+    mean_ms = (0.1 + 0.1 + 0.1) / 3
+    assert mean_ms > 0.1
+    shown = estimates(qos(mean_ms), qos(0.1), qos(0.1))
+    decision = latency_first().decide(observed=qos(), estimates=shown)
+    assert (decision.name, decision.reason) == ("LOC", "hold")
+
+
 def test_ties_of_others_go_to_the_first_candidate() -> None:
     shown = estimates(qos(9.0), qos(5.0), qos(5.0))
     assert latency_first().decide(observed=qos(), estimates=shown).name == "SO"

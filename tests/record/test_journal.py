@@ -124,6 +124,18 @@ def test_a_run_is_gone_on_with(tmp_path: Path) -> None:
     assert start(tmp_path / "run").meta["origin_ns"] == 5
 
 
+def test_a_journal_of_another_version_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as earlier:
+        earlier.setattr("dwell.record.journal.SCHEMA_VERSION", 1)
+        earlier.setattr("dwell.record.schema.SCHEMA_VERSION", 1)
+        write(tmp_path / "run", 2)
+    for read in (open_run, start):
+        with pytest.raises(RunError, match=r"journal\.bin: schema_version is 1; .* run again"):
+            read(tmp_path / "run")
+
+
 def test_sealing_writes_what_a_run_has(tmp_path: Path) -> None:
     write(tmp_path / "run", 3)
     from_journal = open_run(tmp_path / "run")

@@ -97,7 +97,8 @@ def algorithm_1(
         ties = [c for c in allowed if J_of[c] == lowest]
         star = now if now in ties else ties[0]
         Delta = J_now - J_of[star]
-        migrates = star != now and Delta > Delta_min + doubt(shown[now], shown[star], objective)
+        least = Delta_min + doubt(shown[now], shown[star], objective)
+        migrates = star != now and Delta - least > 1e-9
         if migrates:
             n_d = 0
             pi.append(star)

@@ -124,8 +124,8 @@ class Decision:
 class Result:
     """The record of a run.
 
-    `cycles` are those up to the last close. `jobs` and `shadow_jobs` are by cycle and task;
-    `arrived` is when a message was handed to its target, by cell, cycle, source and target.
+    `cycles` are those released before the run ended. `jobs` and `shadow_jobs` are by cycle and
+    task; `arrived` is when a message was handed to its target, by cell, cycle, source and target.
     `stamps` are the candidates that every released cycle runs under, and is also sent through.
     `decisions` are those of the controller, and the moves of the guard.
     `closest_ns` is the least distance, below a microsecond, of two events that have nothing to do
@@ -254,7 +254,8 @@ class Message:
     """What crosses a link: an output of a job, or the state of a task that moves.
 
     `arrive` is what happens when it does. The draws of state are those of `cycle`, too. `flow` is
-    its place in the file, which orders what is for the same job at the same instant.
+    its place in the file, which orders what is for the same job at the same instant. `arrival` is
+    when it would arrive if it waited for no other message, and the event from which that follows.
     """
 
     cell: int
@@ -270,6 +271,7 @@ class Message:
     migration: int = 0
     attempt: int = 0
     number: int = 0
+    arrival: tuple[int, int] | None = None
 
     @property
     def sent(self) -> tuple[int, int]:
@@ -808,6 +810,8 @@ class Simulation:
         }
         self.queues = {link: simpy.Store(self.env) for link in problem.fabric.links}
         self.last_arrival = dict.fromkeys(problem.fabric.links, (0, -1))
+        # Messages of links with an order that have not arrived, by their first attempts.
+        self.ordered: dict[str, list[Message]] = {link: [] for link in problem.fabric.links}
         self.segments: dict[str, list[LinkSegment]] = {link: [] for link in problem.fabric.links}
         for segment in real.link_segments:
             self.segments[segment.link].append(segment)
@@ -980,9 +984,8 @@ class Simulation:
         self.open_window(0)
         while not self.over and self.env.peek() <= self.end:
             self.env.step()
-        played = self.windows[-1].first_cycle + self.problem.window_cycles if self.windows else 0
         return Result(
-            cycles=tuple(self.cycle_result(k) for k in range(played)),
+            cycles=tuple(self.cycle_result(k) for k in range(len(self.stamps))),
             jobs=self.results(ITSELF),
             shadow_jobs=self.results(SHADOW),
             arrived=self.arrived,
@@ -1632,17 +1635,22 @@ class Simulation:
                 # It waits for ever, and so do those behind it.
                 if not message.is_state:
                     self.lose(message.cell, message.cycle, "in_flight", message.sent)
+                self.lose_behind(name, message)
                 message = yield self.queues[name].get()
             state = self.state(name)
             if state.down:
                 self.would_begin(name, message, begun)
                 continue
+            if link.in_order and message not in self.ordered[name]:
+                self.ordered[name].append(message)
             duration = transmission_ns(message.payload_bytes, state.rate_mbps)
             key = int(self.reals[message.cell].loss_keys[message.hop])
             if attempt_uniform(key, message.cycle, message.attempt) >= state.loss:
                 self.propagate(name, message, state, duration, begun)
             elif link.retransmit_ms is None and not message.is_state:
                 self.drop(message, begun)
+                if link.in_order:
+                    self.ordered[name].remove(message)
             else:
                 timeout = link.retransmit_ms
                 timeout_ns = nanoseconds(STATE_TIMEOUT_MS if timeout is None else timeout)
@@ -1659,6 +1667,15 @@ class Simulation:
         ends = [s.at_ns for s in self.segments[name] if s.at_ns > self.now and not s.down]
         if ends:
             self.repeat(name, message, ends[0], message.attempt, -1)
+        else:
+            self.lose_behind(name, message)
+
+    def lose_behind(self, link: str, message: Message) -> None:
+        """Lose the messages that wait for one that never arrives."""
+        ordered = self.ordered[link]
+        for other in ordered[ordered.index(message) + 1 :] if message in ordered else ():
+            if other.arrival is not None and not other.is_state:
+                self.lose(other.cell, other.cycle, "in_flight", message.sent)
 
     def propagate(
         self, link: str, message: Message, state: LinkSegment, duration: int, begun: int
@@ -1669,12 +1686,24 @@ class Simulation:
         for row, (hop, layer) in enumerate(real.layers):
             if hop == message.hop and layer in state.layers:
                 delay += int(real.extra_ns[row, message.cycle])
-        arrival = self.now + duration + delay
+        message.arrival = self.now + duration + delay, begun
         if self.problem.fabric.links[link].in_order:
-            last, last_begun = self.last_arrival[link]
-            if arrival < last:
-                arrival, begun = last, last_begun
-            self.last_arrival[link] = arrival, begun
+            self.release_ordered(link)
+        else:
+            self.announce(message, *message.arrival)
+
+    def release_ordered(self, link: str) -> None:
+        """Let messages arrive in their order, up to the first that is being repeated."""
+        ordered = self.ordered[link]
+        while ordered and ordered[0].arrival is not None:
+            message = ordered.pop(0)
+            arrival, last = message.arrival, self.last_arrival[link]
+            assert arrival is not None
+            self.last_arrival[link] = last if arrival[0] < last[0] else arrival
+            self.announce(message, *self.last_arrival[link])
+
+    def announce(self, message: Message, arrival: int, begun: int) -> None:
+        """Let a message arrive at an instant."""
         if message.is_state:
             self.step(arrival, 0, message.target, message.migration, message.arrive, cause=begun)
             return
@@ -1690,19 +1719,24 @@ class Simulation:
         )
 
     def repeat(self, link: str, message: Message, again: int, attempt: int, begun: int) -> None:
-        """Send a message once more at `again`."""
+        """Send a message once more at `again`, unless it is given up by then."""
+        goes_on = self.going_on(message.migration)
 
         def happen() -> None:
-            if not message.is_state and self.is_given_up(message.cell, message.cycle):
+            if not goes_on() if message.is_state else self.is_given_up(message.cell, message.cycle):
+                # No other message waits for it from now on.
+                if message in self.ordered[link]:
+                    message.arrival = self.now, self.current
+                    self.release_ordered(link)
                 return
             message.attempt = attempt
             message.sent_at, message.sent_by = self.now, self.current
             self.send(link, message)
 
-        if message.is_state:
-            self.step(again, attempt, message.target, message.migration, happen, cause=begun)
-            return
         task = self.index[message.target]
+        if message.is_state:
+            self.at(again, STEP, attempt, task, happen, cause=begun)
+            return
         self.at(
             again,
             REPEAT,

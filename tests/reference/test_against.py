@@ -186,15 +186,37 @@ class Played:
 
 
 def make_case(
-    seed: int, schedulers: Sequence[Scheduler], *, whole_ms: bool = False, orders: bool = False
+    seed: int,
+    schedulers: Sequence[Scheduler],
+    *,
+    whole_ms: bool = False,
+    orders: bool = False,
+    in_order: bool = False,
 ) -> Case:
     rng = Random(seed)
     problem = random_problem(rng, schedulers=schedulers, whole_ms=whole_ms, orders=orders)
+    if in_order:
+        problem = with_order(problem, Random(seed), whole_ms=whole_ms)
     windows = rng.randint(3, 10) if orders else rng.randint(2, 8)
     names = tuple(random_stamps(rng, problem, windows))
     real = dwell.draw(problem, scenario="disturbed", seed=seed, windows=windows)
     share = rng.choice([0.0, 0.1, 0.3, 1.0]) / len(problem.candidates) if orders else 0.0
     return Case(problem, real, names, share)
+
+
+def with_order(problem: Problem, rng: Random, *, whole_ms: bool) -> Problem:
+    """Let all links keep order and lose messages, and most of them send what is lost again."""
+    links = {}
+    for name, link in problem.fabric.links.items():
+        timeout_ms = problem.pipeline.period_ms * rng.choice([0.1, 0.5, 2.0, 6.0])
+        timeout_ms = max(1.0, round(timeout_ms)) if whole_ms else timeout_ms
+        links[name] = replace(
+            link,
+            loss=rng.choice([0.02, 0.2, 0.5]),
+            retransmit_ms=rng.choice([timeout_ms, timeout_ms, timeout_ms, None]),
+            in_order=True,
+        )
+    return replace(problem, fabric=replace(problem.fabric, links=links))
 
 
 def jittered(case: Case, rng: Random, *, whole_ms: bool) -> Case:
@@ -210,10 +232,15 @@ def jittered(case: Case, rng: Random, *, whole_ms: bool) -> Case:
 
 
 def make_guarded(
-    seed: int, schedulers: Sequence[Scheduler], *, whole_ms: bool = False, orders: bool = False
+    seed: int,
+    schedulers: Sequence[Scheduler],
+    *,
+    whole_ms: bool = False,
+    orders: bool = False,
+    in_order: bool = False,
 ) -> Case:
     """Make a case whose cell has a guard."""
-    case = make_case(seed, schedulers, whole_ms=whole_ms, orders=orders)
+    case = make_case(seed, schedulers, whole_ms=whole_ms, orders=orders, in_order=in_order)
     rng = Random(seed)
     names = list(case.problem.candidates)
     settings = replace(
@@ -274,6 +301,7 @@ def reference(case: Case) -> Result:
 def differences(case: Case, found: Played, result: Result, tolerance_ns: int) -> Iterator[str]:
     """Say in what a run differs from the reference."""
     yield from cycle_differences(found.cycles, result, tolerance_ns)
+    yield from lead_differences(case, found.cycles, result)
     yield from job_differences(found.jobs, result, tolerance_ns)
     yield from window_differences(case, found.windows, result)
     if found.decisions is not None:
@@ -310,6 +338,18 @@ def cycle_differences(cycles: pl.DataFrame, result: Result, tolerance_ns: int) -
         parts = [row[column] for column in ("compute_ns", "queue_ns", "network_ns")]
         if not is_split(parts, expected, tolerance_ns):
             yield f"{where}: split into {parts}, expected {set(expected.splits)}"
+
+
+def lead_differences(case: Case, cycles: pl.DataFrame, result: Result) -> Iterator[str]:
+    width = case.problem.window_cycles
+    firsts = [window.first_cycle for window in result.windows]
+    within = {cycle for first in firsts for cycle in range(first, first + width)}
+    end = max(within, default=-1)
+    for cycle, lead, missed in cycles.select("cycle", "lead", "missed").rows():
+        if lead != (cycle not in within):
+            yield f"cycle {cycle}: lead is {lead}"
+        if missed and cycle > end:
+            yield f"cycle {cycle}: missed after the last window"
 
 
 def is_split(parts: Sequence[int | None], expected: CycleResult, tolerance_ns: int) -> bool:
@@ -619,6 +659,7 @@ def compare(
     stamped: bool = False,
     guarded: bool = False,
     jitter: bool = False,
+    in_order: bool = False,
 ) -> None:
     excluded = 0
     failures: list[str] = []
@@ -627,7 +668,7 @@ def compare(
     seeds = range(few) if part == "few" else range(few, examples)
     for seed in seeds:
         make = make_guarded if guarded else make_case
-        case = make(seed, schedulers, whole_ms=whole_ms, orders=orders)
+        case = make(seed, schedulers, whole_ms=whole_ms, orders=orders, in_order=in_order)
         if jitter:
             case = jittered(case, Random(seed), whole_ms=whole_ms)
         found = (
@@ -636,7 +677,7 @@ def compare(
         if found is None:
             excluded += 1
         elif found:
-            how = f"whole_ms={whole_ms}, orders={orders}, jitter={jitter}"
+            how = f"whole_ms={whole_ms}, orders={orders}, jitter={jitter}, in_order={in_order}"
             failures.append(f"{make.__name__}({seed}, {schedulers}, {how}): {found[:3]}")
     assert not failures, f"{len(failures)} of {len(seeds)} differ:\n" + "\n".join(failures[:10])
     assert excluded <= MOST_EXCLUDED * len(seeds)
@@ -713,6 +754,23 @@ def test_release_jitter_equal_to_the_microsecond_with_processor_sharing(part: st
     compare(part, EVERY, FAIR_TOLERANCE_NS, orders=True, jitter=True)
 
 
+@pytest.mark.parametrize("whole_ms", [False, True], ids=["continuous", "whole-ms"])
+def test_links_that_keep_order_equal_to_the_nanosecond_without_processor_sharing(
+    part: str, whole_ms: bool
+) -> None:
+    compare(part, ("fifo", "priority"), whole_ms=whole_ms, in_order=True)
+    compare(part, ("fifo", "priority"), whole_ms=whole_ms, orders=True, in_order=True)
+
+
+@pytest.mark.parametrize("given_up_after", [64, 0])
+def test_links_that_keep_order_with_shadows_equal_to_the_nanosecond(
+    part: str, given_up_after: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sim_arrays, "GIVEN_UP_AFTER", given_up_after)
+    monkeypatch.setattr(reference_simulator, "GIVEN_UP_AFTER", given_up_after)
+    compare(part, ("fifo", "priority"), whole_ms=True, orders=True, stamped=True, in_order=True)
+
+
 @pytest.fixture
 def _early_health(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let few cycles make health."""
@@ -727,6 +785,11 @@ def test_the_guard_equal_to_the_nanosecond_without_processor_sharing(
     part: str, whole_ms: bool, jitter: bool
 ) -> None:
     compare(part, ("fifo", "priority"), whole_ms=whole_ms, orders=True, guarded=True, jitter=jitter)
+
+
+@pytest.mark.usefixtures("_early_health")
+def test_links_that_keep_order_with_the_guard_equal_to_the_nanosecond(part: str) -> None:
+    compare(part, ("fifo", "priority"), whole_ms=True, orders=True, guarded=True, in_order=True)
 
 
 @pytest.mark.usefixtures("_early_health")
@@ -759,8 +822,10 @@ def task(
     priority: int = 0,
     offset_ms: float = 0.0,
     start_ms: float = 0.0,
+    workers: int = 1,
 ) -> Task:
-    on = {node: Execution(Constant(ms), threads=threads, accelerator=accelerator)}
+    execution = Execution(Constant(ms), threads=threads, accelerator=accelerator, workers=workers)
+    on = {node: execution}
     return Task(name, on, priority=priority, offset_ms=offset_ms, start_ms=start_ms)
 
 
@@ -900,6 +965,20 @@ BY_HAND = {
         segments=[LinkSegment(0, "R->E", True, 0, 1000, ())],
         changes=[NodeChange(3 * MS, "F", 0, True)],
     ),
+    "messages wait for one that waits for ever before another branch is lost": by_hand(
+        [FIFO, EDGE, Node("F", "cloud", cores=9)],
+        [task("A", 1), task("B", 1, "E"), task("C", 30, "F", workers=9), task("D", 1, "F")],
+        [Flow("A", "B"), Flow("C", "D")],
+        links=[replace(UP, retransmit_ms=5.0, in_order=True)],
+        segments=[
+            LinkSegment(0, "R->E", False, 1.0, 1000, ()),
+            LinkSegment(2 * MS, "R->E", False, 0, 1000, ()),
+            LinkSegment(6 * MS, "R->E", True, 0, 1000, ()),
+        ],
+        changes=[NodeChange(20 * MS, "F", 0, True)],
+        period_ms=2,
+        windows=20,
+    ),
     "an output is lost as another one makes a job take the place of one of its own cycle": by_hand(
         [FIFO, EDGE],
         [task("A", 1), replace(task("B", 25), depth=1), task("C", 1, "E")],
@@ -918,9 +997,33 @@ BY_HAND = {
 }
 
 
+def test_a_message_that_waits_for_ever_is_the_first_loss_of_those_behind_it() -> None:
+    found = play(BY_HAND["messages wait for one that waits for ever before another branch is lost"])
+    # Message 0 is lost at 1 and would be sent again at 6; message 1 was sent at 3, message 2 at 5.
+    assert found.cycles["outcome"].to_list()[:3] == ["in_flight"] * 3
+
+
 @pytest.mark.parametrize("name", BY_HAND)
 def test_equal_on_cases_made_by_hand(name: str) -> None:
     assert examine(BY_HAND[name], 0) == []
+
+
+def test_an_own_job_begins_where_a_shadow_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sim_arrays, "GIVEN_UP_AFTER", 0)
+    monkeypatch.setattr(reference_simulator, "GIVEN_UP_AFTER", 0)
+    both = {"E": Execution(Constant(1)), "R": Execution(Constant(250))}
+    problem = make_problem(
+        [FIFO, EDGE],
+        [task("A", 10), Task("B", both), Task("C", {"E": Execution(Constant(1))})],
+        [Flow("A", "B"), Flow("B", "C")],
+        links=[UP],
+        candidates={"OFF": {}, "LOC": {"B": "R"}},
+    )
+    case = Case(problem, make_realisation(problem, windows=6), ("OFF",) * 6)
+    stamps, others = ["OFF"] * 6, ["LOC"] * 6
+    found = play_stamped(case, case.real, stamps, others)
+    result = simulate(problem, case.real, stamps, shadows=case.real, shadow_stamps=others)
+    assert list(differences(case, found, result, 0)) == []
 
 
 def test_attempts_draw_the_same_numbers() -> None:

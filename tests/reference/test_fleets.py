@@ -59,11 +59,10 @@ def random_cell(random: Random) -> Problem:
         random.choice(get_args(Scheduler)),
         bursts=random.choice([None, bursts]),
     )
-    rate_mbps = random.choice([float("inf"), 10.0])
-    links = {
-        f"{a}->{b}": Link(a, b, Exponential(0.2), rate_mbps=rate_mbps)
-        for a, b in (("R", "E"), ("E", "R"))
-    }
+    rate_mbps, loss = random.choice([float("inf"), 10.0]), random.choice([0.0, 0.2])
+    usual = Link("R", "E", Exponential(0.2), rate_mbps=rate_mbps, loss=loss, retransmit_ms=12.0)
+    usual = replace(usual, in_order=random.random() < 0.5)
+    links = {f"{a}->{b}": replace(usual, source=a, target=b) for a, b in (("R", "E"), ("E", "R"))}
     return Problem(
         name="cell",
         pipeline=Pipeline(
@@ -116,6 +115,7 @@ def all_in_one(cell: Problem, phases_ms: list[float]) -> Problem:
 def with_draws(whole: Realisation, parts: list[Realisation]) -> Realisation:
     """Return the realisation of the one cell with what the others have drawn."""
     exec_ns, delay_ns = whole.exec_ns.copy(), whole.delay_ns.copy()
+    loss_keys = whole.loss_keys.copy()
     for row, (task, node) in enumerate(whole.sites):
         i = int(task[-1])
         exec_ns[row] = parts[i].exec_ns[parts[i].sites.index((task[:-1], node.rstrip(str(i))))]
@@ -123,8 +123,11 @@ def with_draws(whole: Realisation, parts: list[Realisation]) -> Realisation:
         i = int(source[-1])
         own = (source[:-1], target[:-1], link.replace(f"R{i}", "R"))
         delay_ns[row] = parts[i].delay_ns[parts[i].hops.index(own)]
+        loss_keys[row] = parts[i].loss_keys[parts[i].hops.index(own)]
     changes = [one for one in NodeChanges.of(parts[0].node_changes) if one.node == "E"]
-    return replace(whole, exec_ns=exec_ns, delay_ns=delay_ns, node_changes=changes)
+    return replace(
+        whole, exec_ns=exec_ns, delay_ns=delay_ns, loss_keys=loss_keys, node_changes=changes
+    )
 
 
 def test_fleets_are_one_cell_with_the_pipelines_of_all() -> None:

@@ -471,6 +471,37 @@ def test_retransmission_waits_for_the_link_and_keeps_the_order() -> None:
     assert latencies(result) == [22, 13, 4]
 
 
+def repeated(*, in_order: bool, segments: Sequence[LinkSegment] = ()) -> Result:
+    """Six messages of which the first is lost, and sent again at 27."""
+    link = Link("R", "E", Constant(0), retransmit_ms=25, in_order=in_order)
+    return chain(link, windows=6, segments=[segment(0, loss=1), segment(5), *segments])
+
+
+def test_messages_wait_for_one_that_is_repeated_where_order_is_kept() -> None:
+    assert latencies(repeated(in_order=False))[:4] == [28, 2, 2, 2]
+    assert latencies(repeated(in_order=True))[:4] == [28, 18, 8, 2]
+
+
+def test_messages_do_not_wait_for_one_that_is_dropped() -> None:
+    link = Link("R", "E", Constant(0), in_order=True)
+    result = chain(link, segments=[segment(0, loss=1), segment(5)], delays=[25.0, 1, 1])
+    assert latencies(result) == [None, 3, 3]
+
+
+def test_messages_wait_for_a_repeat_that_waits_for_the_end_of_an_outage() -> None:
+    # From 40 on messages 2, 0 and 3 are sent in this order; 1 and 2 wait for 0.
+    outage = [segment(20, down=True), segment(40)]
+    assert latencies(repeated(in_order=False, segments=outage))[:4] == [42, 2, 21, 13]
+    assert latencies(repeated(in_order=True, segments=outage))[:4] == [42, 32, 22, 13]
+
+
+def test_messages_wait_for_ever_for_a_repeat_that_does() -> None:
+    for_good = [segment(20, down=True)]
+    free, kept = (repeated(in_order=order, segments=for_good) for order in (False, True))
+    assert outcomes(free) == ["in_flight", "done", *["in_flight"] * 4]
+    assert outcomes(kept) == ["in_flight"] * 6
+
+
 def test_a_lost_attempt_is_sent_again_behind_what_is_queued() -> None:
     link = Link("R", "E", Constant(1), rate_mbps=1000, retransmit_ms=9.5)
     segments = [segment(0, loss=1), segment(2)]

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from tests.regression import commands, exact, messages, paper, runs
+from tests.regression import commands, exact, messages, old_runs, paper, runs
 
 
 def _write_commands() -> None:
@@ -31,6 +31,7 @@ KINDS: dict[str, Callable[[], None]] = {
     "commands": _write_commands,
     "messages": _write_messages,
     "runs": _write_runs,
+    "old-runs": old_runs.write,
 }
 
 USAGE = f"""\

@@ -77,9 +77,10 @@ def play(example: str, case: Case, columns: Mapping[str, list[str]]) -> dict[str
         guard=case.guard == "yes",
     )
     windows, decisions = run.windows, run.decisions
+    counted = run.cycles[: run.last_window_end]
     return {
         **{table: digest(getattr(run, table), columns[table]) for table in TABLES},
-        "lost": str(run.cycles.filter(pl.col("outcome") != "done").height),
+        "lost": str(counted.filter(pl.col("outcome") != "done").height),
         "violation_rate": f"{_number(windows['violation_rate'].mean()):.4f}",
         "l95_ms": f"{_number(windows['seen_l95_ms'].median()):.3f}",
         "moves": str(decisions["migrated"].sum()),

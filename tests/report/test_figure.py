@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+import os
 import re
+import subprocess
+import sys
+from pathlib import Path
 
 import polars as pl
 import pytest
 
 from dwell.report.charts import limit_rule
-from dwell.report.figure import Figure, Spec, pdf, printed_svg, svg
+from dwell.report.figure import Figure, Spec, javascript, pdf, printed_svg, svg
 from dwell.report.palette import INK, PRINTED
 
 
@@ -69,3 +73,29 @@ def test_a_file_is_as_wide_as_asked_for_with_letters_of_the_same_size(
     assert "var(" not in text
     assert PRINTED[INK] in text
     assert pdf(figure, width_pt).startswith(b"%PDF")
+
+
+def script_of_a_process(cache: Path) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", "from dwell.report.figure import javascript; print(javascript())"],
+        check=True,
+        capture_output=True,
+        text=True,
+        env={**os.environ, "XDG_CACHE_HOME": str(cache)},
+    )
+    return done.stdout.removesuffix("\n")
+
+
+def test_the_script_of_pages_is_made_once_for_all_processes(tmp_path: Path) -> None:
+    cache = tmp_path / "no such folder yet"
+    made = script_of_a_process(cache)
+    (kept,) = cache.glob("dwell/*")
+    assert kept.read_bytes().decode() == made == javascript()
+    assert "vegaEmbed" in made
+    kept.write_text("// what is kept")
+    assert script_of_a_process(cache) == "// what is kept"
+
+
+def test_pages_have_their_script_where_no_cache_can_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    assert script_of_a_process(tmp_path / "file") == javascript()

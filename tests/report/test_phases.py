@@ -22,6 +22,7 @@ from dwell.model import (
 from dwell.model.disturbed import Disturbed, disturbed
 from dwell.report.phases import CALM, phase_rows, phases
 from dwell.report.run_header import RunHeader
+from tests.cells.late_cycles import late_run, without_late_cycles
 from tests.report.live_runs import PLAYED, TRACKING, live_run
 
 FABRIC = Fabric({"R1": Node("R1", "robot"), "E": Node("E", "edge")}, {})
@@ -97,3 +98,11 @@ def test_a_phase_has_its_moves_shares_losses_and_error() -> None:
     assert calm.rms_mm == 3.0
     assert stress.rms_px == 8.0
     assert (calm.lost, after.lost) == (0, 1)
+
+
+def test_cycles_after_the_last_window_are_in_no_phase() -> None:
+    run = late_run()
+    header = RunHeader.of(run)
+    (calm,) = phase_rows(run, header)
+    assert (calm.cycles, calm.violation_rate) == (20, 1.0)
+    assert str(phase_rows(without_late_cycles(run), header)) == str([calm])

@@ -17,7 +17,15 @@ from dwell.kernels.realisation import LinkSegment, NodeChange
 from dwell.model import Constant, ControllerSettings, Execution, Flow, Link, Node, Problem, Task
 from tests.cells.generated import MS, make_problem, make_realisation
 from tests.reference.simulator import attempt_uniform, control
-from tests.reference.test_against import Case, Played, Replay, differences, make_case
+from tests.reference.test_against import (
+    Case,
+    Played,
+    Replay,
+    differences,
+    make_case,
+    reference,
+)
+from tests.reference.test_against import play as play_case
 
 CANONICAL = Path(__file__).parents[2] / "examples" / "canonical.yaml"
 MOVES = {"LOC": {"B": "R"}, "OFF": {"B": "E"}}
@@ -225,6 +233,46 @@ def test_state_that_is_lost_is_sent_again(
     assert moved_at(found) == 2 * before + 2 + after
 
 
+def lossy(begin_ms: float, end_ms: float) -> list[LinkSegment]:
+    """Let all attempts be lost that begin within a stretch of time."""
+    times = [(0.0, 0.0), (begin_ms, 1.0), (end_ms, 0.0)]
+    return [LinkSegment(round(at * MS), "R->E", False, loss, 8.0, ()) for at, loss in times]
+
+
+@pytest.mark.parametrize(("retransmit_ms", "there"), [(50.0, 96.0), (None, 246.0)])
+def test_messages_wait_for_state_that_is_sent_again_where_order_is_kept(
+    retransmit_ms: float | None, there: float
+) -> None:
+    # Sent from 25 to 35 and lost; messages of cycles 3 and later get through.
+    for in_order in (False, True):
+        link = {"in_order": in_order, "retransmit_ms": retransmit_ms}
+        found = play(cell(link=link), segments=lossy(24.5, 30), windows=20)
+        assert moved_at(found) == math.ceil(there / 10)
+        assert [ready(found, "D", k) for k in (2, 3, 4)] == (
+            [23, there, there] if in_order else [23, 37, 43]
+        )
+
+
+def test_state_waits_for_a_message_that_is_sent_again_where_order_is_kept() -> None:
+    # The message of cycle 2, sent at 21, is lost; the state arrives with its repeat, at 74.
+    link = {"in_order": True, "retransmit_ms": 50.0}
+    found = play(cell(link=link), segments=lossy(20, 24), windows=20)
+    assert [ready(found, "D", k) for k in (2, 3)] == [74, 74]
+    assert moved_at(found) == 8
+
+
+def test_messages_wait_for_state_of_a_void_order_until_it_would_be_sent_again() -> None:
+    moves = {**MOVES, "ALT": {"B": "R"}}
+    problem = cell(link={"in_order": True}, moves=moves, fallbacks=("ALT",), guard_cycles=3)
+    real = make_realisation(problem, windows=20, segments=lossy(24.5, 30))
+    case = Case(problem, real, ("LOC", *["OFF"] * 19), guarded=True)
+    found = play_case(case)
+    assert list(differences(case, found, reference(case), 0)) == []
+    # Lost at 35. The guard moves at 60; else it would be sent again at 235.
+    assert found.cycles["placement"].to_list()[5:7] == ["LOC", "ALT"]
+    assert [ready(found, "D", k) for k in (2, 3, 20)] == [23, 235, 235]
+
+
 def outage(begin_ms: float, end_ms: float, loss: float = 0.0) -> list[LinkSegment]:
     times = [(0.0, False), (begin_ms, True), (end_ms, False)]
     return [
@@ -264,8 +312,8 @@ def test_waiting_for_the_end_of_an_outage_is_no_attempt() -> None:
 def test_over_a_link_that_stays_down_a_cell_never_migrates(retransmit_ms: float | None) -> None:
     found = play(cell(link={"retransmit_ms": retransmit_ms}), segments=outage(20.5, math.inf))
     assert windows_of(found) == [(0, "LOC")]
-    # What is released after the last close is in no table of cycles.
-    assert found.cycles["cycle"].to_list() == [0, 1]
+    # All cycles are released while it migrates, and none of these is in a window.
+    assert found.cycles["lead"].to_list() == [False] * 2 + [True] * 18
 
 
 def test_a_run_that_ends_first_never_migrates() -> None:

@@ -19,7 +19,7 @@ import pytest
 
 import dwell
 from dwell.cellfile import from_document
-from dwell.errors import PolicyError, ProblemError, SimulationError
+from dwell.errors import PolicyError, ProblemError, SimulationError, user_note
 from dwell.estimators.registry import REGISTRY as ESTIMATORS
 from dwell.model import (
     Decision,
@@ -329,8 +329,10 @@ class Failing:
 def test_what_a_policy_raises_in_a_close_is_what_its_author_sees(canonical: Problem) -> None:
     realisation = dwell.draw(canonical, scenario="baseline", seed=1, windows=4)
     before = dwell.simulate_realisation(canonical, realisation, policy="dtp")
-    with pytest.raises(IndexError, match="tuple index out of range"):
+    with pytest.raises(IndexError, match="tuple index out of range") as caught:
         dwell.simulate_realisation(canonical, realisation, policy=Failing())
+    told = "Failing: decide at window 2 failed: IndexError: tuple index out of range (test_engine"
+    assert str(user_note(caught.value)).startswith(told)
     # The realisation is as it was.
     after = dwell.simulate_realisation(canonical, realisation, policy="dtp")
     assert after.cycles.equals(before.cycles)

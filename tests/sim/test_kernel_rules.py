@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 import dwell
+from dwell.cellfile import from_document
 from dwell.control import Controller, plain_rule
 from dwell.errors import PolicyError
 from dwell.model import Caps, Objective, Problem, Targets, Weights
@@ -22,6 +23,52 @@ from tests.cells.generated import random_problem
 
 CELL = Path(__file__).parents[2] / "examples" / "canonical.yaml"
 EXAMPLES = int(os.environ.get("DWELL_EXAMPLES", "60"))
+
+
+#: 5 ms less of a target of 100 ms are 0.05 of J: in floats sometimes a little more or less.
+EXACT: dict[str, Callable[[dict[str, Any]], Any]] = {
+    "dtp": lambda given: DTP(**given, min_dwell=0, min_improvement=0.05),
+    "cusum": lambda given: Cusum(**given, threshold=0.0, slack=0.05),
+    "a sum": lambda given: Cusum(**given, threshold=0.05, slack=0.0, memory=1e-12),
+    "a move": lambda given: Cusum(**given, threshold=0.0, slack=0.0),
+    "atp": lambda given: ATP(**given, latency_ms=0.0, min_dwell=0, every_ms=1.0),
+}
+
+
+def of_two_latencies(here_ms: float, there_ms: float, switching: float) -> Problem:
+    """Return a cell of one stage, with its time on the robot and on the edge."""
+    return from_document(
+        {
+            "dwell": 1,
+            "period_ms": 200,
+            "window_cycles": 2,
+            "nodes": {"R": {"tier": "robot"}, "E": {"tier": "edge"}},
+            "tasks": {"a": {"on": {"R": {"exec_ms": here_ms}, "E": {"exec_ms": there_ms}}}},
+            "candidates": {"LOC": {"a": "R"}, "SO": {"a": "E"}},
+            "objective": {
+                "weights": {
+                    "latency": 1, "violations": 1, "robot": 0, "edge": 0, "switching": switching,
+                },
+                "targets": {"latency_ms": 100},
+            },
+        }
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("rule", EXACT)
+def test_a_gain_equal_to_what_it_must_exceed_moves_nothing(rule: str) -> None:
+    for here_ms in range(10, 100, 5):
+        # For ATP and `a move` the price of the move is equal to the gain.
+        problem = of_two_latencies(here_ms, here_ms - 5, 0.05 if rule in ("atp", "a move") else 0.0)
+        given = {"candidates": problem.candidates, "objective": problem.objective}
+        assert plain_rule(Controller(problem, EXACT[rule](given))) is not None
+        real = dwell.draw(problem, seed=1, windows=5)
+        for by_window in (False, True):
+            policy = EXACT[rule](given)
+            run = simulate_realisation(
+                problem, real, policy=policy, estimator="profile", by_window=by_window
+            )
+            assert run.decisions["migrated"].sum() == 0, (here_ms, by_window)
 
 
 def objective_of(rng: Random, problem: Problem) -> Objective:
@@ -99,6 +146,9 @@ def test_the_kernel_decides_as_the_classes_do(seed: int) -> None:
     rng = Random(seed)
     problem = random_problem(rng, orders=rng.random() < 0.9, whole_ms=rng.random() < 0.3)
     problem = replace(problem, objective=objective_of(rng, problem))
+    if seed % 2:
+        every = rng.randint(1, problem.window_cycles)
+        problem = replace(problem, controller=replace(problem.controller, decide_cycles=every))
     policy = policy_of(rng, problem)
     assert plain_rule(Controller(problem, policy)) is not None
     real = dwell.draw(problem, scenario="disturbed", seed=seed, windows=rng.randint(5, 30))

@@ -106,6 +106,37 @@ def test_phases_are_of_the_cells(canonical: Problem) -> None:
     assert phases("random") == drawn
 
 
+@pytest.mark.parametrize(
+    ("of_cell", "of_entry", "expected"),
+    [
+        ("phase_ms: 0", "", 0.0),
+        ("phase_ms: 5", "", 5.0),
+        ("phase_ms: 5", ", phase_ms: 0", 0.0),
+        ("phase_ms: 0", ", phase_ms: 5", 5.0),
+        ("", "", 10.0),
+    ],
+)
+def test_a_phase_of_a_cell_is_kept_and_0_is_a_phase(
+    tmp_path: Path, of_cell: str, of_entry: str, expected: float
+) -> None:
+    (tmp_path / "cell.yaml").write_text(
+        "dwell: 1\nperiod_ms: 20\nnodes: {E: {tier: edge}}\n"
+        f"tasks: {{a: {{on: {{E: {{exec_ms: 2}}}}}}}}\ncandidates: {{SO: {{}}}}\n{of_cell}\n"
+    )
+    (tmp_path / "fleet.yaml").write_text(
+        "dwell-fleet: 1\nname: two\nphases: [10, 10]\n"
+        f"cells: [{{cell: cell.yaml, count: 2{of_entry}}}]\n"
+    )
+    fleet = dwell.load_fleet(tmp_path / "fleet.yaml")
+    result = simulate_fleet(fleet, windows=2, coordination="none")
+    assert list(result.phases_ms.values()) == [expected] * 2
+    first_ns = [run.cycles["release_ns"][0] for run in result.cells.values()]
+    assert first_ns == [round(expected * 1e6)] * 2
+    # Runs of the fleet read their cells again with the same phase.
+    for name, run in result.cells.items():
+        assert run.problem.pipeline.phase_ms == result.phases_ms[name]
+
+
 def test_without_coordination_a_fleet_herds_and_chance_breaks_it(canonical: Problem) -> None:
     """Robots that are stressed at once all leave at once, and come back at once."""
 

@@ -421,7 +421,8 @@ def test_a_window_in_its_grace_is_cut_short_too() -> None:
 def test_the_run_ends_with_the_last_close_where_no_window_can_follow() -> None:
     found = play(cell(), down={"E": [(42, 10_000)]}, windows=2)
     assert moves(found) == []
-    assert found.cycles.height == 4
+    # The guard fires as cycle 4, the first one that it has not heard of, is two periods old.
+    assert found.cycles["lead"].to_list() == [False] * 4 + [True] * 3
 
 
 # ------------------------------------------------------------------------------------ the return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import polars as pl
 import pytest
@@ -12,8 +13,10 @@ import dwell
 from dwell.errors import RunError
 from dwell.kernels.realisation import NodeChange
 from dwell.model import Constant, Execution, Node, Problem, Task
+from dwell.model.fleet import Fleet, FleetEntry
 from tests.cells.generated import MS, make_problem, make_realisation
-from tests.cells.two_nodes import Script
+from tests.cells.late_cycles import CLOSED, DRAWN, W, late_run
+from tests.cells.two_nodes import Script, two_nodes
 
 
 def runs_of(cells: Mapping[str, Problem]) -> list[tuple[Problem, dwell.Run]]:
@@ -28,12 +31,14 @@ def runs_of(cells: Mapping[str, Problem]) -> list[tuple[Problem, dwell.Run]]:
 
 def test_every_cycle_is_done_lost_or_in_flight(cells: Mapping[str, Problem]) -> None:
     for problem, run in runs_of(cells):
-        cycles = run.cycles
-        # Orders take time: the cycles of a last window that is not complete are never released.
+        # Orders take time: the last window may be incomplete.
         count = run.windows["first_cycle"][-1] + problem.window_cycles
         assert 14 * problem.window_cycles <= count <= 15 * problem.window_cycles
-        assert cycles["cycle"].to_list() == list(range(count))
-        assert (cycles["release_ns"].diff().drop_nulls() > 0).all()
+        assert run.cycles["cycle"].to_list() == list(range(run.cycles.height))
+        assert (run.cycles["release_ns"].diff().drop_nulls() > 0).all()
+        cycles, after = run.cycles[:count], run.cycles[count:]
+        assert after["lead"].all()
+        assert not after["missed"].any()
         done = cycles["outcome"] == "done"
         assert (cycles["latency_ns"].is_not_null() == done).all()
         assert cycles.filter(~done)["missed"].all()
@@ -122,6 +127,44 @@ def test_a_job_ends_when_it_completes_or_is_lost() -> None:
         (40, None, 40, "node_down"),
         (50, 50, None, "in_flight"),
     ]
+
+
+def test_cycles_released_while_the_cell_migrates_are_lead() -> None:
+    run = late_run()
+    assert run.windows.height == CLOSED
+    assert run.cycles.height == DRAWN * W
+    assert run.last_window_end == CLOSED * W
+    assert run.cycles["lead"].to_list() == [False] * CLOSED * W + [True] * (DRAWN - CLOSED) * W
+    # Every cycle took 30 of 20 ms; the windows of the last ones have not closed.
+    assert run.cycles["missed"].to_list() == (~run.cycles["lead"]).to_list()
+    assert set(run.jobs["cycle"]) == set(run.cycles["cycle"])
+    late = run.cycles[CLOSED * W :]
+    assert late["latency_ns"].drop_nulls().unique().to_list() == [30 * MS]
+    assert late["outcome"].cast(pl.String).to_list()[-1] == "in_flight"
+
+
+def test_cycles_released_before_a_late_close_are_lead() -> None:
+    # A window closes 50 ms after the release beyond it; an order takes effect after that.
+    problem = two_nodes(close_grace_ms=50.0)
+    for jobs in (False, True):
+        run = dwell.simulate(
+            problem, policy=Script("LOC", "OFF"), seed=1, windows=4, jobs=jobs, guard=False
+        )
+        firsts = run.windows["first_cycle"].to_list()
+        assert firsts == [0, 10, 23]
+        lead = run.cycles.filter("lead")["cycle"].to_list()
+        assert lead == [20, 21, 22, *range(33, run.cycles.height)]
+        # The last close is 50 ms after the release of cycle 33.
+        assert run.cycles.height == 36
+
+
+def test_a_cell_of_a_fleet_keeps_the_cycles_after_its_last_window() -> None:
+    quick = replace(two_nodes(), name="quick")
+    slow = replace(two_nodes(window_cycles=20), name="slow")
+    fleet = Fleet("pair", (FleetEntry(quick), FleetEntry(slow)), ("E",), phases="sync")
+    run = dwell.simulate_fleet(fleet, seed=1, windows=3, policy="OFF", jobs=True)
+    for cell in run.cells.values():
+        assert set(cell.jobs["cycle"]) <= set(cell.cycles["cycle"])
 
 
 def test_jobs_are_where_their_cycles_were_placed(canonical: Problem) -> None:

@@ -31,7 +31,14 @@ def test_an_answer_asks_for_all_others(by_other: dict[str, str], answer: str) ->
 def test_a_run_that_is_missing_leaves_its_pair_out_alone() -> None:
     ramp = np.linspace(1.0, 1.1, 9)
     runs = pl.concat(
-        pl.DataFrame({"policy": [name] * 9, "seed": range(9), "violation_rate": size * ramp})
+        pl.DataFrame(
+            {
+                "policy": [name] * 9,
+                "seed": range(9),
+                "violation_rate": size * ramp,
+                "played": [f"{name} {seed}" for seed in range(9)],
+            }
+        )
         for name, size in (("HYB", 0.3), ("LOC", 0.5))
     )
     pairs = {"both": ({"policy": "HYB"}, {"policy": "LOC"})}

@@ -44,7 +44,7 @@ def stopped_and_resumed(study: Study, cluster: Any, out: Path) -> StudyResult:
     with pytest.raises(KeyboardInterrupt):
         run_study(study, folder=out, dask=cluster.scheduler_address, progress=stop)
     known = parts_in(out)
-    assert len(known) == 2
+    assert len(known) == 2 * len(study.players)
     result = run_study(study, folder=out, dask=cluster.scheduler_address)
     assert parts_in(out).items() >= known.items(), "a finished item was repeated"
     return result
@@ -117,6 +117,22 @@ def worker_of(_: int) -> str:
     return name
 
 
+def test_the_rest_of_a_unit_is_done_on_the_cluster_too(cluster: Any) -> None:
+    found: list[int] = []
+    spread_on_dask(
+        first_of,
+        [(1, 2, 3), (4,)],
+        address=cluster.scheduler_address,
+        take=lambda _, result: found.append(result[0]),
+        rest=lambda result: result[1] or None,
+    )
+    assert sorted(found) == [1, 2, 3, 4]
+
+
+def first_of(values: tuple[int, ...]) -> tuple[int, tuple[int, ...]]:
+    return values[0], values[1:]
+
+
 def test_an_error_on_a_worker_arrives_as_it_is(cluster: Any) -> None:
     with pytest.raises(ZeroDivisionError):
         spread_on_dask(
@@ -143,6 +159,8 @@ def test_a_scheduler_without_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dwell.study.cluster.WORKER_S", 0.2)
     with (
         distributed.LocalCluster(n_workers=0, processes=False, dashboard_address=":0") as empty,
-        pytest.raises(SimulationError, match="has no workers; start one with"),
+        pytest.raises(
+            SimulationError, match=r"has no workers; start one with `dask worker \S+ --nthreads 1`"
+        ),
     ):
         run_study(make_study(), dask=empty.scheduler_address)

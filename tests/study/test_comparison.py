@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import polars as pl
@@ -11,7 +11,8 @@ from polars.testing import assert_frame_equal
 
 from dwell import simulate
 from dwell.errors import DwellError, PolicyError, ProblemError, SimulationError
-from dwell.policies import Static
+from dwell.model import QoS
+from dwell.policies import DTP, Static
 from dwell.study import Comparison, compare
 from dwell.study.summary import summarise
 from tests.cells.small import make_problem
@@ -96,6 +97,30 @@ def test_all_policies_play_the_same_realisation() -> None:
     assert not difference.known
 
 
+class Nearest:
+    """Takes the placement with the lowest estimated L95."""
+
+    def __init__(self, name: str = "") -> None:
+        self.name = name
+
+    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
+        return self.name or min(estimates, key=lambda name: estimates[name].l95_ms)
+
+
+def test_an_object_in_a_list_has_its_classs_name() -> None:
+    played = compare(
+        PROBLEM,
+        scenarios=("baseline",),
+        policies=["LOC", Nearest(), DTP.from_problem(PROBLEM), "latency-first"],
+        seeds=(1, 2),
+        windows=6,
+        processes=1,
+    )
+    assert played.policies == ("LOC", "Nearest", "DTP", "latency-first")
+    costs = {name: table["cost"].to_list() for (name,), table in played.runs.group_by("policy")}
+    assert costs["Nearest"] == costs["latency-first"]
+
+
 def test_distributions_never_fall_and_end_at_what_finished(comparison: Comparison) -> None:
     for scenario in comparison.scenarios:
         for policy in POLICIES:
@@ -134,10 +159,18 @@ def test_progress_counts_runs() -> None:
         ({"windows": 2}, SimulationError, "more than the 2 windows of warm-up"),
         ({"scenarios": ("rain",)}, ProblemError, "unknown scenario 'rain'"),
         ({"policies": ("dpt",)}, PolicyError, "unknown policy 'dpt'"),
+        (
+            {"policies": (Nearest("LOC"), "LOC", Nearest("SO"))},
+            SimulationError,
+            r"policies holds 'Nearest' twice; .* policies={'first': \.\.\., 'second': ",
+        ),
+        ({"policies": (Nearest,)}, PolicyError, "Nearest'> is no policy: it must be an object"),
+        ({"policies": (3,)}, PolicyError, "3 is no policy: it must be an object with a method"),
+        ({"policies": {"SO": Nearest()}}, SimulationError, "'SO' is a candidate's name"),
     ],
 )
 def test_wrong_requests_are_refused(
-    wrong: dict[str, tuple[str | int, ...]], error: type[DwellError], message: str
+    wrong: dict[str, object], error: type[DwellError], message: str
 ) -> None:
     right = {"scenarios": ("baseline",), "policies": ("LOC",), "seeds": (1,), "windows": 4}
     with pytest.raises(error, match=message):

@@ -15,12 +15,14 @@ from scipy import stats
 from dwell.study.intervals import (
     FARTHEST,
     FEWEST,
+    halves,
     mean_interval,
     median_interval,
     rule_of_three,
     share_difference_interval,
     share_interval,
     share_limits,
+    student_quantile,
     studentised_limits,
     under,
 )
@@ -55,6 +57,19 @@ def test_a_mean_has_the_studentised_bootstrap() -> None:
         assert ts[first] - 1e-9 <= t <= ts[last] + 1e-9
     # What is skewed to the right lies further up than down.
     assert high - mean > mean - low
+
+
+@pytest.mark.parametrize("tail", [0.005, 0.025, 0.05, 0.3])
+def test_quantiles_of_student_are_those_of_scipy(tail: float) -> None:
+    free = [*range(1, 60), 100, 101, 999, 1000]
+    found = [student_quantile(one, tail) for one in free]
+    np.testing.assert_allclose(found, stats.t.ppf(1 - tail, free), rtol=1e-11)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 9, 30, 1000])
+def test_tosses_of_a_coin_are_binomial(count: int) -> None:
+    expected = stats.binom.cdf(np.arange(count + 1), count, 0.5)
+    np.testing.assert_allclose(halves(count), expected, rtol=1e-12, atol=1e-300)
 
 
 def test_the_same_values_have_the_same_interval() -> None:

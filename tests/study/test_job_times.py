@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import polars as pl
 import pytest
+from polars.testing import assert_frame_equal
 
 from dwell import simulate
 from dwell.study.job_times import finished_jobs, job_times, jobs_of, links_of, profiles_of
+from tests.cells.late_cycles import late_run, without_late_cycles
 from tests.cells.small import make_problem
 
 PROBLEM = make_problem()
@@ -55,6 +57,14 @@ def test_messages_are_those_between_nodes_in_every_scenario(jobs: pl.DataFrame) 
         assert mine["delay_ms"].is_sorted()
     for given, empty in zip((links, delays), links_of(None, PROBLEM), strict=True):
         assert empty.schema == given.schema
+
+
+def test_jobs_after_the_last_window_do_not_count() -> None:
+    run = late_run()
+    found, expected = (
+        jobs_of(one, "baseline", "LOC", 1) for one in (run, without_late_cycles(run))
+    )
+    assert_frame_equal(found, expected)
 
 
 def test_jobs_are_compared_where_they_were_kept() -> None:

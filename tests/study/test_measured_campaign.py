@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import re
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -68,20 +65,6 @@ def test_a_repetition_takes_the_place_of_a_seed(measured: MeasuredCampaign) -> N
     assert len(comparison.values("baseline", "dtp", "violation_rate")) == 2
     assert measured.repetitions == 2
     assert measured.kinds == {"simulated"}
-
-
-def test_a_campaign_of_before_has_thresholds_where_it_says_atp(
-    folder: Path, tmp_path: Path
-) -> None:
-    old = tmp_path / "old"
-    shutil.copytree(folder, old)
-    for file in old.rglob("run.json"):
-        meta = json.loads(file.read_text(encoding="utf-8"))
-        told = re.sub(r", every_ms=[^)]*", "", meta["policy"])
-        file.write_text(json.dumps({**meta, "policy": told}), encoding="utf-8")
-    comparison = read_measured(old).comparison
-    assert comparison.policies == ("LOC", "SO", "HYB", "atp-thresholds", "dtp")
-    assert len(comparison.values("baseline", "atp-thresholds", "violation_rate")) == 2
 
 
 def test_excluded_windows_and_failures_are_counted(measured: MeasuredCampaign) -> None:

@@ -33,7 +33,7 @@ def test_of_a_policy_that_moves_what_was_decided_on_them_is_left_out_too() -> No
         ("dtp", {5, 6, 7, 8, 9, 10, 50, 51, 52, 53, last}),
     ):
         (name, run), *_ = measured(problem, "baseline", policy, 101).items()
-        told = {"excluded": [5, {"window": 7, "reason": "steal"}, 50, last]}
+        told = {"excluded": [5, 7, 50, last]}
         one = read_measured(name, with_meta(run, pressure=told), problem)
         assert set(one.excluded) == left_out
 
@@ -43,8 +43,6 @@ def test_of_a_policy_that_moves_what_was_decided_on_them_is_left_out_too() -> No
     [
         ({}, set()),
         ({"excluded_windows": [3, 4]}, {3, 4}),
-        ({"excluded_windows": {"3": "steal"}}, {3}),
-        ({"excluded_windows": [[3, "steal"]]}, {3}),
         ({"pressure": {"excluded": [9]}}, {9}),
     ],
 )
@@ -106,16 +104,6 @@ def test_candidates_are_those_of_the_run() -> None:
     assert list(found.problem.candidates) == ["LOC", "SO"]
 
 
-def test_candidates_of_earlier_records_name_anchored_tasks() -> None:
-    problem = make_problem()
-    fewer = {name: problem.candidates[name] for name in ("LOC", "SO")}
-    run = simulate(replace(problem, candidates=fewer), policy="dtp", seed=1, windows=6)
-    placed = {name: dict(placement) for name, placement in fewer.items()}
-    recorded = {**run.meta["problem"], "candidates": placed}
-    found = read_measured("run", with_meta(run, problem=recorded), problem).problem
-    assert found.candidates == read_measured("run", run, problem).problem.candidates == fewer
-
-
 def test_where_it_began_and_its_fallbacks_come_with_a_runs_candidates() -> None:
     problem = make_problem()
     settings = replace(problem.controller, initial="LOC", fallbacks=("LOC", "HYB"))
@@ -128,13 +116,3 @@ def test_where_it_began_and_its_fallbacks_come_with_a_runs_candidates() -> None:
     assert list(found.problem.candidates) == ["ROB-EDGE"]
     assert found.problem.initial == "ROB-EDGE"
     assert found.problem.controller.fallbacks == ("ROB-EDGE",)
-
-
-def test_what_was_called_atp_is_predicted_as_thresholds_alone() -> None:
-    problem = make_problem()
-    run = simulate(problem, policy="atp-thresholds", seed=1, windows=6)
-    before = str(run.meta["policy"]).replace("ATPThresholds", "ATP")
-    found = read_measured("run", with_meta(run, policy=before), problem)
-    assert found.contender == "atp-thresholds+profile"
-    run = simulate(problem, policy="atp", seed=1, windows=6)
-    assert read_measured("run", run, problem).contender == "atp+profile"

@@ -19,7 +19,8 @@ from dwell.errors import SimulationError
 from dwell.model import FrozenDict, Problem
 from dwell.study import Contender, Study, run_study
 from dwell.study.judged_cost import judged_cost, judged_costs
-from dwell.study.player import Player
+from dwell.study.parts import frame_of
+from dwell.study.player import Batch, Player
 from dwell.study.summary import summarise
 from tests.cells.small import make_problem
 from tests.study.test_study import grid, make_study
@@ -29,14 +30,45 @@ PROBLEM = make_problem()
 
 def test_an_item_is_a_run_of_every_contender_at_every_point() -> None:
     study = make_study(points=grid(dwells=range(2), delays=range(1, 2)))
-    played = Player(study, kept=(2,))(study.items()[2])
-    labels = [(point, one.row["policy"], one.row["seed"]) for point, one in played.summaries]
-    assert labels == [(0, "LOC", 2), (0, "dtp", 2), (1, "LOC", 2), (1, "dtp", 2)]
+    player, item = Player(study, kept=(2,)), study.items()[2]
+    played = player(batch_of(study, 2))
+    for name in ("LOC", "dtp"):
+        rows = [
+            (point, one.row["policy"], one.row["seed"]) for point, one in played.summaries[name]
+        ]
+        assert rows == [(0, name, 2), (1, name, 2)]
     # Runs of a seed that is kept are kept whole.
-    assert list(played.examples) == [(0, "LOC"), (0, "dtp"), (1, "LOC"), (1, "dtp")]
+    labels = [(0, "LOC"), (0, "dtp"), (1, "LOC"), (1, "dtp")]
+    assert list(played.examples) == [(item, *label) for label in labels]
     run = simulate(study.points[1].problem, policy="dtp", seed=2, windows=6)
-    assert_frame_equal(played.examples[1, "dtp"].decisions, run.decisions)
-    assert Player(study, kept=(2,))(study.items()[0]).examples == {}
+    assert_frame_equal(played.examples[item, 1, "dtp"].decisions, run.decisions)
+    assert player(batch_of(study, 0)).examples == {}
+
+
+def batch_of(study: Study, first: int, count: int = 1, *players: str) -> Batch:
+    return Batch(first, study.items()[first : first + count], players or study.players)
+
+
+def test_a_batch_ends_when_its_time_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C waits for a batch that is under way, and loses it where there is one process."""
+    study = make_study()
+    whole = Player(study)(batch_of(study, 1, 4))
+    assert (whole.batch, whole.rest) == (batch_of(study, 1, 4), None)
+    monkeypatch.setattr("dwell.study.player.BATCH_S", 0.0)
+    begun = Player(study)(batch_of(study, 1, 4))
+    assert (begun.batch, begun.rest) == (batch_of(study, 1), batch_of(study, 2, 3))
+    assert [len(mine) for mine in begun.summaries.values()] == [1, 1]
+
+
+def test_a_player_of_a_batch_plays_without_the_others() -> None:
+    study = make_study(references=True)
+    everything = Player(study)(batch_of(study, 0, 2)).summaries
+    for name in study.players:
+        alone = Player(study)(batch_of(study, 0, 2, name)).summaries
+        assert list(alone) == [name]
+        for (_, one), (_, other) in zip(alone[name], everything[name], strict=True):
+            assert (one.row, one.compared) == (other.row, other.compared)
+            assert_frame_equal(frame_of([(0, one)]), frame_of([(0, other)]))
 
 
 @pytest.mark.parametrize("policy", ["dtp", "latency-first", "SO"])
@@ -84,7 +116,7 @@ def test_a_worker_with_other_software_refuses() -> None:
     study = make_study()
     player = Player(study, software={**Player(study).software, "numpy": "1.0"})
     with pytest.raises(SimulationError, match=r"numpy \d.*, not numpy 1\.0"):
-        player(study.items()[0])
+        player(batch_of(study, 0))
 
 
 def test_an_unknown_policy_is_found_before_the_work_begins() -> None:
@@ -115,9 +147,11 @@ def test_a_realisation_is_drawn_once_for_all_that_share_it(
 
 ALONE = """
 import pickle, sys
-player, item = pickle.load(sys.stdin.buffer)
-played = player(item)
-assert len(played.summaries) == 4
+player, batch = pickle.load(sys.stdin.buffer)
+played = player(batch)
+assert {name: len(mine) for name, mine in played.summaries.items()} == {
+    "LOC": 1, "dtp": 1, "clairvoyant": 2
+}
 print([name for name in ("polars", "typer") if name in sys.modules])
 """
 
@@ -125,7 +159,7 @@ print([name for name in ("polars", "typer") if name in sys.modules])
 def test_a_worker_plays_and_sums_up_without_tables() -> None:
     """What it loads besides, every worker of a study pays for."""
     study = make_study(references=True)
-    sent = pickle.dumps((Player(study), study.items()[0]))
+    sent = pickle.dumps((Player(study), batch_of(study, 0)))
     # A problem with traces is larger; it is sent once to a worker.
     assert len(sent) < 10_000
     done = subprocess.run(

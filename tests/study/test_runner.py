@@ -15,6 +15,8 @@ from polars.testing import assert_frame_equal
 from dwell import draw, simulate, simulate_realisation
 from dwell.cellfile.study_paths import with_settings
 from dwell.errors import MetricError
+from dwell.model import Problem
+from dwell.record import Run
 from dwell.study import Contender, Point, StudyResult, compare, run_study
 from dwell.study.judged_cost import judged_cost
 from dwell.study.reference import references
@@ -160,6 +162,46 @@ def test_references_are_rows_and_columns(result: StudyResult) -> None:
         assert row["regret"] == pytest.approx(row["cost"] / known.cost - 1)
     clairvoyant = mine.filter(pl.col("policy") == "clairvoyant").row(0, named=True)
     assert clairvoyant["cost"] == known.costs["clairvoyant"]
+
+
+def test_every_run_is_compared_with_the_reference_of_its_own_realisation(
+    result: StudyResult,
+) -> None:
+    for index, point in enumerate(result.study.points):
+        problem, values = (
+            point.problem,
+            dict(zip(result.parameters, point.values.values(), strict=True)),
+        )
+        for seed in (1, 3):
+            realisation = draw(problem, scenario="network-impairment", seed=seed, windows=6)
+            known = references(problem, realisation)
+            runs = {
+                "LOC": simulate_realisation(problem, realisation, policy="LOC"),
+                "dtp": simulate_realisation(problem, realisation, policy="dtp"),
+                "careless": simulate_realisation(
+                    result.study.contenders[2].problem(problem), realisation, policy="dtp"
+                ),
+                **known.runs,
+            }
+            for name, run in runs.items():
+                found = rows(
+                    result, scenario="network-impairment", policy=name, seed=seed, **values
+                ).row(0, named=True)
+                assert found["reference_cost"] == known.cost, (index, name)
+                assert found["regret"] == found["cost"] / known.cost - 1.0
+                assert found["share_kept"] == share_kept(known.run, run, problem)
+
+
+def share_kept(reference: Run, run: Run, problem: Problem) -> float:
+    """Share of the reference's windows with at most 5 % misses in which a run misses as few."""
+    width, first = problem.window_cycles, problem.warmup_windows * problem.window_cycles
+    few = []
+    for one in (reference, run):
+        missed = one.cycles["missed"].to_list()[first:]
+        whole = range(0, len(missed) - width + 1, width)
+        few.append([sum(missed[at : at + width]) <= 0.05 * width for at in whole])
+    both = [mine for theirs, mine in zip(*few, strict=False) if theirs]
+    return sum(both) / len(both) if both else 1.0
 
 
 def test_a_candidate_among_the_references_shows_what_it_shows_alone(result: StudyResult) -> None:

@@ -94,7 +94,7 @@ def test_items_cover_every_combination_once() -> None:
     study = make_study(points=grid(dwells=range(3), delays=range(1, 4)))
     covered = [(point, item.scenario, item.seed) for item in study.items() for point in item.points]
     assert sorted(covered) == sorted(itertools.product(range(9), study.scenarios, study.seeds))
-    assert len({item.name for item in study.items()}) == len(study.items())
+    assert len(set(study.items())) == len(study.items())
     assert study.runs == len(covered) * 2
     assert study.cycles == study.runs * 6 * PROBLEM.window_cycles
 

@@ -197,18 +197,6 @@ def test_accelerators_are_in_a_row_and_in_u_e_where_j_takes_them() -> None:
     assert row["u_edge"] == row["node_E"] != row["node_E.gpu"]
     taken = on_gpu(accelerators={"E.gpu": "edge"})
     assert summarise(run, taken, labels).row["u_edge"] == row["node_E.gpu"]
-    # Of a run that was made before they were counted nothing is known of them.
-    before = dwell.Run(
-        run.meta,
-        {
-            "cycles": run.cycles,
-            "windows": run.windows.drop("u_E.gpu"),
-            "decisions": run.decisions,
-        },
-    )
-    old = summarise(before, taken, labels).row
-    assert "node_E.gpu" not in old
-    assert old["u_edge"] == row["node_E"]
 
 
 def test_j_of_a_run_takes_accelerators_where_the_cell_says_so() -> None:

@@ -158,7 +158,7 @@ class TestWhatCounts:
     def test_excluded_windows_are_left_out_of_both(self) -> None:
         problem = make_problem()
         (name, run), *_ = measured(problem, "baseline", "LOC", 101).items()
-        run = with_meta(run, excluded_windows=[{"window": 5, "reason": "steal"}, 7, 1])
+        run = with_meta(run, excluded_windows=[5, 7, 1])
         (group,) = validate({name: run}, problem, seeds=2).groups
         # The second window is one of the warm-up.
         assert group.measured.windows == WINDOWS - 2 - 2

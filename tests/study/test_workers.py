@@ -29,6 +29,40 @@ def test_every_unit_comes_back_with_its_result(processes: int) -> None:
     assert spread_all([9.0, 1.0, 4.0], processes) == {9.0: 3.0, 1.0: 1.0, 4.0: 2.0}
 
 
+def first_of(values: tuple[int, ...]) -> tuple[int, tuple[int, ...]]:
+    return values[0], values[1:]
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_the_rest_of_a_unit_is_a_further_unit(processes: int) -> None:
+    found: list[int] = []
+    spread(
+        first_of,
+        [(1, 2, 3), (4,), (5, 6)],
+        processes=processes,
+        take=lambda _, result: found.append(result[0]),
+        rest=lambda result: result[1] or None,
+    )
+    assert sorted(found) == [1, 2, 3, 4, 5, 6]
+
+
+def initial_environment(_: int) -> dict[str, str]:
+    """Return the variables that this process was started with, whatever it has set since."""
+    pairs = Path("/proc/self/environ").read_text(encoding="utf-8").split("\0")
+    return dict(pair.split("=", 1) for pair in pairs if "=" in pair)
+
+
+@pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="only Linux shows it")
+def test_workers_start_with_one_thread_per_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "7")
+    monkeypatch.delenv("POLARS_MAX_THREADS", raising=False)
+    found: list[dict[str, str]] = []
+    spread(initial_environment, [1, 2, 3], processes=2, take=lambda _, known: found.append(known))
+    names = ("OPENBLAS_NUM_THREADS", "POLARS_MAX_THREADS")
+    assert [[known.get(name) for name in names] for known in found] == [["1", "1"]] * 3
+    assert [os.environ.get(name) for name in names] == ["7", None]
+
+
 def test_nothing_to_do_needs_no_process() -> None:
     assert spread_all([], 2) == {}
 

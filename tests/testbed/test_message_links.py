@@ -175,6 +175,20 @@ def test_a_link_that_retransmits_loses_nothing_and_keeps_order_where_it_is_to(
         assert arrivals == sorted(arrivals)
 
 
+def test_messages_wait_for_one_that_is_sent_again_where_order_is_kept(tmp_path: Path) -> None:
+    arrivals = []
+    for in_order in (True, False):
+        link = Link("R1", "E", Constant(5.0), retransmit_ms=200.0, in_order=in_order)
+        with closing(LinkFile(tmp_path / f"links-{in_order}", NODES, [link], seed=1)) as file:
+            file.set("R1", "E", delay_ms=Constant(5.0), loss=0.05)
+            # Two processes send in turn.
+            ways = [ends(file, who).to["E"] for who in ("camera@R1", "stamper@R1")]
+            arrivals.append([ways[n % 2].begin(0, n * 10 * MS) for n in range(2_000)])
+    kept, free = map(np.array, arrivals)
+    assert (np.diff(free) < 0).any()
+    assert (kept == np.maximum.accumulate(free)).all()
+
+
 def test_what_would_wait_too_long_is_lost_and_takes_no_time(file: LinkFile) -> None:
     file.set("R1", "E", rate_mbps=0.1)
     way = ends(file).to["E"]

@@ -10,7 +10,7 @@ import pytest
 
 import dwell
 from dwell.cellfile import from_document
-from dwell.errors import LiveError
+from dwell.errors import LiveError, PolicyError
 from dwell.kernels.random_draws import drawn_scenario
 from dwell.model import Disturbance, Problem
 from dwell.record import open_run
@@ -116,5 +116,11 @@ def test_faults_come_before_the_folder_is_touched(problem: Problem, tmp_path: Pa
     with pytest.raises(LiveError, match=r"nodes\.E has no quota"):
         run_once(
             greedy, scenario="baseline", policy=None, seconds=5, seed=1, out=tmp_path, name="x"
+        )
+    settings = replace(problem.controller, policy="nowhere:Mine")
+    unknown = replace(problem, controller=settings)
+    with pytest.raises(PolicyError, match="there is no module 'nowhere'"):
+        run_once(
+            unknown, scenario="baseline", policy=None, seconds=5, seed=1, out=tmp_path, name="x"
         )
     assert (tmp_path / "before").exists()

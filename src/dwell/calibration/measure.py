@@ -199,7 +199,7 @@ def _series(
         raised_here = error.__traceback__ is not None and error.__traceback__.tb_next is None
         wrong_call = isinstance(error, TypeError) and raised_here
         hint = f"; it is called with {given}" if wrong_call else ""
-        raise MeasurementError(f"{when}: {describe_raised(error, but=__file__)}{hint}") from error
+        raise MeasurementError(f"{when}: {describe_raised(error, users=True)}{hint}") from error
     return wall_ns, cpu_ns
 
 

@@ -71,8 +71,6 @@ class Assembly:
         Less the sources at fault; where None, traces are named and not read.
     faults : Faults
         Holds the faults so far, takes those found here.
-    anchored : bool
-        Whether a candidate may name anchored tasks where they are.
     home : str, optional
         `Problem.folder`.
     """
@@ -80,7 +78,6 @@ class Assembly:
     entry: Entry
     tables: Tables | None
     faults: Faults
-    anchored: bool = False
     home: str | None = None
 
     def problem(self, name: str) -> Problem:
@@ -132,8 +129,7 @@ class Assembly:
             tiers=objective.tiers if objective is not None else {},
             live=live,
         )
-        if not self.anchored:
-            self._refuse_anchored(candidates, tasks)
+        self._refuse_anchored(candidates, tasks)
         self._assume(parts)
         # A record names what its machine had.
         if not self.faults.is_record:

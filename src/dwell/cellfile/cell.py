@@ -83,9 +83,6 @@ def from_document(
 ) -> Problem:
     """Read a cell from plain values, as `dwell.model.document.to_document` makes them.
 
-    A candidate may name anchored tasks, too, as the documents of earlier versions do; a cell file
-    may not.
-
     Parameters
     ----------
     document : mapping
@@ -95,7 +92,7 @@ def from_document(
     source : str, optional
         Name of the document in messages.
     is_record : bool
-        Whether an earlier version may have written it, on a machine with other policies.
+        Whether a machine with other policies and estimators may have written it.
 
     Raises
     ------
@@ -103,7 +100,7 @@ def from_document(
         With every fault found.
     """
     faults = Faults(source, is_record=is_record)
-    return read_problem(document, faults, Path(folder), "cell", anchored=True)
+    return read_problem(document, faults, Path(folder), "cell")
 
 
 def from_record(document: Mapping[str, object]) -> Problem:
@@ -115,7 +112,7 @@ def from_record(document: Mapping[str, object]) -> Problem:
     Parameters
     ----------
     document : mapping
-        Written by this version of Dwell, or by an older one, whose candidates name anchored tasks.
+        Plain values.
 
     Returns
     -------
@@ -127,7 +124,7 @@ def from_record(document: Mapping[str, object]) -> Problem:
     ProblemError
         With every fault found.
     """
-    return read_problem(document, Faults(is_record=True), None, "cell", anchored=True)
+    return read_problem(document, Faults(is_record=True), None, "cell")
 
 
 def read_problem(
@@ -137,7 +134,6 @@ def read_problem(
     name: str,
     known: dict[object, Tables] | None = None,
     *,
-    anchored: bool = False,
     home: str | None = None,
 ) -> Problem:
     """Read a document into a Problem.
@@ -154,8 +150,6 @@ def read_problem(
         For a cell that does not name itself.
     known : dict, optional
         Traces that were read for documents like this one; takes those that are read now.
-    anchored : bool
-        Whether a candidate may name anchored tasks where they are.
     home : str, optional
         Folder of the modules that it names, for `Problem.folder`.
 
@@ -181,4 +175,4 @@ def read_problem(
 
             known[declared] = read_traces(entry, folder, faults)
         tables = known[declared]
-    return Assembly(entry, tables, faults, anchored, home).problem(name)
+    return Assembly(entry, tables, faults, home).problem(name)

@@ -236,7 +236,6 @@ NODE = shape_of(
         # A node without its accelerators, as if tasks named unknown ones.
         "accelerators": _key(Node, "accelerators", breaks=True),
     },
-    gone=("contention_stressed",),
 )
 
 

@@ -20,8 +20,7 @@ class Faults:
     source : str, optional
         Name of the document in messages.
     is_record : bool
-        Whether an earlier version may have written it: keys that have gone are passed over, and
-        policies and estimators need not be known here.
+        Whether another machine may have written it: policies and estimators need not be known here.
     """
 
     def __init__(self, source: str | None = None, *, is_record: bool = False) -> None:

@@ -448,8 +448,6 @@ class Shape(Form):
         Class of the model that its values are the arguments of.
     extra : mapping
         What its JSON Schema has besides.
-    gone : tuple of str
-        Keys of earlier versions.
     """
 
     title: str
@@ -457,7 +455,6 @@ class Shape(Form):
     keys: tuple[FormKey, ...]
     kind: Any = None
     extra: Mapping[str, Any] = field(default_factory=dict)
-    gone: tuple[str, ...] = ()
 
     @property
     def words(self) -> str:
@@ -477,10 +474,7 @@ class Shape(Form):
         missing = [key.named for key in self.keys if key.is_required and key.named not in value]
         for name in value:
             here = beneath(path, name)
-            if name in self.gone:
-                if not faults.is_record:
-                    faults.add(here, f"the key {name!r} has gone; delete the line")
-            elif name not in names:
+            if name not in names:
                 if not faults.at(here):
                     faults.add(here, f"unknown key {name!r}; {nearest(name, names)}")
                 meant = closest(name, names, MISSPELT)
@@ -586,7 +580,6 @@ def shape_of(
     instead: Mapping[str, Form | FormKey] | None = None,
     further: tuple[FormKey, ...] = (),
     says: str = "",
-    gone: tuple[str, ...] = (),
 ) -> Shape:
     """Return the shape of a class of the model.
 
@@ -602,8 +595,6 @@ def shape_of(
         Keys that are no fields; they come last.
     says : str
         The first line of the class's docstring where empty.
-    gone : tuple of str
-        Keys of earlier versions.
     """
     keys = []
     for one in declared_fields(kind):
@@ -615,7 +606,7 @@ def shape_of(
         else:
             keys.append(key_of(one, given or form_of(one, forms)))
     first = (kind.__doc__ or "").partition("\n")[0]
-    return Shape(title or kind.__name__, says or first, (*keys, *further), kind, gone=gone)
+    return Shape(title or kind.__name__, says or first, (*keys, *further), kind)
 
 
 def entries_of(value: Any) -> Iterator[Entry]:

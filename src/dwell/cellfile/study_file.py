@@ -24,6 +24,7 @@ from dwell.model.bounds import as_read
 from dwell.model.dotted_paths import Step, steps_of
 from dwell.model.fleet import Fleet
 from dwell.model.semantics import bad_name, nearest
+from dwell.model.user_classes import user_function
 
 if TYPE_CHECKING:
     from dwell.cellfile.forms import Entry
@@ -71,6 +72,8 @@ class DeclaredStudy:
     seeds: tuple[int, ...]
     windows: int
     references: bool
+    metrics: Mapping[str, str]
+    folder: str
 
 
 def read_study(path: str | PathLike[str], *, references: Collection[str] = ()) -> DeclaredStudy:
@@ -145,6 +148,8 @@ class _Reading:
             seeds=SEEDS if entry.seeds is None else entry.seeds,
             windows=windows,
             references=bool(entry.references),
+            metrics=self._metrics(),
+            folder=self._folder,
         )
 
     def _plays(self, grid: Grid, axes: Axes, policies: list[DeclaredPolicy]) -> _Plays | None:
@@ -162,6 +167,22 @@ class _Reading:
         cells = [cell.problem for _, cell in points]
         made = tuple(DeclaredPoint(values, cell.problem) for values, cell in points)
         return _Plays(made, scenarios, policies, cells)
+
+    @property
+    def _folder(self) -> str:
+        """Folder of the file, where modules of metrics are looked for first."""
+        return str(self.path.resolve().parent)
+
+    def _metrics(self) -> dict[str, str]:
+        """Return the functions of metrics by their names."""
+        metrics = self.entry.metrics or {}
+        for name, function in metrics.items():
+            place = f"metrics.{name}"
+            self._check_name(place, name)
+            if function is not None:  # that is a fault already
+                what = (self._folder, "metric", ProblemError)
+                self.faults.attempt(place, user_function, function, *what)
+        return metrics
 
     def _check_name(self, path: str, name: str) -> None:
         if message := bad_name(name):

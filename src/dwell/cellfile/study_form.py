@@ -16,7 +16,7 @@ from dwell.cellfile.forms import (
     required,
 )
 from dwell.cellfile.structure import FileKind
-from dwell.model.bounds import MAX_COUNT, NOT_EMPTY, SEEDS, Bound, as_read
+from dwell.model.bounds import FUNCTION_PATH, MAX_COUNT, NOT_EMPTY, SEEDS, Bound, as_read
 
 VERSION = 1
 
@@ -136,6 +136,12 @@ STUDY = FileKind.of(
         "zip",
         ListForm(ListForm(NAME)),
         "Groups of parameters whose values go together, the first with the first.",
+        "none",
+    ),
+    optional(
+        "metrics",
+        MappingForm(TextForm(FUNCTION_PATH), keeps=True),
+        "Numbers of your own: name → function of a Run that returns a number.",
         "none",
     ),
     optional(

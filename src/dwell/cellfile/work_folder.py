@@ -45,6 +45,11 @@ class FolderMark(NamedTuple):
     version: int
     folders: tuple[str, ...]
 
+    @property
+    def key(self) -> str:
+        """Key of the version in the file."""
+        return f"dwell-{self.what}-folder"
+
 
 @contextmanager
 def open_work_folder(
@@ -108,7 +113,7 @@ def _require_kind(folder: Path, mark: FolderMark) -> None:
 def _take(folder: Path, mark: FolderMark, description: Description, notes: Description) -> None:
     """Write whose folder it is, or refuse it where it is another's."""
     path = folder / mark.file
-    text = json.dumps({f"dwell-{mark.what}-folder": mark.version, **description}, allow_nan=False)
+    text = json.dumps({mark.key: mark.version, **description}, allow_nan=False)
     digest = hashlib.sha256(text.encode()).hexdigest()
     whole = {**json.loads(text), "digest": digest, **notes}
     if path.is_file():

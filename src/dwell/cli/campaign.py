@@ -22,7 +22,7 @@ from dwell.cli.options import (
     option,
     seconds_of_runs,
 )
-from dwell.cli.output import file_name, print_json, working, write_report
+from dwell.cli.output import file_name, mark_of, print_json, working, write_report
 from dwell.errors import ExitCode
 from dwell.live.log import say
 from dwell.model.bounds import counted
@@ -176,7 +176,8 @@ def _write_page(
 
     with working("writing the report"):
         measured = read_measured(folder)
-        write_report(campaign_page(measured), page, figures=figures, static=static)
+        mark = mark_of(str(folder.resolve()))
+        write_report(campaign_page(measured), page, figures=figures, static=static, mark=mark)
     return measured
 
 

@@ -51,7 +51,7 @@ def check(
         if not check_node(problem, cell, node, keys, insecure=insecure, as_json=as_json):
             raise typer.Exit(ExitCode.WRONG)
         return
-    if faults := tuple(_class_faults(problem)):
+    if faults := tuple(class_faults(problem)):
         _refuse(faults, "\n".join(f"{cell}: {fault}" for fault in faults), as_json=as_json)
     from dwell.estimators import Profile, warnings_of
     from dwell.estimators.cell_warnings import unpriced
@@ -84,7 +84,7 @@ def _refuse(faults: Iterable[Fault], text: str, *, as_json: bool) -> NoReturn:
     raise typer.Exit(ExitCode.WRONG)
 
 
-def _class_faults(problem: Problem) -> Iterator[Fault]:
+def class_faults(problem: Problem) -> Iterator[Fault]:
     """Yield the faults of the policy and the estimator where these are a user's classes."""
     from dwell.estimators import by_name as make_estimator
     from dwell.model.bounds import CLASS_PATH

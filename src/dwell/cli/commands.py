@@ -25,7 +25,7 @@ from dwell.cli.schema import schema
 from dwell.cli.study import study
 from dwell.cli.testbed import testbed
 from dwell.cli.validate import validate
-from dwell.errors import DwellError, ExitCode, line_and_code
+from dwell.errors import ExitCode, line_and_code
 
 
 class Commands(TyperGroup):
@@ -41,16 +41,16 @@ class Commands(TyperGroup):
             return super().invoke(ctx)
         except BrokenPipeError:
             raise
-        except (DwellError, OSError, ModuleNotFoundError) as error:
+        except MemoryError:
+            typer.echo("error: not enough memory; ask for fewer windows", err=True)
+            raise typer.Exit(ExitCode.FAILED) from None
+        except Exception as error:
             known = line_and_code(error)
             if known is None:
                 raise
             line, code = known
             typer.echo(line, err=True)
             raise typer.Exit(code) from None
-        except MemoryError:
-            typer.echo("error: not enough memory; ask for fewer windows", err=True)
-            raise typer.Exit(ExitCode.FAILED) from None
         except KeyboardInterrupt:
             raise typer.Exit(ExitCode.INTERRUPTED) from None
 

@@ -19,7 +19,7 @@ from dwell.cli.options import (
     require_one_length,
     windows_of,
 )
-from dwell.cli.output import print_json, progress, working, write_file
+from dwell.cli.output import mark_of, print_json, progress, require_own, working, write_file
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -58,7 +58,9 @@ def demo(
     if seconds is not None:
         cells = (CANONICAL,) if real is None else REAL
         windows = windows_of(seconds, *(dwell.load(folder / name, traces=real) for name in cells))
-    windows = windows or WINDOWS
+    windows, page = windows or WINDOWS, out / "report.html"
+    mark = mark_of(str(folder.resolve()), str(real), seeds, windows)
+    require_own(page, mark)
     with progress("simulating") as shown:
         plan: dict[str, Any] = {"seeds": seeds, "windows": windows}
         plan |= {"processes": processes, "progress": shown}
@@ -71,13 +73,13 @@ def demo(
             tenants = tenants_demo(folder, **plan)
         else:
             comparisons = real_demo(folder, real, **plan)
-    page = out / "report.html"
     if not as_json:
         for comparison in comparisons:
             typer.echo(f"Cell {comparison.problem.name}\n")
             typer.echo(comparison_text(comparison))
     with working("writing the report"):
-        write_file(page, comparison_html(*comparisons, tenants=tenants, deadlines=deadlines))
+        html = comparison_html(*comparisons, tenants=tenants, deadlines=deadlines)
+        write_file(page, html + mark)
     if as_json:
         tables = {one.problem.name: one.table().to_dicts() for one in comparisons}
         print_json({"report": page, "comparisons": tables})

@@ -16,8 +16,10 @@ from dwell.cli.output import (
     aligned,
     block,
     file_name,
+    mark_of,
     print_json,
     progress,
+    require_own,
     warn,
     working,
     write_report,
@@ -188,12 +190,20 @@ def capacity(
 
     The count of the first entry is varied, the others stay: 10 seeds of 2,000 cycles a cell each.
     """
+    from dwell.record.fleet_run import fleet_document
     from dwell.report.capacity_page import capacity_page
-    from dwell.study.capacity import WhatIf, capacity_of, what_ifs
+    from dwell.study.capacity import WhatIf, capacity_of, policy_of, what_ifs
 
     if not 0 < limit < 1:
         raise typer.BadParameter(f"--limit: {limit:g} is not allowed; it must be between 0 and 1")
     asked = _read(file, phases, policy=policy)
+    page = out
+    if page is None and not as_json:
+        names = ", ".join(dict.fromkeys(policy_of(asked, one) for one in asked.entries))
+        page = Path("capacity", file_name(f"{asked.name}-{names}-{asked.phases}.html"))
+    mark = mark_of(fleet_document(asked), limit, most, what_if)
+    if page is not None:
+        require_own(page, mark)
     settings: dict[str, Any] = {"limit": limit, "most": most, "processes": processes}
     with progress(f"playing up to {most} robots") as shown:
         found = capacity_of(asked, **settings, progress=shown)
@@ -203,13 +213,10 @@ def capacity(
     for change, changed in what_ifs(asked) if what_if else ():
         with progress(f"what if: {change}") as shown:
             changes.append(WhatIf(change, capacity_of(changed, **settings, progress=shown)))
-    page = out
-    if page is None and not as_json:
-        page = Path("capacity", file_name(f"{asked.name}-{found.policy}-{found.phases}.html"))
     if page is not None or figures is not None:
         shown_page = capacity_page(asked.name, found, changes)
         with working("writing the report"):
-            write_report(shown_page, page, figures=figures, static=False)
+            write_report(shown_page, page, figures=figures, static=False, mark=mark)
     if as_json:
         more = {"what_if": [one.as_json() for one in changes]} if what_if else {}
         print_json({"fleet": asked.name, **found.as_json(), **more, "report": page})

@@ -164,10 +164,12 @@ def status(
     if check and watch:
         raise typer.BadParameter("--check looks once; leave --watch out")
     from dwell.cellfile import load_without_traces
+    from dwell.live.local_addresses import running_elsewhere
     from dwell.live.operator_client import OperatorClient
     from dwell.live.security import environment
 
-    with OperatorClient(load_without_traces(cell), environment(keys, insecure=insecure)) as visitor:
+    problem = load_without_traces(cell)
+    with OperatorClient(problem, environment(keys, insecure=insecure)) as visitor:
         if watch:
             _watch(visitor, as_json=as_json)
         answer = visitor.look()
@@ -175,7 +177,7 @@ def status(
     if as_json:
         print_json(answer)
     elif absent:
-        typer.echo(f"error: {answer['headline']}", err=True)
+        typer.echo(f"error: {answer['headline']} {running_elsewhere(problem)}".rstrip(), err=True)
     else:
         typer.echo("\n".join(status_lines(answer)))
     if absent or (check and answer["headline"]):

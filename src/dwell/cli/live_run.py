@@ -13,9 +13,10 @@ from typing import Any, Protocol
 import typer
 
 import dwell
+from dwell.cli.check import class_faults
 from dwell.cli.live_view import CellState, View, live_view
-from dwell.cli.output import print_json, working, write_file
-from dwell.errors import ExitCode, LiveError, installing, not_installed
+from dwell.cli.output import mark_of_run, print_json, working, write_file
+from dwell.errors import ExitCode, LiveError, ProblemError, installing, not_installed
 from dwell.live.stage_modules import require_stages
 from dwell.model import Problem, Scenario
 from dwell.model.bounds import counted
@@ -78,9 +79,13 @@ def run_live(
     scenario = scenario or _first_that_disturbs(problem)
     seconds = seconds or _length_s(problem.scenario(scenario))
     timeline = timeline_of(problem, scenario, seed=seed, seconds=seconds)
+    if faults := tuple(class_faults(problem)):
+        raise ProblemError(faults)
     require_stages(problem, file, problem.fabric.nodes)
     out = out or Path("live-out", problem.name)
     reported, told = _announce_left_out()
+    if (out / MARK).is_file():
+        typer.echo(f"note: the earlier run in {out}, and its report, are replaced", err=True)
     make_folder(out, MARK, "a live run's")
     problem = on_this_machine(problem)
     played = _ObservedRun(problem, scenario, seed, timeline)
@@ -260,7 +265,7 @@ def _told(run: Run, out: Path, *, reported: bool) -> _Outcome:
         return replace(outcome, phases=phases, instead="no report: it ended within its warm-up")
     if not reported:
         return replace(outcome, phases=phases, instead=f"no report; {installing('report')}")
-    write_file(page, run_html(run))
+    write_file(page, run_html(run) + mark_of_run(run))
     return replace(outcome, phases=phases, report=page)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import sys
@@ -12,12 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from dwell.errors import RunError
 from dwell.files import Content, write_whole
 from dwell.record.json_documents import json_ready
 
 if TYPE_CHECKING:
     from dwell.errors import Fault
     from dwell.model.progress import Progress
+    from dwell.record import Run
     from dwell.report.page import Page
 
 BLOCKS = "▁▂▃▄▅▆▇█"
@@ -83,7 +86,34 @@ def write_file(path: Path, content: Content) -> None:
         raise OSError(error.errno, error.strerror, str(path)) from None
 
 
-def write_report(page: Page, path: Path | None, *, figures: Path | None, static: bool) -> None:
+def mark_of(*source: object) -> str:
+    """Return the last line of a page made from a source, given as values for JSON."""
+    text = json.dumps(source, sort_keys=True, default=str)
+    return f"<!-- made from {hashlib.sha256(text.encode()).hexdigest()} -->\n"
+
+
+def mark_of_run(run: Run) -> str:
+    """Return the last line of the page of a run; the same run made again has the same."""
+    return mark_of(run.run_id or {**run.meta, "versions": None})
+
+
+def require_own(page: Path, mark: str) -> None:
+    """Refuse to replace a file, except a page with the same mark (see `mark_of`).
+
+    Raises
+    ------
+    RunError
+        If it is anything else.
+    """
+    if page.is_file() and not page.read_bytes().endswith(mark.encode()):
+        raise RunError(
+            f"{page} was made from something else; name another place with --out, or remove it"
+        )
+
+
+def write_report(
+    page: Page, path: Path | None, *, figures: Path | None, static: bool, mark: str
+) -> None:
     """Write a page, and its figures and tables as files where a folder is named for them.
 
     Parameters
@@ -94,12 +124,14 @@ def write_report(page: Page, path: Path | None, *, figures: Path | None, static:
         Made where there is none; files of the same names are replaced.
     static : bool
         Whether the page is without scripts.
+    mark : str
+        Last line of the page (see `mark_of`).
     """
     from dwell.report.figure_files import figure_files
     from dwell.report.page import page_html
 
     if path is not None:
-        write_file(path, page_html(page, static=static))
+        write_file(path, page_html(page, static=static) + mark)
     if figures is not None:
         figures.mkdir(parents=True, exist_ok=True)
         for name, data in figure_files(page):

@@ -14,8 +14,18 @@ import typer
 
 import dwell
 from dwell.cli.options import Json, argument, flag, option
-from dwell.cli.output import print_json, progress, working, write_file, write_report
+from dwell.cli.output import (
+    mark_of,
+    mark_of_run,
+    print_json,
+    progress,
+    require_own,
+    working,
+    write_file,
+    write_report,
+)
 from dwell.errors import RunError
+from dwell.record.run import NO_JOBS
 
 if TYPE_CHECKING:
     from dwell.files import Content
@@ -69,6 +79,10 @@ def report(
             raise RunError(f"{folder} is a {kind}; name one of its runs for {what}")
     if cells and kind != "fleet":
         raise RunError(f"{folder} is a {kind}, which has no cells; leave out --cells")
+    run = dwell.open_run(folder) if kind == "run" else None
+    mark = mark_of(str(folder.resolve())) if run is None else mark_of_run(run)
+    if page != folder / PAGE:
+        require_own(page, mark)
     if kind == "campaign":
         from dwell.cli.campaign import report_campaign
 
@@ -83,18 +97,21 @@ def report(
         if cells:
             extras["cells"] = _write_cells(folder, fleet.cells, static=static)
     with working("writing the report"):
-        if kind == "study":
-            from dwell.report.study_page import study_page
-
-            document = study_page(open_study(folder))
-        elif kind == "fleet":
+        if kind == "fleet":
             from dwell.report.fleet_page import fleet_page
 
             document = fleet_page(fleet, links=_links(folder, page))
+        elif run is None:
+            from dwell.report.study_page import study_page
+
+            document = study_page(open_study(folder))
         else:
             from dwell.report.run_page import run_page
 
-            run = dwell.open_run(folder)
+            if trace is not None and not (run.is_simulated or run.has_jobs):
+                # A measured run cannot be made again for it.
+                typer.echo(f"note: no {trace}: {NO_JOBS}", err=True)
+                trace = None
             extras["trace"] = trace
             if lost := run.losses:
                 extras |= {"recovered": run.meta["recovered"], "lost": lost}
@@ -108,7 +125,7 @@ def report(
                 files[mcap] = partial(write_mcap, run)
                 extras["mcap"] = mcap
             document = run_page(run)
-        write_report(document, page, figures=figures, static=static)
+        write_report(document, page, figures=figures, static=static, mark=mark)
         for path, content in files.items():
             write_file(path, content)
     if figures is not None:
@@ -137,7 +154,8 @@ def _write_cells(folder: Path, runs: Mapping[str, Run], *, static: bool) -> dict
     with progress("writing the reports of cells") as shown:
         for name, run in runs.items():
             pages[name] = folder / name / PAGE
-            write_report(run_page(run), pages[name], figures=None, static=static)
+            mark = mark_of_run(run)
+            write_report(run_page(run), pages[name], figures=None, static=static, mark=mark)
             if shown is not None:
                 shown(len(pages), len(runs))
     return pages

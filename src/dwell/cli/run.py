@@ -31,6 +31,7 @@ from dwell.cli.output import file_name, print_json, warn, working
 from dwell.display import milliseconds
 from dwell.errors import ExitCode, RunError
 from dwell.model.bounds import counted
+from dwell.record.json_documents import read_document
 
 if TYPE_CHECKING:
     from dwell.model import Problem
@@ -139,8 +140,8 @@ def _require_same(folder: Path, settings: Mapping[str, Any]) -> None:
     """Raise a RunError where a folder holds another run: other than this one made again."""
     if not (folder / "run.json").is_file():
         return
-    kept = dwell.open_run(folder).meta
-    # Versions of software make no other run.
+    # Of whatever version; that of the software makes no other run.
+    kept = read_document(folder / "run.json")
     if {**kept, "versions": None} != {**json.loads(json.dumps(settings)), "versions": None}:
         raise RunError(
             f"{folder} holds another run; choose another folder, or say --force to replace it"

@@ -17,6 +17,7 @@ from dwell.cli.options import (
     Seconds,
     Windows,
     argument,
+    flag,
     option,
     require_few,
     require_one_length,
@@ -52,6 +53,13 @@ def study(
     ] = None,
     windows: Windows = None,
     seconds: Seconds = None,
+    shard: Annotated[
+        str | None,
+        option("I/N", "Simulate one of N shards, in a folder of its own."),
+    ] = None,
+    merge: Annotated[
+        bool, flag("--merge", "Put all shards in the folder together, and simulate nothing.")
+    ] = False,
     # Options of what was `dwell study paper`; they say where that is.
     quick: Annotated[bool, typer.Option("--quick", hidden=True)] = False,
     chapter: Annotated[list[str] | None, typer.Option(hidden=True)] = None,
@@ -61,8 +69,9 @@ def study(
 ) -> None:
     """Simulate every scenario, policy, parameter and seed of a study.
 
-    What is finished stays in the folder, whatever ends the work: the same command goes on. Runs are
-    as long as the file says, if neither --windows nor --seconds is given.
+    Finished runs stay in the folder, whatever ends the work: the same command plays the rest. Runs
+    have the length of the file, if neither --windows nor --seconds is given. Several computers
+    share a study with --shard; copy their shards into one folder, and --merge them.
     """
     if str(file) == "paper" or quick or chapter or real or examples:
         raise typer.BadParameter(
@@ -70,8 +79,11 @@ def study(
             "(reproduction/README.md)"
         )
     from dwell.estimators import unplayed
-    from dwell.study import load_study, run_study
+    from dwell.study import Shard, load_study, merge_shards, run_shard, run_study
 
+    if merge and shard is not None:
+        raise typer.BadParameter("give --shard or --merge")
+    mine = None if shard is None else Shard.read(shard)
     require_one_length(windows, seconds)
     plan = load_study(file)
     if seeds is not None:
@@ -84,8 +96,23 @@ def study(
     late = (unplayed(point.problem, one, plan.windows) for point, one in played)
     warn(file, dict.fromkeys(chain.from_iterable(late)))
     folder = out or Path("studies", file_name(plan.name))
-    with _interruptible(folder, plan) as shown:
-        result = run_study(plan, folder=folder, processes=processes, dask=dask, progress=shown)
+    if mine is not None:
+        with _interruptible(mine.folder(folder), plan) as shown:
+            runs = run_shard(
+                plan, mine, folder=folder, processes=processes, dask=dask, progress=shown
+            )
+        found = {"study": plan.name, "folder": mine.folder(folder), "shard": shard, "runs": runs}
+        if as_json:
+            print_json(found)
+        else:
+            typer.echo(f"shard {shard}: {counted(runs, 'run')} in {mine.folder(folder)}")
+        return
+    if merge:
+        with working("merging"):
+            result = merge_shards(plan, folder)
+    else:
+        with _interruptible(folder, plan) as shown:
+            result = run_study(plan, folder=folder, processes=processes, dask=dask, progress=shown)
     if as_json:
         with working("intervals"):
             table = result.table([measure.column for measure in _measures(plan)]).to_dicts()
@@ -100,20 +127,20 @@ def study(
 @contextmanager
 def _interruptible(folder: Path, study: Study) -> Iterator[Progress]:
     """Show progress; after Ctrl-C, say what is finished and how to go on."""
-    done = 0
+    done, of = 0, study.runs
     try:
         with progress("simulating", cycles=study.cycles / study.runs) as shown:
 
             def count(finished: int, total: int) -> None:
-                nonlocal done
-                done = finished
+                nonlocal done, of
+                done, of = finished, total
                 if shown is not None:
                     shown(finished, total)
 
             yield count
     except KeyboardInterrupt:
         typer.echo(
-            f"interrupted: {done} of {counted(study.runs, 'run')} are finished and stay in "
+            f"interrupted: {done} of {counted(of, 'run')} are finished and stay in "
             f"{folder}; the same command goes on from there",
             err=True,
         )
@@ -122,9 +149,10 @@ def _interruptible(folder: Path, study: Study) -> Iterator[Progress]:
 
 def _measures(study: Study) -> list[Measure]:
     """Return what the terminal shows."""
-    from dwell.report.formatting import COST, MIGRATIONS, RATE, REGRET
+    from dwell.report.formatting import COST, MIGRATIONS, RATE, REGRET, own_measures
 
-    return [RATE, COST, MIGRATIONS, *([REGRET] if study.references else [])]
+    regret = [REGRET] if study.references else []
+    return [RATE, COST, MIGRATIONS, *regret, *own_measures(study.metrics)]
 
 
 def _text(result: StudyResult) -> str:

@@ -11,7 +11,15 @@ import typer
 
 import dwell
 from dwell.cli.options import Json, Processes, Traces, argument, option, require_few
-from dwell.cli.output import json_text, print_json, progress, write_file
+from dwell.cli.output import (
+    json_text,
+    mark_of,
+    mark_of_run,
+    print_json,
+    progress,
+    require_own,
+    write_file,
+)
 from dwell.errors import RunError
 
 if TYPE_CHECKING:
@@ -42,6 +50,7 @@ def validate(
     as_json: Json = False,
 ) -> None:
     """Set what a calibrated cell predicts beside what its runs measured, and judge it."""
+    from dwell.model.document import to_document
     from dwell.report.validation_page import validation_html, validation_text
     from dwell.study.validation import validate as validate_cell
 
@@ -49,6 +58,11 @@ def validate(
     opened = _open(runs)
     ids, usual = _sidecar(cell)
     used = [*ids, *(path.resolve().name for path in calibrated_from or ())]
+    out = out or Path("validations", problem.name)
+    page, table = out / "report.html", out / "validation.json"
+    marks = sorted(map(mark_of_run, opened.values()))
+    mark = mark_of(to_document(problem), marks, sorted(used), seeds)
+    require_own(page, mark)
     with progress("simulating") as show:
         validation = validate_cell(
             opened,
@@ -59,10 +73,8 @@ def validate(
             processes=processes,
             progress=show,
         )
-    out = out or Path("validations", problem.name)
-    page, table = out / "report.html", out / "validation.json"
     document = _document(validation)
-    write_file(page, validation_html(validation))
+    write_file(page, validation_html(validation) + mark)
     write_file(table, json_text(document) + "\n")
     if as_json:
         print_json({"report": page, "table": table, **document})

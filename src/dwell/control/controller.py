@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -28,10 +27,10 @@ from dwell.model.controller_settings import SHADOW_FRACTION
 from dwell.model.qos import NO_ERROR
 from dwell.model.semantics import too_many_shadows
 from dwell.model.table_columns import DECISIONS, Feature, columns_of, those_with
+from dwell.model.user_classes import UserCall
 from dwell.policies import MinimalPolicy, parameters_of
 from dwell.policies import by_name as policy_by_name
 from dwell.policies.pricing import Pricing
-from dwell.policies.protocol import Proposer
 from dwell.policies.user_policy import as_proposer
 
 Ints: TypeAlias = NDArray[np.int64]
@@ -170,15 +169,17 @@ class Controller:
         self.problem, self.coordination = problem, coordination
         if isinstance(policy, str):
             policy, estimator = _without_estimator(policy, estimator, problem)
-        named = (policy or problem.controller.policy, estimator or problem.controller.estimator)
+        policy = policy or problem.controller.policy
+        estimator = estimator or problem.controller.estimator
         #: Names of the policy and the estimator where these are classes of a user's own, else None.
-        self._own = tuple(name if CLASS_PATH.holds(name) else None for name in named)
-        self._policy = _prepared_policy(policy, problem)
-        if estimator is None or isinstance(estimator, str):
-            name = estimator or problem.controller.estimator
-            self._estimator = as_started(estimator_by_name(name, problem), problem)
-        else:
-            self._estimator = as_started(copy.deepcopy(estimator), problem, again=True)
+        self._own = tuple(one if CLASS_PATH.holds(one) else None for one in (policy, estimator))
+        decider = policy_by_name(policy, problem) if isinstance(policy, str) else policy
+        with UserCall(decider, "start"):
+            self._policy = as_proposer(decider)
+            self._policy.start(problem)
+        made = estimator_by_name(estimator, problem) if isinstance(estimator, str) else estimator
+        with UserCall(made, "start"):
+            self._estimator = as_started(made, problem, copied=made is estimator)
         if coordination is not None:
             coordination.meet(self._estimator)
         #: Share of the cycles that the estimator wants sent through each alternative.
@@ -352,16 +353,13 @@ class Controller:
         incumbent = course.placement
         # With the switching term of the decision that led to it.
         measured = self._pricing.cost(observed, incumbent, course.previous)
-        seen_by = observed if recent is None else recent
-        estimates = dict(self._estimator.estimate(observed=seen_by, incumbent=incumbent, own=own))
-        if not self._estimator.learns:
-            # It knows no more of the incumbent than the window shows.
-            estimates[incumbent] = observed
-        decision, after = self._policy.propose(
-            observed=observed,
-            estimates=estimates,
-            tentative=course.by_guard or self.coordination is not None,
-        )
+        estimates = self._estimates(observed, own, recent or observed)
+        with UserCall(self.policy, "decide", self.looked.window):
+            decision, after = self._policy.propose(
+                observed=observed,
+                estimates=estimates,
+                tentative=course.by_guard or self.coordination is not None,
+            )
         decision = self._checked(decision)
         seen = observed.l95_ms, observed.violation_rate, measured
         priced = self._priced(decision, estimates)
@@ -369,6 +367,26 @@ class Controller:
         if self.coordination is not None:
             self._consider(proposal, estimates, self.coordination)
         return proposal
+
+    def _estimates(
+        self, observed: QoS, own: Mapping[str, float], recent: QoS
+    ) -> FrozenDict[str, QoS]:
+        """Estimate every candidate; a policy cannot change the estimates that are recorded."""
+        incumbent = self.course.placement
+        with UserCall(self.estimator, "estimate", self.looked.window):
+            known = self._estimator.estimate(observed=recent, incumbent=incumbent, own=own)
+            estimates = dict(known)
+        if not self._estimator.learns:
+            # It knows no more of the incumbent than the window shows.
+            estimates[incumbent] = observed
+        missing = [one for one in self._names if not isinstance(estimates.get(one), QoS)]
+        if missing:
+            who, window = type(self.estimator).__name__, self.looked.window
+            raise MetricError(
+                f"{who}.estimate returned no QoS for {missing[0]} at window {window}; it must "
+                f"return one for each of {', '.join(self._names)}"
+            )
+        return FrozenDict(estimates)
 
     def _consider(
         self, proposal: Proposal, estimates: Mapping[str, QoS], coordination: Coordination
@@ -394,7 +412,8 @@ class Controller:
     def learn(self, evidence: Callable[[], Evidence]) -> None:
         """Have the estimator learn from a window, if it learns, before it is decided on."""
         if self._estimator.learns:
-            self._estimator.look(evidence())
+            with UserCall(self.estimator, "learn", self.looked.window):
+                self._estimator.look(evidence())
 
     def utilisation(self, window: ClosedWindow) -> Floats:
         """Busy, own and shadow share of every resource, shape (3, resources)."""
@@ -428,7 +447,7 @@ class Controller:
             self._policy.commit(proposal.after)
         elif decision.migrated or self.course.previous != self.course.placement:
             # The fleet decides in its place, so that it has decided nothing.
-            self._policy.adopt(decision.name)
+            self._adopt(decision.name)
         self._record(proposal)
         if decision.migrated:
             self.course.move(decision.name, decision.dwell)
@@ -461,7 +480,7 @@ class Controller:
         self._record(proposal, why)
         if course.previous != course.placement:
             # Nothing has been decided since the guard moved; this window has paid for the move.
-            self._policy.adopt(course.placement)
+            self._adopt(course.placement)
         course.hold(wanted.name)
 
     def miss(self) -> None:
@@ -496,8 +515,8 @@ class Controller:
                     f"no candidate (candidates here: {', '.join(self.problem.candidates)})"
                 )
         if left != self.course.placement:
-            self._policy.adopt(left)
-        self._policy.adopt(name)
+            self._adopt(left)
+        self._adopt(name)
         self.course.fall(name, left)
         if self.coordination is not None:
             self.coordination.place(name)
@@ -528,7 +547,12 @@ class Controller:
         """Tell a policy that believes the cell elsewhere where it is."""
         if name != believed:
             # The second time there is no move to tell of, so that no switching term remains.
-            self._policy.adopt(name)
+            self._adopt(name)
+            self._adopt(name)
+
+    def _adopt(self, name: str) -> None:
+        """Report to the policy where the cell is."""
+        with UserCall(self.policy, "adopt", self.looked.window):
             self._policy.adopt(name)
 
     def _record(self, proposal: Proposal, why: str | None = None) -> None:
@@ -580,7 +604,8 @@ class Controller:
     def _supported(self) -> list[float]:
         if not self._estimator.supports:
             return []
-        support = self._estimator.support()
+        with UserCall(self.estimator, "support", self.looked.window):
+            support = self._estimator.support()
         behind = [support[name] for name in self._names if name in support]
         if len(behind) < len(self._names):
             who, known = type(self.estimator).__name__, ", ".join(support) or "nothing"
@@ -634,15 +659,6 @@ def _without_estimator(
     if named is not None and estimator is not None and estimator != named:
         raise PolicyError(f"policy {name!r} names its estimator; leave the other one out")
     return policy, named or estimator
-
-
-def _prepared_policy(policy: MinimalPolicy | str | None, problem: Problem) -> Proposer:
-    """Return a started copy of a policy."""
-    if policy is None or isinstance(policy, str):
-        policy = policy_by_name(policy or problem.controller.policy, problem)
-    prepared = as_proposer(policy)
-    prepared.start(problem)
-    return prepared
 
 
 def _shadow_fraction(estimator: CellEstimator, problem: Problem) -> float:

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.control.coordination import Coordination, Verdict, Wish
-from dwell.cost import excess, hamming, price
+from dwell.cost import GAIN_TOLERANCE, exceeds, excess, hamming, price
 from dwell.estimators.fleet_prices import CellTerms, FleetPrice, FleetPrices, PricedCell
 from dwell.estimators.load_table import LoadTable, load_table
 from dwell.estimators.presents import Present
@@ -180,7 +180,7 @@ class FleetLedger:
             if name != self.placements[index]:
                 rise = self.loads.rise(self._at, index, self.placements[index], name)
                 rise += self.alone[index][name] - self.alone[index][self.placements[index]]
-                if -rise > self.owed(index, name) or self._helps_the_worst(index, name):
+                if exceeds(-rise, self.owed(index, name)) or self._helps_the_worst(index, name):
                     found.append((rise, name))
         return [name for _, name in sorted(found)[:LOOKS]]
 
@@ -229,12 +229,12 @@ class FleetLedger:
             one, other = self._from_the_worst(before), self._from_the_worst(after)
             if one != other:
                 return other < one
-        return sum(before) - sum(after) > owed
+        return exceeds(sum(before) - sum(after), owed)
 
     def _from_the_worst(self, costs: Sequence[float]) -> list[int]:
         """Costs of cells in steps of the least Δ_min, the largest first."""
-        step = self._least or 1e-9
-        return sorted((math.ceil(cost / step) for cost in costs[: len(self.cells)]), reverse=True)
+        step, own = self._least or GAIN_TOLERANCE, costs[: len(self.cells)]
+        return sorted((math.ceil((cost - GAIN_TOLERANCE) / step) for cost in own), reverse=True)
 
 
 class Seat(Coordination):

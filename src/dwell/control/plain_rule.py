@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.control.controller import Controller
-from dwell.cost import tier_nodes
+from dwell.cost import GAIN_TOLERANCE, tier_nodes
 from dwell.estimators import Profile
 from dwell.model import Objective
 from dwell.policies import ATP, DTP, Cusum, LatencyFirst, Static
@@ -82,6 +82,7 @@ def plain_rule(controller: Controller) -> PlainRule | None:
         numbers={
             **numbers(own, names),
             **_objective(problem.objective),
+            "gain_tolerance": GAIN_TOLERANCE,
             "is_priced": own.objective is not None,
             "incumbent": names.index(controller.course.placement),
             "previous": names.index(controller.course.previous),

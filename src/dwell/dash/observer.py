@@ -23,6 +23,7 @@ from dwell.dash.feed import Feed
 from dwell.errors import LiveError
 from dwell.live.cycle_ledger import Ledger, LiveCycle
 from dwell.live.failures import start_thread
+from dwell.live.local_addresses import running_elsewhere
 from dwell.live.log import printable
 from dwell.live.messages import Accepted, Beat, Stamped, decode
 from dwell.live.operator_client import OperatorClient
@@ -378,7 +379,10 @@ class Observer:
             self._look()
 
     def _look(self) -> None:
-        self._answer(self._client.look(patience_s=MOST_ASK_S))
+        status = self._client.look(patience_s=MOST_ASK_S)
+        if status["health"] == "absent":
+            status["headline"] = f"{status['headline']} {running_elsewhere(self.problem)}".rstrip()
+        self._answer(status)
 
     def _answer(self, status: Mapping[str, Any]) -> None:
         """Take in how the cell is, and what has happened since the answer before."""

@@ -107,7 +107,7 @@ class RecordedCell:
 
 def same_realisation(one: Run, other: Run) -> bool:
     """Whether two runs met the same draws, cycle by cycle."""
-    simulated = all(run.meta.get("kind", "simulated") == "simulated" for run in (one, other))
+    simulated = one.is_simulated and other.is_simulated
     drawn = [(run.meta.get("seed"), run.meta.get("scenario")) for run in (one, other)]
     return simulated and drawn[0] == drawn[1] and one.problem.drawn == other.problem.drawn
 
@@ -119,19 +119,19 @@ class _Contents:
         self.run, self.unit, self.source, self.problem = run, unit, source, run.problem
         self.growing = run.unfinished
         self._candidates = tuple(self.problem.candidates)
-        cycles = run.arrays("cycles")
-        self._release_ns = cycles["release_ns"].astype(np.int64, copy=False)
+        cycles, counted = run.arrays("cycles"), slice(run.last_window_end)
+        self._release_ns = cycles["release_ns"][counted].astype(np.int64, copy=False)
         if not len(self._release_ns):
             raise RunError(f"{source}: this run has no cycles yet")
-        latency_ms = cycles["latency_ns"] / 1e6
+        latency_ms = cycles["latency_ns"][counted] / 1e6
         latency_ms[latency_ms >= NEVER_NS / 1e6] = np.nan
-        self._cycle = cycles["cycle"].astype(np.int64, copy=False)
+        self._cycle = cycles["cycle"][counted].astype(np.int64, copy=False)
         seconds = np.maximum.accumulate(self._release_ns) / 1e9
         self.strip = Strip(
             at=seconds if unit == "s" else self._cycle.astype(np.float64),
             latency_ms=latency_ms,
-            missed=cycles["missed"].astype(bool, copy=False),
-            placement=placement_codes(cycles.names("placement"), self._candidates),
+            missed=cycles["missed"][counted].astype(bool, copy=False),
+            placement=placement_codes(cycles.names("placement")[counted], self._candidates),
             number=self._cycle,
         )
         size, period_s = self.problem.window_cycles, self.problem.pipeline.period_ms / 1e3

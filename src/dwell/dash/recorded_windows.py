@@ -66,9 +66,7 @@ class RecordedWindows:
         self.placement = placement_codes(windows.names("placement"), self._candidates)
         self.seen = {name: windows[of].astype(np.float64) for name, of in SEEN.items()}
         self.used = {
-            name: windows[f"u_{name}"].astype(np.float64)
-            for name in problem.fabric.resources
-            if f"u_{name}" in windows
+            name: windows[f"u_{name}"].astype(np.float64) for name in problem.fabric.resources
         }
         self._decide(run.arrays("decisions"))
 
@@ -95,7 +93,6 @@ class RecordedWindows:
         self.costs = {
             name: self._by_window(table[f"j_{name}"].astype(np.float64))
             for name in self._candidates
-            if f"j_{name}" in table
         }
 
     def _by_window(self, column: Floats) -> Floats:
@@ -177,19 +174,15 @@ class RecordedWindows:
         """Return what a decision believed of a candidate: cost, L95, V_D, whether it is in caps."""
         columns = (f"j_{name}", f"est_l95_ms_{name}", f"est_violation_rate_{name}")
         values = self._numbers(row, *columns)
-        eligible = f"eligible_{name}"
-        within = bool(self.decisions[eligible][row]) if eligible in self.decisions else True
+        within = bool(self.decisions[f"eligible_{name}"][row])
         found = zip(("cost", "l95_ms", "violation_rate"), values.values(), strict=True)
         return {**dict(found), "eligible": within}
 
     def _numbers(self, row: int, *columns: str) -> Plain:
         """Return values of a decision; None where there is none."""
-        table = self.decisions
+        rows = slice(row, row + 1)
         return {
-            name: plain(table[name][row : row + 1].astype(np.float64), 4)[0]
-            if name in table
-            else None
-            for name in columns
+            name: plain(self.decisions[name][rows].astype(np.float64), 4)[0] for name in columns
         }
 
 

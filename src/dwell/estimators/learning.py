@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, TypeAlias
+from typing import ClassVar, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +44,6 @@ class Learning(Online):
         If `half_life_windows` is out of its range.
     """
 
-    supports = True
     #: Half-lives after which a measured value gives way to newer ones, and after which a part that
     #: was not measured any more is as declared again.
     MEMORY: ClassVar[float]
@@ -62,9 +61,16 @@ class Learning(Online):
         self.shadow_fraction = given
         half_life = settings.half_life_windows if half_life_windows is None else half_life_windows
         HALF_LIFE_WINDOWS.check("half_life_windows", half_life)
-        self.memory, self.unseen = self.MEMORY * half_life, self.UNSEEN * half_life
+        #: In decisions.
+        decisions = half_life * problem.decisions_per_window
+        self.memory, self.unseen = self.MEMORY * decisions, self.UNSEEN * decisions
         self.seed = seed
         self.start(problem)
+
+    @classmethod
+    def from_problem(cls, problem: Problem) -> Self:
+        """Make the estimator with the settings of ``problem.controller``."""
+        return cls(problem)
 
     def __repr__(self) -> str:
         return (
@@ -75,6 +81,7 @@ class Learning(Online):
     def start(self, problem: Problem) -> None:
         """Forget everything but the profile."""
         super().start(problem)
+        #: Decisions that have been learnt from.
         self._window = 0
         self._pools = {
             part: Pool(reference, isinstance(part, Message))
@@ -111,7 +118,7 @@ class Learning(Online):
         return {
             name: Support(
                 min(self._pools[part].measured for part in parts),
-                self._window - min(self._pools[part].last for part in parts),
+                self._windows_since(min(self._pools[part].last for part in parts)),
             )
             for name, parts in self._parts.items()
         }
@@ -127,14 +134,18 @@ class Learning(Online):
     def _widening(self, pool: Pool) -> float:
         if pool.is_declared:
             return 0.0
-        return WIDENING * math.sqrt(max(self._window - pool.last, 0))
+        return WIDENING * math.sqrt(max(self._windows_since(pool.last), 0))
+
+    def _windows_since(self, decision: int) -> float:
+        """Return the age of what was learnt at a decision, in windows."""
+        return (self._window - decision) / self.problem.decisions_per_window
 
     def _known_error(self, name: str, rate: float) -> tuple[float, float]:
         pools = [self._pools[part] for part in self._parts[name]]
         measured = [pool for pool in pools if not pool.is_declared]
         if not measured:
             return 0.0, 0.0
-        l95_ms = math.sqrt(sum(pool.error_ms**2 for pool in measured))
+        l95_ms = math.hypot(*(pool.error_ms for pool in measured))
         widened = max(map(self._widening, measured)) * self._playing.played(name).l95_ms
         count = max(min(pool.measured for pool in measured), 1)
         return math.hypot(l95_ms, widened), unseen_error(rate, count)

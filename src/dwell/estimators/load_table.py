@@ -87,7 +87,7 @@ class LoadTable:
         self.kinds = kinds_of(cells)
         self.work = tuple(_work(cell.problem, shared) for cell in cells)
         if cycles is None:
-            cycles = min(max(2 * CYCLES // len(cells) ** 2, FEWEST), MOST)
+            cycles = min(max(2 * CYCLES // (len(cells) * len(cells)), FEWEST), MOST)
         plays = FleetPrices(cells, shared, cycles * len(cells))
         asked = [(kind, name) for kind in dict.fromkeys(self.kinds) for name in self.work[kind]]
         self.columns: dict[tuple[int, str], LoadColumn] = {}
@@ -137,11 +137,11 @@ def _controlled(
     if count < 3:
         return windows.mean(axis=0), np.full(2, np.inf)
     spread = alone - alone.mean(axis=0)
-    squares = (spread**2).sum(axis=0)
+    squares = (spread * spread).sum(axis=0)
     slope = np.divide((spread * windows).sum(axis=0), squares, where=squares > 0, out=0 * squares)
     rest = windows - slope * alone
-    errors = np.hypot(rest.std(axis=0, ddof=2) / np.sqrt(count), slope * known_error)
-    return np.maximum(rest.mean(axis=0) + slope * known, 0.0), errors
+    variance = rest.var(axis=0, ddof=2) / count + (slope * known_error) * (slope * known_error)
+    return np.maximum(rest.mean(axis=0) + slope * known, 0.0), np.sqrt(variance)
 
 
 _known: dict[tuple[tuple[PricedCell, ...], tuple[str, ...]], LoadTable] = {}

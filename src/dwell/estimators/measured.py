@@ -83,7 +83,7 @@ class Meter:
         self._times = PartTimes(len(self._parts))
         costs = [_cost(problem, part) for part in self._parts]
         self._cost, self._usual_cost = np.array(costs), np.array(costs)
-        self._demands = PartTimes(len(self._parts), self._cost, self._links())
+        self._demands = PartTimes(len(self._parts), self._cost, *self._links())
         nodes = problem.fabric.nodes
         #: Parts whose jobs need more of the core beside foreign threads, with their nodes.
         self._interfered = [
@@ -106,10 +106,11 @@ class Meter:
     ) -> dict[Part, Floats]:
         """Demands of every part that the window has any of, milliseconds, infinite where lost.
 
-        The demand of a job is its work: how long it takes alone on its node, what it waits for
-        that nobody on the node is the cause of included; of a message its
-        delay: the time on the way less waiting behind others of the cell, and less their
-        transmission at the rate of the link. They are overwritten by those of the next window.
+        The demand of a job is its work: how long it takes alone on its node, with the waits that no
+        job there causes. The demand of a message is its delay: the time on the way less the wait
+        behind other messages of the cell, and less its transmission at the rate of the link. A
+        message that waited for a repeated message counts with the last delay of its link that is
+        not longer than its time on the way. The next window overwrites the values.
 
         Parameters
         ----------
@@ -229,16 +230,19 @@ class Meter:
             received.append(cores)
         return np.array(received)
 
-    def _links(self) -> Ints:
-        """Number of each part's link, if it is a message on one that has a rate; else -1."""
-        rated = [
-            link.name for link in self._problem.fabric.links.values() if link.rate_mbps < np.inf
-        ]
-        links = [
-            rated.index(part.link) if isinstance(part, Message) and part.link in rated else -1
-            for part in self._parts
-        ]
-        return np.array(links, np.int64)
+    def _links(self) -> tuple[Ints, Ints]:
+        """By part: the number of the link on which it waits, else -1; whether for repeats, 1 or 0.
+
+        Messages wait on links that have a rate, or repeat what is lost and keep the order.
+        """
+        links = self._problem.fabric.links.values()
+        repeating = [one.name for one in links if one.in_order and one.retransmit_ms is not None]
+        waited = [one.name for one in links if one.rate_mbps < np.inf or one.name in repeating]
+        names = [part.link if isinstance(part, Message) else None for part in self._parts]
+        number = np.array(
+            [waited.index(name) if name in waited else -1 for name in names], np.int64
+        )
+        return number, np.array([name in repeating for name in names], np.int64)
 
     def _layout(self, active: int) -> CyclesLayout:
         """Return what cycles under a candidate, and their shadows, have for themselves."""

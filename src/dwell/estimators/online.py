@@ -56,7 +56,6 @@ class Online(CellEstimator):
         Seed of what is played.
     """
 
-    learns = True
     seed = SEED
 
     def start(self, problem: Problem) -> None:
@@ -70,7 +69,10 @@ class Online(CellEstimator):
             name: tuple(dict.fromkeys(parts_of(problem.pipeline, placed)))
             for name, placed in problem.candidates.items()
         }
-        self._foreign = {name: ForeignThreads(node) for name, node in problem.fabric.nodes.items()}
+        every = problem.decisions_per_window
+        self._foreign = {
+            name: ForeignThreads(node, every) for name, node in problem.fabric.nodes.items()
+        }
         self._down: frozenset[str] = frozenset()
         self._shared: frozenset[str] = frozenset()
         #: Counts presents: changes, and every time that what is known of one has doubled.
@@ -121,10 +123,6 @@ class Online(CellEstimator):
         """Take in a window: what it showed of each part, once it is known of its nodes."""
         self._take_in_pending()
         self._evidence = self._pending = evidence
-
-    def look(self, evidence: Evidence) -> None:
-        """Learn from a window."""
-        self.learn(evidence)
 
     def _take_in_pending(self) -> None:
         """Take in the demands of the last window, if they have not been; its nodes come first."""

@@ -17,6 +17,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.kernels.elementary import cube_root, logarithms
 from dwell.kernels.meter import places
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -307,7 +308,7 @@ class PlaceSums:
         # Of a sum of exponential values, by the cube root of its mean (Wilson and Hilferty).
         part = 1.0 / (9.0 * size)
         largest = max(self.larger, self.smaller, 0.0) / size
-        off: float = (largest ** (1.0 / 3.0) - (1.0 - part)) / math.sqrt(part)
+        off: float = (cube_root(largest) - (1.0 - part)) / math.sqrt(part)
         return off / math.sqrt(1.0 + ((together or size) - 1) * likeness)
 
 
@@ -343,7 +344,7 @@ def _likeness(ordered: Floats, values: Floats, block: int) -> float:
     if stretches < 2 or block < 2 or ordered[0] == ordered[-1]:
         return 0.0
     left, right = ordered.searchsorted(values, "left"), ordered.searchsorted(values, "right")
-    logs = -np.log1p(-(left + right + 1) / (2 * len(ordered) + 2))
+    logs = -logarithms(1.0 - (left + right + 1) / (2 * len(ordered) + 2))
     variance = float(logs.var())
     if variance == 0.0:
         return 0.0

@@ -462,7 +462,7 @@ def _mean_and_error(values: Sequence[float]) -> tuple[float, float]:
     mean = values[0] + sum(value - values[0] for value in values) / count
     if count < 2:
         return mean, abs(mean)
-    squares = sum((value - mean) ** 2 for value in values)
+    squares = sum((value - mean) * (value - mean) for value in values)
     # Of few values the deviation is itself hardly known: about Student's t over 2.
     few = (count + 1) / (count - 1)
     return mean, few * math.sqrt(squares / (count * (count - 1)))

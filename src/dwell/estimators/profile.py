@@ -19,7 +19,7 @@ estimates.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,8 +110,13 @@ class Profile(CellEstimator):
         self._table, self._work = tuple(table), tuple(work)
         self.start(problem)
 
+    @classmethod
+    def from_problem(cls, problem: Problem) -> Self:
+        """Make the estimator with the defaults of its parameters."""
+        return cls(problem)
+
     def __repr__(self) -> str:
-        return f"Profile(samples={self._samples}, seed={self._seed})"
+        return f"{type(self).__name__}(samples={self._samples}, seed={self._seed})"
 
     def start(self, problem: Problem) -> None:
         """Forget every window."""

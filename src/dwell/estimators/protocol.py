@@ -105,6 +105,11 @@ class CellEstimator(ABC):
     shadow_fraction: float = 0.0
     revision: int = 0
 
+    def __init_subclass__(cls) -> None:
+        """Use the `learn` and the `support` of a subclass, also of a user's."""
+        cls.learns = issubclass(cls, Learner)
+        cls.supports = cls.support is not CellEstimator.support
+
     @property
     def given(self) -> object:
         """The object that was given as the estimator."""
@@ -121,7 +126,8 @@ class CellEstimator(ABC):
 
     def look(self, evidence: Evidence) -> None:
         """Take in what happened to the jobs of a window, where it learns."""
-        return
+        if isinstance(self, Learner):
+            self.learn(evidence)
 
     @abstractmethod
     def estimate(

@@ -122,7 +122,7 @@ def by_name(name: str, problem: Problem) -> Estimator:
 
 
 def name_in_run(meta: Mapping[str, Any]) -> str:
-    """Return the name of the estimator that a run had; the profile where it does not say.
+    """Return the name of the estimator that a run had.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ def name_in_run(meta: Mapping[str, Any]) -> str:
     RunError
         If it is none of these.
     """
-    told = str(meta.get("estimator") or "profile")
+    told = str(meta.get("estimator"))
     classes = {entry.path.partition(":")[2]: name for name, entry in REGISTRY.items()}
     name = classes.get(told, told)
     if name not in REGISTRY and not CLASS_PATH.holds(name):

@@ -196,9 +196,9 @@ class SlowProcesses:
                 continue
             seen, shares = one.seen(realisation, edges_ns)
             spread = shares - shares.mean()
-            variance, effect = float(spread @ spread), most
+            variance, effect = float((spread * spread).sum()), most
             if variance:
-                slope = spread @ columns / variance
+                slope = (spread[:, None] * columns).sum(axis=0) / variance
                 columns = columns - np.outer(spread, slope)
                 effect = np.minimum(np.abs(slope), most)
             # A sum of n exponential times on, where n has a Poisson distribution.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 
 from dwell.estimators.evidence import Evidence
@@ -55,18 +56,17 @@ class UserEstimator(CellEstimator):
         return support
 
 
-def as_started(given: Estimator, problem: Problem, *, again: bool = False) -> CellEstimator:
+def as_started(given: Estimator, problem: Problem, *, copied: bool) -> CellEstimator:
     """Return an estimator that the controller works with, at the begin of a run.
 
     Parameters
     ----------
-    again : bool
-        Whether one of ours may have seen windows since it was made.
+    copied : bool
+        Whether to start a copy: the object may have seen windows since it was made.
     """
-    if isinstance(given, CellEstimator):
-        if again:
-            given.start(problem)
-        return given
-    own = UserEstimator(given)
-    own.start(problem)
+    made = copy.deepcopy(given) if copied else given
+    own = made if isinstance(made, CellEstimator) else UserEstimator(made)
+    # One of ours starts itself when it is made.
+    if copied or own is not made:
+        own.start(problem)
     return own

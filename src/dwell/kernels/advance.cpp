@@ -60,12 +60,20 @@ DWELL_EXPORT void dwell_logged_instants(const Tables* tables, i64 cell_0, i64 n_
   }
 }
 
-// Sends the state of a task that moves (see send_state); `out`: at_ns, has_arrived, attempt.
-DWELL_EXPORT void dwell_send_state(const Tables* tables, i64 hop, i64 cycle, i64 attempt, i64 now,
-                                   i64* out) noexcept {
+// Sends the state of a task that moves (see send_state); `key` is the event of its arrival, `out`
+// the instant of the next attempt, -1 for none, and its number. There must be room.
+DWELL_EXPORT void dwell_send_state(const Tables* tables, i64 hop, i64 cycle, i64 attempt, i64 key,
+                                   i64 now, i64* out) noexcept {
   Simulation<true, false> simulation(*tables);
-  const StateSent sent = send_state(simulation, hop, cycle, attempt, now);
-  out[0] = sent.at_ns;
-  out[1] = sent.has_arrived;
-  out[2] = sent.attempt;
+  const StateAttempt next = send_state(simulation, hop, cycle, attempt, key, now);
+  simulation.queue.save(tables->clock[0]);
+  out[0] = next.at_ns;
+  out[1] = next.number;
+}
+
+// Lets other messages wait no longer for state that is not sent again.
+DWELL_EXPORT void dwell_end_repeats(const Tables* tables, i64 key, i64 now) noexcept {
+  Simulation<true, false> simulation(*tables);
+  end_repeats(simulation, key, now);
+  simulation.queue.save(tables->clock[0]);
 }

@@ -8,7 +8,7 @@ namespace dwell {
 // Whether the next event finds room for all it may add; otherwise what must grow.
 template <class S>
 Status room(const S& s, i64 margin) {
-  if (!s.queue.has_room(margin)) return kGrowEvents;
+  if (!s.queue.has_room(margin + s.clock[0].n_held)) return kGrowEvents;
   const i64 key = s.queue.first().key;
   if (kind_of(key) != kRelease) return kPaused;
   if (s.slot(cell_of(key), cycle_of(key)).live > 0) return kGrowRing;
@@ -31,7 +31,11 @@ void handle(S& s, i64 key, i64 now) {
       if (!is_given_up(s, cell, cycle)) note_ready(s, job_key(cell, cycle, item));
       break;
     case kRetry:
-      if (!is_given_up(s, cell, cycle)) retry(s, cell, cycle, item, now);
+      if (is_given_up(s, cell, cycle)) {
+        end_repeats(s, make_key(kArrival, cell, cycle, item), now);
+      } else {
+        retry(s, cell, cycle, item, now);
+      }
       break;
     case kChange:
       if (item == 0) {

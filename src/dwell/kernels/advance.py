@@ -15,7 +15,8 @@ STATUSES = tuple(Status)
 
 _advance = foreign("dwell_advance", c_int32, c_void_p)
 _post = foreign("dwell_post_event", None, c_void_p, c_int64, c_int64)
-_send = foreign("dwell_send_state", None, c_void_p, *(c_int64,) * 4, POINTER(c_int64))
+_send = foreign("dwell_send_state", None, c_void_p, *(c_int64,) * 5, POINTER(c_int64))
+_end_repeats = foreign("dwell_end_repeats", None, c_void_p, *(c_int64,) * 2)
 _logged = foreign(
     "dwell_logged_instants", None, c_void_p, *(c_int64,) * 4, c_void_p, c_int64, c_void_p
 )
@@ -82,24 +83,30 @@ def logged_instants(
 
 
 def send_state(
-    of: CellArrays, hop: int, cycle: int, attempt: int, now_ns: int
-) -> tuple[int, bool, int]:
-    """Send the state of a task that moves; it is carried reliably, whatever the link does.
+    of: CellArrays, hop: int, cycle: int, attempt: int, arrival: int, now_ns: int
+) -> tuple[int, int]:
+    """Send the state of a task that moves, reliably, whatever the link does; post its arrival.
 
     Parameters
     ----------
     hop : int
         Which of the realisation's.
+    arrival : int
+        Key of the event of its arrival.
 
     Returns
     -------
     at_ns : int
-        Instant of its arrival, or of the next attempt; -1 where the link is down for good.
-    arrived : bool
-        Which of the two.
+        Instant of the next attempt; -1 if this one succeeds, or the link is down for good.
     attempt : int
         Number of the next attempt; waiting for the end of an outage is none.
     """
-    sent = (c_int64 * 3)()
-    _send()(of.whole.address, of.part.hop_0 + hop, cycle, attempt, now_ns, sent)
-    return sent[0], bool(sent[1]), sent[2]
+    following = (c_int64 * 2)()
+    hop += of.part.hop_0
+    _send()(of.whole.address, hop, cycle, attempt, arrival, now_ns, following)
+    return following[0], following[1]
+
+
+def end_repeats(of: CellArrays, arrival: int, now_ns: int) -> None:
+    """Let messages wait no longer for state that is not sent again; `arrival` is its key."""
+    _end_repeats()(of.whole.address, arrival, now_ns)

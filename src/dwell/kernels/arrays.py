@@ -142,12 +142,11 @@ class Arrays:
         )
 
     def grow_events(self) -> None:
-        """Double the room of the queue of events."""
+        """Double the room of the queue of events, and of held messages."""
         t = self.tables
         room = 2 * len(t.events)
-        self._use(
-            t._replace(events=np.resize(t.events, room), following=np.resize(t.following, room))
-        )
+        names = ("events", "following", "held")
+        self._use(t._replace(**{name: np.resize(getattr(t, name), room) for name in names}))
 
     def grow_ring(self) -> None:
         """Double the number of cycles that may be in flight, and move those that are."""
@@ -691,6 +690,7 @@ class _Layout:
         # Rows beyond those that are laid out.
         room = {
             "events": 4 * margin,
+            "held": len(rows["events"]) + 4 * margin,
             "running": base,
             "waiting": base,
             "jobs": cells * slots * self.max_tasks,

@@ -122,14 +122,6 @@ bool is_discarded(const S& s, i64 cell, i64 cycle, i64 task) {
   return s.shadow_parts[s.slot(cell, cycle).pair * s.n_tasks + task] == kDiscarded;
 }
 
-// Whether a cycle is that of a shadow that has been given up.
-template <class S>
-bool is_given_up(const S& s, i64 cell, i64 cycle) {
-  if (S::kPlain || s.cell(cell).parent < 0) return false;
-  const Cell& parent = s.cell(s.cell(cell).parent);
-  return cycle + parent.given_up_after < parent.released;
-}
-
 // Shadow that shares a task with a cycle, -1 for none.
 template <class S>
 i64 shared_by(const S& s, i64 cell, i64 cycle, i64 task) {
@@ -357,10 +349,8 @@ void begin_cycle(S& s, i64 cell, i64 cycle, i64 active, bool is_shadow, i64 now)
 template <class S>
 void release(S& s, i64 cell, i64 cycle, i64 now) {
   const i64 active = s.stamp(cell, cycle);
-  if (!S::kPlain) {
-    s.cell(cell).released = cycle + 1;
-    give_up_before(s, cell, cycle, now);
-  }
+  s.cell(cell).released = cycle + 1;
+  if (!S::kPlain) give_up_before(s, cell, cycle, now);
   clear_log(s, cell, cycle);
   begin_cycle(s, cell, cycle, active, false, now);
   if (!S::kPlain) {

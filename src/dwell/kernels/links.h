@@ -5,22 +5,13 @@
 #include <limits>
 
 #include "attempts.h"
-#include "simulation.h"
+#include "order.h"
 
 namespace dwell {
 
 // Where a link has no timeout of its own, state that was lost is sent again after Linux's least TCP
 // retransmission timeout.
 constexpr i64 kStateTimeoutNs = 200'000'000;
-
-// Marks a cycle as one that can never be done; its first loss names the outcome.
-template <class S>
-void lose(S& s, i64 cell, i64 cycle, Outcome outcome) {
-  Slot& slot = s.slot(cell, cycle);
-  if (slot.is_lost) return;
-  slot.is_lost = 1;
-  s.outcome[s.output(cell, cycle)] = outcome;
-}
 
 // When the link can take a message; its current segment becomes the one of that instant.
 //
@@ -61,17 +52,6 @@ i64 propagation_ns(const S& s, i64 hop, const Segment& segment, i64 cycle) {
   return delay;
 }
 
-// Instant at which a message arrives whose transmission has ended.
-template <class S>
-i64 arrival_ns(const S& s, Link& link, i64 hop, const Segment& segment, i64 cycle, i64 sent) {
-  i64 arrival = later(sent, propagation_ns(s, hop, segment, cycle));
-  if (link.in_order) {
-    arrival = std::max(arrival, link.last_arrival_ns);
-    link.last_arrival_ns = arrival;
-  }
-  return arrival;
-}
-
 // Loses a message when its transmission begins, or would begin.
 template <class S>
 [[gnu::noinline]] void lose_message(S& s, i64 cell, i64 cycle, i64 flow, Outcome outcome, i64 at_ns,
@@ -87,6 +67,7 @@ template <class S>
 // Sends one message of a flow for the first time (attempt 0) or once more.
 template <class S>
 void send(S& s, i64 cell, i64 cycle, i64 flow, i64 hop_row, i64 attempt, i64 now) {
+  const i64 key = make_key(kArrival, cell, cycle, flow);
   const Hop& hop = s.hops[hop_row];
   Link& link = s.links[hop.link];
   const i64 start = begin(s, link, now);
@@ -100,29 +81,30 @@ void send(S& s, i64 cell, i64 cycle, i64 flow, i64 hop_row, i64 attempt, i64 now
     is_lost = loses(hop, rate, cycle, attempt);
   }
   if (!is_lost) {
-    const i64 arrival = arrival_ns(s, link, hop_row, segment, cycle, sent);
-    s.post(arrival, make_key(kArrival, cell, cycle, flow));
+    const i64 arrival = later(sent, propagation_ns(s, hop_row, segment, cycle));
+    post_arrival(s, hop.link, key, arrival, attempt > 0);
   } else if (link.retransmit_ns < 0) {
     lose_message(s, cell, cycle, flow, kDropped, start, now);
   } else if (segment.is_down) {
     // A link that holds messages back and is down for good: it waits for ever.
     lose_message(s, cell, cycle, flow, kInFlight, now, now);
+    lose_behind(s, key);
   } else {
+    if (link.in_order && attempt == 0) hold(s, hop.link, key, kUnknown);
     s.attempts[s.slot_row(cell, cycle) * s.n_flows + flow] = attempt;
     s.post(later(sent, link.retransmit_ns), make_key(kRetry, cell, cycle, flow));
   }
 }
 
-// What becomes of an attempt to send the state of a task.
-struct StateSent {
-  i64 at_ns;  // its arrival, or the next attempt; -1 where the link is down for good
-  bool has_arrived;
-  i64 attempt;  // number of the next; waiting for the end of an outage is none
+// When the state of a task is sent next, -1 if never; and the number of that attempt.
+struct StateAttempt {
+  i64 at_ns;
+  i64 number;  // waiting for the end of an outage is none
 };
 
-// Sends the state of a task that moves; it is carried reliably, whatever the link does.
+// Sends the state of a task that moves, reliably, whatever the link does; posts its arrival.
 template <class S>
-StateSent send_state(S& s, i64 hop_row, i64 cycle, i64 attempt, i64 now) {
+StateAttempt send_state(S& s, i64 hop_row, i64 cycle, i64 attempt, i64 key, i64 now) {
   const Hop& hop = s.hops[hop_row];
   Link& link = s.links[hop.link];
   const i64 start = begin(s, link, now);
@@ -130,17 +112,21 @@ StateSent send_state(S& s, i64 hop_row, i64 cycle, i64 attempt, i64 now) {
   const Rate& rate = s.rates[link.segment];
   if (segment.is_down) {
     for (i64 following = link.segment + 1; following < link.segment_end; ++following) {
-      if (!s.segments[following].is_down) return {s.segments[following].at_ns, false, attempt};
+      if (!s.segments[following].is_down) return {s.segments[following].at_ns, attempt};
     }
-    return {-1, false, attempt};
+    lose_behind(s, key);
+    return {-1, attempt};
   }
   const i64 sent = later(start, transmission_ns(hop, rate));
   link.free_ns = sent;
   if (loses(hop, rate, cycle, attempt)) {
+    if (link.in_order && attempt == 0) hold(s, hop.link, key, kUnknown);
     const i64 timeout = link.retransmit_ns >= 0 ? link.retransmit_ns : kStateTimeoutNs;
-    return {later(sent, timeout), false, attempt + 1};
+    return {later(sent, timeout), attempt + 1};
   }
-  return {arrival_ns(s, link, hop_row, segment, cycle, sent), true, attempt};
+  const i64 arrival = later(sent, propagation_ns(s, hop_row, segment, cycle));
+  post_arrival(s, hop.link, key, arrival, attempt > 0);
+  return {-1, attempt};
 }
 
 }  // namespace dwell

@@ -10,9 +10,10 @@
 
 namespace dwell {
 
-// A message on a link with a rate: when it was sent, how long that takes, and its time so far.
+// A message on a link: when it was sent, how long that takes, and its time so far.
 struct Crossing {
   i64 link, sent_ns, number;  // of those that were found
+  i64 arrived_ns, repeats;
   f64 cost_ns;
   f64* ms;
 
@@ -23,6 +24,9 @@ struct Crossing {
 };
 
 namespace {
+
+// Messages that waited for the same one are handed over within this time of each other.
+constexpr i64 kTogetherNs = 100'000;
 
 void add(Found& found, i64 part, f64 ms) {
   if (found.count[part] == 0) found.order[found.n_parts++] = part;
@@ -42,19 +46,37 @@ bool add_span(Found& found, i64 part, i64 begin_ns, i64 end_ns, i64 limit_ns) {
   return false;
 }
 
+// The delay of a message that waited for one before it: the last known one that may be its own.
+f64 last_delay_within(const Crossing* crossing, const Crossing* first) {
+  for (const Crossing* other = crossing; other != first;) {
+    --other;
+    if (other->link != crossing->link) break;
+    if (*other->ms <= *crossing->ms) return *other->ms;
+  }
+  return *crossing->ms;
+}
+
 // Takes off the time that messages waited behind others of the cell, and that they were sent for.
 void take_off_waits(const Found& found) {
   std::sort(found.crossings, found.crossings + found.n_crossings);
-  i64 link = -1;
+  i64 link = -1, last_ns = 0;
   f64 free_ns = 0.0;
   for (i64 i = 0; i < found.n_crossings; ++i) {
     const Crossing& crossing = found.crossings[i];
     const f64 sent_ns = static_cast<f64>(crossing.sent_ns);
-    if (crossing.link != link) free_ns = sent_ns;
+    if (crossing.link != link) {
+      free_ns = sent_ns;
+      last_ns = std::numeric_limits<i64>::min();
+    }
     link = crossing.link;
     free_ns = std::max(free_ns, sent_ns) + crossing.cost_ns;
     // What arrived earlier than that went over a link that is better than is known.
     *crossing.ms = std::max(*crossing.ms - (free_ns - sent_ns) / 1e6, 0.0);
+    if (crossing.repeats == 0) continue;
+    if (crossing.arrived_ns - kTogetherNs <= last_ns) {
+      *crossing.ms = last_delay_within(&crossing, found.crossings);
+    }
+    last_ns = std::max(last_ns, crossing.arrived_ns);
   }
 }
 
@@ -109,7 +131,9 @@ DWELL_EXPORT void dwell_meter(const Layout* layout, const Window* window, i64 ac
           if (!has_come) continue;
           f64* ms = found->ms + part * found->most + found->count[part] - 1;
           const i64 number = found->n_crossings++;
-          found->crossings[number] = {found->link[part], sent_ns, number, found->cost[part], ms};
+          found->crossings[number] = {
+              found->link[part],    sent_ns,           number, arrived_ns[flow],
+              found->repeats[part], found->cost[part], ms};
         }
       }
     }

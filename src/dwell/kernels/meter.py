@@ -50,7 +50,9 @@ class PartTimes:
         Where demands are asked for: of a job its time alone over its core time, of a message the
         nanoseconds that its link takes to send it.
     link : int64 array, shape (parts,), optional
-        Number of the link of a message, if it has a rate; -1 for none.
+        Number of the link of a message, if messages wait there; -1 for none.
+    repeats : int64 array, shape (parts,), optional
+        1 for messages of links that repeat what is lost and keep the order, else 0.
 
     Raises
     ------
@@ -58,19 +60,28 @@ class PartTimes:
         If the library cannot be loaded: before the first window, and not in it.
     """
 
-    def __init__(self, parts: int, cost: Floats | None = None, link: Ints | None = None) -> None:
+    def __init__(
+        self,
+        parts: int,
+        cost: Floats | None = None,
+        link: Ints | None = None,
+        repeats: Ints | None = None,
+    ) -> None:
         self._meter = _meter()
-        self._cost, self._link = cost, link
+        self._cost, self._link, self._repeats = cost, link, repeats
         self._count, self._order = np.zeros((2, parts), np.int64)
         self._window, self._found = structs()["Window"](), structs()["Found"]()
         self._found.count, self._found.order = self._count.ctypes.data, self._order.ctypes.data
-        if cost is not None and link is not None:
+        if cost is not None and link is not None and repeats is not None:
             self._found.cost, self._found.link = cost.ctypes.data, link.ctypes.data
+            self._found.repeats = repeats.ctypes.data
         self._ms, self._crossings = np.empty((parts, 0)), np.empty(0, np.int64)
 
-    def __reduce__(self) -> tuple[type[PartTimes], tuple[int, Floats | None, Ints | None]]:
+    def __reduce__(
+        self,
+    ) -> tuple[type[PartTimes], tuple[int, Floats | None, Ints | None, Ints | None]]:
         # As in a copy of `CyclesLayout`; what has been found stays here.
-        return PartTimes, (len(self._count), self._cost, self._link)
+        return PartTimes, (len(self._count), self._cost, self._link, self._repeats)
 
     def begin(
         self,
@@ -102,8 +113,8 @@ class PartTimes:
             self._ms = np.empty((len(self._count), 2 * count))
             self._found.ms, self._found.most = self._ms.ctypes.data, self._ms.shape[1]
         if self._cost is not None:
-            # Of every cycle and its shadow the messages, five numbers each (`Crossing`).
-            room = 2 * count * cycles[3].shape[1] * 5
+            # Of every cycle and its shadow the messages, seven numbers each (`Crossing`).
+            room = 2 * count * cycles[3].shape[1] * 7
             if len(self._crossings) < room:
                 self._crossings = np.empty(room, np.int64)
                 self._found.crossings = self._crossings.ctypes.data

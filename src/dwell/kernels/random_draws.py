@@ -402,7 +402,7 @@ class Drawing:
         for at in range(0, count, BLOCK):
             nominal = np.arange(at, min(at + BLOCK, count), dtype=np.float64)
             nominal *= pipeline.period_ms * NS_PER_MS
-            nominal += pipeline.phase_ms * NS_PER_MS
+            nominal += pipeline.first_release_ms * NS_PER_MS
             release[at : at + BLOCK] = np.rint(nominal, out=nominal)
         jitter = pipeline.release_jitter_ms
         if jitter == Constant(0.0):

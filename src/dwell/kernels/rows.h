@@ -37,7 +37,7 @@ struct Crossing;  // of meter.cpp
 
 // Numbers of the whole simulation. Up to `n_slots` cycles of a cell, a power of two, may be in
 // flight, each of up to `n_tasks` jobs and `n_flows` messages; one event adds `margin` events at
-// most. A call ends after `budget` events.
+// most, and one more per held message. A call ends after `budget` events.
 #define DWELL_CLOCK(field)                                                                       \
   field(i64, n_slots) field(i64, n_tasks) field(i64, n_flows) field(i64, n_layers)               \
   field(i64, n_resources) /* of a cell */                                                        \
@@ -47,6 +47,7 @@ struct Crossing;  // of meter.cpp
   field(i64, margin) field(i64, budget)                                                          \
   field(i64, logs_all) /* whether logs are of all cycles, or of those in the ring */             \
   field(i64, n_events) field(i64, first_event) field(i64, used_events) field(i64, free_event)    \
+  field(i64, n_held)                                                                             \
   field(i64, is_calendar) field(i64, day_bits) /* a day is 2^day_bits ns; see queue.h */         \
   field(i64, next_change)                                                                        \
   field(i64, pauses) /* whether a call ends when the cell is to be decided on */                 \
@@ -141,7 +142,11 @@ struct Crossing;  // of meter.cpp
 // `retransmit_ns` is -1 where what is lost is lost.
 #define DWELL_LINK(field)                                                                        \
   field(i64, free_ns) field(i64, last_arrival_ns) field(i64, retransmit_ns)                      \
-  field(i64, in_order) field(i64, segment) field(i64, segment_end)
+  field(i64, in_order) field(i64, n_held) field(i64, segment) field(i64, segment_end)
+
+// A message that waits for those before it, or is being repeated (order.h): the event of its
+// arrival, and when that would be without the wait.
+#define DWELL_HELD(field) field(i64, key) field(i64, link) field(i64, arrival_ns)
 
 #define DWELL_EVENT(field) field(i64, at_ns) field(i64, key)
 
@@ -181,7 +186,7 @@ struct Crossing;  // of meter.cpp
   field(i64, policy) field(i64, is_priced)                                                       \
   field(i64, incumbent) field(i64, previous) field(i64, dwell) field(i64, stamped)               \
   field(i64, min_dwell) field(i64, escape) field(f64, min_improvement)                           \
-  field(f64, threshold) field(f64, slack) field(f64, memory)                                     \
+  field(f64, threshold) field(f64, slack) field(f64, memory) field(f64, gain_tolerance)          \
   field(i64, local) field(i64, offload) field(i64, every_windows) field(i64, outside_is_cloud)   \
   field(f64, most_ms) field(f64, most_robot) field(f64, most_outside)                            \
   field(i64, n_shown) field(f64, shown_ms) field(f64, shown_robot) field(f64, shown_edge)        \
@@ -243,18 +248,19 @@ struct Crossing;  // of meter.cpp
 
 // The times found: up to `most` of each part, and the parts in the order in which they were found.
 // Where demands are asked for, and not times, there is a `cost` of each part: of a job its time
-// alone over its core time, of a message the nanoseconds that its link takes to send it; and a
-// `link` that has a rate, -1 for none.
+// alone over its core time, of a message the nanoseconds that its link takes to send it; a `link`
+// on which messages wait, -1 for none; and whether it `repeats` messages and keeps their order.
 #define DWELL_FOUND(field)                                                                       \
   field(f64*, ms) field(i64*, count) field(i64*, order) field(i64, most) field(i64, n_parts)     \
-  field(const f64*, cost) field(const i64*, link) field(Crossing*, crossings)                    \
-  field(i64, n_crossings)
+  field(const f64*, cost) field(const i64*, link) field(const i64*, repeats)                     \
+  field(Crossing*, crossings) field(i64, n_crossings)
 
 #define DWELL_ROWS(row)                                                                          \
   row(Clock, DWELL_CLOCK) row(Cell, DWELL_CELL) row(Task, DWELL_TASK) row(Flow, DWELL_FLOW)      \
   row(Site, DWELL_SITE) row(Server, DWELL_SERVER) row(Quota, DWELL_QUOTA)                        \
   row(Node, DWELL_NODE) row(Change, DWELL_CHANGE) row(Hop, DWELL_HOP)                            \
-  row(Link, DWELL_LINK) row(Segment, DWELL_SEGMENT) row(Rate, DWELL_RATE)                        \
+  row(Link, DWELL_LINK) row(Held, DWELL_HELD)                                                    \
+  row(Segment, DWELL_SEGMENT) row(Rate, DWELL_RATE)                                              \
   row(Event, DWELL_EVENT) row(Running, DWELL_RUNNING) row(Waiting, DWELL_WAITING)                \
   row(Job, DWELL_JOB) row(Slot, DWELL_SLOT) row(Log, DWELL_LOG) row(Seen, DWELL_SEEN)            \
   row(Rule, DWELL_RULE) row(Option, DWELL_OPTION) row(Decided, DWELL_DECIDED)                    \
@@ -285,7 +291,7 @@ DWELL_ROWS(DWELL_STRUCT)
   table(Change, changes) table(f64, work) table(f64, switching)               \
   table(i8, tiers) table(i16, stamps)                                                            \
   table(Site, sites) table(Server, servers) table(Quota, quotas) table(Link, links)              \
-  table(Event, events) table(i32, following) table(i32, days)                                    \
+  table(Event, events) table(i32, following) table(i32, days) table(Held, held)                  \
   table(Running, running) table(Waiting, waiting)                                                \
   table(i32, dirty) table(i64, ready) table(Job, jobs) table(Slot, slots) table(i64, attempts)   \
   table(f64, own_ns) table(i64, soonest_ns) table(i64, ages)                                     \

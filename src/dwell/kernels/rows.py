@@ -118,6 +118,7 @@ class Tables(NamedTuple):
     events: Rows  # the queue, with the next event of the same day, and the first of every day
     following: NDArray[np.int32]
     days: NDArray[np.int32]
+    held: Rows  # messages that wait for others, or for their repeat; as many rows as events
     running: Rows  # per server a heap of running jobs by virtual finish
     waiting: Rows  # per server a heap of jobs that wait for cores
     dirty: NDArray[np.int32]  # servers to look after at the end of the event

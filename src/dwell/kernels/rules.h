@@ -139,6 +139,11 @@ struct Eligible {
   }
 };
 
+// dwell.cost.exceeds.
+inline bool exceeds(const Rule& rule, f64 gain, f64 threshold) {
+  return gain > threshold + rule.gain_tolerance;
+}
+
 struct Choice {
   i64 placement;
   Reason reason;
@@ -183,7 +188,7 @@ Choice decide_dtp(Priced<S>& priced, f64 measured) {
     return {best, reason_of(priced, best, eligible), delta_j};
   }
   if (rule.dwell < rule.min_dwell) return {rule.incumbent, kDwell, NAN};
-  if (best != rule.incumbent && delta_j > rule.min_improvement) {
+  if (best != rule.incumbent && exceeds(rule, delta_j, rule.min_improvement)) {
     return {best, reason_of(priced, best, eligible), delta_j};
   }
   return {rule.incumbent, eligible.within_caps ? kHold : kInfeasible, delta_j};
@@ -200,12 +205,13 @@ Choice decide_cusum(Priced<S>& priced, f64 alone) {
     f64& sum = s.options[c].sum;
     sum = c == rule.incumbent ? 0.0 : std::max(0.0, rule.memory * sum + gain);
   }
-  const i64 best =
-      cheapest(priced, [&](i64 c) { return eligible.has(c) && s.options[c].sum > rule.threshold; });
+  const i64 best = cheapest(priced, [&](i64 c) {
+    return eligible.has(c) && exceeds(rule, s.options[c].sum, rule.threshold);
+  });
   const Reason holds = eligible.within_caps ? kHold : kInfeasible;
   if (best < 0) return {rule.incumbent, holds, 0.0};
   const f64 delta_j = alone - priced.j(best);
-  if (delta_j <= 0.0) return {rule.incumbent, holds, delta_j};
+  if (!exceeds(rule, delta_j, 0.0)) return {rule.incumbent, holds, delta_j};
   for (i64 c = 0; c < priced.n; ++c) s.options[c].sum = 0.0;
   return {best, reason_of(priced, best, eligible), delta_j};
 }
@@ -213,12 +219,14 @@ Choice decide_cusum(Priced<S>& priced, f64 alone) {
 // dwell.policies.latency_first.
 template <class S>
 Choice decide_latency_first(Priced<S>& priced) {
-  const i64 incumbent = priced.s.rule[0].incumbent;
-  i64 best = incumbent;
+  const Rule& rule = priced.s.rule[0];
+  i64 best = rule.incumbent;
   for (i64 c = 0; c < priced.n; ++c) {
     if (priced.l95_ms(c) < priced.l95_ms(best)) best = c;
   }
-  return {best, best == incumbent ? kHold : kMove, NAN};
+  const f64 saved_ms = priced.l95_ms(rule.incumbent) - priced.l95_ms(best);
+  if (!exceeds(rule, saved_ms, 0.0)) return {rule.incumbent, kHold, NAN};
+  return {best, kMove, NAN};
 }
 
 // dwell.policies.atp.
@@ -255,7 +263,7 @@ Choice decide_atp(Priced<S>& priced) {
   if (!(ms > rule.most_ms || is_busy)) return {incumbent, kHold, NAN};
   const f64 moved = s.switching[incumbent * priced.n + other];
   const f64 saved = price(s, ms, 0.0, shown, 0.0) - price(s, told_ms, 0.0, told, moved);
-  if (saved > 0.0) return {other, kMove, saved};
+  if (exceeds(rule, saved, 0.0)) return {other, kMove, saved};
   return {incumbent, kHold, saved};
 }
 

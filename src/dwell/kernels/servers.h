@@ -360,7 +360,7 @@ void admit(S& s, i64 key, i64 now) {
     if (is_below(s, server)) return;
   }
   if (server.scheduler == kFair) set_speed(s, server);
-  if (server.is_dirty) return;
+  if (server.is_dirty & kIsDirty) return;
   const bool lone = server.n_run == 1 && !has_quota(s, server);
   if (lone && server.speed == 1.0 && left == static_cast<f64>(work_ns)) {
     announce(s, server, later(now, work_ns), key);

@@ -6,9 +6,13 @@ import errno
 import os
 import socket
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
+
+from dwell.cellfile import load_without_traces
+from dwell.errors import DwellError
+from dwell.model import Problem
 
 #: State of a socket that listens, in /proc/net/tcp.
 LISTENS = "0A"
@@ -86,6 +90,28 @@ def owners_of(inodes: Iterable[str]) -> dict[str, str]:
                         line = " ".join([Path(words[0]).name, *words[1:]]).strip()
                         owners[inode] = f"{textwrap.shorten(line, 60)} (process {process.name})"
     return owners
+
+
+def running_elsewhere(problem: Problem) -> str:
+    """Return a sentence that names the file by which a cell runs here with other addresses.
+
+    `dwell live run CELL` gives the cell ports of its own. Empty if no cell of this name runs here.
+    """
+    for file in _controlled_cells():
+        with suppress(DwellError, OSError):
+            other = load_without_traces(file)
+            if other.name == problem.name and other.live.hosts != problem.live.hosts:
+                return f"It runs here with other ports: name {file}."
+    return ""
+
+
+def _controlled_cells() -> Iterator[Path]:
+    """Yield the cell files of the controllers that run here, in this network namespace."""
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError, ValueError):
+            words = (process / "cmdline").read_bytes().decode(errors="replace").split("\0")
+            if "controller" in words and (process / "ns/net").samefile("/proc/self/ns/net"):
+                yield Path(os.readlink(process / "cwd"), words[words.index("--cell") + 1])
 
 
 def taken_ports(wanted: Iterable[int]) -> str:

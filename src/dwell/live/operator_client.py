@@ -13,6 +13,7 @@ import msgspec
 
 from dwell.errors import LiveError, TrustError
 from dwell.live.keys import Keys
+from dwell.live.local_addresses import running_elsewhere
 from dwell.live.log import printable
 from dwell.live.messages import Answer, Ask, decode, encode
 from dwell.live.security import Security
@@ -93,7 +94,7 @@ class OperatorClient:
             raise TrustError(f"{keyring.folder}: keys of an observer, who may look and no more")
         answer = self._answer(what, about, patience_s)
         if answer is None:
-            raise LiveError(self._absent())
+            raise LiveError(f"{self._absent()} {running_elsewhere(self.problem)}".rstrip())
         if answer.refused:
             raise LiveError(f"refused: {answer.refused}")
         return answer.status

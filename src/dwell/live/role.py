@@ -102,7 +102,7 @@ class RolePlace:
     period_ns: int = field(init=False)
 
     def __post_init__(self) -> None:
-        phase_ms = self.problem.pipeline.phase_ms
+        phase_ms = self.problem.pipeline.first_release_ms
         require(phase_ms == 0, "phase_ms", phase_ms, "0 in a live cell, which begins when it is up")
         self.keys = Keys(self.problem.name)
         self.period_ns = self.problem.pipeline.period_ns

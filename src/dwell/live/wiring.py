@@ -13,6 +13,7 @@ from itertools import combinations, permutations
 from typing import Literal, TypeAlias
 
 from dwell.errors import LiveError
+from dwell.live.local_addresses import running_elsewhere
 from dwell.live.messages import MAX_CONTROL_BYTES, MAX_HEADER_BYTES
 from dwell.live.transport.transport import Lane
 from dwell.model import Flow, FrozenDict, Problem
@@ -411,6 +412,7 @@ def _require_hosts(problem: Problem, everybody: Sequence[Role]) -> None:
             if port > last
         ]
     if faults:
+        faults += filter(None, [running_elsewhere(problem)])
         raise LiveError("\n".join(faults))
 
 

@@ -156,3 +156,5 @@ LENGTH_S = Bound(0, 9.2e9)
 SEEDS = Bound(1, 100_000, whole=True)
 #: Classes of a user's own.
 CLASS_PATH = Pattern(r"[^\W\d]\w*(?:\.[^\W\d]\w*)*:[^\W\d]\w*", "package.module:Class")
+#: Functions of a user's own.
+FUNCTION_PATH = Pattern(CLASS_PATH.expression, "package.module:function")

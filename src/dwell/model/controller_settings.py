@@ -12,6 +12,7 @@ PROBE_CYCLES = Bound(1, MAX_COUNT, whole=True)
 HALF_LIFE_WINDOWS = Bound(0, MAX_COUNT, above=True)
 SHADOW_FRACTION = Bound(0, 1)
 DECIDE_CYCLES = Bound(1, MAX_COUNT, whole=True)
+MIN_DWELL_CYCLES = Bound(0, MAX_COUNT, whole=True)
 
 
 @declared()
@@ -34,6 +35,11 @@ class ControllerSettings:
         usual="W: one decision per window",
     )
     min_dwell: int = key("Windows that a placement stays at least (N_min).", MIN_DWELL, default=3)
+    min_dwell_cycles: int = key(
+        "Cycles that a placement stays at least, where N_min windows are fewer.",
+        MIN_DWELL_CYCLES,
+        default=0,
+    )
     min_improvement: float = key(
         "Improvement of J that a migration must promise (Delta_min).",
         MIN_IMPROVEMENT,

@@ -6,10 +6,12 @@ import sys
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from dwell.errors import DwellError
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 
 def class_at(path: str) -> Any:
@@ -69,4 +71,6 @@ def _declared(group: str) -> Mapping[str, EntryPoint]:
 @lru_cache(maxsize=8)
 def _found(group: str, path: tuple[str, ...]) -> Mapping[str, EntryPoint]:
     """Look for entry points: milliseconds, in which all that is on the path is looked through."""
+    from importlib.metadata import entry_points
+
     return {one.name: one for one in entry_points(group=group)}

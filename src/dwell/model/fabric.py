@@ -275,7 +275,8 @@ class Link:
         named="on_loss.retransmit_ms",
     )
     in_order: bool = key(
-        "Whether a message waits for those sent before it, so that none overtakes another.",
+        "Whether messages arrive in the order in which they were sent; they wait for a lost "
+        "message that is sent again.",
         default=False,
     )
     bursts: Bursts | None = key("Episodes of extra delay, in every scenario.", default=None)

@@ -24,7 +24,7 @@ class FrozenDict(dict[K, V]):
     __slots__ = ()
 
     def _immutable(self, *_args: object, **_kwargs: object) -> NoReturn:
-        raise TypeError(f"{type(self).__name__} cannot be changed; make a new one")
+        raise TypeError(f"{type(self).__name__} cannot be changed; make a new one, as dict(...)")
 
     __setitem__ = _immutable
     __delitem__ = _immutable

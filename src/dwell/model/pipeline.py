@@ -137,10 +137,11 @@ class Pipeline:
         "Factors, one a cycle, that tasks may name, as the scene's complexity.",
         default_factory=FrozenDict,
     )
-    phase_ms: float = key(
+    phase_ms: float | None = key(
         "Offset of all its releases, with their deadlines and windows, ms; less than P.",
         TIME_MS,
-        default=0.0,
+        default=None,
+        usual="0, or the fleet's `phases`",
         is_rare=True,
     )
 
@@ -148,7 +149,7 @@ class Pipeline:
         bound = f"at most period_ms = {self.period_ms:g}"
         require(self.deadline_ms <= self.period_ms, "deadline_ms", self.deadline_ms, bound)
         bound = f"less than period_ms = {self.period_ms:g}"
-        require(self.phase_ms < self.period_ms, "phase_ms", self.phase_ms, bound)
+        require(self.first_release_ms < self.period_ms, "phase_ms", self.phase_ms, bound)
         require_names("tasks", self.tasks)
 
     def __repr__(self) -> str:
@@ -161,6 +162,11 @@ class Pipeline:
     def __str__(self) -> str:
         """Return its flows as chains: ``a → b → d; c → b``."""
         return "; ".join(" → ".join(chain) for chain in self.chains())
+
+    @property
+    def first_release_ms(self) -> float:
+        """Instant of the first release without jitter: `phase_ms`, or 0 if it is None."""
+        return self.phase_ms or 0.0
 
     @property
     def period_ns(self) -> int:

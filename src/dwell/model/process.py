@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from decimal import Context, Decimal
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, runtime_checkable
 
 from dwell.errors import Fault, TraceError
@@ -25,6 +27,9 @@ Floats: TypeAlias = "NDArray[np.float64]"
 
 # One nanosecond, in milliseconds.
 NS = 1e-6
+
+# Logarithms and exponentials of parameters: libm's last bit depends on the processor.
+EXACT = Context(prec=40)
 
 MEAN, CV = Bound(0, LARGEST, above=True), Bound(0, 100)
 SPREAD = "Coefficient of variation: standard deviation / mean."
@@ -95,10 +100,16 @@ class Normal:
         """Mean after clipping."""
         if self.std == 0:
             return max(self.mean, self.min)
-        z = (self.min - self.mean) / self.std
-        density = math.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)
-        below = 0.5 * math.erfc(-z / math.sqrt(2))
-        return self.min * below + self.mean * (1 - below) + self.std * density
+        z, least = (self.min - self.mean) / self.std, max(self.mean, self.min)
+        if abs(z) > 9:
+            return least
+        density = float(EXACT.exp(Decimal(-0.5 * z * z))) / math.sqrt(2 * math.pi)
+        # Phi(z) - 1/2 = phi(z) (z + z^3 / 3 + z^5 / (3 5) + ...): 150 terms are enough up to 9.
+        series = 0.0
+        for odd in range(301, 0, -2):
+            series = (z * z * series + 1) / odd
+        below = 0.5 + density * z * series
+        return max(self.min * below + self.mean * (1 - below) + self.std * density, least)
 
     def marginal(self, rng: np.random.Generator, size: int) -> Floats:
         """Draw `size` independent values."""
@@ -132,8 +143,7 @@ class LogNormal(_ByMean):
     @property
     def log_parameters(self) -> tuple[float, float]:
         """Mean and standard deviation of the logarithm."""
-        variance = math.log1p(self.cv * self.cv)
-        return math.log(self.mean) - variance / 2, math.sqrt(variance)
+        return _log_parameters(self.mean, self.cv)
 
     def marginal(self, rng: np.random.Generator, size: int) -> Floats:
         """Draw `size` independent values."""
@@ -188,7 +198,8 @@ class AR1(_ByMean):
     )
 
     def __post_init__(self) -> None:
-        reachable = 1 + self.rho * self.cv**2 > 0 and abs(self.log_correlation) < 1
+        # As r > -1, where r is the correlation of the logarithm.
+        reachable = 1 + self.rho * (1 + self.cv * self.cv) > 0
         require(
             reachable, "ar1.rho", self.rho, f"reachable by a positive process of cv {self.cv:g}"
         )
@@ -198,11 +209,23 @@ class AR1(_ByMean):
         """Lag-1 correlation of the logarithm."""
         if self.cv < 1e-8:  # the limit; below it, cv^2 leaves the floating-point numbers
             return self.rho
-        return math.log1p(self.rho * self.cv**2) / math.log1p(self.cv**2)
+        square = self.cv * self.cv
+        return max(_log1p(self.rho * square) / _log1p(square), -1.0)
 
     def marginal(self, rng: np.random.Generator, size: int) -> Floats:
         """Draw `size` independent values (without the memory)."""
         return LogNormal(self.mean, self.cv).marginal(rng, size)
+
+
+@lru_cache(maxsize=4096)
+def _log_parameters(mean: float, cv: float) -> tuple[float, float]:
+    variance = _log1p(cv * cv)
+    return float(EXACT.ln(Decimal(mean))) - variance / 2, math.sqrt(variance)
+
+
+def _log1p(x: float) -> float:
+    """Return log(1 + x), correctly rounded."""
+    return float(EXACT.ln(EXACT.add(1, Decimal(x)))) if abs(x) > 1e-16 else x
 
 
 def _one_group() -> NDArray[np.int64]:

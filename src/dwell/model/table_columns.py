@@ -99,16 +99,17 @@ CYCLES = (
         "missed",
         "Boolean",
         "Later than D, or unfinished when its window closed, which is no earlier; or its "
-        "command was not applied. False where a live run's controller could not hear of it.",
+        "command was not applied. False where a live run's controller could not hear of it, "
+        "or after the last window of a simulated run.",
     ),
     Column("outcome", "outcome", "What became of it."),
     Column("compute_ns", "Int64", "Part of the latency: execution.", "ns", APART),
     Column("queue_ns", "Int64", "Part of the latency: waiting.", "ns", APART),
     Column("network_ns", "Int64", "Part of the latency: links.", "ns", APART),
+    Column("lead", "Boolean", "Whether it belongs to no window."),
     Column("run", "Int64", "Id of the run, as stamped.", of=LIVE),
     Column("number", "Int64", "Number of the cycle, as stamped.", of=LIVE),
     Column("term", "Int64", "Term of the order, as stamped.", of=LIVE),
-    Column("lead", "Boolean", "Whether it belongs to no window.", of=LIVE),
     Column("heard", "Boolean", "False where it is known by its neighbours only.", of=LIVE),
     Column("actuated", "Boolean", "Whether all its commands were applied.", of=LIVE),
     Column(
@@ -178,7 +179,7 @@ WINDOWS = (
     Column("closed_unix_ns", "Int64", "Time of day of its close.", "ns", of=LIVE),
 )
 DECISIONS = (
-    Column("window", "Int64", "The window of the last cycle that it looked at."),
+    Column("window", "Int64", "The window of the last cycle that it looked at, or the next one."),
     Column("incumbent", "candidate", "The placement before."),
     Column("placement", "candidate", "The placement after."),
     Column("migrated", "Boolean", "Whether they differ."),

@@ -1,4 +1,4 @@
-"""Classes of a user's own, named ``package.module:Class``: beside the cell file or installed."""
+"""A user's own classes and functions, named ``package.module:name``, from a folder or installed."""
 
 from __future__ import annotations
 
@@ -9,19 +9,23 @@ import inspect
 import pkgutil
 import sys
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
-from dwell.errors import DwellError, describe_raised
+from dwell.errors import DwellError, KernelError, SimulationError, UserNote, describe_raised
 
 if TYPE_CHECKING:
     from dwell.model.problem import Problem
 
+#: Modules of this package begin with it.
+OURS = f"{__name__.partition('.')[0]}."
 #: Modules that were found beside a cell file, by its folder and their name.
 _beside: dict[tuple[str, str], ModuleType] = {}
 _importing = threading.RLock()
+#: Digests of sources, as they were first needed.
+_digests: dict[ModuleType, str] = {}
 
 
 def make_user_class(
@@ -48,12 +52,7 @@ def make_user_class(
     """
     who = f"{what} {name!r}"
     module_name, _, attribute = name.partition(":")
-    module = import_user_module(module_name, problem.folder, who, error)
-    kind = getattr(module, attribute, None)
-    if kind is None:
-        near = difflib.get_close_matches(attribute, dir(module), n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise error(f"{who}: {module_name} has no class {attribute!r}{hint}")
+    kind = _named(name, problem.folder, "class", who, error)
     if not isinstance(kind, type):
         raise error(f"{who}: {attribute!r} in {module_name} is no class")
     if not callable(getattr(kind, method, None)):
@@ -72,7 +71,76 @@ def make_user_class(
         raise
     except Exception as fault:
         call = f"{attribute}()" if from_problem is None else f"{attribute}.from_problem(problem)"
-        raise error(f"{who}: {call} failed: {describe_raised(fault)}") from fault
+        raise error(f"{who}: {call} failed: {describe_raised(fault, users=True)}") from fault
+
+
+class UserCall(NamedTuple):
+    """A call of an object that may be a user's: the errors that it raises get a `UserNote`.
+
+    Parameters
+    ----------
+    method : str
+        Which is called.
+    window : int, optional
+        At whose close, where it is at a close.
+    """
+
+    given: object
+    method: str
+    window: int | None = None
+
+    def __enter__(self) -> None:
+        """Begin the call."""
+
+    def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
+        """End it; an error passes."""
+        if not isinstance(error, Exception) or isinstance(error, KernelError):
+            return
+        kind = type(self.given)
+        if not kind.__module__.startswith(OURS):
+            when = "" if self.window is None else f" at window {self.window}"
+            raised = describe_raised(error, users=True)
+            error.add_note(UserNote(f"{kind.__name__}: {self.method}{when} failed: {raised}"))
+
+
+def user_function(
+    name: str, folder: str | None, what: str, error: type[DwellError]
+) -> Callable[..., object]:
+    """Return a function of a user's own.
+
+    Parameters
+    ----------
+    name : str
+        ``package.module:function``.
+    folder : str, optional
+        Its modules are preferred to installed modules.
+    what : str
+        Kind of the function, for messages: ``metric``.
+
+    Raises
+    ------
+    DwellError
+        An `error`, if there is no such module or function, or the module raises when it is
+        imported.
+    """
+    who = f"{what} {name!r}"
+    function = _named(name, folder, "function", who, error)
+    if not callable(function):
+        module_name, _, attribute = name.partition(":")
+        raise error(f"{who}: {attribute!r} in {module_name} is not a function")
+    return cast("Callable[..., object]", function)
+
+
+def _named(name: str, folder: str | None, kind: str, who: str, error: type[DwellError]) -> object:
+    """Return the class or function that ``package.module:name`` names."""
+    module_name, _, attribute = name.partition(":")
+    module = import_user_module(module_name, folder, who, error)
+    found: object = getattr(module, attribute, None)
+    if found is None:
+        near = difflib.get_close_matches(attribute, dir(module), n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise error(f"{who}: {module_name} has no {kind} {attribute!r}{hint}")
+    return found
 
 
 def source_digest(name: str, folder: str | None) -> str | None:
@@ -82,13 +150,38 @@ def source_digest(name: str, folder: str | None) -> str | None:
     -------
     str or None
         None where the module cannot be imported, or has no source.
+
+    Raises
+    ------
+    SimulationError
+        If the source has changed since this process imported it.
     """
-    module_name = name.partition(":")[0]
     try:
-        source = inspect.getsource(import_user_module(module_name, folder, name, DwellError))
-    except (DwellError, OSError, TypeError):
+        module = import_user_module(name.partition(":")[0], folder, name, DwellError)
+    except DwellError:
         return None
-    return hashlib.sha256(source.encode()).hexdigest()[:16]
+    return _digest(module)
+
+
+def object_digest(given: object) -> str | None:
+    """Return a digest of the source of the module of an object's class, or None."""
+    module = sys.modules.get(type(given).__module__)
+    return None if module is None else _digest(module)
+
+
+def _digest(module: ModuleType) -> str | None:
+    """Return a digest of a module's source, which must stay as this process plays it."""
+    try:
+        source = inspect.getsource(module)
+    except (OSError, TypeError):
+        return None
+    digest = hashlib.sha256(source.encode()).hexdigest()[:16]
+    if _digests.setdefault(module, digest) != digest:
+        raise SimulationError(
+            f"{module.__name__}: its source has changed since this process imported it; start a "
+            "new process (in a notebook, restart the kernel)"
+        )
+    return digest
 
 
 def _arguments(kind: type) -> list[str]:
@@ -113,7 +206,7 @@ def import_user_module(
     except (Exception, SystemExit) as fault:
         missing = fault.name if isinstance(fault, ModuleNotFoundError) else None
         if missing is not None and f"{name}.".startswith(f"{missing}."):
-            place = "" if folder is None else f"neither beside the cell file ({folder}) nor "
+            place = "" if folder is None else f"neither in {folder} nor "
             raise error(f"{who}: there is no module {missing!r}, {place}installed") from None
         raise error(f"{who}: importing {name} failed: {describe_raised(fault)}") from fault
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, replace
 from types import FrameType
 from typing import Any, NoReturn
 
+from dwell.model.frozen import FrozenDict
 from dwell.model.problem import Problem
 from dwell.model.qos import REASONS, Decision, QoS
 from dwell.policies.protocol import MinimalPolicy
@@ -149,7 +150,7 @@ class _Check:
 
     def decide(self, policy: Any, window: Window, incumbent: str, where: str) -> object:
         """Return the answer to a window."""
-        observed, estimates = window[incumbent], dict(window)
+        observed, estimates = window[incumbent], FrozenDict(window)
         before = repr(estimates)
         answer = self.call("decide", where, policy.decide, observed=observed, estimates=estimates)
         if repr(estimates) != before:

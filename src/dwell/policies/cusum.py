@@ -26,6 +26,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
+from dwell.cost import exceeds
 from dwell.model.bounds import MIN_IMPROVEMENT, Bound
 from dwell.model.objective import Objective
 from dwell.model.placement import Placement
@@ -110,12 +111,12 @@ class Cusum(PricingPolicy):
             least = self.slack + pricing.margin(estimates[name], known)
             gain = stays - costs[name] - least
             sums[name] = 0.0 if name == now else max(0.0, self.memory * value + gain)
-        due = [name for name in eligible if sums[name] > self.threshold]
+        due = [name for name in eligible if exceeds(sums[name], self.threshold)]
         delta_j = 0.0
         if due:
             best = cheapest(costs, due, now)
             delta_j = stays - costs[best]
-        if delta_j <= 0:
+        if not exceeds(delta_j, 0.0):
             reason: Reason = "hold" if within_caps else "infeasible"
             return self._stay(reason, costs, delta_j), tuple(sums.values())
         reason = pricing.reason(best, costs, eligible, within_caps=within_caps)

@@ -3,12 +3,12 @@
 Window k ran under the incumbent, placement k - 1. The lines of the algorithm, with its corner
 cases decided:
 
-* J of the incumbent is that of its entry in the estimates, with the switching term of its own last
-  decision (placement k - 1 against k - 2); J of every candidate, the incumbent included, is that of
+* J of the incumbent comes from its entry in the estimates, with the switching term of its own last
+  decision (placement k - 1 against k - 2). J of every candidate, the incumbent included, comes from
   its entry against the incumbent. The incumbent's entry is what was measured, as in the paper,
   unless the estimator learns: both sides of Delta J are then its predictions.
 * Delta J must exceed Delta_min and the `dwell.cost.margin` of the two estimates, which is 0 where
-  they say no errors.
+  they say no errors, by more than `dwell.cost.GAIN_TOLERANCE`.
 * n_d counts windows since the last migration and blocks while n_d < N_min. Two migrations are
   therefore at least N_min + 1 windows apart, and K windows hold at most
   floor(K / (N_min + 1)) of them, whatever the metrics do.
@@ -27,12 +27,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
+from typing import Self
 
-from dwell.cost import excess
+from dwell.cost import exceeds, excess
 from dwell.errors import MetricError
 from dwell.model.bounds import MIN_DWELL, MIN_IMPROVEMENT
 from dwell.model.objective import Objective
 from dwell.model.placement import Placement
+from dwell.model.problem import Problem
 from dwell.model.qos import Decision, QoS
 from dwell.policies.incumbent import PricingPolicy, check_parameter
 
@@ -49,7 +51,8 @@ class DTP(PricingPolicy):
     objective : Objective
         Weights, targets, caps and tiers of J.
     min_dwell : int
-        N_min, windows; 0 lets every window migrate.
+        N_min, calls of `decide`; 0 lets every call migrate. `from_problem` turns the cell's windows
+        into calls.
     min_improvement : float
         Delta_min, in units of J: an improvement must exceed it, and the margin of the estimates.
     escape : bool
@@ -64,9 +67,7 @@ class DTP(PricingPolicy):
 
     by_price = True
 
-    SETTINGS = MappingProxyType(
-        {"min_dwell": "min_dwell", "min_improvement": "min_improvement", "escape": "escape"}
-    )
+    SETTINGS = MappingProxyType({"min_improvement": "min_improvement", "escape": "escape"})
 
     def __init__(
         self,
@@ -82,6 +83,13 @@ class DTP(PricingPolicy):
         self.min_dwell = check_parameter("min_dwell", min_dwell, MIN_DWELL)
         self.min_improvement = check_parameter("min_improvement", min_improvement, MIN_IMPROVEMENT)
         self.escape = escape
+
+    @classmethod
+    def from_problem(cls, problem: Problem) -> Self:
+        """Make the policy with the parameters of ``problem.controller``."""
+        policy = super().from_problem(problem)
+        policy.min_dwell = problem.min_dwell_decisions
+        return policy
 
     def __repr__(self) -> str:
         return (
@@ -110,7 +118,7 @@ class DTP(PricingPolicy):
         best = cheapest(costs, eligible, now)
         delta_j = self._stays(estimates) - costs[best]
         least = self.min_improvement + pricing.margin(estimates[best], estimates[now])
-        if best != now and delta_j > least:
+        if best != now and exceeds(delta_j, least):
             reason = pricing.reason(best, costs, eligible, within_caps=within_caps)
             return self._move(best, reason, costs, delta_j), None
         return self._stay("hold" if within_caps else "infeasible", costs, delta_j), None

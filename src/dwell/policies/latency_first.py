@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from dwell.cost import margin
+from dwell.cost import exceeds, margin
 from dwell.model.qos import NO_ERROR, Decision, QoS
 from dwell.policies.incumbent import CandidatePolicy
 from dwell.policies.pricing import explain_estimate
@@ -42,7 +42,7 @@ class LatencyFirst(CandidatePolicy):
             raise
         costs = self._costs(known)
         here, there = known[now], known[best]
-        if best == now or here.l95_ms - lowest <= _margin_ms(here, there):
+        if best == now or not exceeds(here.l95_ms - lowest, _margin_ms(here, there)):
             return self._stay("hold", costs), None
         return self._move(best, "migrate", costs), None
 

@@ -27,9 +27,10 @@ class UserPolicy(Proposer):
     """
 
     def __init__(self, given: MinimalPolicy) -> None:
-        if not callable(getattr(given, "decide", None)):
+        if isinstance(given, type) or not callable(getattr(given, "decide", None)):
             raise PolicyError(
-                f"{given!r} is no policy: it has no method decide(observed=..., estimates=...)"
+                f"{given!r} is no policy: it must be an object with a method "
+                "decide(observed=..., estimates=...)"
             )
         self._given = copy.deepcopy(given)
 

@@ -21,13 +21,13 @@ from dwell.model.document import Document, to_document
 from dwell.model.fleet import Fleet, FleetEntry
 from dwell.record.json_documents import read_document
 from dwell.record.run import FLEET, Run, open_run, read_table, write_table
+from dwell.record.schema import SCHEMA_VERSION, require_version
 
 if TYPE_CHECKING:
     import numpy as np
     import polars as pl
     from numpy.typing import NDArray
 
-VERSION = 1
 #: `FLEET` until all the rest is written.
 UNFINISHED = f".{FLEET}.unfinished"
 LOAD = "fleet-windows.parquet"
@@ -170,7 +170,7 @@ def describe_fleet(fleet: Fleet, **settings: Any) -> dict[str, Any]:
     document = fleet_document(fleet)
     digest = hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
     return {
-        "schema_version": VERSION,
+        "schema_version": SCHEMA_VERSION,
         "name": fleet.name,
         "file": fleet.file or None,
         "hash": digest,
@@ -254,9 +254,7 @@ def open_fleet(path: str | os.PathLike[str], *, whole: bool = True) -> FleetRun:
     if file is None:
         raise RunError(f"{folder}: no fleet's folder (it has no {FLEET})")
     described = read_document(file)
-    version = described.get("schema_version")
-    if not isinstance(version, int) or version > VERSION:
-        raise RunError(f"{file}: schema_version is {version!r}; this version reads up to {VERSION}")
+    require_version(described, f"{file}: ")
     try:
         names = [str(name) for name in described["cells"]]
         fleet = _fleet_of(described["fleet"], str(described.get("file") or ""))

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from dwell.errors import RunError, UnwritableError
 from dwell.model.table_columns import TABLES
-from dwell.record.schema import Columns, Types, polars_schema
+from dwell.record.schema import SCHEMA_VERSION, Columns, Types, polars_schema, require_version
 
 if TYPE_CHECKING:
     import polars as pl
@@ -176,6 +176,7 @@ class _Contents:
                 self.tables[name].add(rows)
 
     def _take_header(self, frame: Mapping[str, Any]) -> None:
+        require_version(frame)
         if self.run is None:
             self.run = str(frame["run"])
             self.columns = frame["columns"]
@@ -349,7 +350,8 @@ class Journal:
         self.cut_bytes = 0
         self.file = self.folder / JOURNAL
         # Anything that cannot be written must not leave half a journal.
-        header = {"run": run, "meta": dict(meta), "columns": self.columns}
+        version = {"schema_version": SCHEMA_VERSION}
+        header = {"run": run, **version, "meta": dict(meta), "columns": self.columns}
         _frame({**header, "opened": 1})
         self._require_place()
         try:

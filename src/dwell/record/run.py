@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import re
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
@@ -20,7 +19,7 @@ from dwell.model import Problem, Scenario
 from dwell.model.table_columns import TABLES
 from dwell.record.journal import JOURNAL, Journal, read_journal
 from dwell.record.json_documents import read_document
-from dwell.record.schema import SCHEMA_VERSION
+from dwell.record.schema import SCHEMA_VERSION, require_version
 from dwell.record.table_arrays import TableArrays, arrays_of
 
 if TYPE_CHECKING:
@@ -40,6 +39,9 @@ LOSSES = {
     "missing_cycles": "Cycles missing from the run: {}.",
     "missing_windows": "Windows missing from the run: {}.",
 }
+
+#: Why a measured run has no jobs.
+NO_JOBS = "this run kept no jobs; `dwell controller --jobs` keeps them"
 
 Table: TypeAlias = "pl.DataFrame | Callable[[], pl.DataFrame]"
 
@@ -81,7 +83,7 @@ class Run(Displayed):
     def meta(self) -> dict[str, Any]:
         """What it is the record of, ready for JSON."""
         meta = self._meta() if callable(self._meta) else self._meta
-        return {**_in_todays_words(meta), "schema_version": SCHEMA_VERSION}
+        return {**meta, "schema_version": SCHEMA_VERSION}
 
     def _table(self, name: str) -> pl.DataFrame:
         table = self._tables[name]
@@ -159,6 +161,12 @@ class Run(Displayed):
         return self._table("cycles")
 
     @property
+    def last_window_end(self) -> int:
+        """Number of rows of `cycles` up to the end of the last window; statistics end there."""
+        (within,) = (~self.arrays("cycles")["lead"]).nonzero()
+        return int(within[-1]) + 1 if len(within) else 0
+
+    @property
     def windows(self) -> pl.DataFrame:
         """One row a window: what it showed, and what the controller saw of it."""
         return self._table("windows")
@@ -178,7 +186,8 @@ class Run(Displayed):
             If the run was made without them.
         """
         if "jobs" not in self._tables:
-            raise RunError("this run kept no jobs; simulate with jobs=True (`dwell run --jobs`)")
+            how = "simulate with jobs=True (`dwell run --jobs`)"
+            raise RunError(f"this run kept no jobs; {how}" if self.is_simulated else NO_JOBS)
         return self._table("jobs")
 
     @property
@@ -205,6 +214,11 @@ class Run(Displayed):
         if "run" not in self.cycles.columns or self.cycles.is_empty():
             return None
         return str(self.cycles["run"][0])
+
+    @property
+    def is_simulated(self) -> bool:
+        """Whether a simulator made it; a live run was measured."""
+        return str(self.meta.get("kind", "simulated")) == "simulated"
 
     @property
     def has_jobs(self) -> bool:
@@ -338,7 +352,7 @@ def open_run(path: str | os.PathLike[str]) -> Run:
     Raises
     ------
     RunError
-        If the folder is missing, is not a run, lacks a table, or has a newer schema.
+        If the folder is missing, is not a run, lacks a table, or has another version of the schema.
     """
     folder = Path(path)
     if not folder.is_dir():
@@ -355,28 +369,13 @@ def open_run(path: str | os.PathLike[str]) -> Run:
             raise RunError(f"{folder} is a fleet's folder; name the run of a cell in it")
         raise RunError(f"{folder}: not a run (it has no run.json)")
     meta = read_document(file)
-    version = meta.get("schema_version")
-    if not isinstance(version, int) or version > SCHEMA_VERSION:
-        raise RunError(
-            f"{file}: schema_version is {version!r}; this version reads up to {SCHEMA_VERSION}"
-        )
+    require_version(meta, f"{file}: ")
     missing = [name for name in ALWAYS if not (folder / f"{name}.parquet").is_file()]
     if missing:
         raise RunError(f"{folder}: incomplete run, without {', '.join(missing)}")
     more = [name for name in ON_REQUEST if (folder / f"{name}.parquet").is_file()]
     names = [*ALWAYS, *more]
     return Run(meta, {name: read_table(folder / f"{name}.parquet") for name in names})
-
-
-def _in_todays_words(meta: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return what a run says of itself in today's words.
-
-    The class ``ATP`` of runs without ``every_ms`` is today's ``ATPThresholds``.
-    """
-    policy = meta.get("policy")
-    if isinstance(policy, str) and re.match(r"ATP(\(|$)", policy) and "every_ms=" not in policy:
-        return {**meta, "policy": f"ATPThresholds{policy.removeprefix('ATP')}"}
-    return meta
 
 
 def seal_run(path: str | os.PathLike[str], **meta: object) -> Run:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias, cast, get_args
 
+from dwell.errors import RunError
 from dwell.model import REASONS, Problem, Reason
 from dwell.model.instants import NEVER_NS
 from dwell.model.table_columns import TABLES, Column, Feature, columns_of, those_with
@@ -19,7 +20,8 @@ from dwell.record.table_arrays import Names
 if TYPE_CHECKING:
     import polars as pl
 
-SCHEMA_VERSION = 1
+#: Version of the folders of runs and fleets; no other version is read.
+SCHEMA_VERSION = 2
 
 #: What became of a cycle or a job. Their order is that of the kernels' codes.
 OUTCOMES = ("in_flight", "done", "dropped", "replaced", "node_down", "not_applied")
@@ -56,6 +58,22 @@ Columns: TypeAlias = Mapping[str, Types]
 Row: TypeAlias = tuple[object, ...]
 #: Values of a row by column.
 Values: TypeAlias = Mapping[str, object]
+
+
+def require_version(written: Mapping[str, Any], source: str = "") -> None:
+    """Refuse the record of a run or fleet that has another version.
+
+    Raises
+    ------
+    RunError
+        If it has; `source` begins the message.
+    """
+    version = written.get("schema_version")
+    if version != SCHEMA_VERSION:
+        raise RunError(
+            f"{source}schema_version is {version!r}; this version of Dwell reads "
+            f"{SCHEMA_VERSION} only: make the run again"
+        )
 
 
 def column_types(table: str, problem: Problem, features: Collection[Feature] = ()) -> Types:

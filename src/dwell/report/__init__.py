@@ -1,19 +1,6 @@
-"""Reports: pages, text for the terminal, files for papers; nothing heavy is imported here."""
+"""Reports: pages, text for the terminal, files for papers."""
 
-from dwell.report.campaign_page import campaign_html
-from dwell.report.comparison_page import comparison_html, comparison_text
-from dwell.report.run_page import run_html
-from dwell.report.study_page import study_html
-from dwell.report.trace_events import trace_events
-from dwell.report.validation_page import validation_html, validation_text
+import lazy_loader
 
-__all__ = [
-    "campaign_html",
-    "comparison_html",
-    "comparison_text",
-    "run_html",
-    "study_html",
-    "trace_events",
-    "validation_html",
-    "validation_text",
-]
+# A name is imported when it is used; the stub lists them.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -8,13 +8,17 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from html import escape
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from dwell.files import write_whole
 from dwell.report.palette import PRINTED
 
 if TYPE_CHECKING:
@@ -147,7 +151,25 @@ def _resolved(drawing: Spec) -> Spec:
 
 @cache
 def javascript() -> str:
-    """Return Vega, Vega-Lite, their embedding and its interpreter as one script."""
+    """Return Vega, Vega-Lite, their embedding and its interpreter as one script.
+
+    vl-convert takes seconds to make it, so the user's cache keeps one per version of vl-convert.
+    """
+    from importlib.metadata import version
+
+    # Without a home (RuntimeError), or where it cannot be written, every process makes the script.
+    with suppress(OSError, RuntimeError):
+        caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        kept = Path(caches, "dwell", f"vega-{version('vl-convert-python')}.js")
+        if not kept.is_file():
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(kept, _made_javascript())
+        return kept.read_bytes().decode()
+    return _made_javascript()
+
+
+@cache
+def _made_javascript() -> str:
     import vl_convert
 
     # Without a snippet it is the whole bundle; the types of the package ask for one.

@@ -72,6 +72,11 @@ MIGRATIONS = Measure("migrations", "migrations")
 REGRET = Measure("regret", "regret", "%", 100.0)
 
 
+def own_measures(metrics: Iterable[str]) -> list[Measure]:
+    """Return the measures of a user's own metrics, without units."""
+    return [Measure(name, name, decimals=2) for name in metrics]
+
+
 class Written(NamedTuple):
     """A number and what is known of its error, each as text."""
 

@@ -14,6 +14,8 @@ from dwell.report.table import Columns, Table, Text
 from dwell.study.summary import latency_ms, order_statistic
 
 if TYPE_CHECKING:
+    import polars as pl
+
     from dwell.record import Run
     from dwell.report.run_header import RunHeader
 
@@ -87,14 +89,14 @@ def phase_rows(run: Run, header: RunHeader) -> list[PhaseRow]:
     """Return the phases of a run that have cycles; none where there are too many of them."""
     import polars as pl
 
-    cycles = run.cycles
+    cycles = run.cycles[: run.last_window_end]
     if cycles.is_empty():
         return []
     released_s = cycles["release_ns"].to_numpy() / 1e9
     found = phases(header.disturbed, float(released_s[-1]) + header.period_ms / 1e3)
     if len(found) > MOST:
         return []
-    moved_s = _moves(run)
+    moved_s = _moves(cycles)
     guard_s = _guarded(run, moved_s)
     rows = []
     for phase in found:
@@ -154,12 +156,12 @@ def phase_table(rows: Sequence[PhaseRow], palette: Palette) -> Table:
     return Table("phases", "By phase", columns, shown, caption=caption)
 
 
-def _moves(run: Run) -> list[tuple[float, str]]:
+def _moves(cycles: pl.DataFrame) -> list[tuple[float, str]]:
     """When the first cycle on another placement was released, and on which."""
     import polars as pl
 
-    cycles = run.cycles.select("release_ns", pl.col("placement").cast(pl.String))
-    changed = cycles.filter(pl.col("placement") != pl.col("placement").shift(1))
+    placed = cycles.select("release_ns", pl.col("placement").cast(pl.String))
+    changed = placed.filter(pl.col("placement") != pl.col("placement").shift(1))
     return [(at_ns / 1e9, placement) for at_ns, placement in changed.rows()]
 
 

@@ -26,6 +26,7 @@ from dwell.report.formatting import (
     MIGRATIONS,
     RATE,
     Measure,
+    own_measures,
     shown_contender,
     shown_policy,
     shown_scenario,
@@ -337,7 +338,8 @@ class PolicyBlocks:
             Measure(f"node_{name}", f"U of {name}", "%", 100.0)
             for name in self.problem.fabric.resources
         ]
-        measures = [one for one in (*MORE, *used) if one.column in self.runs.columns]
+        known = (*MORE, *used, *own_measures(self.found.metrics))
+        measures = [one for one in known if one.column in self.runs.columns]
         return Table(
             f"{self.prefix}more",
             "More numbers",

@@ -62,6 +62,8 @@ if TYPE_CHECKING:
     from dwell.record import Run
 
 WORST = 10
+#: Most labels of a figure's cycles.
+LABELS = 25
 #: Share of a deadline that clocks may be off by, where a window's latencies are proven.
 PROVEN_SHARE = 0.2
 
@@ -234,7 +236,9 @@ class _RunPage:
             value_name="time_ms",
         )
         lost = frame.filter(pl.col("latency_ms").is_null()).select("cycle", "outcome")
-        axis = {"labelOverlap": True, "labelAngle": 0}
+        # Vega measures every label before it drops some that overlap.
+        shown = cycles["cycle"].to_list()[:: -(-len(cycles) // LABELS)]
+        axis = {"values": shown, "labelOverlap": True, "labelAngle": 0}
         across = {"field": "cycle", "type": "ordinal", "title": "cycle", "axis": axis}
         cycle, outcome = quantity("cycle", "cycle"), *names("outcome")
         time = {
@@ -253,8 +257,11 @@ class _RunPage:
         layers = [
             in_order(layer("bar", time, rows="parts"), PART_COLOURS),
             *limit_rule("y", self.header.deadline_ms, "deadline"),
-            layer("point", top, rows="lost", shape="triangle-down", filled=True, color=BAD),
         ]
+        if len(lost):
+            layers.append(
+                layer("point", top, rows="lost", shape="triangle-down", filled=True, color=BAD)
+            )
         return Figure(
             f"cycles-{window['window']}",
             "",

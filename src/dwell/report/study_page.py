@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING
 from dwell.model.bounds import counted
 from dwell.report.charts import NO_LIMIT, Limit, curves
 from dwell.report.figure import Figure
-from dwell.report.formatting import COST, L95, MIGRATIONS, RATE, REGRET, Measure, few_seeds
+from dwell.report.formatting import (
+    COST,
+    L95,
+    MIGRATIONS,
+    RATE,
+    REGRET,
+    Measure,
+    few_seeds,
+    own_measures,
+)
 from dwell.report.method import numbered
 from dwell.report.page import Block, Definitions, Page, Section, page_html
 from dwell.report.policy_blocks import THE_AIM, PolicyBlocks, named, scaled
@@ -56,6 +65,7 @@ def _sections(study: StudyRuns, blocks: PolicyBlocks) -> Iterator[Section]:
         figures = [blocks.tail(), blocks.measure(COST, title="J"), blocks.distribution()]
         if REGRET in _measures(study):
             figures.append(blocks.measure(REGRET, title="Regret"))
+        figures += [blocks.measure(one, title=one.name) for one in own_measures(study.metrics)]
         yield Section("Figures", [*figures, *blocks.placed(), blocks.split()])
         yield Section("More numbers", [blocks.more()])
     method = blocks.method(
@@ -66,7 +76,7 @@ def _sections(study: StudyRuns, blocks: PolicyBlocks) -> Iterator[Section]:
 
 
 def _measures(study: StudyRuns) -> list[Measure]:
-    measures = (RATE, L95, COST, MIGRATIONS, REGRET)
+    measures = (RATE, L95, COST, MIGRATIONS, REGRET, *own_measures(study.metrics))
     return [one for one in measures if one.column in study.runs.columns]
 
 

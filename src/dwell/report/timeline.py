@@ -262,16 +262,11 @@ def _spread(rates: pl.DataFrame, step_s: float) -> pl.DataFrame:
 
 
 def resources_in(windows: pl.DataFrame, problem: Problem) -> tuple[str, ...]:
-    """Return the resources of which windows say how busy they were.
-
-    They say so of every node; of accelerators not where nobody measured them, nor in runs that were
-    made before they were counted.
-    """
+    """Return the nodes, and the accelerators whose use was measured."""
     return tuple(
         name
         for name, one in problem.fabric.resources.items()
-        if not one.kind
-        or (f"u_{name}" in windows.columns and windows[f"u_{name}"].null_count() < windows.height)
+        if not one.kind or windows[f"u_{name}"].null_count() < windows.height
     )
 
 
@@ -320,15 +315,13 @@ def _estimates(
             .alias("j"),
         )
         for name in candidates
-        if f"j_{name}" in priced.columns
     ]
-    schema = {"time": pl.Float64, "placement": pl.String, "j": pl.Float64}
-    found = pl.concat(parts) if parts else pl.DataFrame(schema=schema)
+    found = pl.concat(parts)
     if each == 1:
         return found
     bins = found.with_columns(bin=(pl.col("time").rank("dense") - 1) // each)
     means = bins.group_by("bin", "placement", maintain_order=True)
-    return means.agg(pl.col("time").mean(), pl.col("j").median()).select(list(schema))
+    return means.agg(pl.col("time").mean(), pl.col("j").median()).select(found.columns)
 
 
 def _moves(

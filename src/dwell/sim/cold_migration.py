@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dwell.kernels.advance import post_event, send_state
+from dwell.kernels.advance import end_repeats, post_event, send_state
 from dwell.kernels.arrays import CellArrays
-from dwell.kernels.codes import CYCLE_BITS, EventKind, cycle_of, item_of
+from dwell.kernels.codes import CYCLE_BITS, EventKind, cycle_of, item_of, make_key
 from dwell.kernels.realisation import Realisation
 from dwell.model import Problem
 
@@ -55,15 +55,18 @@ class ColdMigration:
         key, now = int(clock["step_key"]), int(clock["step_ns"])
         field, row = cycle_of(key), item_of(key)
         attempt, ready = (field >> 1) & ATTEMPTS, bool(field & 1)
-        if not self.hops or field >> NUMBER_SHIFT != self.number & NUMBERS:
+        number = field >> NUMBER_SHIFT
+        arrival = make_key(EventKind.MIGRATE, arrays.part.row, number << NUMBER_SHIFT | 1, row)
+        if not self.hops or number != self.number & NUMBERS:
             # A step of a migration that the guard has cut short.
+            end_repeats(arrays, arrival, now)
             return False
         if ready:
             del self.hops[row]
             return not self.hops
-        t, arrived, attempt = send_state(arrays, self.hops[row], self.boundary, attempt, now)
+        t, attempt = send_state(arrays, self.hops[row], self.boundary, attempt, arrival, now)
         if t >= 0:
-            self._announce(arrays, row, attempt, arrived, t)
+            self._announce(arrays, row, attempt, False, t)
         return False
 
     def stop(self) -> None:

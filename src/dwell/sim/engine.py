@@ -332,7 +332,7 @@ class _Stamper:
         # What every decision reads; these tables never grow.
         tables = arrays.tables
         self.stamps, self.cell = tables.stamps, tables.cells[0]
-        self.closed = tables.cells["window"]
+        self.closed, self.firsts = tables.cells["window"], tables.seen["first_cycle"]
         seen = tables.looked if self.looks else tables.seen
         self.seen = [seen[name] for name in SEEN]
         self.made = tables.cells["look" if self.looks else "window"]
@@ -401,8 +401,7 @@ class _Stamper:
         boundary = self.seen[0].item(0, index) + cycles
         close_ns = self._close_ns(boundary)
         left = self.course.placement
-        window = self.closed.item(0) - (boundary <= int(self.cell["window_first"]))
-        self.controller.looked = LookedAt(window, boundary - 1, cycles)
+        self.controller.looked = LookedAt(self._window_of(boundary - 1), boundary - 1, cycles)
         if len(self.decided):
             self.course.move(self.names[self.decided.item(0)])
         elif self.host_is_down(close_ns):
@@ -420,6 +419,13 @@ class _Stamper:
         if over or not self._begin(left, boundary, close_ns):
             self._stamp(self.stamped, earliest, left)
             self._move(earliest, begins_window=not self.looks)
+
+    def _window_of(self, cycle: int) -> int:
+        """Return the number of windows that have ended by a cycle: that of its own, if any."""
+        window = self.closed.item(0)
+        while window and self.firsts.item(0, window - 1) + self.window_cycles > cycle:
+            window -= 1
+        return window
 
     def _decide(self, index: int, boundary: int, close_ns: int) -> None:
         """Ask the controller, and send the probes that it wants."""
@@ -550,7 +556,7 @@ def _evidence(
         instants = [Instants(*of) for of in logged_instants(arrays, first, last, flows)]
         return Evidence(
             close_ns=close_ns,
-            release_ns=realisation.release_ns[first:last],
+            release_ns=realisation.release_ns[first:last].copy(),
             placement=stamps[0, first:last].copy(),
             cycles=instants[0],
             shadow_placement=(

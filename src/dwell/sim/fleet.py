@@ -152,7 +152,9 @@ def phases_ms(fleet: Fleet, seed: int) -> dict[str, float]:
     found = {}
     for i, cell in enumerate(cells):
         own = cell.entry.phase_ms
-        if own is None and not (own := cell.problem.pipeline.phase_ms):
+        if own is None:
+            own = cell.problem.pipeline.phase_ms
+        if own is None:
             own = _phase_ms(fleet.phases, cell, i, len(cells), seed)
         found[cell.name] = own
     return found

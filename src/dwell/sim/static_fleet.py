@@ -72,7 +72,7 @@ class StaticFleet:
         reals = []
         for i, (cell, problem) in enumerate(zip(fleet.cells, problems, strict=True)):
             key = (problem.name, cell.copy, cell.entry.scenario, i == 0)
-            phase_ms = problem.pipeline.phase_ms
+            phase_ms = problem.pipeline.first_release_ms
             known = self._drawn.get(key)
             if known is None or (known[1].trace_starts and known[0] != phase_ms):
                 real = draw_cell(fleet, cell, problem, self.seed, self.windows, is_first=i == 0)

@@ -92,23 +92,35 @@ class PlayedRealisation:
     def by_window(self, cycles: NDArray[T]) -> NDArray[T]:
         """Values of cycles as rows of windows, (windows, W); a view where none is left out."""
         if self.whole:
-            return cycles[: self.released].reshape(-1, self.problem.window_cycles)
+            return cycles[: self.counted].reshape(-1, self.problem.window_cycles)
         rows: NDArray[T] = sliding_window_view(cycles, self.problem.window_cycles)[self.first]
         return rows
 
     @property
     def whole(self) -> bool:
-        """Whether every cycle up to the last close is in a window."""
-        return self.released == len(self.first) * self.problem.window_cycles
+        """Whether every cycle up to the end of the last window is in a window."""
+        return self.counted == len(self.first) * self.problem.window_cycles
+
+    @property
+    def counted(self) -> int:
+        """Number of cycles up to the end of the last window."""
+        return int(self.first[-1]) + self.problem.window_cycles if len(self.first) else 0
 
     @property
     def released(self) -> int:
-        """Number of cycles played: those up to the last close.
+        """Number of cycles released before the run ended.
 
-        Fewer than were drawn where orders take time, because the cycles between a close and the
-        first one an order stamps belong to no window, and the last window may not be complete.
+        Fewer than were drawn if an order takes time: the cycles between a close and the first
+        cycle of the new placement belong to no window, and the last window may be incomplete.
         """
-        return int(self.first[-1]) + self.problem.window_cycles if len(self.first) else 0
+        return int(self.arrays.tables.cells[0]["released"])
+
+    @cached_property
+    def lead(self) -> NDArray[np.bool_]:
+        """Whether each cycle belongs to no window."""
+        lead = np.ones(self.released, np.bool_)
+        lead[self.first[:, None] + np.arange(self.problem.window_cycles)] = False
+        return lead
 
     @property
     def close_ns(self) -> Ints:
@@ -121,10 +133,12 @@ class PlayedRealisation:
         """Whether each cycle missed: later than D, or unfinished when its window closed."""
         latency_ns = self.arrays.tables.latency_ns[0, : self.released]
         missed: NDArray[np.bool_] = latency_ns > self.problem.pipeline.deadline_ns
+        # The run has ended before the windows of the last cycles could close.
+        missed[self.counted :] = False
         age_ns = self.close_ns[:, None] - self.by_window(self.realisation.release_ns)
         late = self.by_window(latency_ns) > age_ns
         if self.whole:
-            missed |= late.ravel()
+            missed[: self.counted] |= late.ravel()
         else:
             window, place = late.nonzero()
             missed[self.first[window] + place] = True
@@ -188,6 +202,7 @@ def _cycles(played: PlayedRealisation) -> TableArrays:
             "compute_ns": lambda: finished(compute),
             "queue_ns": lambda: finished(latency - compute - network),
             "network_ns": lambda: finished(network),
+            "lead": lambda: played.lead,
         }
     )
 
@@ -267,19 +282,18 @@ def _costs(played: PlayedRealisation, seen: dict[str, Floats]) -> Floats:
     """
     problem, resources = played.problem, played.controller.resources
     used = played.shares[:, 0]
-    tiers = [
-        used[:, [resources.index(name) for name in names]].max(axis=1) if names else 0.0
+    robot, edge, cloud = (
+        used[:, [resources.index(name) for name in names]].max(axis=1, initial=0.0)
         for names in tier_nodes(problem.objective)
-    ]
+    )
     candidates = list(problem.candidates.values())
     moved = np.array([[hamming(there, here) for there in candidates] for here in candidates])
     stamps = played.arrays.tables.stamps[0].astype(np.int64)
     switched = np.zeros(len(stamps))
     switched[1:] = moved[stamps[:-1], stamps[1:]]
     switching = played.by_window(switched).sum(axis=1)
-    costs: Floats = price(
-        seen["l95_ms"], seen["violation_rate"], *tiers, switching, problem.objective
-    )
+    l95_ms, rate = seen["l95_ms"], seen["violation_rate"]
+    costs: Floats = price(l95_ms, rate, robot, edge, cloud, switching, problem.objective)
     unseen = [played.host_down(at_ns) for at_ns in played.close_ns.tolist()]
     for values in (*seen.values(), costs):
         values[unseen] = np.nan
@@ -312,7 +326,7 @@ def _decided_by_kernel(played: PlayedRealisation) -> TableArrays:
     count, last = len(looked), looked["first_cycle"] + looked["cycles"] - 1
     decided = tables.decided[:count]
     columns: dict[str, object] = {
-        "window": np.searchsorted(played.first, last, side="right") - 1,
+        "window": np.searchsorted(played.first + played.problem.window_cycles, last, side="right"),
         "last_cycle": last,
         "cycles": looked["cycles"],
         "incumbent": Names(decided["incumbent"], names),

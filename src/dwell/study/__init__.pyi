@@ -3,7 +3,6 @@ from .capacity import CapacityPoint as CapacityPoint
 from .capacity import Limiting as Limiting
 from .capacity import capacity_of as capacity_of
 from .capacity import what_ifs as what_ifs
-from .comparison import AIM as AIM
 from .comparison import Comparison as Comparison
 from .comparison import compare as compare
 from .demo import canonical_demo as canonical_demo
@@ -22,6 +21,7 @@ from .intervals import mean_interval as mean_interval
 from .intervals import median_interval as median_interval
 from .intervals import share_interval as share_interval
 from .intervals import under as under
+from .kept_bounds import AIM as AIM
 from .kept_bounds import keeps as keeps
 from .over_seeds import over_seeds as over_seeds
 from .over_seeds import windows_behind as windows_behind
@@ -34,10 +34,13 @@ from .predictions import paper_predictions as paper_predictions
 from .results import StudyRuns as StudyRuns
 from .runner import StudyResult as StudyResult
 from .runner import run_study as run_study
+from .shards import merge_shards as merge_shards
+from .shards import run_shard as run_shard
 from .study import Contender as Contender
 from .study import Point as Point
 from .study import Study as Study
 from .study import load_study as load_study
+from .study_folder import Shard as Shard
 from .study_folder import open_study as open_study
 from .validation import Validation as Validation
 from .validation import validate as validate

@@ -32,6 +32,7 @@ def spread_on_dask(
     *,
     address: str,
     take: Callable[[Unit, Result], None],
+    rest: Callable[[Result], Unit | None] = lambda _: None,
 ) -> None:
     """Do a task on every unit.
 
@@ -43,6 +44,8 @@ def spread_on_dask(
         The scheduler's, as ``tcp://host:8786``.
     take : callable
         Called in this process with each unit and its result, as soon as that is ready.
+    rest : callable
+        Returns the part of a unit that its result leaves open, which is then a further unit.
 
     Raises
     ------
@@ -53,7 +56,7 @@ def spread_on_dask(
     with _quiet():
         client = _connect(dask, address)
         try:
-            _work(dask, client, task, units, take)
+            _work(dask, client, task, units, take, rest)
         finally:
             # The scheduler forgets what waits: nobody else asks for it.
             client.close(timeout=ANSWER_S)
@@ -92,7 +95,7 @@ def _connect(dask: Any, address: str) -> Any:
         client.close(timeout=ANSWER_S)
         raise SimulationError(
             f"the Dask scheduler at {address} has no workers; start one with "
-            f"`dask worker {address}`"
+            f"`dask worker {address} --nthreads 1`"
         ) from None
     return client
 
@@ -124,15 +127,25 @@ def _work(
     task: Callable[[Unit], Result],
     units: Sequence[Unit],
     take: Callable[[Unit, Result], None],
+    rest: Callable[[Result], Unit | None],
 ) -> None:
     """Send all units, and take their results as they come."""
     # Sent to each worker once, like the task of a local process.
     everywhere = client.scatter(task, broadcast=True, hash=False)
-    futures = client.map(operator.call, [everywhere] * len(units), units, pure=False)
-    waiting = dict(zip(futures, units, strict=True))
+
+    def send(those: Sequence[Unit]) -> dict[Any, Unit]:
+        futures = client.map(operator.call, [everywhere] * len(those), those, pure=False)
+        return dict(zip(futures, those, strict=True))
+
+    waiting = send(units)
+    ready = dask.as_completed(list(waiting), loop=client.loop)
     try:
-        for future in dask.as_completed(list(waiting), loop=client.loop):
-            take(waiting.pop(future), future.result())
+        for future in ready:
+            unit, result = waiting.pop(future), future.result()
+            take(unit, result)
+            if (left := rest(result)) is not None:
+                waiting |= (more := send([left]))
+                ready.update(more)
     except dask.KilledWorker:
         raise SimulationError(
             "workers of the Dask cluster ended again and again before their work was done; look "

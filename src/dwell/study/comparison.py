@@ -22,9 +22,6 @@ if TYPE_CHECKING:
 
 Contenders: TypeAlias = "Mapping[str, MinimalPolicy | str]"
 
-#: Share of missed deadlines that a cell should stay under (the paper's 5 %).
-AIM = 0.05
-
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False, kw_only=True)
 class Comparison(StudyRuns):
@@ -43,7 +40,7 @@ def compare(
     problem: Problem,
     *,
     scenarios: Sequence[str] | None = None,
-    policies: Sequence[str | Contender] | Contenders,
+    policies: Sequence[str | Contender | MinimalPolicy] | Contenders,
     seeds: Sequence[int],
     windows: int,
     processes: int | None = None,
@@ -55,10 +52,10 @@ def compare(
     ----------
     scenarios : sequence of str, optional
         All of the problem's where None.
-    policies : sequence of str or Contender, or mapping of str to policy or str
-        Names (`dtp`, a candidate's, ...), policies with an estimator of their own, or policies of
-        your own by the name they shall have in the tables. A policy that is an object must pickle
-        where there are several processes.
+    policies : sequence of str, Contender or policy, or mapping of str to policy or str
+        Names (`dtp`, a candidate's, ...), policies with an estimator of their own, or objects of
+        your own. In a sequence an object has its class's name in the tables, in a mapping its key.
+        With several processes an object must pickle, and its class must be in a module.
     seeds : sequence of int
         All different; the result is the same for the same seeds, whatever `processes` is.
     windows : int
@@ -73,13 +70,14 @@ def compare(
     ProblemError, PolicyError, TraceError
         If something named is unknown, or a trace is too short.
     SimulationError
-        If a number is out of its range, or a worker process ended early.
+        If a number is out of its range, two objects have one class's name, an object cannot be
+        sent to worker processes, or a worker process ended early.
     """
     if isinstance(policies, Mapping):
-        contenders = [_contender(problem, name, policy) for name, policy in policies.items()]
+        contenders = [_contender(problem, policy, name) for name, policy in policies.items()]
     else:
         contenders = [
-            one if isinstance(one, Contender) else _contender(problem, one, one) for one in policies
+            one if isinstance(one, Contender) else _contender(problem, one) for one in policies
         ]
     study = Study(
         name=problem.name,
@@ -95,8 +93,8 @@ def compare(
     return Comparison(**results_of(study, tables), examples=examples)
 
 
-def _contender(problem: Problem, name: str, policy: MinimalPolicy | str) -> Contender:
+def _contender(problem: Problem, policy: MinimalPolicy | str, name: str = "") -> Contender:
     """Return a policy of a comparison; ``cusum+corrected`` names its estimator."""
     if isinstance(policy, str):
-        return Contender(name, *problem.policy_and_estimator(policy))
-    return Contender(name, policy)
+        return Contender(name or policy, *problem.policy_and_estimator(policy))
+    return Contender(name or type(policy).__name__, policy)

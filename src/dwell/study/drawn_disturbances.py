@@ -19,7 +19,7 @@ def disturbances_of(run: Run) -> Scenario:
         If the run's record of them cannot be read.
     """
     scenario, seed = run.meta.get("scenario"), run.meta.get("seed")
-    played = run.played is not None or run.meta.get("kind", "simulated") != "simulated"
+    played = run.played is not None or not run.is_simulated
     known = scenario in run.problem.scenarios and isinstance(seed, int)
     if played or not known or run.windows.is_empty():
         return run.disturbances

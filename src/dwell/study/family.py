@@ -206,11 +206,8 @@ def same_run(runs: pl.DataFrame, pair: Contrast) -> bool:
     Parameters
     ----------
     runs : DataFrame
-        One row a run. Those of older versions do not have what tells it: then it is not known, and
-        this is False.
+        One row per run.
     """
-    if PLAYED not in runs.columns:
-        return False
     first, second = (_group(runs, labels).select("seed", PLAYED) for labels in pair)
     return first.equals(second, null_equal=False)
 

@@ -18,8 +18,10 @@ the bootstrap has nothing to say: below `FEWEST` values, and where almost all ar
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import accumulate
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -254,14 +256,12 @@ def median_interval(values: Values) -> Interval:
         The ceil(n/2)-th smallest; the ends are the r-th smallest and r-th largest for the largest
         r whose coverage reaches `CONFIDENCE`. NaN at the ends below 6 values, where none does.
     """
-    from scipy.stats import binom
-
     sample = np.sort(np.asarray(values, np.float64))
     count = len(sample)
     median = float(sample[(count + 1) // 2 - 1])
     # The largest r such that fewer than r of n values fall below the median with a probability of
     # at most half of what is left over.
-    rank = int(binom.ppf((1 - CONFIDENCE) / 2, count, 0.5))
+    rank = bisect_left(halves(count), (1 - CONFIDENCE) / 2)
     if rank < 1:
         return Interval(median, math.nan, math.nan)
     return Interval(median, float(sample[rank - 1]), float(sample[count - rank]))
@@ -310,8 +310,6 @@ def studentised_limits(
 @lru_cache(maxsize=4096)
 def _studentised(values: tuple[float, ...], tail: float, seed: int) -> tuple[float, float]:
     """Quantiles `tail` and 1 - `tail` of t*, over resamples of the values."""
-    from scipy.stats import bootstrap
-
     sample = np.array(values)
     centred = sample - sample.mean()
     # What rounding leaves: of a value that is the mean, and of the spread of equal values.
@@ -319,21 +317,11 @@ def _studentised(values: tuple[float, ...], tail: float, seed: int) -> tuple[flo
     centred[np.abs(centred) < least] = 0.0
     root = math.sqrt(len(values))
 
-    def angle(resample: Floats, axis: int = -1) -> Floats:
-        """Arctangent of t*: in the same order, and finite where t* is not."""
-        error = resample.std(axis=axis, ddof=1) / root
-        angles: Floats = np.arctan2(resample.mean(axis=axis), np.where(error > least, error, 0.0))
-        return angles
-
-    resampled = bootstrap(
-        (centred,),
-        angle,
-        n_resamples=RESAMPLES,
-        vectorized=True,
-        method="percentile",
-        rng=np.random.default_rng(seed),
-    )
-    angles = np.sort(resampled.bootstrap_distribution)
+    rng = np.random.default_rng(seed)
+    resamples = centred[rng.integers(len(values), size=(RESAMPLES, len(values)))]
+    error = resamples.std(axis=1, ddof=1) / root
+    # Arctangents of t*: in the same order, and finite where t* is not.
+    angles = np.sort(np.arctan2(resamples.mean(axis=1), np.where(error > least, error, 0.0)))
     rank = round((RESAMPLES + 1) * tail)
     return _tangent(float(angles[rank - 1])), _tangent(float(angles[-rank]))
 
@@ -404,10 +392,36 @@ def _unseen(runs: int, tail: float) -> float:
 
 def _half_width(sample: Floats, tail: float) -> float:
     """Student's t quantile times the standard error of the mean; for at least two values."""
-    from scipy.stats import t
-
     count = len(sample)
-    return float(t.ppf(1 - tail, count - 1) * sample.std(ddof=1) / math.sqrt(count))
+    return student_quantile(count - 1, tail) * float(sample.std(ddof=1)) / math.sqrt(count)
+
+
+@lru_cache(maxsize=4096)
+def student_quantile(free: int, tail: float) -> float:
+    """Student's t that is exceeded with probability `tail`, by whole degrees of freedom.
+
+    With t = √free tan θ, the probability of |T| < t is a finite sum in sin θ and cos θ (Abramowitz
+    and Stegun, Handbook of Mathematical Functions, 26.7.3 and 26.7.4).
+    """
+
+    def within(angle: float) -> float:
+        sine, cosine, total = math.sin(angle), math.cos(angle), float(free > 1)
+        for k in range(free - 3, 0, -2):
+            total = 1 + k / (k + 1) * cosine * cosine * total
+        return 2 / math.pi * (angle + sine * cosine * total) if free % 2 else sine * total
+
+    low, high = 0.0, math.pi / 2
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if within(middle) < 1 - 2 * tail else (low, middle)
+    return math.sqrt(free) * math.tan(low)
+
+
+@lru_cache(maxsize=4096)
+def halves(count: int) -> tuple[float, ...]:
+    """Probabilities that at most 0, 1, 2, ... of so many tosses of a coin are heads."""
+    ways = accumulate(range(count), lambda of, k: of * (count - k) // (k + 1), initial=1)
+    return tuple(below / 2**count for below in accumulate(ways))
 
 
 def _same(sample: Floats) -> bool:

@@ -45,7 +45,8 @@ def jobs_of(run: Run, scenario: str, policy: str, number: int) -> pl.DataFrame:
     import polars as pl
 
     first = int(run.windows.filter(~pl.col("warmup"))["first_cycle"][0])
-    jobs = run.jobs.filter(pl.col("cycle") >= first)
+    last = int(run.cycles["cycle"][run.last_window_end - 1])
+    jobs = run.jobs.filter(pl.col("cycle").is_between(first, last))
     if "shadow" in jobs.columns:
         jobs = jobs.filter(~pl.col("shadow"))
     columns = ["cycle", "task", "node", "ready_ns", "start_ns", "end_ns"]

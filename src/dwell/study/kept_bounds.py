@@ -6,6 +6,8 @@ import math
 
 from dwell.study.intervals import Interval
 
+#: Share of missed deadlines that a cell should stay under (the paper's 5 %).
+AIM = 0.05
 #: The least number above 0: at least this is "above 0".
 ABOVE_ZERO = math.ulp(0.0)
 

@@ -107,12 +107,10 @@ def read_measured(folder: Path) -> MeasuredCampaign:
     logged: list[dict[str, Any]] = []
     within: dict[tuple[str, str], Any] = {}
     examples: dict[tuple[str, str], Example] = {}
-    renamed: dict[str, str] = {}
     windows, jobs, versions, kinds = [], [], {}, set()
     for path, record in kept.done.items():
         run = open_run(path)
-        scenario, policy = str(record["scenario"]), _contender(str(record["policy"]), run)
-        renamed[str(record["policy"])] = policy
+        scenario, policy = str(record["scenario"]), str(record["policy"])
         counted = without_excluded(run, problem)
         repetition = int(record["repetition"])
         labels: dict[str, str | int] = {"scenario": scenario, "policy": policy, "seed": repetition}
@@ -121,14 +119,12 @@ def read_measured(folder: Path) -> MeasuredCampaign:
         costs += summary.costs
         within[scenario, policy] = within.get((scenario, policy), 0) + summary.within
         examples.setdefault((scenario, policy), Example(run.windows, run.decisions))
-        logged.append(_logged({**record, "policy": policy}, run, counted))
+        logged.append(_logged(record, run, counted))
         windows.append(_windows(counted, problem, scenario, policy))
         if run.has_jobs:
             jobs.append(jobs_of(counted, scenario, policy, len(rows)))
         kinds.add(str(run.meta.get("kind", "simulated")))
         versions = dict(run.meta.get("versions", {}))
-    policies = {renamed.get(name, name): one for name, one in described["policies"].items()}
-    described = {**described, "policies": policies}
     runs = _in_order(pl.DataFrame(rows, infer_schema_length=None).sort("seed"), described)
     comparison = Comparison(
         name=problem.name,
@@ -153,7 +149,7 @@ def read_measured(folder: Path) -> MeasuredCampaign:
         seconds=float(described["seconds"]),
         planned=len(described["plan"]),
         log=pl.DataFrame(logged, infer_schema_length=None),
-        failed=_failed(kept, renamed),
+        failed=_failed(kept),
         profiles=profiles_of(every, problem),
         links=links,
         delays=delays,
@@ -198,20 +194,11 @@ def _logged(record: Mapping[str, Any], run: Run, counted: Run) -> dict[str, Any]
     }
 
 
-def _contender(name: str, run: Run) -> str:
-    """Return a run's policy by today's name: what ``atp`` was is ``atp-thresholds``."""
-    policy, plus, estimator = name.partition("+")
-    by_thresholds = str(run.meta.get("policy")).startswith("ATPThresholds")
-    return f"atp-thresholds{plus}{estimator}" if policy == "atp" and by_thresholds else name
-
-
-def _failed(kept: CampaignFolder, renamed: Mapping[str, str]) -> pl.DataFrame:
+def _failed(kept: CampaignFolder) -> pl.DataFrame:
     import polars as pl
 
     names = ("scenario", "policy", "repetition", "attempt", "outcome", "reason")
     rows = [{name: record.get(name) for name in names} for record in kept.failed]
-    for row in rows:
-        row["policy"] = renamed.get(str(row["policy"]), row["policy"])
     kinds = dict.fromkeys(names, pl.String) | {"repetition": pl.Int64, "attempt": pl.Int64}
     return pl.DataFrame(rows, schema=kinds)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
@@ -133,8 +133,7 @@ def read_measured(name: str, run: Run, problem: Problem, usual: Usual | None = N
             }
     except DwellError as error:
         raise RunError(f"{name}: {error}") from None
-    live = meta.get("kind", "simulated") != "simulated"
-    guard = bool(problem.controller.fallbacks) if live else bool(meta.get("guard", False))
+    guard = bool(meta.get("guard") if run.is_simulated else problem.controller.fallbacks)
     return MeasuredRun(
         name=name,
         problem=problem,
@@ -154,9 +153,7 @@ def excluded_windows(meta: Mapping[str, Any]) -> frozenset[int]:
     Parameters
     ----------
     meta : mapping
-        ``excluded_windows``, or ``excluded`` of ``pressure``: numbers, mappings with ``window``
-        and ``reason``, pairs of these, or a mapping of number to reason. None where both are
-        missing.
+        ``excluded_windows``, or ``excluded`` of ``pressure``: numbers. None where both are missing.
 
     Raises
     ------
@@ -171,18 +168,10 @@ def excluded_windows(meta: Mapping[str, Any]) -> frozenset[int]:
     numbers: set[int] = set()
     for field, windows in named.items():
         try:
-            numbers.update(map(_number_of, windows or ()))
+            numbers.update(map(int, windows or ()))
         except (TypeError, ValueError):
             raise RunError(f"{field} is {windows!r}; numbers of windows are wanted") from None
     return frozenset(numbers)
-
-
-def _number_of(window: Any) -> int:
-    if isinstance(window, Mapping):
-        window = window.get("window")
-    elif isinstance(window, Sequence) and not isinstance(window, str) and len(window) == 2:
-        window = window[0]
-    return int(window)
 
 
 # ------------------------------------------------------------------------------------- the cell

@@ -112,6 +112,11 @@ def interval_of(column: str, windows: int | None = None) -> Callable[[Floats], I
     return _not_negative if column in NOT_NEGATIVE or column.startswith("u_") else mean_interval
 
 
+def is_plain(column: str) -> bool:
+    """Whether a column's name gives no other interval than that of a mean."""
+    return interval_of(column) is mean_interval
+
+
 def difference_of(column: str, windows: int | None = None) -> Callable[[Floats, Floats], Interval]:
     """Which interval the mean difference of a column of runs takes, between pairs of runs."""
     if is_share(column):

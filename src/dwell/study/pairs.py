@@ -23,6 +23,7 @@ from dwell.study.intervals import (
     RESAMPLING_SEED,
     Floats,
     Values,
+    halves,
     mean_interval,
     median_interval,
     share_difference_interval,
@@ -181,8 +182,6 @@ def paired_median(first: Values, second: Values) -> PairedMedian:
     SimulationError
         If the samples are empty, differ in length, or hold a NaN.
     """
-    from scipy.stats import binomtest
-
     differences = _differences(*_pairs(first, second))
     below, above = int((differences < 0).sum()), int((differences > 0).sum())
     median, low, high = median_interval(differences)
@@ -191,7 +190,7 @@ def paired_median(first: Values, second: Values) -> PairedMedian:
         low=low,
         high=high,
         superiority=_superiority(differences),
-        p=float(binomtest(below, below + above).pvalue) if below + above else 1.0,
+        p=min(2.0 * halves(below + above)[min(below, above)], 1.0),
         n=len(differences),
     )
 
@@ -275,15 +274,13 @@ def _standardised(differences: Floats) -> float:
 
     Hedges 1981, DOI 10.3102/10769986006002107.
     """
-    from scipy.special import gammaln
-
     count, mean = len(differences), float(differences.mean())
     if count < 3:
         return math.nan
     if (differences == differences[0]).all():
         return math.copysign(math.inf, mean) if mean else 0.0
     free = count - 1
-    ratio = math.exp(gammaln(free / 2) - gammaln((free - 1) / 2))
+    ratio = math.exp(math.lgamma(free / 2) - math.lgamma((free - 1) / 2))
     return mean / float(differences.std(ddof=1)) * ratio * math.sqrt(2 / free)
 
 

@@ -1,4 +1,4 @@
-"""Player: does an item of a study, wherever it is sent to.
+"""Player: plays a batch of a study's items, wherever it is sent to.
 
 A contender may weigh in its own way: its controller then minimises one J, and is judged by
 another. What a window showed is the same for both.
@@ -6,12 +6,11 @@ another. What a window showed is the same for both.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, TypeAlias
-
-import numpy as np
-from numpy.typing import NDArray
+from itertools import product
+from typing import TYPE_CHECKING
 
 from dwell.errors import SimulationError
 from dwell.estimators.prices import Price, Question, known_prices, take_over
@@ -19,9 +18,10 @@ from dwell.model import Problem
 from dwell.model.bounds import counted
 from dwell.study.hindsight import Hindsight
 from dwell.study.judged_cost import judged_cost
-from dwell.study.reference import References, kept, play_alone, references, regret
+from dwell.study.own_metrics import own_metric
+from dwell.study.reference import CLAIRVOYANT, References, few_misses, play_alone, references
 from dwell.study.software import software
-from dwell.study.study import Contender, Item, Study
+from dwell.study.study import TAKEN, Contender, Item, Study
 from dwell.study.summary import Summary, summarise
 
 if TYPE_CHECKING:
@@ -30,7 +30,22 @@ if TYPE_CHECKING:
     from dwell.record import Run
     from dwell.sim import Realisation
 
-Floats: TypeAlias = NDArray[np.float64]
+#: How long a batch is played, seconds: this much work of a process is lost at most, and an item.
+BATCH_S = 1.0
+#: Columns by which tables compare runs with the references.
+COMPARED = frozenset(
+    {
+        "kept",
+        "asked",
+        "reference_cost",
+        "best_static",
+        "regret",
+        "share_kept",
+        "point",
+        "costs",
+        "within",
+    }
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,24 +61,58 @@ class Example:
 
 
 @dataclass(frozen=True, slots=True)
-class PlayedItem:
-    """Result of an item.
+class Batch:
+    """Items that follow each other in a study, and who plays them.
 
     Parameters
     ----------
-    summaries : tuple of (int, Summary)
-        The summary of every run, with the index of its point.
-    examples : mapping of (int, str) to Example
-        The runs that are kept whole, by point and policy.
+    first : int
+        Place of the first item in the study, from 0.
+    players : tuple of str
+        Some of `Study.players`.
     """
 
-    summaries: tuple[tuple[int, Summary], ...]
-    examples: Mapping[tuple[int, str], Example]
+    first: int
+    items: tuple[Item, ...]
+    players: tuple[str, ...]
+
+    @property
+    def end(self) -> int:
+        """Place after the last item."""
+        return self.first + len(self.items)
+
+    def split(self, count: int) -> tuple[Batch, Batch | None]:
+        """Return the first items, and the others if there are any."""
+        begun, left = self.items[:count], self.items[count:]
+        rest = replace(self, first=self.first + count, items=left) if left else None
+        return replace(self, items=begun), rest
+
+
+@dataclass(frozen=True, slots=True)
+class PlayedBatch:
+    """Result of a batch, as far as it was played.
+
+    Parameters
+    ----------
+    batch : Batch
+        The items that were played.
+    rest : Batch, optional
+        The items that were not.
+    summaries : mapping of str to list of (int, Summary)
+        The summaries of a player's runs, with the index of their points.
+    examples : mapping of (Item, int, str) to Example
+        The runs that are kept whole, by item, point and policy.
+    """
+
+    batch: Batch
+    rest: Batch | None
+    summaries: Mapping[str, list[tuple[int, Summary]]]
+    examples: Mapping[tuple[Item, int, str], Example]
 
 
 @dataclass(frozen=True, slots=True)
 class Player:
-    """Draws the realisation of an item and lets every contender play it.
+    """Draws the realisations of items and lets contenders play them.
 
     Parameters
     ----------
@@ -84,16 +133,16 @@ class Player:
     # Problems as contenders see them, by point and contender: a study asks for each many times.
     _seen: dict[tuple[int, str], Problem] = field(default_factory=dict, repr=False, compare=False)
 
-    def __call__(self, item: Item) -> PlayedItem:
-        """Do an item.
+    def __call__(self, batch: Batch) -> PlayedBatch:
+        """Play a batch for about `BATCH_S`, at least one item.
+
+        Every item is drawn once for all its players.
 
         Raises
         ------
         SimulationError
-            If this process runs other software than the one that asks.
+            If this process and the sender of the batch differ in their software, or a metric fails.
         """
-        from dwell.sim import draw
-
         mine = software()
         differing = [name for name in mine if mine[name] != self.software.get(name)]
         if differing:
@@ -103,47 +152,101 @@ class Player:
                 f"a worker has other software than the process that asks it: {has}, not {needs}"
             )
         take_over(self.prices)
-        if self.study.points[item.points[0]].fleet is not None:
-            return PlayedItem(tuple(self._play_fleets(item)), {})
-        realisation = draw(
-            self.study.points[item.points[0]].problem,
-            scenario=item.scenario,
-            seed=item.seed,
-            windows=self.study.windows,
-        )
-        summaries: list[tuple[int, Summary]] = []
-        examples: dict[tuple[int, str], Example] = {}
-        for point in item.points:
-            for name, run, summary in self._play(point, item, realisation):
-                summaries.append((point, summary))
-                if item.seed in self.kept:
-                    examples[point, name] = Example(run.windows, run.decisions)
-        return PlayedItem(tuple(summaries), examples)
+        summaries: dict[str, list[tuple[int, Summary]]] = {name: [] for name in batch.players}
+        examples: dict[tuple[Item, int, str], Example] = {}
+        until, done = time.monotonic() + BATCH_S, 0
+        for item in batch.items:
+            for player, point, run, summary in self._play(item, batch.players):
+                summaries[player].append((point, summary))
+                if run is not None and item.seed in self.kept:
+                    key = (item, point, str(summary.row["policy"]))
+                    examples[key] = Example(run.windows, run.decisions)
+            done += 1
+            if time.monotonic() > until:
+                break
+        return PlayedBatch(*batch.split(done), summaries, examples)
 
     def rehearse(self) -> None:
-        """Play one window of everything at the first point.
+        """Play one window of everything at the first point of each estimator.
 
-        What is named wrongly is found before the work begins.
+        Wrong names are found before the work begins.
         """
         from dwell.sim import draw
         from dwell.sim.fleet import simulate_fleet
 
-        first = self.study.points[0]
-        problem = first.problem
-        for scenario in self.study.scenarios:
+        points, contenders = self.study.points, self.study.contenders
+        # The last assignment of a key stays, so the first point of each estimator.
+        firsts = {points[i].problem.controller.estimator: i for i in reversed(range(len(points)))}
+        for index, scenario in product(firsts.values(), self.study.scenarios):
+            first, problem = points[index], points[index].problem
             if first.fleet is not None:
                 fleet = replace(first.fleet, coordination="none")
-                for contender in self.study.contenders:
+                for contender in contenders:
                     simulate_fleet(contender.fleet(fleet, scenario), seed=0, windows=1)
                 continue
             realisation = draw(problem, scenario=scenario, seed=0, windows=1)
-            alone = play_alone(problem, realisation) if self._in_hindsight else None
-            for contender in self.study.contenders:
-                self._simulate(contender, 0, realisation, alone)
+            alone = (
+                play_alone(problem, realisation) if any(map(_in_hindsight, contenders)) else None
+            )
+            for contender in contenders:
+                self._simulate(contender, index, realisation, alone)
         self.prices.update(known_prices())
 
-    def _play_fleets(self, item: Item) -> Iterator[tuple[int, Summary]]:
-        """Yield what the fleet of every point comes to under every contender."""
+    def _play(
+        self, item: Item, players: Sequence[str]
+    ) -> Iterator[tuple[str, int, Run | None, Summary]]:
+        """Yield the player, the point and the run of all that some players do in an item."""
+        from dwell.sim import draw
+
+        contenders = [one for one in self.study.contenders if one.name in players]
+        first = self.study.points[item.points[0]]
+        if first.fleet is not None:
+            yield from self._play_fleets(item, contenders)
+            return
+        realisation = draw(
+            first.problem, scenario=item.scenario, seed=item.seed, windows=self.study.windows
+        )
+        for point in item.points:
+            problem = self.study.points[point].problem
+            known = None
+            if self.study.references and CLAIRVOYANT in players:
+                known = references(problem, realisation)
+            for contender, run in self._runs(contenders, point, realisation, known):
+                summary = self._summary(run, problem, _labels(item, contender.name))
+                if self._problem(contender, point).objective != problem.objective:
+                    cost = judged_cost(run, problem)
+                    summary = replace(summary, row={**summary.row, "cost": cost})
+                yield contender.name, point, run, summary
+            if known is None:
+                continue
+            found = _compared(known, problem)
+            for name, run in known.runs.items():
+                summary = self._summary(run, problem, _labels(item, name))
+                compared = {**summary.compared, **found}
+                yield CLAIRVOYANT, point, run, replace(summary, compared=compared)
+
+    def _runs(
+        self,
+        contenders: Sequence[Contender],
+        point: int,
+        realisation: Realisation,
+        known: References | None,
+    ) -> Iterator[tuple[Contender, Run]]:
+        """Yield the runs of contenders at a point."""
+        problem = self.study.points[point].problem
+        alone = known.statics if known is not None else None
+        if alone is None and any(map(_in_hindsight, contenders)):
+            alone = play_alone(problem, realisation)
+        for contender in contenders:
+            if known is not None and self._is_static(contender, point):
+                yield contender, known.statics[str(contender.policy)]
+            else:
+                yield contender, self._simulate(contender, point, realisation, alone)
+
+    def _play_fleets(
+        self, item: Item, contenders: Sequence[Contender]
+    ) -> Iterator[tuple[str, int, None, Summary]]:
+        """Yield the summary of the fleet's run at every point under every contender."""
         from dwell.sim.fleet import simulate_fleet
         from dwell.study.fleet_summary import summarise_fleet
 
@@ -151,32 +254,35 @@ class Player:
             fleet = self.study.points[point].fleet
             if fleet is None:
                 continue
-            for contender in self.study.contenders:
+            for contender in contenders:
                 played = contender.fleet(fleet, item.scenario)
                 run = simulate_fleet(played, seed=item.seed, windows=self.study.windows)
-                yield point, summarise_fleet(run, fleet, _labels(item, contender.name))
+                labels = _labels(item, contender.name)
+                summary = summarise_fleet(run, fleet, labels)
+                worst = run.cells[str(summary.row["worst_cell"])]
+                yield contender.name, point, None, self._with_metrics(summary, worst, labels)
 
-    def _play(
-        self, point: int, item: Item, realisation: Realisation
-    ) -> Iterator[tuple[str, Run, Summary]]:
-        """Yield every run at a point, and what it comes to."""
-        problem = self.study.points[point].problem
-        known = references(problem, realisation) if self.study.references else None
-        alone = known.statics if known is not None else None
-        if alone is None and self._in_hindsight:
-            alone = play_alone(problem, realisation)
-        for contender in self.study.contenders:
-            run = _known_run(contender, problem, known)
-            if run is None:
-                run = self._simulate(contender, point, realisation, alone)
-            summary = summarise(run, problem, _labels(item, contender.name))
-            if self._problem(contender, point).objective != problem.objective:
-                summary = replace(summary, row={**summary.row, "cost": judged_cost(run, problem)})
-            yield contender.name, run, _compared(summary, run, problem, known)
-        if known is not None:
-            for name, run in known.runs.items():
-                summary = summarise(run, problem, _labels(item, name))
-                yield name, run, _compared(summary, run, problem, known)
+    def _summary(self, run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Summary:
+        """Sum up a run, with the metrics of the study's own."""
+        summary = self._with_metrics(summarise(run, problem, labels), run, labels)
+        if self.study.references:
+            kept = few_misses(run, problem).tobytes()
+            summary = replace(summary, compared={"kept": kept})
+        return summary
+
+    def _with_metrics(self, summary: Summary, run: Run, labels: Mapping[str, str | int]) -> Summary:
+        """Add the metrics of the study's own to the row of a run."""
+        if not self.study.metrics:
+            return summary
+        taken = [name for name in self.study.metrics if name in summary.row or name in COMPARED]
+        if taken:
+            raise SimulationError(f"metrics.{taken[0]}: {TAKEN}")
+        where = "policy {policy}, scenario {scenario}, seed {seed}".format_map(labels)
+        own = {
+            name: own_metric(path, self.study.folder, run, f"metrics.{name} ({path}): {where}")
+            for name, path in self.study.metrics.items()
+        }
+        return replace(summary, row={**summary.row, **own})
 
     def _simulate(
         self,
@@ -198,10 +304,13 @@ class Player:
             estimator=estimator,
         )
 
-    @property
-    def _in_hindsight(self) -> bool:
-        """Whether some contender is told what every candidate alone shows."""
-        return any(isinstance(one.estimator, Hindsight) for one in self.study.contenders)
+    def _is_static(self, contender: Contender, point: int) -> bool:
+        """Whether a contender's run is a candidate's alone.
+
+        Those are played with the estimator ``profile``: shadow jobs would be load.
+        """
+        problem = self._problem(contender, point)
+        return contender.is_candidate(problem) and problem.controller.estimator == "profile"
 
     def _problem(self, contender: Contender, point: int) -> Problem:
         """Return the problem of a point as a contender sees it."""
@@ -211,31 +320,19 @@ class Player:
         return self._seen[key]
 
 
-def _known_run(contender: Contender, problem: Problem, known: References | None) -> Run | None:
-    """Return the run of a bare candidate that the references have played already.
-
-    They are played with the estimator ``profile``; shadow jobs of another one would be load.
-    """
-    if known is None or not contender.is_candidate(problem):
-        return None
-    return (
-        known.statics[str(contender.policy)] if problem.controller.estimator == "profile" else None
-    )
-
-
 def _labels(item: Item, policy: str) -> dict[str, str | int]:
     return {"scenario": item.scenario, "policy": policy, "seed": item.seed}
 
 
-def _compared(summary: Summary, run: Run, problem: Problem, known: References | None) -> Summary:
-    """Add what a run costs beside the references, where there are any."""
-    if known is None:
-        return summary
-    row = {
-        **summary.row,
+def _compared(known: References, problem: Problem) -> dict[str, float | str | bytes]:
+    """Return what tables need of the references to compare runs with them."""
+    return {
         "reference_cost": known.cost,
         "best_static": known.best_static,
-        "regret": regret(float(summary.row["cost"]), known),
-        "share_kept": kept(run, known, problem),
+        "asked": few_misses(known.run, problem).tobytes(),
     }
-    return replace(summary, row=row)
+
+
+def _in_hindsight(contender: Contender) -> bool:
+    """Whether a contender needs the runs of every candidate alone."""
+    return isinstance(contender.estimator, Hindsight)

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from dwell.study.comparison import AIM
 from dwell.study.intervals import (
     Floats,
     Interval,
@@ -23,7 +22,7 @@ from dwell.study.intervals import (
     share_interval,
     under,
 )
-from dwell.study.kept_bounds import ABOVE_ZERO, keeps
+from dwell.study.kept_bounds import ABOVE_ZERO, AIM, keeps
 from dwell.study.over_seeds import difference_of, windows_behind
 from dwell.study.results import StudyRuns
 

@@ -285,7 +285,6 @@ def _window_sums(
         **{
             f"u_{name}": _sums(column(f"u_{name}"), unit, units)
             for name in problem.fabric.resources
-            if f"u_{name}" in windows.columns
         },
         **{
             f"share_{name}": _sums((placed == name).astype(np.float64), unit, units)

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from dwell.sim import Realisation
 
 Floats: TypeAlias = NDArray[np.float64]
+Mask: TypeAlias = NDArray[np.bool_]
 
 CLAIRVOYANT = "clairvoyant"
 CLAIRVOYANT_DWELL = "clairvoyant-dwell"
@@ -174,13 +175,13 @@ def references(problem: Problem, realisation: Realisation) -> References:
     )
 
 
-def regret(run_cost: float, references: References) -> float:
+def regret(run_cost: float, reference_cost: float) -> float:
     """How much more a run costs than the reference, as a share of what that costs.
 
     Parameters
     ----------
-    run_cost : float
-        `mean_cost` of a run of the same realisation.
+    run_cost, reference_cost : float
+        `mean_cost` of a run, and `References.cost` of the same realisation.
 
     Returns
     -------
@@ -188,31 +189,46 @@ def regret(run_cost: float, references: References) -> float:
         0.1 is a tenth more. Negative where the run costs less than the reference, which is no
         bound.
     """
-    return run_cost / references.cost - 1.0
+    return run_cost / reference_cost - 1.0
 
 
-def kept(run: Run, references: References, problem: Problem, limit: float = 0.05) -> float:
-    """Share of the windows in which the reference misses no more than a limit and a run neither.
+def few_misses(run: Run, problem: Problem, limit: float = 0.05) -> Mask:
+    """Whether a run misses no more than a limit, in every window.
 
     Parameters
     ----------
-    run : Run
-        A run of the same realisation.
     limit : float
         Share of a window's cycles.
 
     Returns
     -------
-    float
-        Windows have W cycles each, after the warm-up, and are the same for both, wherever their own
-        windows begin; 1 where the reference misses more in all of them: nothing was asked.
+    bool array, shape (windows,)
+        Windows have W cycles each, after the warm-up, and are the same for all runs of a
+        realisation, wherever their own windows begin.
     """
     width, first = problem.window_cycles, problem.warmup_windows * problem.window_cycles
-    missed = [one.arrays("cycles")["missed"][first:] for one in (references.run, run)]
-    count = min(map(len, missed)) // width
-    theirs, mine = (one[: count * width].reshape(count, width).mean(axis=1) for one in missed)
-    asked = theirs <= limit
-    return float((mine[asked] <= limit).mean()) if asked.any() else 1.0
+    missed = run.arrays("cycles")["missed"][first : run.last_window_end]
+    count = len(missed) // width
+    few: Mask = missed[: count * width].reshape(count, width).mean(axis=1) <= limit
+    return few
+
+
+def share_kept(mine: Mask, asked: Mask) -> float:
+    """Share of the windows in which the reference misses few cycles and a run does too.
+
+    Parameters
+    ----------
+    mine, asked : bool array
+        `few_misses` of the run, and of the cheapest reference of the same realisation.
+
+    Returns
+    -------
+    float
+        1 where the reference misses more in all of them.
+    """
+    count = min(len(mine), len(asked))
+    asked = asked[:count]
+    return float(mine[:count][asked].mean()) if asked.any() else 1.0
 
 
 def mean_cost(run: Run) -> float:

@@ -62,6 +62,8 @@ class StudyRuns(Displayed):
         Versions of the software that made the runs, by package.
     labels : mapping of str to str
         Names of parameters in figures and tables, by their paths.
+    metrics : tuple of str
+        Columns of `runs` that are metrics of the study's own.
     """
 
     name: str
@@ -75,6 +77,7 @@ class StudyRuns(Displayed):
     latencies: pl.DataFrame
     versions: Mapping[str, str]
     labels: Mapping[str, str] = field(default_factory=FrozenDict)
+    metrics: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         return (

@@ -1,38 +1,45 @@
-"""Run a study: items over processes or a cluster, parts as they are ready, tables at the end.
+"""Run a study: batches over processes or a cluster, parts as they are ready, tables at the end.
 
-An item is one realisation, drawn once and played by every contender; it depends on nothing but the
-study, its scenario and its seed. Tables are put together from the items in the order of the study.
-So they are the same, byte for byte, whoever did the items, in whatever order, and in however many
-attempts.
+A run depends only on the study, its scenario, its seed and its contender. So the tables have the
+same bytes, however the batches are played: by which process, in which order, in how many attempts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import operator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from dwell.cellfile.work_folder import open_work_folder
 from dwell.errors import SimulationError
 from dwell.model.progress import Progress
-from dwell.study.player import Example, PlayedItem, Player
-from dwell.study.results import PARAMETER, StudyRuns
-from dwell.study.software import describe, versions
+from dwell.study.parts import (
+    Parts,
+    batches_of,
+    frame_of,
+    play_and_write,
+    read_parquet,
+    runs_of,
+    write_parquet,
+    write_parts,
+)
+from dwell.study.player import Batch, Example, PlayedBatch, Player
+from dwell.study.results import StudyRuns
+from dwell.study.software import describe, modules_of, own_sources, part_digests, versions
 from dwell.study.study import Item, Study
-from dwell.study.study_folder import PARTS, STUDY, TABLES, finished, read_parts, write_table
-from dwell.study.summary import latency_grid_ms
-from dwell.study.workers import available_processes, spread
+from dwell.study.study_folder import STUDY, TABLES, Shard
+from dwell.study.study_tables import Tables, tables_of
+from dwell.study.workers import available_processes, require_importable, spread
 
 if TYPE_CHECKING:
     import polars as pl
 
-#: By their names, see `TABLES`.
-Tables: TypeAlias = "dict[str, pl.DataFrame]"
-
-LABELS = ("scenario", "policy", "seed")
+#: Processes of a cluster, for the size of batches: it may have more or fewer.
+DASK_WORKERS = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False, kw_only=True)
@@ -62,16 +69,15 @@ def run_study(
     Parameters
     ----------
     folder : Path, optional
-        Where a part for each finished item and the tables go (``runs.parquet``, ``costs.parquet``,
-        ``latencies.parquet``); a study that was stopped there goes on. Nothing is written where
-        None.
+        For the parts and the tables (``runs.parquet``, ``costs.parquet``, ``latencies.parquet``);
+        a study that was stopped there continues. If None, the tables stay in memory.
     processes : int, optional
-        Over which the items are spread; one a CPU where None (see `dwell.study.workers`).
+        Over which the batches are spread; one per CPU where None (see `dwell.study.workers`).
     dask : str, optional
-        Address of a Dask scheduler, whose workers do the items instead.
+        Address of a Dask scheduler, whose workers play the batches instead.
     progress : callable, optional
-        Called with the number of runs done and of all runs after each item; in a folder also at
-        the begin, with what is done already.
+        Called with the number of runs done and of all runs after each batch; in a folder also
+        once before.
 
     Raises
     ------
@@ -81,13 +87,16 @@ def run_study(
         If the folder holds something else than this study, or another process works on it.
     SimulationError
         If the folder cannot be written, a worker ended early, or the cluster is out of reach. The
-        items that are finished stay.
+        runs that are finished stay.
     """
-    player = Player(study)
     if folder is None:
-        tables, _ = play_in_memory(player, processes=processes, dask=dask, progress=progress)
+        tables, _ = play_in_memory(Player(study), processes=processes, dask=dask, progress=progress)
     else:
-        tables = _play_in_folder(player, folder, processes, dask, progress)
+        require_sendable(study, processes, dask)
+        player = Player(study)
+        with open_parts(study, folder, player=player) as parts:
+            play_parts(parts, player, processes=processes, dask=dask, progress=progress)
+            tables = write_tables(parts)
     return StudyResult(**results_of(study, tables), study=study, folder=folder)
 
 
@@ -95,7 +104,8 @@ def results_of(study: Study, tables: Tables) -> dict[str, Any]:
     """Return what all results of a study have: its plan, tables, and versions of the software."""
     names = ("name", "scenarios", "policies", "seeds", "windows", "labels")
     plan = {name: getattr(study, name) for name in names}
-    return {**plan, **tables, "problem": study.points[0].problem, "versions": versions()}
+    more = {"metrics": tuple(study.metrics), "versions": versions()}
+    return {**plan, **tables, "problem": study.points[0].problem, **more}
 
 
 def play_in_memory(
@@ -114,167 +124,167 @@ def play_in_memory(
     examples : dict of (Item, point, policy) to Example
         The runs of the seeds that the player keeps.
     """
-    import polars as pl
-
-    count = _counter(player.study, progress)
+    study, done = player.study, 0
     frames: list[pl.DataFrame] = []
     examples: dict[tuple[Item, int, str], Example] = {}
 
-    def take(item: Item, played: PlayedItem) -> None:
-        frames.append(_frame(played))
-        examples.update({(item, *key): one for key, one in played.examples.items()})
-        count([item])
-
-    _play(player, player.study.items(), processes, dask, take)
-    return _assembled(player.study, pl.concat(frames)), examples
-
-
-def _play_in_folder(
-    player: Player,
-    folder: Path,
-    processes: int | None,
-    dask: str | None,
-    progress: Progress | None,
-) -> Tables:
-    """Do the items whose parts are missing in a folder, and write the tables of all."""
-    study = player.study
-    items = study.items()
-    names = [item.name for item in items]
-    count = _counter(study, progress)
-
-    def take(item: Item, played: PlayedItem) -> None:
-        write_table(folder, f"{PARTS}/{item.name}", _frame(played))
-        count([item])
-
-    notes = {"labels": dict(study.labels)} if study.labels else {}
-    with open_work_folder(folder, STUDY, describe(study), notes):
-        known = finished(folder)
-        count([item for item in items if item.name in known])
-        missing = [item for item in items if item.name not in known]
-        try:
-            _play(player, missing, processes, dask, take)
-            # From the files in any case: a study that was stopped makes its tables of the same.
-            tables = _assembled(study, read_parts(folder, names))
-            for name, table in tables.items():
-                write_table(folder, name, table)
-        except SimulationError as error:
-            done = len(finished(folder).intersection(names))
-            if not done:
-                raise
-            raise SimulationError(
-                f"{error}\n{done} of {len(items)} items are finished and stay in {folder}: remove "
-                "the cause, and run the study again to go on"
-            ) from None
-    return tables
-
-
-def _counter(study: Study, progress: Progress | None) -> Callable[[Sequence[Item]], None]:
-    """Return what counts the runs of items as they are done, and tells `progress`."""
-    done = 0
-
-    def count(items: Sequence[Item]) -> None:
+    def take(_: Batch, played: PlayedBatch) -> None:
         nonlocal done
-        done += sum(len(item.points) for item in items) * len(study.contenders)
+        frames.extend(map(frame_of, played.summaries.values()))
+        examples.update(played.examples)
+        done += runs_of(study, played.batch.items, played.batch.players)
         if progress is not None:
             progress(done, study.runs)
 
-    return count
-
-
-def _play(
-    player: Player,
-    items: Sequence[Item],
-    processes: int | None,
-    dask: str | None,
-    take: Callable[[Item, PlayedItem], None],
-) -> None:
-    """Do items, and hand over what came of each as soon as it is ready."""
-    if not items:
-        return
+    workers = _workers(processes, dask)
+    everything = dict.fromkeys(range(len(study.items())), study.players)
+    require_sendable(study, processes, dask)
     player.rehearse()
+    _spread(player, batches_of(study, everything, workers), workers, dask, take)
+    return tables_of(study, frames), examples
+
+
+def require_sendable(study: Study, processes: int | None, dask: str | None) -> None:
+    """Refuse objects that worker processes cannot import, if there will be some.
+
+    Raises
+    ------
+    SimulationError
+        If an object does not pickle, or its class is in no module.
+    """
+    if dask is None and min(_workers(processes, dask), len(study.items())) > 1:
+        require_importable({one.name: (one.policy, one.estimator) for one in study.contenders})
+
+
+@contextmanager
+def open_parts(
+    study: Study,
+    folder: Path,
+    shard: Shard | None = None,
+    *,
+    player: Player | None = None,
+) -> Iterator[Parts]:
+    """Open the folder of a study, or of a shard, for this process alone.
+
+    Parameters
+    ----------
+    player : Player, optional
+        If runs are missing, it rehearses before the folder is made.
+
+    Raises
+    ------
+    RunError
+        If the folder holds something else than this study, or another process works on it.
+    SimulationError
+        If it cannot be made or written, or a metric cannot be imported.
+    """
+    description, sources = describe(study), own_sources(study)
+    digests = part_digests(description, sources)
+    notes = {
+        **({"labels": dict(study.labels)} if study.labels else {}),
+        **({"modules": modules} if (modules := modules_of(sources)) else {}),
+    }
+    span = range(len(study.items()))
+    if shard is not None:
+        span, description = shard.span(len(span)), {**description, "shard": [*shard]}
+    parts = Parts(folder, study, digests, span)
+    if player is not None and parts.done < parts.total:
+        player.rehearse()
+    with open_work_folder(folder, STUDY, description, notes):
+        parts.look()
+        try:
+            yield parts
+        except SimulationError as error:
+            # This process may not know yet what the others have written.
+            parts.look()
+            if not parts.done:
+                raise
+            raise SimulationError(
+                f"{error}\n{parts.done} of {parts.total} runs are finished and stay in {folder}: "
+                "remove the cause, and run the same command again"
+            ) from None
+
+
+def play_parts(
+    parts: Parts,
+    player: Player,
+    *,
+    processes: int | None = None,
+    dask: str | None = None,
+    progress: Progress | None = None,
+) -> None:
+    """Play what a folder misses; see `run_study`."""
+    study, folder, done = parts.study, parts.folder, parts.done
+    workers = _workers(processes, dask)
+    missing = parts.missing(workers)
+
+    def count(more: int = 0) -> None:
+        nonlocal done
+        done += more
+        if progress is not None:
+            progress(done, parts.total)
+
+    def take(_: Batch, played: PlayedBatch) -> None:
+        write_parts(folder, parts.digests, played)
+        parts.add(played.batch)
+        count(runs_of(study, played.batch.items, played.batch.players))
+
+    count()
+    if not missing:
+        return
+    for name in TABLES:
+        (folder / f"{name}.parquet").unlink(missing_ok=True)
+    # Workers of a cluster have no file system in common.
+    writer = partial(play_and_write, player, folder, parts.digests)
+    task = writer if dask is None else player
+    try:
+        _spread(task, missing, workers, dask, take)
+    except KeyboardInterrupt:
+        # Workers have finished the batches that they had begun.
+        parts.look()
+        done = parts.done
+        count()
+        raise
+    parts.clear()
+
+
+def write_tables(parts: Parts) -> Tables:
+    """Write the tables of a study whose parts are all there.
+
+    Raises
+    ------
+    RunError
+        If a part cannot be read.
+    SimulationError
+        If a table cannot be written.
+    """
+    # From the files in any case: a study that was stopped makes its tables of the same.
+    remedy = "; remove it and run the study again"
+    tables = tables_of(parts.study, (read_parquet(file, remedy) for file in parts.files))
+    for name, table in tables.items():
+        write_parquet(parts.folder / f"{name}.parquet", table)
+    return tables
+
+
+def _workers(processes: int | None, dask: str | None) -> int:
+    """Return how many processes share the work; of a cluster, a guess."""
+    if dask is not None:
+        return DASK_WORKERS
+    return available_processes() if processes is None else processes
+
+
+def _spread(
+    task: Callable[[Batch], PlayedBatch],
+    batches: Sequence[Batch],
+    processes: int,
+    dask: str | None,
+    take: Callable[[Batch, PlayedBatch], None],
+) -> None:
+    """Play batches, and hand over each result as soon as it is ready."""
+    rest = operator.attrgetter("rest")
     if dask is None:
-        workers = available_processes() if processes is None else processes
-        spread(player, items, processes=workers, take=take)
+        spread(task, batches, processes=processes, take=take, rest=rest)
     else:
         from dwell.study.cluster import spread_on_dask
 
-        spread_on_dask(player, items, address=dask, take=take)
-
-
-def _frame(played: PlayedItem) -> pl.DataFrame:
-    """Return what came of an item as one row a run.
-
-    Returns
-    -------
-    DataFrame
-        The index of its ``point``, the columns of its row, and as lists its ``costs`` by candidate
-        and the cycles ``within`` each point of the latency grid.
-    """
-    import polars as pl
-
-    rows = [
-        {
-            "point": point,
-            **summary.row,
-            "costs": [
-                {name: value for name, value in costs.items() if name not in LABELS}
-                for costs in summary.costs
-            ],
-        }
-        for point, summary in played.summaries
-    ]
-    within = np.stack([summary.within for _, summary in played.summaries])
-    frame = pl.DataFrame(rows, infer_schema_length=None)
-    return frame.with_columns(pl.Series("within", within).arr.to_list())
-
-
-def _assembled(study: Study, frame: pl.DataFrame) -> Tables:
-    """Return the tables of a study, of the rows of all items in any order (see `_frame`)."""
-    import polars as pl
-
-    places = zip(LABELS, (study.scenarios, study.policies, study.seeds), strict=True)
-    ordered = frame.sort(
-        "point",
-        *(
-            pl.col(column).replace_strict(list(names), list(range(len(names))))
-            for column, names in places
-        ),
-    )
-    costs = ordered.select("point", *LABELS, "costs").explode("costs").unnest("costs")
-    tables = (
-        _with_values(study, ordered.drop("costs", "within")),
-        _with_values(study, costs).with_columns(pl.selectors.float().fill_nan(None)),
-        _with_values(study, _latencies(study, ordered)),
-    )
-    return dict(zip(TABLES, tables, strict=True))
-
-
-def _with_values(study: Study, frame: pl.DataFrame) -> pl.DataFrame:
-    """Put the values of parameters in place of the index of a point."""
-    import polars as pl
-
-    values = [
-        pl.Series(PARAMETER + name, [point.values[name] for point in study.points]).gather(
-            frame["point"]
-        )
-        for name in study.parameters
-    ]
-    return pl.DataFrame([*values, *frame.drop("point")])
-
-
-def _latencies(study: Study, ordered: pl.DataFrame) -> pl.DataFrame:
-    """Return the distributions of latency over seeds, of runs in the order of the study."""
-    import polars as pl
-
-    grids = np.stack(
-        [latency_grid_ms(point.problem.pipeline.deadline_ms) for point in study.points]
-    )
-    seeds, places = len(study.seeds), grids.shape[1]
-    within = ordered["within"].explode().to_numpy().reshape(-1, seeds, places).sum(axis=1)
-    cycles = ordered["cycles"].to_numpy().reshape(-1, seeds).sum(axis=1)
-    groups = ordered.gather_every(seeds).select("point", "scenario", "policy")
-    share = within / cycles[:, None]
-    return groups[np.repeat(np.arange(len(groups)), places)].with_columns(
-        pl.Series("latency_ms", grids[groups["point"].to_numpy()].ravel()),
-        pl.Series("share", share.ravel()),
-    )
+        spread_on_dask(task, batches, address=dask, take=take, rest=rest)

@@ -5,27 +5,31 @@ from __future__ import annotations
 import hashlib
 import json
 import pickle
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib.metadata import version
-from typing import Any
+from typing import Any, TypeAlias
 
 from dwell.cellfile.sources import digest_of
 from dwell.errors import SimulationError
 from dwell.model import FrozenDict
 from dwell.model.bounds import CLASS_PATH
 from dwell.model.document import to_document
-from dwell.model.user_classes import source_digest
+from dwell.model.user_classes import object_digest, source_digest, user_function
 from dwell.record.fleet_run import fleet_document
-from dwell.study.study import Contender, Study
+from dwell.study.study import Contender, Point, Study
 
 #: Python sources of this package that make numbers; the kernel has a digest of its own.
 SOURCES = (
     *("control", "cost.py", "estimators", "kernels", "model", "policies", "sim"),
     "record/table_arrays.py",
-    *(f"study/{name}.py" for name in ("clairvoyant", "fleet_summary", "hindsight", "player")),
-    *(f"study/{name}.py" for name in ("quality", "reference", "runner", "script", "summary")),
+    *(f"study/{name}.py" for name in ("clairvoyant", "fleet_summary", "hindsight", "parts")),
+    *(f"study/{name}.py" for name in ("player", "quality", "reference", "script")),
+    *(f"study/{name}.py" for name in ("study_tables", "summary")),
 )
+
+#: Digests of own code by its name, for each player.
+Sources: TypeAlias = "Mapping[str, Mapping[str, str | None]]"
 
 
 def versions() -> dict[str, str]:
@@ -58,7 +62,7 @@ def software() -> Mapping[str, str]:
 
 
 def describe(study: Study) -> dict[str, Any]:
-    """Return all that the tables of a study depend on, ready for JSON.
+    """Return all that the tables of a study depend on but a user's own code, ready for JSON.
 
     Raises
     ------
@@ -67,7 +71,6 @@ def describe(study: Study) -> dict[str, Any]:
     """
     cells = [to_document(point.problem) for point in study.points]
     fleets = [fleet_document(one.fleet) for one in study.points if one.fleet is not None]
-    own = _own_sources(study)
     return {
         "name": study.name,
         "software": software(),
@@ -81,18 +84,76 @@ def describe(study: Study) -> dict[str, Any]:
         "cell": cells[0],
         "cells": hashlib.sha256(json.dumps(cells).encode()).hexdigest(),
         **({"fleets": hashlib.sha256(json.dumps(fleets).encode()).hexdigest()} if fleets else {}),
-        **({"modules": own} if own else {}),
+        **({"metrics": dict(study.metrics)} if study.metrics else {}),
     }
 
 
-def _own_sources(study: Study) -> dict[str, str | None]:
-    """Return a digest of the module of every class of a user's own, by the class's name."""
-    settings = study.points[0].problem.controller
-    used = [part for one in study.contenders for part in (one.policy, one.estimator)]
-    folder = study.points[0].problem.folder
-    given = [settings.estimator, *(part for part in used if isinstance(part, str))]
-    names = sorted(filter(CLASS_PATH.holds, given))
-    return {name: source_digest(name, folder) for name in names}
+def own_sources(study: Study) -> Sources:
+    """Return a digest of the source of all code of a user's own, by its name, for each player.
+
+    Raises
+    ------
+    SimulationError
+        If a metric cannot be imported.
+    """
+    metrics = {}
+    for path in study.metrics.values():
+        user_function(path, study.folder, "metric", SimulationError)
+        metrics[path] = source_digest(path, study.folder)
+    own = {one.name: {**_sources(one, study), **metrics} for one in study.contenders}
+    return {name: own.get(name, metrics) for name in study.players}
+
+
+def modules_of(sources: Sources) -> dict[str, str | None]:
+    """Return the digests of all code of a user's own, by its name."""
+    return {name: digest for used in sources.values() for name, digest in used.items()}
+
+
+def _sources(contender: Contender, study: Study) -> dict[str, str | None]:
+    """Return a digest of the source of a contender's own classes, by their names."""
+    found: dict[str, str | None] = {}
+    for point in study.points:
+        for part, folder in _used(contender, point):
+            if not isinstance(part, str):
+                path = f"{type(part).__module__}:{type(part).__qualname__}"
+                found.setdefault(path, object_digest(part))
+            elif CLASS_PATH.holds(part) and part not in found:
+                found[part] = source_digest(part, folder)
+    return found
+
+
+def _used(contender: Contender, point: Point) -> Iterator[tuple[object, str | None]]:
+    """Yield the policy and the estimators of a contender at a point, with their folders."""
+    problem, fleet = point.problem, point.fleet
+    yield contender.policy, problem.folder
+    estimator = contender.estimator or contender.settings.get("controller.estimator")
+    if estimator is not None:
+        yield estimator, problem.folder
+    elif fleet is None:
+        yield problem.controller.estimator, problem.folder
+    else:
+        for one in fleet.entries:
+            named = one.estimator or fleet.estimator or one.cell.controller.estimator
+            yield named, one.cell.folder
+
+
+def part_digests(description: Mapping[str, Any], sources: Sources) -> dict[str, str]:
+    """Return a digest of all that the runs of each player depend on, by the player.
+
+    Parameters
+    ----------
+    description, sources
+        What `describe` and `own_sources` return.
+    """
+    policies = description["policies"]
+    common = {name: value for name, value in description.items() if name != "policies"}
+    shared = hashlib.sha256(json.dumps(common).encode()).hexdigest()
+    return {
+        name: hashlib.sha256(
+            json.dumps([shared, name, policies.get(name), used]).encode()
+        ).hexdigest()[:16]
+        for name, used in sources.items()
+    }
 
 
 def _contender(contender: Contender) -> Mapping[str, Any]:

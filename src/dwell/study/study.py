@@ -17,6 +17,7 @@ from dwell.model.bounds import counted
 from dwell.model.fleet import Fleet
 from dwell.model.problem import Drawn
 from dwell.model.semantics import nearest
+from dwell.study.over_seeds import is_plain
 from dwell.study.reference import CLAIRVOYANT, CLAIRVOYANT_DWELL
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 ITEM_RUNS = 64
 
 REFERENCES = (CLAIRVOYANT, CLAIRVOYANT_DWELL)
+TAKEN = "the tables have such a column already; choose another name"
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +134,7 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """Unit of work: one realisation, played by every contender, and kept as a whole.
+    """One realisation, which every contender plays.
 
     Parameters
     ----------
@@ -143,11 +145,6 @@ class Item:
     points: tuple[int, ...]
     scenario: str
     seed: int
-
-    @property
-    def name(self) -> str:
-        """Name among the items of its study."""
-        return f"{self.points[0]:05d}-{self.scenario}-{self.seed}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,6 +161,11 @@ class Study:
         Whether the references in hindsight play as well.
     labels : mapping of str to str
         Names of parameters in figures and tables, by their paths; a path where there is none.
+    metrics : mapping of str to str
+        Functions of a Run that return a number, as ``package.module:function``, by the names of
+        their columns.
+    folder : str, optional
+        Where modules of metrics are looked for first.
 
     Raises
     ------
@@ -181,13 +183,17 @@ class Study:
     windows: int
     references: bool = False
     labels: Mapping[str, str] = field(default_factory=FrozenDict)
+    metrics: Mapping[str, str] = field(default_factory=FrozenDict)
+    folder: str | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "labels", FrozenDict(self.labels))
+        object.__setattr__(self, "metrics", FrozenDict(self.metrics))
         names = tuple(contender.name for contender in self.contenders)
         _require_each_once("points", [dict(point.values) for point in self.points])
         _require_each_once("scenarios", self.scenarios)
-        _require_each_once("policies", names)
+        remedy = "name each once; policies={'first': ..., 'second': ...} names objects"
+        _require_each_once("policies", names, remedy)
         _require_each_once("seeds", self.seeds)
         for point in self.points:
             self._check(point)
@@ -195,9 +201,15 @@ class Study:
             if path not in self.parameters:
                 hint = nearest(path, self.parameters)
                 raise SimulationError(f"labels: {path!r} is none of the parameters; {hint}")
+        for name in self.metrics:
+            if not is_plain(name):
+                raise SimulationError(f"metrics.{name}: {TAKEN}")
         objects = [one.name for one in self.contenders if not isinstance(one.policy, str)]
         if objects and any(point.fleet is not None for point in self.points):
             raise SimulationError(f"{objects[0]}: the policies of a fleet have to be named")
+        moving = [one.name for one in self.contenders if one.policy != one.name]
+        if taken := [name for name in moving if name in self.points[0].problem.candidates]:
+            raise SimulationError(f"{taken[0]!r} is a candidate's name; choose another")
         reserved = [name for name in names if self.references and name in REFERENCES]
         if reserved:
             raise SimulationError(f"{reserved[0]!r} is a reference's name; choose another")
@@ -234,6 +246,12 @@ class Study:
         """Names in the tables, the references' last."""
         names = tuple(contender.name for contender in self.contenders)
         return (*names, *REFERENCES) if self.references else names
+
+    @property
+    def players(self) -> tuple[str, ...]:
+        """Names of all that have parts of their own: the contenders, and the references."""
+        names = tuple(contender.name for contender in self.contenders)
+        return (*names, CLAIRVOYANT) if self.references else names
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -280,7 +298,7 @@ class Study:
         yield from (tuple(group) for group in groups.values())
 
 
-def _require_each_once(what: str, given: Sequence[object]) -> None:
+def _require_each_once(what: str, given: Sequence[object], remedy: str = "name each once") -> None:
     """Refuse nothing at all, and anything twice."""
     if not given:
         raise SimulationError(f"{what} is empty; name at least one")
@@ -288,7 +306,7 @@ def _require_each_once(what: str, given: Sequence[object]) -> None:
     for one in given:
         text = repr(one)
         if text in seen:
-            raise SimulationError(f"{what} holds {text} twice; name each once")
+            raise SimulationError(f"{what} holds {text} twice; {remedy}")
         seen.add(text)
 
 
@@ -313,4 +331,6 @@ def load_study(path: str | PathLike[str]) -> Study:
         windows=declared.windows,
         references=declared.references,
         labels=declared.labels,
+        metrics=declared.metrics,
+        folder=declared.folder,
     )

@@ -1,68 +1,58 @@
-"""The folder of a study: what study it is, a part for every finished item, and the tables.
-
-``study.json`` says what study the folder belongs to, ``parts`` holds one Parquet file an item. A
-file appears complete or not at all: it is written under another name, brought to the disk, and
-renamed. Whatever kills the process, what is there can be relied on, and what is not is done again.
-"""
+"""The folder of a study: ``study.json``, which describes it, its parts, its shards, its tables."""
 
 from __future__ import annotations
 
-import io
-import json
-from collections.abc import Sequence
+import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import NamedTuple
 
 from dwell.cellfile import from_record
-from dwell.cellfile.work_folder import FolderMark, unwritable
-from dwell.errors import DwellError, RunError
-from dwell.files import write_whole
+from dwell.cellfile.forms import not_allowed
+from dwell.cellfile.work_folder import FolderMark
+from dwell.errors import DwellError, Fault, ProblemError, RunError
+from dwell.record.json_documents import read_document
+from dwell.study.parts import PARTS, read_parquet
 from dwell.study.results import StudyRuns
 
-if TYPE_CHECKING:
-    import polars as pl
-
-PARTS = "parts"
-STUDY = FolderMark("study", "study.json", 1, (PARTS,))
+#: Folders of shards, by their names.
+SHARDS = "shards"
+STUDY = FolderMark("study", "study.json", 2, (PARTS, SHARDS))
 #: Of a finished study, each a Parquet file.
 TABLES = ("runs", "costs", "latencies")
 
 
-def finished(folder: Path) -> frozenset[str]:
-    """Return the names of the items whose parts are in the folder of a study."""
-    return frozenset(path.stem for path in (folder / PARTS).glob("*.parquet"))
+class Shard(NamedTuple):
+    """The i-th of n shards, from 1."""
 
+    place: int
+    of: int
 
-def read_parts(folder: Path, names: Sequence[str]) -> pl.DataFrame:
-    """Return the parts of items, one below the other.
+    @classmethod
+    def read(cls, text: str) -> Shard:
+        """Return the shard of ``2/4``.
 
-    Raises
-    ------
-    RunError
-        If one cannot be read.
-    """
-    import polars as pl
+        Raises
+        ------
+        ProblemError
+            If it is none.
+        """
+        found = re.fullmatch(r"([1-9]\d{0,5})/([1-9]\d{0,5})", text)
+        if found is None or int(found[1]) > int(found[2]):
+            raise ProblemError(
+                [Fault("shard", not_allowed(text, "i/n with i from 1 to n, as 2/4"))]
+            )
+        return cls(int(found[1]), int(found[2]))
 
-    remedy = "; remove it and run the study again"
-    return pl.concat([_read(folder / PARTS / f"{name}.parquet", remedy) for name in names])
+    def __str__(self) -> str:
+        return f"{self.place}/{self.of}"
 
+    def folder(self, study: Path) -> Path:
+        """Return its folder in the folder of its study."""
+        return study / SHARDS / f"{self.place}-of-{self.of}"
 
-def write_table(folder: Path, name: str, frame: pl.DataFrame) -> None:
-    """Write a table of the whole study, or the part ``parts/ITEM``.
-
-    Raises
-    ------
-    SimulationError
-        If that fails.
-    """
-    path = folder / f"{name}.parquet"
-    # To memory first: how a disk is full is then the system's own answer.
-    data = io.BytesIO()
-    frame.rechunk().write_parquet(data)
-    try:
-        write_whole(path, data.getvalue())
-    except OSError as error:
-        raise unwritable(path, error) from None
+    def span(self, items: int) -> range:
+        """Return the places of its items."""
+        return range(items * (self.place - 1) // self.of, items * self.place // self.of)
 
 
 def is_study(folder: Path) -> bool:
@@ -78,28 +68,37 @@ def open_study(folder: str | Path) -> StudyRuns:
     RunError
         If it is none, its runs are not finished, or a file of it cannot be read.
     """
+    from dwell.study.results import StudyRuns
+
     folder = Path(folder)
     path = folder / STUDY.file
     if not is_study(folder):
         raise RunError(f"{folder} is no study: there is no {STUDY.file}")
+    known = read_document(path)
+    version = known.get(STUDY.key)
+    if known and version != STUDY.version:
+        raise RunError(
+            f"{path}: version {version} of a study's folder, and this Dwell reads {STUDY.version}; "
+            "run the study again in another folder"
+        )
     try:
-        known: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         problem = from_record(known["cell"])
         scenarios, policies = (tuple(map(str, known[name])) for name in ("scenarios", "policies"))
         seeds = tuple(map(int, known["seeds"]))
         windows = int(known["windows"])
+        metrics = tuple(map(str, known.get("metrics", ())))
         labels = {str(path): str(label) for path, label in known.get("labels", {}).items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, DwellError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, DwellError) as error:
         raise RunError(f"{path}: cannot be read ({error!r})") from None
     tables = {}
     for name in TABLES:
         table = folder / f"{name}.parquet"
         if not table.is_file():
             raise RunError(
-                f"{folder}: the study is not finished: there is no {table.name}; `dwell study` "
-                "with its file goes on with it"
+                f"{folder}: the study is not finished: there is no {table.name}; run "
+                "`dwell study` with its file again"
             )
-        tables[name] = _read(table)
+        tables[name] = read_parquet(table)
     software = {name: one for name, one in known.get("software", {}).items() if name != "sources"}
     return StudyRuns(
         name=str(known.get("name", folder.name)),
@@ -111,13 +110,5 @@ def open_study(folder: str | Path) -> StudyRuns:
         **tables,
         versions=software,
         labels=labels,
+        metrics=metrics,
     )
-
-
-def _read(path: Path, remedy: str = "") -> pl.DataFrame:
-    import polars as pl
-
-    try:
-        return pl.read_parquet(path, glob=False)
-    except (OSError, pl.exceptions.PolarsError) as error:
-        raise RunError(f"{path}: cannot be read ({error}){remedy}") from None

@@ -22,7 +22,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from dwell.cost import tier_nodes
 from dwell.errors import SimulationError
-from dwell.model import Problem
+from dwell.model import FrozenDict, Problem
 from dwell.model.instants import NEVER_NS
 from dwell.model.table_columns import SHARE_OF, USE_OF
 from dwell.study.quality import actuations, age_of_information, misses_in, track
@@ -79,11 +79,14 @@ class Summary:
         One a candidate: mean estimated J while it was not active, mean measured J while it was.
     within : int64 array
         Cycles that finished within each point of the latency grid.
+    compared : mapping
+        What tables need of it to compare runs with the references (see `dwell.study.player`).
     """
 
     row: Row
     costs: list[Row]
     within: Ints
+    compared: Mapping[str, float | str | bytes] = field(default_factory=FrozenDict)
 
 
 def latency_grid_ms(deadline_ms: float) -> Floats:
@@ -332,12 +335,8 @@ def _percentiles(latencies: Latencies) -> dict[str, float]:
 
 
 def used_in(windows: TableArrays, problem: Problem) -> dict[str, Floats]:
-    """Utilisation of every resource in every window.
-
-    Runs that were made before accelerators were counted say nothing of those.
-    """
-    names = {name: f"u_{name}" for name in problem.fabric.resources}
-    return {name: windows[column] for name, column in names.items() if column in windows}
+    """Utilisation of every resource in every window."""
+    return {name: windows[f"u_{name}"] for name in problem.fabric.resources}
 
 
 def busiest(used: Mapping[str, Floats], problem: Problem) -> tuple[Floats, Floats, Floats]:
@@ -346,12 +345,11 @@ def busiest(used: Mapping[str, Floats], problem: Problem) -> tuple[Floats, Float
     Parameters
     ----------
     used : mapping of str to float64 array, shape (windows,)
-        Utilisation of every node, and of the accelerators that are known; NaN where one was not
-        measured. A tier without nodes has 0.
+        Utilisation of every resource; NaN where it was not measured. A tier without nodes has 0.
     """
     none = np.zeros(len(next(iter(used.values()))))
     robot, edge, cloud = (
-        np.fmax.reduce([used[name] for name in names if name in used]) if names else none
+        np.fmax.reduce([used[name] for name in names]) if names else none
         for names in tier_nodes(problem.objective)
     )
     return robot, edge, cloud

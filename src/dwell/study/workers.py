@@ -9,20 +9,28 @@ began them, even where that is killed.
 
 from __future__ import annotations
 
+import io
 import multiprocessing
 import os
+import pickle
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from typing import TypeVar, cast
+from queue import SimpleQueue
+from types import FunctionType
+from typing import Any, TypeVar, cast
 
-from dwell.errors import SimulationError
+from dwell.errors import PolicyError, SimulationError, describe_raised, user_note
 
 Unit = TypeVar("Unit")
 Result = TypeVar("Result")
+
+#: One process per CPU: threads of libraries inside would only compete with each other.
+SINGLE_THREADED = {"OPENBLAS_NUM_THREADS": "1", "POLARS_MAX_THREADS": "1"}
 
 
 def available_processes() -> int:
@@ -38,6 +46,7 @@ def spread(
     *,
     processes: int,
     take: Callable[[Unit, Result], bool | None],
+    rest: Callable[[Result], Unit | None] = lambda _: None,
 ) -> None:
     """Do a task on every unit, or until there is enough.
 
@@ -53,6 +62,8 @@ def spread(
     take : callable
         Called in this process with each unit and its result, as soon as that is ready. Where it
         returns True, the units that are left are not done.
+    rest : callable
+        Returns the part of a unit that its result leaves open, which is then a further unit.
 
     Raises
     ------
@@ -60,9 +71,14 @@ def spread(
         If a process ended before its work was done.
     """
     if min(processes, len(units)) <= 1:
-        for unit in units:
-            if take(unit, task(unit)):
+        queue = deque(units)
+        while queue:
+            unit = queue.popleft()
+            result = task(unit)
+            if take(unit, result):
                 break
+            if (left := rest(result)) is not None:
+                queue.appendleft(left)
         return
     pool = ProcessPoolExecutor(
         max_workers=min(processes, len(units)),
@@ -70,13 +86,26 @@ def spread(
         initializer=_begin,
         initargs=(task,),
     )
+    waiting: dict[Future[object], Unit] = {}
+    ready: SimpleQueue[Future[object]] = SimpleQueue()
+
+    def submit(those: Sequence[Unit]) -> None:
+        with _as_for_workers():
+            for unit in those:
+                future = pool.submit(_work, unit)
+                waiting[future] = unit
+                future.add_done_callback(ready.put)
+
     try:
-        with _interrupts_ignored():
-            waiting = {pool.submit(_work, unit): unit for unit in units}
-        for future in as_completed(waiting):
-            # A future keeps its result: it is let go, so that only what is taken is kept.
-            if take(waiting.pop(future), cast("Result", future.result())):
+        submit(units)
+        while waiting:
+            future = ready.get()
+            # A future keeps its result, and `waiting` would keep the future.
+            unit, result = waiting.pop(future), cast("Result", future.result())
+            if take(unit, result):
                 break
+            if (left := rest(result)) is not None:
+                submit([left])
     except BrokenProcessPool:
         raise SimulationError(
             "a worker process ended before its work was done: out of memory, killed, or a script "
@@ -87,6 +116,41 @@ def spread(
         pool.shutdown(wait=True, cancel_futures=True)
 
 
+def require_importable(objects: Mapping[str, object]) -> None:
+    """Refuse objects that worker processes cannot get.
+
+    Parameters
+    ----------
+    objects : mapping of str to object
+        By their names for messages.
+
+    Raises
+    ------
+    SimulationError
+        If an object does not pickle, or its class is in no module.
+    """
+    for name, given in objects.items():
+        try:
+            _Sender(io.BytesIO()).dump(given)
+        except (pickle.PicklingError, AttributeError, TypeError) as error:
+            raise SimulationError(
+                f"{name} cannot be sent to worker processes: it does not pickle ({error}); change "
+                "that, or processes=1"
+            ) from None
+
+
+class _Sender(pickle.Pickler):
+    """A pickler that refuses classes and functions of a notebook or script."""
+
+    def reducer_override(self, one: object) -> Any:
+        if isinstance(one, type | FunctionType) and one.__module__ == "__main__":
+            raise SimulationError(
+                f"{one.__qualname__} is defined in a notebook or script (__main__); put it into a "
+                "module, or processes=1"
+            )
+        return NotImplemented
+
+
 class _Worker:
     """Settings that a worker process was started with; their types end at the pickle."""
 
@@ -95,8 +159,6 @@ class _Worker:
 
 def _begin(task: Callable[..., object]) -> None:
     """Prepare a worker process."""
-    # One process a CPU: threads inside would only get into each other's way.
-    os.environ["POLARS_MAX_THREADS"] = "1"
     _Worker.task = task
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
@@ -111,17 +173,32 @@ def _end_with_parent() -> None:
 
 def _work(unit: object) -> object:
     """Do the task on a unit, in a worker process."""
-    return _Worker.task(unit)
+    try:
+        return _Worker.task(unit)
+    except Exception as error:
+        try:
+            pickle.loads(pickle.dumps(error))  # noqa: S301 - made here
+        except Exception:
+            # The process that waits could not read it.
+            raise PolicyError(user_note(error) or describe_raised(error)) from None
+        raise
 
 
 @contextmanager
-def _interrupts_ignored() -> Iterator[None]:
-    """Let processes that begin here ignore Ctrl-C; this one, which it reaches too, ends them."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _as_for_workers() -> Iterator[None]:
+    """Let processes that begin here ignore Ctrl-C, which this process handles, and use one thread.
+
+    NumPy reads its variable when it is imported, before a worker runs any line of ours.
+    """
+    before = {name: os.environ[name] for name in SINGLE_THREADED if name in os.environ}
+    os.environ.update(SINGLE_THREADED)
+    is_main = threading.current_thread() is threading.main_thread()
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if is_main else None
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        if is_main:
+            signal.signal(signal.SIGINT, handler)
+        for name in SINGLE_THREADED:
+            del os.environ[name]
+        os.environ.update(before)

@@ -14,7 +14,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from dwell.errors import DwellError, ExitCode, line_and_code
+from dwell.errors import ExitCode, line_and_code
 from dwell.live import role_command
 from dwell.live.hosting import Clock, Platform
 from dwell.live.log import say
@@ -94,7 +94,7 @@ def _run_node(command: str, words: Sequence[str], platform: Platform) -> int:
             node_command.controller(**options, platform=platform)
     except node_command.OptionError as error:
         parser.error(str(error))
-    except (DwellError, OSError, ModuleNotFoundError) as error:
+    except Exception as error:
         known = line_and_code(error)
         if known is None:
             raise

@@ -104,8 +104,8 @@ def run_once(
     """
     if policy is not None:
         problem = problem.under(policy)
-        by_name(problem.controller.policy, problem)
-        estimators.by_name(problem.controller.estimator, problem)
+    by_name(problem.controller.policy, problem)
+    estimators.by_name(problem.controller.estimator, problem)
     timeline = timeline_of(problem, scenario, seed=seed, seconds=seconds, outages=True)
     arguments = ["--jobs"] if jobs else []
     testbed = NetnsTestbed(problem, out, name=name, seed=seed, more=arguments)
