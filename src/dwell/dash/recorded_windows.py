@@ -61,6 +61,7 @@ class RecordedWindows:
         self.number = windows["window"].astype(np.int64)
         self.opens = opens(windows["first_cycle"].astype(np.int64))
         self.closes = self.opens + length
+        self._first, self._cycle = windows["first_cycle"], length / problem.window_cycles
         self.rates = windows["violation_rate"].astype(np.float64)
         self.counts = ~windows["warmup"].astype(bool)
         self.placement = placement_codes(windows.names("placement"), self._candidates)
@@ -117,8 +118,8 @@ class RecordedWindows:
             if place < 0:
                 continue
             reason = self._reasons[row]
-            # The guard's move is noted under the window that follows it.
-            at = float((self.opens if reason == "guard" else self.closes)[place])
+            beyond = int(self.decisions["last_cycle"][row]) + 1 - int(self._first[place])
+            at = float(self.opens[place]) + beyond * self._cycle
             names = [self._candidates[code[row]] for code in (self._incumbent, self._target)]
             event = {"at": at, "window": int(self.number[place])}
             if refused[row]:

@@ -128,11 +128,10 @@ def _cycle_events(cycles: pl.DataFrame, jobs: pl.DataFrame) -> Iterator[TraceEve
 
 
 def _migration_events(run: Run, header: RunHeader) -> Iterator[TraceEvent]:
-    """Decisions that migrate, at the close of the window they were made after."""
+    """Decisions that migrate, at the release of the first cycle that they did not look at."""
     import polars as pl
 
-    closes = run.windows.select("window", cycle=pl.col("first_cycle") + header.window_cycles)
-    moves = run.decisions.filter(pl.col("migrated")).join(closes, on="window")
+    moves = run.decisions.filter(pl.col("migrated")).with_columns(cycle=pl.col("last_cycle") + 1)
     for move in moves.join(run.cycles, on="cycle", suffix="_of_cycle").iter_rows(named=True):
         yield {
             "name": f"{move['incumbent']} → {move['placement']}",

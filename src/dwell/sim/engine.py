@@ -422,7 +422,7 @@ class _Stamper:
 
     def _window_of(self, cycle: int) -> int:
         """Return the number of windows that have ended by a cycle: that of its own, if any."""
-        window = self.closed.item(0)
+        window: int = self.closed.item(0)
         while window and self.firsts.item(0, window - 1) + self.window_cycles > cycle:
             window -= 1
         return window
