@@ -19,6 +19,9 @@ from dwell.model import FrozenDict, Problem, QoS
 from dwell.model.window_close import window_close_ns
 from dwell.record import Run
 from dwell.sim.engine import simulate_realisation
+from dwell.study.hindsight import Hindsight
+from dwell.study.judged_cost import judged_costs
+from dwell.study.reference import play_alone
 from tests.cells.examples import EXAMPLES
 from tests.cells.generated import random_problem
 
@@ -207,3 +210,24 @@ def test_it_is_at_most_a_window() -> None:
         often(CANONICAL, 101)
     with pytest.raises(ProblemError, match=r"decide_cycles"):
         often(CANONICAL, 0)
+
+
+@pytest.mark.parametrize("every", [25, 100])
+def test_a_judge_of_a_run_counts_the_moves_of_each_window(every: int) -> None:
+    problem = often(CANONICAL, every)
+    run = walked(problem, {1: "SO", 3: "HYB", 4: "LOC"})
+    assert judged_costs(run, problem) == pytest.approx(run.windows["cost"].to_numpy(), abs=1e-12)
+
+
+def test_hindsight_knows_the_last_window_at_each_decision() -> None:
+    problem = often(CANONICAL, 25)
+    real = dwell.draw(problem, scenario="baseline", seed=3, windows=4)
+    alone = play_alone(problem, real)
+    run = simulate_realisation(problem, real, policy="LOC", estimator=Hindsight(alone))
+    for row in run.decisions.iter_rows(named=True):
+        # It never moves, so it is what was seen, of the last 100 cycles or fewer.
+        latency = run.cycles["latency_ns"][
+            row["last_cycle"] + 1 - row["cycles"] : row["last_cycle"] + 1
+        ]
+        late = (latency > problem.pipeline.deadline_ns).mean()
+        assert row["est_violation_rate_LOC"] == late

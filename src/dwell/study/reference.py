@@ -294,9 +294,16 @@ def tier_use(windows: TableArrays, problem: Problem) -> tuple[Floats, Floats, Fl
 
 
 def _in_time(problem: Problem) -> Problem:
-    """Return the same problem with a controller whose orders take effect as windows close."""
+    """Return the same problem with a controller whose orders take effect as windows close.
+
+    It decides once per window, since the sequences have one placement per window.
+    """
     settings = replace(
-        problem.controller, order_delay_ms=0.0, order_lead_cycles=0, migration="warm"
+        problem.controller,
+        order_delay_ms=0.0,
+        order_lead_cycles=0,
+        migration="warm",
+        decide_cycles=None,
     )
     return replace(problem, controller=settings)
 
