@@ -211,9 +211,6 @@ class Observer:
         # Moves that no answer has told the reason of yet.
         self._moves: deque[_SeenMove] = deque(maxlen=MOST_EVENTS)
 
-    def __repr__(self) -> str:
-        return f"<Observer of {self.problem.name}>"
-
     def __enter__(self) -> Observer:
         """Begin to listen."""
         self._look()

@@ -49,7 +49,8 @@ def _require_run(folder: Path) -> None:
         return
     if is_fleet(folder):
         raise RunError(f"{folder}: a fleet; name the folder of one of its cells")
-    runs = sorted(path.relative_to(folder).as_posix() for path in _runs_in(folder))
+    below = (*folder.glob("*"), *folder.glob("runs/*"))
+    runs = sorted(path.relative_to(folder).as_posix() for path in below if is_run(path))
     if runs:
         more = f", and {len(runs) - MOST_NAMED} more" if len(runs) > MOST_NAMED else ""
         named = ", ".join(runs[:MOST_NAMED])
@@ -57,10 +58,6 @@ def _require_run(folder: Path) -> None:
             f"{folder}: not a run, and no fleet (it has no fleet.json); it holds {named}{more}: "
             "name one of them, and another with --beside"
         )
-
-
-def _runs_in(folder: Path) -> list[Path]:
-    return [path for path in (*folder.glob("*"), *folder.glob("runs/*")) if is_run(path)]
 
 
 def _fleet(folder: Path) -> dict[str, Any]:

@@ -53,9 +53,6 @@ class RecordedCell:
         self._size, self._read_again_s = self._bytes(), 0.0
         self._contents = self._read()
 
-    def __repr__(self) -> str:
-        return f"<RecordedCell of {str(self.folder)!r}>"
-
     def _bytes(self) -> int:
         """Return how long the folder's files are."""
         return sum(file.stat().st_size for file in self.folder.glob("*") if file.is_file())

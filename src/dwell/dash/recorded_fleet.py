@@ -125,9 +125,6 @@ class RecordedFleet:
         self._events = RecordedEvents(self._all_events())
         self.cell = lru_cache(MOST_OPEN)(self._open)
 
-    def __repr__(self) -> str:
-        return f"<RecordedFleet of {str(self.folder)!r}>"
-
     # --------------------------------------------------------------------- what is read
 
     def _whole(self, run: FleetRun) -> Iterator[_Member]:

@@ -38,9 +38,6 @@ class WatchedCell:
         self._lines: tuple[Floats, dict[str, Floats]] = (np.zeros(0), {})
         self._told = (0, 0, 0)
 
-    def __repr__(self) -> str:
-        return f"<WatchedCell of {self.problem.name}>"
-
     def _take(self) -> Strip:
         """Take in what the observer has heard since."""
         observer = self.observer

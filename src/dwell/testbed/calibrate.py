@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from dwell.calibration.cell_yaml import replay
 from dwell.calibration.profile_file import Measurement, link_name, stamp, task_name, write_profile
 from dwell.calibration.speeds import Usual, at_speed_of
 from dwell.cellfile.yaml_text import yaml_of
@@ -141,8 +142,10 @@ def calibrate(
     document = _document(cell, out)
     samples = out.with_name(f"{out.stem}.samples.parquet")
     _write_samples(samples, costs, columns, delays_ms, measured, added_ms)
-    _put_in(document, samples.name, costs, delays_ms, nodes)
-    _write_cell(out, document, cell, runs)
+    _put_in(document, Path(samples.name), costs, delays_ms, nodes)
+    head = f"# {cell.name} with what was measured of it, by `dwell testbed calibrate`.\n"
+    head += f"# Runs: {', '.join(path.resolve().name for path in runs)}\n"
+    write_whole(out, head + yaml_of(document))
     written = load(out)
     missing = _missing(problem, costs, delays_ms)
     report = {
@@ -332,19 +335,15 @@ def _document(cell: Path, out: Path) -> dict[str, Any]:
 
 def _put_in(
     document: dict[str, Any],
-    file: str,
+    file: Path,
     costs: Mapping[SiteName, TaskCost],
     delays_ms: Mapping[str, Floats],
     nodes: Mapping[str, Mapping[str, Any]],
 ) -> None:
     """Put findings on tasks, on nodes by key, and on links into a cell's document."""
-
-    def replay(column: str) -> dict[str, Any]:
-        return {"trace": {"file": file, "column": column, "by": "row", "wrap": True}}
-
     for (task, node), of in costs.items():
         on = document["tasks"][task]["on"][node]
-        on["exec_ms"] = replay(task_name(task, node))
+        on["exec_ms"] = replay(file, task_name(task, node))
         on |= {"before_ms": _short(of.before_ms), "after_ms": _short(of.after_ms)}
         # The samples have what the task shares with others already.
         document["tasks"][task].pop("scale", None)
@@ -364,17 +363,10 @@ def _put_in(
             one = {name: value for name, value in entry.items() if name != "both_ways"}
             one |= {"from": source, "to": target}
             if f"{source}->{target}" in delays_ms:
-                one["delay_ms"] = replay(f"{source}->{target}")
+                one["delay_ms"] = replay(file, f"{source}->{target}")
             links.append(one)
     if links:
         document["links"] = links
-
-
-def _write_cell(out: Path, document: dict[str, Any], cell: Path, runs: Sequence[Path]) -> None:
-    names = ", ".join(path.resolve().name for path in runs)
-    head = f"# {cell.name} with what was measured of it, by `dwell testbed calibrate`.\n"
-    head += f"# Runs: {names}\n"
-    write_whole(out, head + yaml_of(document))
 
 
 def _missing(
