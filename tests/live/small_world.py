@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from dwell.live.wiring import Role, roles, wire
 from dwell.live.worker import Job, Worker
 from dwell.model import Host, Problem, QoS
 from dwell.policies import MinimalPolicy
-from tests.live.memory_transport import Clock, MemoryTransport, Network, NetworkConditions
+from tests.live.memory_transport import Clock, MemoryTransport, Network, NetworkConditions, hears
 
 # All processes of a cell are here, and take the digest of one and the same.
 role_module.fingerprint = lru_cache(role_module.fingerprint)  # type: ignore[attr-defined]
@@ -278,7 +278,7 @@ class World:
         live = replace(problem.live, hosts=hosts)
         self.problem = problem = replace(problem, live=live)
         # Nobody hears anybody that it would have no connection to.
-        reach = wire(problem).hears
+        reach = partial(hears, wire(problem))
         delay_ns = round(delay_ms * MS)
         self.network = Network(seed=seed, delay_ns=delay_ns, start_ns=start_ns, reach=reach)
         self.clocks = dict(clocks or {})

@@ -98,7 +98,8 @@ class ForkServer(Launcher):
         self._serves = False
         self._next_s = 0.0
         self._codes: dict[int, int] = {}
-        self._watched: set[int] = set()
+        #: Processes that the present server has forked, and whose end it will report.
+        self.watched: set[int] = set()
 
     def ready(self) -> bool:
         """Return whether it has done its imports; starts it where it does not run."""
@@ -126,7 +127,7 @@ class ForkServer(Launcher):
         while self._channel is not None and (left_s := deadline - time.monotonic()) > 0:
             reply = self._receive(left_s)
             if "forked" in reply:
-                self._watched.add(reply["forked"])
+                self.watched.add(reply["forked"])
                 return _Forked(self, reply["forked"])
             if "refused" in reply:
                 raise OSError(reply["refused"], os.strerror(reply["refused"]))
@@ -163,13 +164,9 @@ class ForkServer(Launcher):
         self.hear()
         return self._codes.pop(pid, None)
 
-    def watches(self, pid: int) -> bool:
-        """Return whether the server that has forked a process is there, and will tell its end."""
-        return pid in self._watched
-
     def _end(self) -> None:
         channel, self._channel, self._serves = self._channel, None, False
-        self._watched.clear()
+        self.watched.clear()
         if channel is not None:
             channel.close()
         if self._server is not None:
@@ -222,7 +219,7 @@ class _Forked(Survivor):
         """Return its exit code, negative for a signal; None while it runs."""
         if self._code is None:
             self._code = self._server.code(self.pid)
-        if self._code is None and not self._server.watches(self.pid):
+        if self._code is None and self.pid not in self._server.watched:
             self._code = super().poll()
         return self._code
 

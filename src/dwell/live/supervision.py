@@ -368,10 +368,8 @@ class Supervisor:
 
 
 def _signal(process: psutil.Process, number: int) -> None:
-    try:
+    with suppress(psutil.Error):
         process.send_signal(number)
-    except psutil.Error:
-        return
 
 
 def write_mark(mark: Path, group: ProcessGroup | None) -> None:
