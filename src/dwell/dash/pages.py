@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,13 +29,8 @@ def recorded_page(folder: Path, beside: Path | None) -> Dash:
     RunError
         If a folder is neither, or damaged, or no run of a fleet is whole.
     """
-    read: Callable[[], dict[str, Any]] = partial(_fleet, folder)
-    if not is_fleet(folder):
-        for one in filter(None, (folder, beside)):
-            _require_run(one)
-        read = partial(_on_one_line, folder, beside)
     with ThreadPoolExecutor(1) as reader:
-        reading = reader.submit(read)
+        reading = reader.submit(_read, folder, beside)
         # Meanwhile: both take as long.
         from dwell.dash.server import Dash
 
@@ -60,14 +54,14 @@ def _require_run(folder: Path) -> None:
         )
 
 
-def _fleet(folder: Path) -> dict[str, Any]:
-    from dwell.dash.recorded_fleet import RecordedFleet
+def _read(folder: Path, beside: Path | None) -> dict[str, Any]:
+    """Return a fleet, or runs and the unit of their time line: cycles where these are the same."""
+    if is_fleet(folder):
+        from dwell.dash.recorded_fleet import RecordedFleet
 
-    return {"fleet": RecordedFleet(folder)}
-
-
-def _on_one_line(folder: Path, beside: Path | None) -> dict[str, Any]:
-    """Return the runs, and what their time line counts: cycles where these are the same."""
+        return {"fleet": RecordedFleet(folder)}
+    for path in filter(None, (folder, beside)):
+        _require_run(path)
     from dwell.dash.recorded_cell import RecordedCell, same_realisation
 
     one = RecordedCell(folder)
