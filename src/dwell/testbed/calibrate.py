@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -58,28 +58,6 @@ NODE_LINES = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Calibrated:
-    """Files that were written, and what is in them.
-
-    Parameters
-    ----------
-    problem : Problem
-        As read from the new cell file.
-    report : dict
-        As in the sidecar.
-    missing : tuple of str
-        Tasks and links that no run has visited, and that are as they were.
-    """
-
-    cell: Path
-    samples: Path
-    sidecar: Path
-    problem: Problem
-    report: dict[str, Any]
-    missing: tuple[str, ...]
-
-
 def calibrate(
     cell: Path,
     runs: Sequence[Path],
@@ -87,7 +65,7 @@ def calibrate(
     *,
     emulated: bool = True,
     say: Callable[[str], None] = print,
-) -> Calibrated:
+) -> None:
     """Write a cell with the execution times, delays and backgrounds that runs have shown.
 
     Parameters
@@ -147,7 +125,6 @@ def calibrate(
     head += f"# Runs: {', '.join(path.resolve().name for path in runs)}\n"
     write_whole(out, head + yaml_of(document))
     written = load(out)
-    missing = _missing(problem, costs, delays_ms)
     report = {
         "runs": [one.name for one in measured],
         "ids": [one.run.run_id for one in measured if one.run.run_id is not None],
@@ -165,13 +142,19 @@ def calibrate(
             {task_name(*site): value for site, value in usual.sensitivity.items()}
         ),
         "check": [row for one in measured if (row := _check(one, written, usual)) is not None],
-        "missing": list(missing),
+        "missing": [
+            *(
+                task_name(task.name, node)
+                for task in problem.pipeline.tasks.values()
+                for node in task.on
+                if (task.name, node) not in costs
+            ),
+            *(link for link in problem.fabric.links if link not in delays_ms),
+        ],
     }
-    sidecar = out.with_name(f"{out.stem}.calibration.json")
-    write_whole(sidecar, json.dumps(report, indent=2) + "\n")
+    write_whole(out.with_name(f"{out.stem}.calibration.json"), json.dumps(report, indent=2) + "\n")
     for line in _lines(report):
         say(line)
-    return Calibrated(out, samples, sidecar, written, report, missing)
 
 
 def _cpus(measured: Sequence[Measured]) -> dict[str, tuple[int, ...]]:
@@ -367,18 +350,6 @@ def _put_in(
             links.append(one)
     if links:
         document["links"] = links
-
-
-def _missing(
-    problem: Problem, costs: Mapping[SiteName, TaskCost], delays_ms: Mapping[str, Floats]
-) -> tuple[str, ...]:
-    tasks = (
-        task_name(task.name, node)
-        for task in problem.pipeline.tasks.values()
-        for node in task.on
-        if (task.name, node) not in costs
-    )
-    return *tasks, *(link for link in problem.fabric.links if link not in delays_ms)
 
 
 # ------------------------------------------------------------------------------ the report
