@@ -11,7 +11,7 @@ from typing import Any
 import dwell
 from dwell.control import Controller
 from dwell.live import role as role_module
-from dwell.live.agent import Agent, CpuCount
+from dwell.live.agent import Agent
 from dwell.live.controlled_cell import ControlledCell, Recorder
 from dwell.live.keys import CONTROLLER, Keys
 from dwell.live.messages import Ask, Order, encode
@@ -29,6 +29,7 @@ from dwell.live.worker import Job, Worker
 from dwell.model import Host, Problem, QoS
 from dwell.policies import MinimalPolicy
 from tests.live.memory_transport import Clock, MemoryTransport, Network, NetworkConditions, hears
+from tests.live.plain_launcher import PlainLauncher
 
 # All processes of a cell are here, and take the digest of one and the same.
 role_module.fingerprint = lru_cache(role_module.fingerprint)  # type: ignore[attr-defined]
@@ -463,19 +464,9 @@ class Recorded(World):
         return folder
 
 
-class IdleCpu(CpuCount):
-    """A CPU that does nothing."""
-
-    def __init__(self) -> None:
-        pass
-
-    def busy_ns(self) -> int:
-        return 0
-
-
 class Quiet(Agent):
     """An agent without processes to look after."""
 
     def __init__(self, place: RolePlace) -> None:
-        super().__init__(place, Supervisor(None, print), IdleCpu())  # type: ignore[arg-type]
+        super().__init__(place, Supervisor(None, print, PlainLauncher()), lambda: 0)  # type: ignore[arg-type]
         self.cpu_clock = lambda: 0

@@ -37,47 +37,7 @@ AGAIN_S = 1.0
 Running: TypeAlias = "subprocess.Popen[bytes] | Survivor"
 
 
-class Launcher:
-    """Runs commands.
-
-    Parameters
-    ----------
-    environment : mapping of str to str, optional
-        Environment of the processes; this one's own if left out.
-    """
-
-    def __init__(self, environment: Mapping[str, str] | None = None) -> None:
-        given = os.environ if environment is None else environment
-        self.environment = {**given, "PYTHONUNBUFFERED": "1"}
-
-    def ready(self) -> bool:
-        """Return whether `start` can be called; called again and again until it can."""
-        return True
-
-    def start(self, command: Sequence[str], log: BinaryIO) -> Running:
-        """Start a process that prints into a log.
-
-        Raises
-        ------
-        OSError
-            If it cannot be started.
-        """
-        return subprocess.Popen(  # noqa: S603 - our own interpreter and module
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            env=self.environment,
-            # Ctrl-C in a terminal is for the agent; a session of its own would make each
-            # process one of the groups that share the CPU, whatever runs in it.
-            process_group=0,
-        )
-
-    def stop(self) -> None:
-        """Take note that nothing will be started any more."""
-
-
-class ForkServer(Launcher):
+class ForkServer:
     """Has processes forked; a `command` is the words that `serve` returns in the new process.
 
     The fork server ends with this process. Those that it has forked do not.
@@ -86,12 +46,15 @@ class ForkServer(Launcher):
     ----------
     program : sequence of str
         Command of the fork server; it calls `serve` with its standard input.
+    environment : mapping of str to str, optional
+        Environment of the processes; this one's own if left out.
     """
 
     def __init__(
         self, program: Sequence[str], environment: Mapping[str, str] | None = None
     ) -> None:
-        super().__init__(environment)
+        given = os.environ if environment is None else environment
+        self.environment = {**given, "PYTHONUNBUFFERED": "1"}
         self._program = list(program)
         self._server: subprocess.Popen[bytes] | None = None
         self._channel: socket.socket | None = None
@@ -102,23 +65,31 @@ class ForkServer(Launcher):
         self.watched: set[int] = set()
 
     def ready(self) -> bool:
-        """Return whether it has done its imports; starts it where it does not run."""
+        """Return whether it has done its imports; starts it where it does not run.
+
+        `start` can be called once it has.
+        """
         if self._channel is None and time.monotonic() >= self._next_s:
-            self._begin()
+            self._next_s = time.monotonic() + AGAIN_S
+            channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            with theirs:
+                # Ctrl-C in a terminal is for the agent; a session of its own would make each
+                # process one of the groups that share the CPU, whatever runs in it.
+                self._server = subprocess.Popen(  # noqa: S603 - our own interpreter and module
+                    self._program, stdin=theirs.fileno(), env=self.environment, process_group=0
+                )
+            self._channel = channel
         self.hear()
         return self._serves
 
-    def _begin(self) -> None:
-        self._next_s = time.monotonic() + AGAIN_S
-        channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with theirs:
-            self._server = subprocess.Popen(  # noqa: S603 - our own interpreter and module
-                self._program, stdin=theirs.fileno(), env=self.environment, process_group=0
-            )
-        self._channel = channel
-
     def start(self, command: Sequence[str], log: BinaryIO) -> Running:
-        """Have a process forked."""
+        """Have a process forked that prints into a log.
+
+        Raises
+        ------
+        OSError
+            If it cannot be started.
+        """
         deadline = time.monotonic() + PATIENCE_S
         if self._channel is not None:
             self._channel.settimeout(PATIENCE_S)
@@ -191,13 +162,10 @@ class Survivor:
 
     def poll(self) -> int | None:
         """Return `UNKNOWN_CODE` when it has ended; None while it runs."""
-        try:
-            process = self._process
-            runs = process is not None and process.is_running()
-            if process is not None and runs and process.status() != psutil.STATUS_ZOMBIE:
+        process = self._process
+        with suppress(psutil.NoSuchProcess):
+            if process and process.is_running() and process.status() != psutil.STATUS_ZOMBIE:
                 return None
-        except psutil.NoSuchProcess:
-            pass
         return UNKNOWN_CODE
 
     def wait(self) -> int:
@@ -255,7 +223,10 @@ def serve(stdin: int = 0) -> list[str] | None:
             ready, _, _ = select.select([channel.fileno(), woken], [], [])
             if woken in ready:
                 os.read(woken, LONGEST_BYTES)
-                _tell_of_ended(channel)
+                with suppress(ChildProcessError):
+                    while (ended := os.waitpid(-1, os.WNOHANG)) != (0, 0):
+                        code = os.waitstatus_to_exitcode(ended[1])
+                        _tell(channel, {"ended": ended[0], "code": code})
             if channel.fileno() in ready and (words := _fork(channel)) is not None:
                 return words
     except (EOFError, ConnectionError):
@@ -270,14 +241,6 @@ def serve(stdin: int = 0) -> list[str] | None:
 
 def _tell(channel: socket.socket, what: Mapping[str, int]) -> None:
     channel.sendall(json.dumps(what).encode())
-
-
-def _tell_of_ended(channel: socket.socket) -> None:
-    """Tell how processes have ended that were forked."""
-    with suppress(ChildProcessError):
-        while (ended := os.waitpid(-1, os.WNOHANG)) != (0, 0):
-            pid, status = ended
-            _tell(channel, {"ended": pid, "code": os.waitstatus_to_exitcode(status)})
 
 
 def _fork(channel: socket.socket) -> list[str] | None:

@@ -18,7 +18,7 @@ from dwell.live.stamper import StamperState
 
 _CYCLE = struct.Struct("<qq")
 _LENGTH = struct.Struct("<QI")
-# How often the file had been written, the length of what was, and a checksum of both.
+# Number of writes, length of the content, and a checksum of both.
 _SLOT = struct.Struct("<QII")
 _BOOK_BYTES = 2_048
 #: Bits of a folder's mode by which its group, or everybody, may change what is in it.

@@ -219,7 +219,11 @@ def wire(problem: Problem, *, protocol: str = "tcp") -> Wiring:
     _require_hosts(problem, everybody)
     hosts = problem.live.hosts
     rank = {role.who: i for i, role in enumerate(everybody)}
-    places = _places(everybody)
+    # Place of everybody on its node, from 0.
+    counts, places = Counter[str](), dict[str, int]()
+    for role in everybody:
+        places[role.who] = counts[role.node]
+        counts[role.node] += 1
 
     def locator(who: str, session: Session, seen_from: str | None = None) -> Locator:
         host = hosts[everybody[rank[who]].node]
@@ -365,16 +369,6 @@ def _calls(problem: Problem, one: Role, other: Role) -> bool:
             stops = not problem.pipeline.outputs(other.task)
             return stops or (other.kind == "worker" and not task.anchored)
     return False
-
-
-def _places(everybody: Iterable[Role]) -> dict[str, int]:
-    """Place of everybody on its node, from 0."""
-    counts: dict[str, int] = {}
-    places = {}
-    for role in everybody:
-        places[role.who] = counts.get(role.node, 0)
-        counts[role.node] = places[role.who] + 1
-    return places
 
 
 def _require_hosts(problem: Problem, everybody: Sequence[Role]) -> None:

@@ -22,7 +22,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 from dwell.errors import LiveError, describe_raised, installing
 from dwell.live.failures import start_thread
@@ -30,6 +30,7 @@ from dwell.live.local_addresses import why_not_listen
 from dwell.live.transport.abandoned import AbandonedConnections
 from dwell.live.transport.forked import SessionDescriptors
 from dwell.live.transport.no_linger import Connections
+from dwell.live.transport.orphans import SHARED_MEMORY
 from dwell.live.transport.transport import Arrival, Lane, Receive, require_expression, require_key
 from dwell.live.wiring import Session, WiringEntry, session_of
 from dwell.model import FrozenDict
@@ -65,7 +66,6 @@ MARK = b"\xc1"
 MARKED_BYTES = 5
 
 _LOG = logging.getLogger(__name__)
-_SHARED_MEMORY = "/dev/shm"  # noqa: S108 - where Linux keeps it
 #: Different failures of receivers that are logged.
 MOST_FAILURES = 100
 #: Publishers kept declared; more keys than a process ever puts, answers to questions aside.
@@ -82,9 +82,6 @@ _PRIORITIES = (
     "data_low",
     "background",
 )
-
-
-_Put: TypeAlias = Callable[..., None]
 
 
 @lru_cache(maxsize=1_024)
@@ -373,7 +370,7 @@ def _keep_thread_state() -> None:
 class _Route:
     """How messages of a key and lane go out."""
 
-    put: _Put
+    put: Callable[..., None]
     pool: _Pool | None
     #: Once there is one, everything goes through it, so that the order stays.
     sender: _Sender | None = None
@@ -440,14 +437,14 @@ class _Pool:
     def of(cls, pool_bytes: int = POOL_BYTES) -> _Pool | None:
         """Return a pool, or None where there is no shared memory for it."""
         try:
-            room = os.statvfs(_SHARED_MEMORY)
+            room = os.statvfs(SHARED_MEMORY)
         except OSError:
             return None
         # The file is sparse: writing to one that does not fit would kill the process.
         if room.f_bavail * room.f_frsize < 2 * pool_bytes:
             _LOG.warning(
                 "%s has less than %d bytes free: images are copied through sockets",
-                _SHARED_MEMORY,
+                SHARED_MEMORY,
                 2 * pool_bytes,
             )
             return None
