@@ -18,13 +18,13 @@ from dwell.cost import price, tier_utilisation
 from dwell.display import milliseconds
 from dwell.errors import Fault
 from dwell.estimators.profile import Profile, mean_ms
-from dwell.model.fabric import Link, Node
+from dwell.model.fabric import Link, Node, Resource
 from dwell.model.objective import TIERS, Objective
 from dwell.model.pipeline import Execution, Flow, Task
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.process import Process, Trace, TraceTable
-from dwell.model.scenario import Disturbance, LinkDisturbance, NodeDisturbance
+from dwell.model.scenario import LinkDisturbance, NodeDisturbance, acts
 from dwell.model.servo import Servo
 
 #: Draws of a process that a percentile, or a mean of latencies, is taken of.
@@ -50,7 +50,6 @@ def warnings_of(problem: Problem, profile: Profile | None = None) -> Iterator[Fa
     profile = profile or Profile(problem)
     yield from _overloads(problem)
     yield from _slow_stages(problem)
-    yield from _starved_stages(problem)
     yield from _unused_priorities(problem)
     yield from _full_links(problem)
     yield from _fast_links(problem)
@@ -103,46 +102,38 @@ def unpriced(problem: Problem, scenario: str, cycles: int) -> Iterator[Fault]:
 
 def _overloads(problem: Problem) -> Iterator[Fault]:
     """Yield candidates whose own work is more than a node can do, or than an accelerator nearly."""
-    nodes = problem.fabric.nodes
     for name, placement in problem.candidates.items():
-        for node in nodes.values():
-            share = _own_share(problem, node, placement)
+        for resource, share in _own_shares(problem, placement):
+            node, kind = problem.fabric.nodes[resource.node], resource.kind
             left = _left_share(problem, node, placement)
-            if share > left:
-                yield Fault(
-                    f"candidates.{name}",
-                    f"its own work takes {share:.0%} of {_limit(node, left)}: it can never keep "
-                    f"pace; {_remedy(node, left)}",
-                )
-            elif node.scheduler != "fair":
-                yield from _wide_jobs(problem, name, placement, node, left)
-        for (where, kind), share in _accelerator_shares(problem, placement).items():
-            if share > NEARLY_FULL:
+            if kind and share > NEARLY_FULL:
                 what = "it can never keep pace" if share > 1 else "its jobs wait for each other"
                 yield Fault(
                     f"candidates.{name}",
-                    f"its own work takes {share:.0%} of {kind} of {where}: {what}; place less "
-                    f"there, or raise nodes.{where}.accelerators.{kind}",
+                    f"its own work takes {share:.0%} of {kind} of {node.name}: {what}; place less "
+                    f"there, or raise {resource.path}",
                 )
+            elif not kind and share > left:
+                limit, remedy = _limit_and_remedy(node, left)
+                yield Fault(
+                    f"candidates.{name}",
+                    f"its own work takes {share:.0%} of {limit}: it can never keep pace; place "
+                    f"less there{remedy}",
+                )
+            elif not kind and node.scheduler != "fair":
+                yield from _wide_jobs(problem, name, placement, node, left)
 
 
-def _limit(node: Node, left: float) -> str:
-    """What the own work on a node must not exceed, as messages have it."""
-    has = f"the cores of {node.name}"
+def _limit_and_remedy(node: Node, left: float) -> tuple[str, str]:
+    """Return the limit on the own work on a node, and how to raise it, as messages have them."""
+    limit, remedy = f"the cores of {node.name}", ", or give the node more cores"
     if node.quota is not None and node.quota.cpu < node.cores:
-        has = f"the quota of {node.name} ({node.quota.cpu:g} of {node.cores} cores)"
+        limit = f"the quota of {node.name} ({node.quota.cpu:g} of {node.cores} cores)"
+        remedy = f", or raise nodes.{node.name}.quota.cpu"
     if left >= 1:
-        return has
+        return limit, remedy
     takers = {"background": node.background > 0, "bursts": node.bursts is not None}
-    return f"{has}, of which {' and '.join(filter(takers.get, takers))} leave {left:.0%}"
-
-
-def _remedy(node: Node, left: float) -> str:
-    if left < 1:
-        return "place less there"
-    if node.quota is not None and node.quota.cpu < node.cores:
-        return f"place less there, or raise nodes.{node.name}.quota.cpu"
-    return "place less there, or give the node more cores"
+    return f"{limit}, of which {' and '.join(filter(takers.get, takers))} leave {left:.0%}", ""
 
 
 def _on_cpu(problem: Problem, node: Node, placement: Placement) -> list[tuple[Task, Execution]]:
@@ -152,12 +143,17 @@ def _on_cpu(problem: Problem, node: Node, placement: Placement) -> list[tuple[Ta
     return [(task, execution) for task, execution in both if execution.accelerator is None]
 
 
-def _own_share(problem: Problem, node: Node, placement: Placement) -> float:
-    """Share of a node's capacity that its own work asks for."""
-    work_ms = 0.0
-    for task, execution in _on_cpu(problem, node, placement):
-        work_ms += mean_ms(problem.pipeline, task, execution) * execution.threads
-    return work_ms / (problem.pipeline.period_ms * node.capacity)
+def _own_shares(problem: Problem, placement: Placement) -> Iterator[tuple[Resource, float]]:
+    """Yield each resource with the share of its capacity that own work asks for."""
+    work_ms: dict[str, float] = {}
+    for task in problem.pipeline.tasks.values():
+        node = placement[task.name]
+        execution = task.on[node]
+        name, ms = execution.resource(node), mean_ms(problem.pipeline, task, execution)
+        threads = execution.threads if execution.accelerator is None else 1
+        work_ms[name] = work_ms.get(name, 0.0) + ms * threads
+    for name, resource in problem.fabric.resources.items():
+        yield resource, work_ms.get(name, 0.0) / (problem.pipeline.period_ms * resource.capacity)
 
 
 def _left_share(problem: Problem, node: Node, placement: Placement) -> float:
@@ -174,29 +170,14 @@ def _left_share(problem: Problem, node: Node, placement: Placement) -> float:
     return left * (1 - bursts.share * (1 - beside / node.interference))
 
 
-def _accelerator_shares(problem: Problem, placement: Placement) -> dict[tuple[str, str], float]:
-    """Share of each accelerator that own work asks for, by node and kind."""
-    work_ms: dict[tuple[str, str], float] = {}
-    for task in problem.pipeline.tasks.values():
-        node = placement[task.name]
-        execution = task.on[node]
-        if execution.accelerator is not None:
-            place = node, execution.accelerator
-            work_ms[place] = work_ms.get(place, 0.0) + mean_ms(problem.pipeline, task, execution)
-    period_ms, nodes = problem.pipeline.period_ms, problem.fabric.nodes
-    return {
-        (node, kind): work / (period_ms * nodes[node].accelerators[kind])
-        for (node, kind), work in work_ms.items()
-    }
-
-
 def _slow_stages(problem: Problem) -> Iterator[Fault]:
     """Yield stages that take longer for a job than their workers have."""
     pipeline, nodes = problem.pipeline, problem.fabric.nodes
     for candidate, placement in problem.candidates.items():
+        shares = {resource.name: share for resource, share in _own_shares(problem, placement)}
         for task in pipeline.tasks.values():
             node, execution = nodes[placement[task.name]], task.on[placement[task.name]]
-            if _own_share(problem, node, placement) > 1:
+            if shares[node.name] > 1:
                 continue
             job_ms = mean_ms(pipeline, task, execution)
             if execution.accelerator is None:
@@ -274,30 +255,6 @@ def _needed_ms(jobs: Sequence[_Jobs], cores: int) -> float:
                 largest[held:] = np.maximum(largest[held:], largest[:-held] + count * weights)
         bounds += (total / largest[-1]).tolist() if chosen else []
     return max(bounds)
-
-
-def _starved_stages(problem: Problem) -> Iterator[Fault]:
-    """Yield stages that those of a higher priority leave no core to."""
-    pipeline, nodes = problem.pipeline, problem.fabric.nodes
-    for candidate, placement in problem.candidates.items():
-        for node in (one for one in nodes.values() if one.scheduler == "priority"):
-            tasks = [task for task, _ in _on_cpu(problem, node, placement)]
-            for task in tasks:
-                above = [other for other in tasks if other.priority > task.priority]
-                held = 0.0
-                for other in above:
-                    execution = other.on[node.name]
-                    threads = min(execution.threads, node.cores)
-                    job_ms = mean_ms(pipeline, other, execution) * execution.threads / threads
-                    busy = min(job_ms / pipeline.period_ms, execution.workers)
-                    held += busy * threads / node.cores
-                if held >= 1:
-                    names = ", ".join(other.name for other in above)
-                    yield Fault(
-                        f"candidates.{candidate}",
-                        f"{task.name} is never done: {names} of a higher priority take all of "
-                        f"{node.name}; place less there, or change tasks.{task.name}.priority",
-                    )
 
 
 def _unused_priorities(problem: Problem) -> Iterator[Fault]:
@@ -387,12 +344,12 @@ def _over_caps(problem: Problem, profile: Profile) -> Iterator[Fault]:
                 "is never eligible while another one is",
             )
     for name, placement in problem.candidates.items():
-        for (node, kind), share in _accelerator_shares(problem, placement).items():
-            if cap < share <= 1:
+        for resource, share in _own_shares(problem, placement):
+            if resource.kind and cap < share <= 1:
                 yield Fault(
                     f"candidates.{name}",
-                    f"its own work takes {share:.0%} of {kind} of {node}, over the cap of "
-                    f"{cap:.0%}: it is never eligible while another one is",
+                    f"its own work takes {share:.0%} of {resource.kind} of {resource.node}, over "
+                    f"the cap of {cap:.0%}: it is never eligible while another one is",
                 )
 
 
@@ -626,7 +583,7 @@ def _without_effect(problem: Problem) -> Iterator[Fault]:
     """Yield disturbances and bursts that change nothing."""
     for name, items in problem.scenarios.items():
         for index, item in enumerate(items):
-            if not _does_something(problem, item):
+            if not acts(item, problem.fabric):
                 keys = "stress_threads or down"
                 if not isinstance(item, NodeDisturbance):
                     keys = "add_delay_ms, loss, a rate_mbps below the link's, or down"
@@ -642,14 +599,3 @@ def _without_effect(problem: Problem) -> Iterator[Fault]:
             yield Fault(
                 f"links[{index}].bursts", "do nothing; give them add_delay_ms, or remove them"
             )
-
-
-def _does_something(problem: Problem, item: Disturbance) -> bool:
-    """Whether a disturbance changes anything while it is on."""
-    if item.down:
-        return True
-    if isinstance(item, NodeDisturbance):
-        return item.stress_threads > 0
-    delays = item.add_delay_ms is not None and item.add_delay_ms.expectation > 0
-    slows = item.rate_mbps < problem.fabric.links[item.link].rate_mbps
-    return delays or slows or item.loss > 0

@@ -23,7 +23,7 @@ from dwell.kernels.realisation import Realisation
 from dwell.model.fabric import Bursts
 from dwell.model.problem import Problem
 from dwell.model.process import AR1, Constant, Process, Trace
-from dwell.model.scenario import LinkDisturbance, NodeDisturbance, Scenario
+from dwell.model.scenario import LinkDisturbance, Scenario, acts
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -308,7 +308,7 @@ def _on_off(problem: Problem, scenario: Scenario) -> Iterator[OnOff]:
             yield _bursts(name, link.bursts)
     for item in scenario:
         episodes = item.episodes
-        if episodes is not None and math.isinf(item.for_s) and _acts(item):
+        if episodes is not None and math.isinf(item.for_s) and acts(item, fabric):
             begin_ns = round(item.at_s * NS_PER_S)
             stream, times = f"episodes/{episodes.name}", (episodes.every_s, episodes.for_s)
             yield OnOff(stream, frozenset((item.place,)), *times, NS_PER_S, begin_ns)
@@ -317,13 +317,6 @@ def _on_off(problem: Problem, scenario: Scenario) -> Iterator[OnOff]:
 def _bursts(place: str, bursts: Bursts) -> OnOff:
     times = bursts.every_ms, bursts.for_ms
     return OnOff(f"bursts/{place}", frozenset((place,)), *times, NS_PER_MS)
-
-
-def _acts(item: NodeDisturbance | LinkDisturbance) -> bool:
-    if isinstance(item, NodeDisturbance):
-        return item.down or item.stress_threads > 0
-    slows = item.loss > 0 or math.isfinite(item.rate_mbps)
-    return item.down or slows or item.add_delay_ms is not None
 
 
 def _places(problem: Problem, name: str) -> frozenset[str]:
