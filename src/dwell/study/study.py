@@ -318,19 +318,7 @@ def load_study(path: str | PathLike[str]) -> Study:
     ProblemError
         With every fault found in it, each with its line and field path.
     """
-    declared = read_study(path, references=REFERENCES)
-    return Study(
-        name=declared.name,
-        points=tuple(Point(point.values, point.problem, point.fleet) for point in declared.points),
-        scenarios=declared.scenarios,
-        contenders=tuple(
-            Contender(one.name, one.policy, one.estimator, one.settings)
-            for one in declared.policies
-        ),
-        seeds=declared.seeds,
-        windows=declared.windows,
-        references=declared.references,
-        labels=declared.labels,
-        metrics=declared.metrics,
-        folder=declared.folder,
-    )
+    declared = read_study(path, references=REFERENCES)._asdict()
+    points = tuple(Point(*one) for one in declared.pop("points"))
+    contenders = tuple(Contender(*one) for one in declared.pop("policies"))
+    return Study(**declared, points=points, contenders=contenders)
