@@ -155,7 +155,10 @@ class SlowProcesses:
         """
         counted = len(rates) * problem.window_cycles
         if self.has_one_loop and counted >= self.loops[0]:
-            return errors[0], self._loop_error(float(rates.mean()), counted)
+            rate = float(rates.mean())
+            # Cycles beyond whole loops count some rows once more than others.
+            more = math.fmod(counted, self.loops[0]) / counted
+            return errors[0], more * math.sqrt(rate * (1 - rate))
         places, columns = _places(problem, name), np.column_stack((l95_ms, rates))
         rest, by_times = self._by_times(problem, realisation, places, columns)
         squares = np.square(errors)
@@ -168,7 +171,10 @@ class SlowProcesses:
                 least = columns[:, 0].std() / math.sqrt(known), unseen_error(rates.mean(), known)
                 squares = np.maximum(squares, np.square(least))
         if any(counted < cycles for cycles in self.loops):
-            squares = np.maximum(squares, self._unseen_loops(problem, counted, l95_ms))
+            # Each of `STRETCHES` parts of a trace counts as one value.
+            share = unseen_error(0.0, STRETCHES) * math.sqrt(1 - counted / max(self.loops))
+            most_ms = problem.censor_ms - float(l95_ms.mean())
+            squares = np.maximum(squares, np.square((share * most_ms, share)))
         l95_error_ms, rate_error = np.sqrt(squares + by_times).tolist()
         return l95_error_ms, rate_error
 
@@ -205,22 +211,6 @@ class SlowProcesses:
             share_error = min(math.sqrt(2 * (seen + 1)) * one.on_ms / counted_ms, 1.0)
             squares += np.square(effect * share_error)
         return columns, squares
-
-    def _loop_error(self, rate: float, cycles: int) -> float:
-        """Return the standard error of V_D if a single trace is all that is random.
-
-        Cycles beyond whole loops count some rows once more than others.
-        """
-        return math.fmod(cycles, self.loops[0]) / cycles * math.sqrt(rate * (1 - rate))
-
-    def _unseen_loops(self, problem: Problem, cycles: int, l95_ms: Floats) -> Floats:
-        """Return the squared errors of L95 and V_D by the parts of traces that were not replayed.
-
-        Each of `STRETCHES` parts counts as one value.
-        """
-        share = unseen_error(0.0, STRETCHES) * math.sqrt(1 - cycles / max(self.loops))
-        most_ms = problem.censor_ms - float(l95_ms.mean())
-        return np.square((share * most_ms, share))
 
     def whole_loops(self, width: int, most: int) -> int | None:
         """Return after how many windows a single trace that is all that is random was replayed.

@@ -429,15 +429,15 @@ def write_table(table: pl.DataFrame, file: Path) -> None:
         raise OSError(str(error)) from None
 
 
-def read_table(file: Path) -> Callable[[], pl.DataFrame]:
-    """Return the function that reads a table."""
+def read_table(file: Path, remedy: str = "") -> Callable[[], pl.DataFrame]:
+    """Return the function that reads a table; `remedy` ends the message where it cannot."""
 
     def read() -> pl.DataFrame:
         import polars as pl
 
         try:
-            return pl.read_parquet(file)
+            return pl.read_parquet(file, glob=False)
         except (OSError, pl.exceptions.PolarsError) as error:
-            raise RunError(f"{file}: cannot be read ({error})") from None
+            raise RunError(f"{file}: cannot be read ({error}){remedy}") from None
 
     return read

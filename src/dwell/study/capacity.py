@@ -179,12 +179,13 @@ class FleetPlayer:
         if self.placements:
             static = StaticFleet(self.placements, seed=unit.seed, windows=self.windows)
             return [float(static.violation_rates(fleet).max()) for fleet in fleets]
-        return [self._worst(fleet, unit.seed) for fleet in fleets]
-
-    def _worst(self, fleet: Fleet, seed: int) -> float:
-        runs = simulate_fleet(fleet, seed=seed, windows=self.windows).cells.values()
-        tables = [run.arrays("windows") for run in runs]
-        return max(float(one["violation_rate"][~one["warmup"]].mean()) for one in tables)
+        worst = []
+        for fleet in fleets:
+            runs = simulate_fleet(fleet, seed=unit.seed, windows=self.windows).cells.values()
+            tables = [run.arrays("windows") for run in runs]
+            rates = [float(one["violation_rate"][~one["warmup"]].mean()) for one in tables]
+            worst.append(max(rates))
+        return worst
 
     def limiting(self, robots: int, seeds: Sequence[int]) -> Limiting | None:
         """Return what the cycles that missed have waited for most; None where for nothing."""
@@ -381,13 +382,12 @@ def _require_capacity(fleet: Fleet) -> None:
         raise ProblemError(faults)
 
 
-def what_ifs(fleet: Fleet, policy: str | None = None) -> Iterator[tuple[str, Fleet]]:
+def what_ifs(fleet: Fleet) -> Iterator[tuple[str, Fleet]]:
     """Yield changes that may take more robots, in words, and the fleet with each.
 
     A core more on every shared node, phases that are evenly spread, and every other candidate of
     the first entry that uses a shared node.
     """
-    fleet = fleet.changed(policy=policy)
     for node in fleet.shared:
         cores = fleet.entries[0].cell.fabric.nodes[node].cores + 1
         entries = [

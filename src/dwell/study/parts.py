@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from dwell.cellfile.work_folder import unwritable
-from dwell.errors import RunError
 from dwell.files import write_whole
 from dwell.study.player import Batch, PlayedBatch, Player
 from dwell.study.study import Item, Study
@@ -197,22 +196,6 @@ def write_parquet(path: Path, frame: pl.DataFrame, *, statistics: bool = True) -
         write_whole(path, data.getvalue())
     except OSError as error:
         raise unwritable(path, error) from None
-
-
-def read_parquet(path: Path, remedy: str = "") -> pl.DataFrame:
-    """Read a table.
-
-    Raises
-    ------
-    RunError
-        If it cannot be read.
-    """
-    import polars as pl
-
-    try:
-        return pl.read_parquet(path, glob=False)
-    except (OSError, pl.exceptions.PolarsError) as error:
-        raise RunError(f"{path}: cannot be read ({error}){remedy}") from None
 
 
 def frame_of(summaries: Sequence[tuple[int, Summary]]) -> pl.DataFrame:

@@ -219,7 +219,11 @@ class Player:
                 yield contender.name, point, run, summary
             if known is None:
                 continue
-            found = _compared(known, problem)
+            found: dict[str, float | str | bytes] = {
+                "reference_cost": known.cost,
+                "best_static": known.best_static,
+                "asked": few_misses(known.run, problem).tobytes(),
+            }
             for name, run in known.runs.items():
                 summary = self._summary(run, problem, _labels(item, name))
                 compared = {**summary.compared, **found}
@@ -238,7 +242,10 @@ class Player:
         if alone is None and any(map(_in_hindsight, contenders)):
             alone = play_alone(problem, realisation)
         for contender in contenders:
-            if known is not None and self._is_static(contender, point):
+            seen = self._problem(contender, point)
+            # A candidate alone is played with the estimator `profile`: shadow jobs would be load.
+            is_static = contender.is_candidate(seen) and seen.controller.estimator == "profile"
+            if known is not None and is_static:
                 yield contender, known.statics[str(contender.policy)]
             else:
                 yield contender, self._simulate(contender, point, realisation, alone)
@@ -304,14 +311,6 @@ class Player:
             estimator=estimator,
         )
 
-    def _is_static(self, contender: Contender, point: int) -> bool:
-        """Whether a contender's run is a candidate's alone.
-
-        Those are played with the estimator ``profile``: shadow jobs would be load.
-        """
-        problem = self._problem(contender, point)
-        return contender.is_candidate(problem) and problem.controller.estimator == "profile"
-
     def _problem(self, contender: Contender, point: int) -> Problem:
         """Return the problem of a point as a contender sees it."""
         key = (point, contender.name)
@@ -322,15 +321,6 @@ class Player:
 
 def _labels(item: Item, policy: str) -> dict[str, str | int]:
     return {"scenario": item.scenario, "policy": policy, "seed": item.seed}
-
-
-def _compared(known: References, problem: Problem) -> dict[str, float | str | bytes]:
-    """Return what tables need of the references to compare runs with them."""
-    return {
-        "reference_cost": known.cost,
-        "best_static": known.best_static,
-        "asked": few_misses(known.run, problem).tobytes(),
-    }
 
 
 def _in_hindsight(contender: Contender) -> bool:

@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING, Any
 from dwell.cellfile.work_folder import open_work_folder
 from dwell.errors import SimulationError
 from dwell.model.progress import Progress
+from dwell.record.run import read_table
 from dwell.study.parts import (
     Parts,
     batches_of,
     frame_of,
     play_and_write,
-    read_parquet,
     runs_of,
     write_parquet,
     write_parts,
@@ -260,7 +260,7 @@ def write_tables(parts: Parts) -> Tables:
     """
     # From the files in any case: a study that was stopped makes its tables of the same.
     remedy = "; remove it and run the study again"
-    tables = tables_of(parts.study, (read_parquet(file, remedy) for file in parts.files))
+    tables = tables_of(parts.study, (read_table(file, remedy)() for file in parts.files))
     for name, table in tables.items():
         write_parquet(parts.folder / f"{name}.parquet", table)
     return tables
