@@ -454,7 +454,10 @@ class _FleetReading(_Reading):
         for cell in cells:
             for policy in policies:
                 self._check_names(policy, cell)
-        self._check_policy_settings(policies, fleet)
+        for policy in policies:
+            for entry in fleet.entries if policy.settings else ():
+                place = f"policies.{policy.name}"
+                self.faults.attempt(place, with_settings, entry.cell, policy.settings)
         points = tuple(DeclaredPoint(values, first.cell, one) for values, one in fleets)
         return _Plays(points, scenarios, policies, cells)
 
@@ -494,13 +497,6 @@ class _FleetReading(_Reading):
                 self.faults.add(place, fault.message)
             return None
         return fleet
-
-    def _check_policy_settings(self, policies: Sequence[DeclaredPolicy], fleet: Fleet) -> None:
-        """Check that the settings of policies are right in every cell."""
-        for policy in policies:
-            for entry in fleet.entries if policy.settings else ():
-                place = f"policies.{policy.name}"
-                self.faults.attempt(place, with_settings, entry.cell, policy.settings)
 
 
 def _combinations(grid: Grid, axes: Axes) -> Iterator[tuple[dict[str, int], dict[str, Value]]]:

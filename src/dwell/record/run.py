@@ -312,12 +312,10 @@ def require_free(path: str | os.PathLike[str]) -> None:
     target = Path(path)
     if (target / JOURNAL).is_file() and not (target / "run.json").is_file():
         raise RunError(f"{target} holds a live run that has not been sealed; choose another folder")
-    if target.exists() and not (target / "run.json").is_file() and _occupied(target):
+    if target.exists() and not (target / "run.json").is_file():
+        if target.is_dir() and not any(target.iterdir()):
+            return
         raise RunError(f"{target} exists and is not a run; choose another folder")
-
-
-def _occupied(target: Path) -> bool:
-    return not target.is_dir() or any(target.iterdir())
 
 
 def _replace(draft: Path, target: Path) -> None:

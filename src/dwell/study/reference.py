@@ -265,18 +265,11 @@ def window_costs(run: Run, problem: Problem, realisation: Realisation) -> Floats
     -------
     float64 array, shape (windows,)
     """
-    costs: Floats = run.arrays("windows")["cost"].copy()
-    unseen = np.isnan(costs)
-    if unseen.any():
-        costs[unseen] = _unseen_costs(run, unseen, problem, realisation)
-    return costs
-
-
-def _unseen_costs(
-    run: Run, unseen: NDArray[np.bool_], problem: Problem, realisation: Realisation
-) -> Floats:
-    """J of the windows that the controller did not see, in their order."""
     windows = run.arrays("windows")
+    costs: Floats = windows["cost"].copy()
+    unseen = np.isnan(costs)
+    if not unseen.any():
+        return costs
     rows = windows["first_cycle"][unseen][:, None] + np.arange(problem.window_cycles)
     latency_ns = run.arrays("cycles")["latency_ns"][rows]
     release_ns = realisation.release_ns
@@ -285,7 +278,8 @@ def _unseen_costs(
     l95_ms, _ = seen_l95_ms(latency_ns, age_ns, problem.censor_ms)
     rate = windows["violation_rate"][unseen]
     robot, edge, cloud = (share[unseen] for share in tier_use(windows, problem))
-    return price(l95_ms, rate, robot, edge, cloud, 0.0, problem.objective)
+    costs[unseen] = price(l95_ms, rate, robot, edge, cloud, 0.0, problem.objective)
+    return costs
 
 
 def tier_use(windows: TableArrays, problem: Problem) -> tuple[Floats, Floats, Floats]:
