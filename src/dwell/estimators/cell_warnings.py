@@ -7,8 +7,8 @@ length of a run. Each says which setting it is, and what to do about it.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from collections.abc import Iterator, Sequence
+from functools import partial
 from itertools import chain, combinations
 from typing import NamedTuple
 
@@ -17,13 +17,15 @@ import numpy as np
 from dwell.cost import price, tier_utilisation
 from dwell.display import milliseconds
 from dwell.errors import Fault
+from dwell.estimators.paths import longest_path, steps_of
 from dwell.estimators.profile import Profile, mean_ms
+from dwell.estimators.slow_processes import processes_of
 from dwell.model.fabric import Link, Node, Resource
 from dwell.model.objective import TIERS, Objective
 from dwell.model.pipeline import Execution, Flow, Task
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
-from dwell.model.process import Process, Trace, TraceTable
+from dwell.model.process import Process, Trace
 from dwell.model.scenario import LinkDisturbance, NodeDisturbance, acts
 from dwell.model.servo import Servo
 
@@ -39,15 +41,9 @@ FASTEST_MBPS = 1e6
 LONGEST_STEP, LONGEST_SPAN = 1_000, 1_000_000
 
 
-def warnings_of(problem: Problem, profile: Profile | None = None) -> Iterator[Fault]:
-    """Yield what is allowed in a cell but seldom meant.
-
-    Parameters
-    ----------
-    profile : Profile, optional
-        Of the problem; made where None.
-    """
-    profile = profile or Profile(problem)
+def warnings_of(problem: Problem) -> Iterator[Fault]:
+    """Yield what is allowed in a cell but seldom meant."""
+    profile = Profile(problem)
     yield from _overloads(problem)
     yield from _slow_stages(problem)
     yield from _unused_priorities(problem)
@@ -487,7 +483,9 @@ def _late_releases(problem: Problem) -> Iterator[Fault]:
 def _odd_traces(problem: Problem) -> Iterator[Fault]:
     """Yield traces by time whose instants are probably wrong, or in another unit."""
     period_ms = problem.pipeline.period_ms
-    for table in {id(table): table for table in _tables(problem.drawn)}.values():
+    processes = chain.from_iterable(map(partial(processes_of, problem), problem.scenarios.values()))
+    traces = (process for _, process in processes if isinstance(process, Trace))
+    for table in {id(trace.table): trace.table for trace in traces}.values():
         if table.time_ms is None:
             continue
         # Each group begins at 0: no positive step leads into it.
@@ -503,33 +501,21 @@ def _odd_traces(problem: Problem) -> Iterator[Fault]:
             yield Fault(table.file, f"its rows last {odd}; convert its instants to ms")
 
 
-def _tables(part: object) -> Iterator[TraceTable]:
-    """Yield the tables of the traces in a part of a cell."""
-    if isinstance(part, Trace):
-        yield part.table
-    elif isinstance(part, Mapping | tuple):
-        for inner in part.values() if isinstance(part, Mapping) else part:
-            yield from _tables(inner)
-    elif is_dataclass(part):
-        for one in fields(part):
-            yield from _tables(getattr(part, one.name))
-
-
 def _stale_commands(problem: Problem) -> Iterator[Fault]:
     """Yield a largest age of commands that is less than the latency of each cycle."""
     pipeline, age_ms = problem.pipeline, problem.live.max_age_ms
     if age_ms is None:
         return
     for candidate, placement in problem.candidates.items():
-        links, end_ms = dict(_crossings(problem, placement)), dict[str, float]()
-        for name in pipeline.topological():
-            task, ready_ms = pipeline.tasks[name], pipeline.tasks[name].offset_ms
-            for flow in pipeline.inputs(name):
-                sent_ms = _shortest(links[flow].delay_ms) if flow in links else 0.0
-                ready_ms = max(ready_ms, end_ms[flow.source] + sent_ms)
+        links = dict(_crossings(problem, placement))
+        sent_ms = [
+            _shortest(links[flow].delay_ms) if flow in links else 0.0 for flow in pipeline.flows
+        ]
+        job_ms = []
+        for name, task in pipeline.tasks.items():
             scale = 1.0 if task.scale is None else _shortest(pipeline.scales[task.scale])
-            end_ms[name] = ready_ms + scale * _shortest(task.on[placement[name]].exec_ms)
-        shortest_ms = max(end_ms.values())
+            job_ms.append(np.array(scale * _shortest(task.on[placement[name]].exec_ms)))
+        shortest_ms = float(longest_path(steps_of(pipeline), job_ms, sent_ms))
         if age_ms < shortest_ms:
             yield Fault(
                 "live.max_age_ms",

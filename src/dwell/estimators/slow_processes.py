@@ -240,7 +240,7 @@ class SlowProcesses:
 def slow_processes(problem: Problem, scenario: str) -> SlowProcesses:
     """Return the slow processes of a cell under a scenario."""
     items, fabric = problem.scenario(scenario), problem.fabric
-    processes = list(_processes(problem, items))
+    processes = list(processes_of(problem, items))
     tables = {id(one.table): one.table for _, one in processes if isinstance(one, Trace)}
     loops = tuple(table.loop_cycles(problem.pipeline.period_ms) for table in tables.values())
     # Where instants of rows are closer than releases, a loop does not replay each of them.
@@ -268,7 +268,7 @@ def slow_processes(problem: Problem, scenario: str) -> SlowProcesses:
     )
 
 
-def _processes(problem: Problem, scenario: Scenario) -> Iterator[tuple[frozenset[str], Process]]:
+def processes_of(problem: Problem, scenario: Scenario) -> Iterator[tuple[frozenset[str], Process]]:
     """Yield the processes that have a value for each cycle, and the nodes and links they act on."""
     pipeline, fabric = problem.pipeline, problem.fabric
     yield frozenset(fabric.nodes), pipeline.release_jitter_ms
