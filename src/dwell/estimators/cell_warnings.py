@@ -20,7 +20,7 @@ from dwell.errors import Fault
 from dwell.estimators.paths import longest_path, steps_of
 from dwell.estimators.profile import Profile, mean_ms
 from dwell.estimators.slow_processes import processes_of
-from dwell.model.fabric import Link, Node, Resource
+from dwell.model.fabric import Link, Node
 from dwell.model.objective import TIERS, Objective
 from dwell.model.pipeline import Execution, Flow, Task
 from dwell.model.placement import Placement
@@ -44,13 +44,17 @@ LONGEST_STEP, LONGEST_SPAN = 1_000, 1_000_000
 def warnings_of(problem: Problem) -> Iterator[Fault]:
     """Yield what is allowed in a cell but seldom meant."""
     profile = Profile(problem)
-    yield from _overloads(problem)
-    yield from _slow_stages(problem)
+    for name, placement in problem.candidates.items():
+        messages = chain(
+            _overloads(problem, placement),
+            _slow_stages(problem, placement),
+            _full_links(problem, placement),
+            _over_caps(problem, placement, profile.uncut_l95_ms[name]),
+        )
+        yield from (Fault(f"candidates.{name}", message) for message in messages)
     yield from _unused_priorities(problem)
-    yield from _full_links(problem)
     yield from _fast_links(problem)
     yield from _same_placements(problem)
-    yield from _over_caps(problem, profile)
     yield from _percentages(problem)
     yield from _dominant_terms(problem, profile)
     yield from _false_alarms(problem, profile)
@@ -96,28 +100,26 @@ def unpriced(problem: Problem, scenario: str, cycles: int) -> Iterator[Fault]:
 # ------------------------------------------------------------------------------- keeping pace
 
 
-def _overloads(problem: Problem) -> Iterator[Fault]:
-    """Yield candidates whose own work is more than a node can do, or than an accelerator nearly."""
-    for name, placement in problem.candidates.items():
-        for resource, share in _own_shares(problem, placement):
-            node, kind = problem.fabric.nodes[resource.node], resource.kind
-            left = _left_share(problem, node, placement)
-            if kind and share > NEARLY_FULL:
-                what = "it can never keep pace" if share > 1 else "its jobs wait for each other"
-                yield Fault(
-                    f"candidates.{name}",
-                    f"its own work takes {share:.0%} of {kind} of {node.name}: {what}; place less "
-                    f"there, or raise {resource.path}",
-                )
-            elif not kind and share > left:
-                limit, remedy = _limit_and_remedy(node, left)
-                yield Fault(
-                    f"candidates.{name}",
-                    f"its own work takes {share:.0%} of {limit}: it can never keep pace; place "
-                    f"less there{remedy}",
-                )
-            elif not kind and node.scheduler != "fair":
-                yield from _wide_jobs(problem, name, placement, node, left)
+def _overloads(problem: Problem, placement: Placement) -> Iterator[str]:
+    """Yield where own work is more than a node can do, or than an accelerator nearly."""
+    for name, share in _own_shares(problem, placement).items():
+        resource = problem.fabric.resources[name]
+        node, kind = problem.fabric.nodes[resource.node], resource.kind
+        left = _left_share(problem, node, placement)
+        if kind and share > NEARLY_FULL:
+            what = "it can never keep pace" if share > 1 else "its jobs wait for each other"
+            yield (
+                f"its own work takes {share:.0%} of {kind} of {node.name}: {what}; place less "
+                f"there, or raise {resource.path}"
+            )
+        elif not kind and share > left:
+            limit, remedy = _limit_and_remedy(node, left)
+            yield (
+                f"its own work takes {share:.0%} of {limit}: it can never keep pace; place less "
+                f"there{remedy}"
+            )
+        elif not kind and node.scheduler != "fair":
+            yield from _wide_jobs(problem, placement, node, left)
 
 
 def _limit_and_remedy(node: Node, left: float) -> tuple[str, str]:
@@ -139,17 +141,19 @@ def _on_cpu(problem: Problem, node: Node, placement: Placement) -> list[tuple[Ta
     return [(task, execution) for task, execution in both if execution.accelerator is None]
 
 
-def _own_shares(problem: Problem, placement: Placement) -> Iterator[tuple[Resource, float]]:
-    """Yield each resource with the share of its capacity that own work asks for."""
-    work_ms: dict[str, float] = {}
+def _own_shares(problem: Problem, placement: Placement) -> dict[str, float]:
+    """Return the share of each resource's capacity that own work asks for."""
+    work_ms = dict.fromkeys(problem.fabric.resources, 0.0)
     for task in problem.pipeline.tasks.values():
-        node = placement[task.name]
-        execution = task.on[node]
-        name, ms = execution.resource(node), mean_ms(problem.pipeline, task, execution)
+        execution = task.on[placement[task.name]]
         threads = execution.threads if execution.accelerator is None else 1
-        work_ms[name] = work_ms.get(name, 0.0) + ms * threads
-    for name, resource in problem.fabric.resources.items():
-        yield resource, work_ms.get(name, 0.0) / (problem.pipeline.period_ms * resource.capacity)
+        name = _resource(task, placement)
+        work_ms[name] += mean_ms(problem.pipeline, task, execution) * threads
+    period_ms = problem.pipeline.period_ms
+    return {
+        name: work_ms[name] / (period_ms * resource.capacity)
+        for name, resource in problem.fabric.resources.items()
+    }
 
 
 def _left_share(problem: Problem, node: Node, placement: Placement) -> float:
@@ -166,26 +170,21 @@ def _left_share(problem: Problem, node: Node, placement: Placement) -> float:
     return left * (1 - bursts.share * (1 - beside / node.interference))
 
 
-def _slow_stages(problem: Problem) -> Iterator[Fault]:
+def _slow_stages(problem: Problem, placement: Placement) -> Iterator[str]:
     """Yield stages that take longer for a job than their workers have."""
-    pipeline, nodes = problem.pipeline, problem.fabric.nodes
-    for candidate, placement in problem.candidates.items():
-        shares = {resource.name: share for resource, share in _own_shares(problem, placement)}
-        for task in pipeline.tasks.values():
-            node, execution = nodes[placement[task.name]], task.on[placement[task.name]]
-            if shares[node.name] > 1:
-                continue
-            job_ms = mean_ms(pipeline, task, execution)
-            if execution.accelerator is None:
-                cpu = node.cores if node.quota is None else min(node.cores, node.quota.cpu)
-                job_ms *= max(1.0, execution.threads / cpu)
-            if job_ms > execution.workers * pipeline.period_ms:
-                yield Fault(
-                    f"candidates.{candidate}",
-                    f"{task.name} takes {job_ms:.4g} ms a job on {node.name}, a job comes every "
-                    f"{pipeline.period_ms:.4g} ms, and workers are {execution.workers}: it can "
-                    f"never keep pace; raise tasks.{task.name}.on.{node.name}.workers",
-                )
+    period_ms, shares = problem.pipeline.period_ms, _own_shares(problem, placement)
+    for task in problem.pipeline.tasks.values():
+        node = problem.fabric.nodes[placement[task.name]]
+        execution = task.on[node.name]
+        job_ms = mean_ms(problem.pipeline, task, execution)
+        if execution.accelerator is None:
+            job_ms *= max(1.0, execution.threads / node.capacity)
+        if shares[node.name] <= 1 and job_ms > execution.workers * period_ms:
+            yield (
+                f"{task.name} takes {job_ms:.4g} ms a job on {node.name}, a job comes every "
+                f"{period_ms:.4g} ms, and workers are {execution.workers}: it can never keep "
+                f"pace; raise tasks.{task.name}.on.{node.name}.workers"
+            )
 
 
 class _Jobs(NamedTuple):
@@ -196,9 +195,7 @@ class _Jobs(NamedTuple):
     ms: float
 
 
-def _wide_jobs(
-    problem: Problem, candidate: str, placement: Placement, node: Node, left: float
-) -> Iterator[Fault]:
+def _wide_jobs(problem: Problem, placement: Placement, node: Node, left: float) -> Iterator[str]:
     """Yield a warning if jobs on a node cannot run side by side, and together take more than P."""
     period_ms, jobs, alone_ms = problem.pipeline.period_ms, {}, 0.0
     for task, execution in _on_cpu(problem, node, placement):
@@ -214,11 +211,10 @@ def _wide_jobs(
     needed_ms = _needed_ms([*jobs.values()], node.cores) * arriving / speed
     if alone_ms <= period_ms < needed_ms * (1 - 1e-9):
         held = ", ".join(f"{name}: {of.cores}" for name, of in jobs.items())
-        yield Fault(
-            f"candidates.{candidate}",
+        yield (
             f"its jobs do not fit side by side on the {node.cores} cores of {node.name} ({held}) "
             f"and take at least {needed_ms:.4g} ms in every {period_ms:.4g} ms: it can never keep "
-            "pace; lower their threads, or place less there",
+            "pace; lower their threads, or place less there"
         )
 
 
@@ -287,23 +283,19 @@ def _crossings(problem: Problem, placement: Placement) -> Iterator[tuple[Flow, L
             yield flow, problem.fabric.links[name]
 
 
-def _full_links(problem: Problem) -> Iterator[Fault]:
-    """Yield candidates that send more over a link than it carries, repetitions included."""
-    pipeline, links = problem.pipeline, problem.fabric.links
-    for candidate, placement in problem.candidates.items():
-        sent_bytes = dict.fromkeys(links, 0.0)
-        for flow, link in _crossings(problem, placement):
-            attempts = 1 if link.retransmit_ms is None else 1 / (1 - link.loss)
-            sent_bytes[link.name] += attempts * flow.payload_bytes
-        for name, count in sent_bytes.items():
-            mbps = 8e-3 * count / pipeline.period_ms
-            if mbps > links[name].rate_mbps:
-                yield Fault(
-                    f"candidates.{candidate}",
-                    f"it sends {mbps:.4g} Mbit/s over {name}, which carries "
-                    f"{links[name].rate_mbps:.4g}: messages wait ever longer; send less, or "
-                    "raise rate_mbps",
-                )
+def _full_links(problem: Problem, placement: Placement) -> Iterator[str]:
+    """Yield links over which more is sent than they carry, repetitions included."""
+    sent_bytes = dict.fromkeys(problem.fabric.links, 0.0)
+    for flow, link in _crossings(problem, placement):
+        attempts = 1 if link.retransmit_ms is None else 1 / (1 - link.loss)
+        sent_bytes[link.name] += attempts * flow.payload_bytes
+    for name, link in problem.fabric.links.items():
+        mbps = 8e-3 * sent_bytes[name] / problem.pipeline.period_ms
+        if mbps > link.rate_mbps:
+            yield (
+                f"it sends {mbps:.4g} Mbit/s over {name}, which carries {link.rate_mbps:.4g}: "
+                "messages wait ever longer; send less, or raise rate_mbps"
+            )
 
 
 def _fast_links(problem: Problem) -> Iterator[Fault]:
@@ -329,24 +321,20 @@ def _same_placements(problem: Problem) -> Iterator[Fault]:
             )
 
 
-def _over_caps(problem: Problem, profile: Profile) -> Iterator[Fault]:
-    """Yield candidates that are over a cap before anything disturbs them."""
-    cap_ms, cap = problem.objective.caps.latency_ms, problem.objective.caps.utilisation
-    for name, l95_ms in profile.uncut_l95_ms.items():
-        if l95_ms > cap_ms:
-            yield Fault(
-                f"candidates.{name}",
-                f"L95 is {milliseconds(l95_ms)} ms undisturbed, over the cap of {cap_ms:g} ms: it "
-                "is never eligible while another one is",
+def _over_caps(problem: Problem, placement: Placement, l95_ms: float) -> Iterator[str]:
+    """Yield the caps that a candidate is over before anything disturbs it."""
+    caps = problem.objective.caps
+    never = "it is never eligible while another one is"
+    if l95_ms > caps.latency_ms:
+        shown_ms = milliseconds(l95_ms)
+        yield f"L95 is {shown_ms} ms undisturbed, over the cap of {caps.latency_ms:g} ms: {never}"
+    for name, share in _own_shares(problem, placement).items():
+        resource = problem.fabric.resources[name]
+        if resource.kind and caps.utilisation < share <= 1:
+            yield (
+                f"its own work takes {share:.0%} of {resource.kind} of {resource.node}, "
+                f"over the cap of {caps.utilisation:.0%}: {never}"
             )
-    for name, placement in problem.candidates.items():
-        for resource, share in _own_shares(problem, placement):
-            if resource.kind and cap < share <= 1:
-                yield Fault(
-                    f"candidates.{name}",
-                    f"its own work takes {share:.0%} of {resource.kind} of {resource.node}, over "
-                    f"the cap of {cap:.0%}: it is never eligible while another one is",
-                )
 
 
 def _percentages(problem: Problem) -> Iterator[Fault]:
