@@ -374,7 +374,15 @@ class TraceTable:
 
         spans = time_ms[ends - 1]
         if wraps:
-            return self._wrap_time(rng, elapsed_ms, time_ms, spans, ends - self.starts)
+            counts = ends - self.starts
+            lengths = _lasting_ms(spans, counts)
+            total = float(lengths.sum())
+            if total == 0:  # every row has the same instant: their order is all there is
+                return self._replay_rows(rng, len(elapsed_ms), np.array([self.rows]), True)
+            begin = np.concatenate(([0.0], np.cumsum(lengths)[:-1]))
+            instants = np.repeat(begin, counts) + time_ms
+            phase = (rng.uniform(0, total) + elapsed_ms) % total
+            return np.asarray(np.searchsorted(instants, phase, side="right") - 1, np.int64)
         needs = float(elapsed_ms[-1])
         # Releases are whole nanoseconds: a trace that ends within one of them is long enough.
         long_enough = spans + NS >= needs
@@ -392,25 +400,6 @@ class TraceTable:
         rows = slice(int(self.starts[group]), int(ends[group]))
         inside = np.searchsorted(time_ms[rows], offset + elapsed_ms, side="right") - 1
         return np.asarray(inside + int(self.starts[group]), np.int64)
-
-    def _wrap_time(
-        self,
-        rng: np.random.Generator,
-        elapsed_ms: Floats,
-        time_ms: Floats,
-        spans: Floats,
-        counts: NDArray[np.int64],
-    ) -> NDArray[np.int64]:
-        import numpy as np
-
-        lengths = _lasting_ms(spans, counts)
-        total = float(lengths.sum())
-        if total == 0:  # every row has the same instant: their order is all there is
-            return self._replay_rows(rng, len(elapsed_ms), np.array([self.rows]), True)
-        begin = np.concatenate(([0.0], np.cumsum(lengths)[:-1]))
-        instants = np.repeat(begin, counts) + time_ms
-        phase = (rng.uniform(0, total) + elapsed_ms) % total
-        return np.asarray(np.searchsorted(instants, phase, side="right") - 1, np.int64)
 
     def loop_cycles(self, period_ms: float) -> float:
         """Return the number of cycles after which a replay that wraps is back at its start."""
