@@ -246,7 +246,9 @@ def capacity_of(
     fleet = fleet.changed(policy=policy, phases=phases)
     _require_capacity(fleet)
     fleet.with_count(most)
-    player = FleetPlayer(fleet, _windows(fleet, cycles), _placements(fleet))
+    counted = ((one.warmup_windows, one.window_cycles) for one in fleet.problems.values())
+    windows = max(warmup + -(-cycles // width) for warmup, width in counted)
+    player = FleetPlayer(fleet, windows, _placements(fleet))
     together = TOGETHER if player.placements else 1
     units = [
         Sizes(first, min(first + together - 1, most), seed)
@@ -338,11 +340,6 @@ class _Curve:
 def policy_of(fleet: Fleet, entry: FleetEntry) -> str:
     """Return the policy of the cells of an entry."""
     return entry.policy or fleet.policy or entry.cell.controller.policy
-
-
-def _windows(fleet: Fleet, cycles: int) -> int:
-    cells = [entry.cell for entry in fleet.entries]
-    return max(cell.warmup_windows + -(-cycles // cell.window_cycles) for cell in cells)
 
 
 def _placements(fleet: Fleet) -> dict[str, str]:

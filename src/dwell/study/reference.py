@@ -148,7 +148,10 @@ def references(problem: Problem, realisation: Realisation) -> References:
     statics = play_alone(problem, realisation)
     costs = {name: mean_cost(run) for name, run in statics.items()}
     alone = np.stack([window_costs(run, problem, realisation) for run in statics.values()], axis=1)
-    switching = _switching(problem)
+    placements = problem.candidates.values()
+    shares = [[hamming(after, before) for after in placements] for before in placements]
+    # From the row's candidate to the column's.
+    switching = problem.objective.weights.switching * np.array(shares, np.float64)
     windows = statics[names[0]].arrays("windows")
     seen, warmup = ~np.isnan(windows["cost"]), windows["warmup"]
     sequences, runs, promised = {}, {}, {}
@@ -293,10 +296,3 @@ def _in_time(problem: Problem) -> Problem:
         problem.controller, order_delay_ms=0.0, order_lead_cycles=0, migration="warm"
     )
     return replace(problem, controller=settings)
-
-
-def _switching(problem: Problem) -> Floats:
-    """Price of every move in units of J, from the row's candidate to the column's."""
-    placements = problem.candidates.values()
-    shares = [[hamming(after, before) for after in placements] for before in placements]
-    return problem.objective.weights.switching * np.array(shares, np.float64)
