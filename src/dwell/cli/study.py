@@ -23,8 +23,7 @@ from dwell.cli.options import (
     require_one_length,
     windows_of,
 )
-from dwell.cli.output import file_name, print_json, progress, warn, working
-from dwell.errors import ExitCode
+from dwell.cli.output import file_name, interrupted, print_json, progress, warn, working
 from dwell.model.bounds import counted
 
 if TYPE_CHECKING:
@@ -139,12 +138,10 @@ def _interruptible(folder: Path, study: Study) -> Iterator[Progress]:
 
             yield count
     except KeyboardInterrupt:
-        typer.echo(
-            f"interrupted: {done} of {counted(of, 'run')} are finished and stay in "
-            f"{folder}; the same command goes on from there",
-            err=True,
+        interrupted(
+            f"{done} of {counted(of, 'run')} are finished and stay in {folder}; the same command "
+            "goes on from there"
         )
-        raise typer.Exit(ExitCode.INTERRUPTED) from None
 
 
 def _measures(study: Study) -> list[Measure]:

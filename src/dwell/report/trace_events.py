@@ -131,7 +131,9 @@ def _migration_events(run: Run, header: RunHeader) -> Iterator[TraceEvent]:
     """Decisions that migrate, at the close of the window they were made after."""
     import polars as pl
 
-    closes = run.windows.select("window", cycle=pl.col("first_cycle") + header.window_cycles)
+    closes = run.windows.select(
+        "window", cycle=pl.col("first_cycle") + header.problem.window_cycles
+    )
     moves = run.decisions.filter(pl.col("migrated")).join(closes, on="window")
     for move in moves.join(run.cycles, on="cycle", suffix="_of_cycle").iter_rows(named=True):
         yield {
@@ -147,7 +149,7 @@ def _migration_events(run: Run, header: RunHeader) -> Iterator[TraceEvent]:
 
 
 def _processes(header: RunHeader) -> dict[str, int]:
-    return {node: pid for pid, node in enumerate(header.nodes, start=CELL + 1)}
+    return {node: pid for pid, node in enumerate(header.problem.fabric.nodes, start=CELL + 1)}
 
 
 def _threads(jobs: pl.DataFrame) -> dict[str, int]:
