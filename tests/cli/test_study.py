@@ -140,16 +140,3 @@ def test_an_interrupted_study_says_how_to_go_on(study: Path) -> None:
     finished = [len(part) for part in parts if "asked" not in part.columns]
     assert 0 <= sum(finished) - int(said) <= BATCH_RUNS
     assert not list(Path("out").rglob(".*"))
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["paper"],
-        ["paper", "--quick"],
-        ["paper", "--chapter", "table", "--examples", "examples"],
-        ["my-study.yaml", "--quick"],
-    ],
-)
-def test_the_old_command_for_the_paper_names_the_new_one(words: list[str]) -> None:
-    assert_refused(call("study", *words), "make paper")

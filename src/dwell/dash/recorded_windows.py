@@ -12,7 +12,7 @@ from dwell.dash.paged_cell import Plain, health_by
 from dwell.dash.strip import Floats, plain
 from dwell.model import Problem
 from dwell.model.live import RECENT_WINDOWS
-from dwell.record import Names, Run, TableArrays
+from dwell.record import Names, Run
 
 #: What is both estimated and seen of a window, and the columns that say what was seen.
 SEEN = {"l95_ms": "seen_l95_ms", "violation_rate": "seen_violation_rate", "cost": "cost"}
@@ -55,7 +55,7 @@ class RecordedWindows:
         opens: Callable[[NDArray[np.int64]], Floats],
         length: float,
     ) -> None:
-        self._run, self._problem = run, problem
+        self._problem = problem
         self._candidates = tuple(problem.candidates)
         windows = run.arrays("windows")
         self.number = windows["window"].astype(np.int64)
@@ -69,19 +69,17 @@ class RecordedWindows:
         self.used = {
             name: windows[f"u_{name}"].astype(np.float64) for name in problem.fabric.resources
         }
-        self._decide(run.arrays("decisions"))
+        self._decide(run)
 
-    def __repr__(self) -> str:
-        return f"<RecordedWindows: {len(self.number)} of {self._problem.name}>"
-
-    def _decide(self, table: TableArrays) -> None:
+    def _decide(self, run: Run) -> None:
         """Take in the decisions: those at a window's close, by window, and all of them."""
-        self.decisions = table
+        self.decisions = table = run.arrays("decisions")
         windows, reasons = table["window"].astype(np.int64), table.names("reason")
         self._reasons = reasons.to_list()
         self._target = placement_codes(table.names("placement"), self._candidates)
         self._incumbent = placement_codes(table.names("incumbent"), self._candidates)
-        self._refused = self._texts("refused")
+        refused = run.decisions["refused"].to_list() if "refused" in table else []
+        self._refused = [text or "" for text in refused] or [""] * len(self._reasons)
         at_close = ~reasons.equal("guard")
         # Of a window, the row of its decision; -1 where nothing was decided.
         self._row = np.full(len(self.number), -1)
@@ -102,12 +100,6 @@ class RecordedWindows:
         known = self._row >= 0
         values[known] = column[self._row[known]]
         return values
-
-    def _texts(self, column: str) -> Sequence[str]:
-        """Return a column of texts of the decisions; empty where there is none."""
-        if column not in self.decisions:
-            return [""] * len(self._reasons)
-        return [text or "" for text in self._run.decisions[column].to_list()]
 
     def events(self) -> Iterator[Plain]:
         """Yield moves and refusals."""

@@ -60,15 +60,12 @@ class RoleLogic(Protocol):
 
     def subscriptions(self) -> Iterable[str]:
         """Key expressions that it wants to hear."""
-        ...
 
     def receive(self, sample: Arrival, now_ns: int) -> int | None:
         """Take a message in; returns an instant at which something is due since, if that is so."""
-        ...
 
     def wake(self, now_ns: int) -> int:
         """Do what is due; returns the next instant at which something is."""
-        ...
 
 
 @dataclass(slots=True)

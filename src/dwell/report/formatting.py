@@ -200,13 +200,9 @@ def _shown(name: str, remark: str = "") -> str:
 
 def shown_scenario(name: str) -> str:
     """``robot-cpu-stress`` as ``Robot CPU stress``."""
-    text = shown_in_sentence(name)
+    words = name.replace("_", "-").split("-")
+    text = " ".join(ABBREVIATIONS.get(word, word) for word in words)
     return text[:1].upper() + text[1:]
-
-
-def shown_in_sentence(name: str) -> str:
-    """``robot-cpu-stress`` as ``robot CPU stress``."""
-    return " ".join(ABBREVIATIONS.get(word, word) for word in name.replace("_", "-").split("-"))
 
 
 def listed(items: Iterable[str], last: str = "and") -> str:

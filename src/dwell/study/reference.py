@@ -148,7 +148,10 @@ def references(problem: Problem, realisation: Realisation) -> References:
     statics = play_alone(problem, realisation)
     costs = {name: mean_cost(run) for name, run in statics.items()}
     alone = np.stack([window_costs(run, problem, realisation) for run in statics.values()], axis=1)
-    switching = _switching(problem)
+    placements = problem.candidates.values()
+    shares = [[hamming(after, before) for after in placements] for before in placements]
+    # From the row's candidate to the column's.
+    switching = problem.objective.weights.switching * np.array(shares, np.float64)
     windows = statics[names[0]].arrays("windows")
     seen, warmup = ~np.isnan(windows["cost"]), windows["warmup"]
     sequences, runs, promised = {}, {}, {}
@@ -265,18 +268,11 @@ def window_costs(run: Run, problem: Problem, realisation: Realisation) -> Floats
     -------
     float64 array, shape (windows,)
     """
-    costs: Floats = run.arrays("windows")["cost"].copy()
-    unseen = np.isnan(costs)
-    if unseen.any():
-        costs[unseen] = _unseen_costs(run, unseen, problem, realisation)
-    return costs
-
-
-def _unseen_costs(
-    run: Run, unseen: NDArray[np.bool_], problem: Problem, realisation: Realisation
-) -> Floats:
-    """J of the windows that the controller did not see, in their order."""
     windows = run.arrays("windows")
+    costs: Floats = windows["cost"].copy()
+    unseen = np.isnan(costs)
+    if not unseen.any():
+        return costs
     rows = windows["first_cycle"][unseen][:, None] + np.arange(problem.window_cycles)
     latency_ns = run.arrays("cycles")["latency_ns"][rows]
     release_ns = realisation.release_ns
@@ -285,7 +281,8 @@ def _unseen_costs(
     l95_ms, _ = seen_l95_ms(latency_ns, age_ns, problem.censor_ms)
     rate = windows["violation_rate"][unseen]
     robot, edge, cloud = (share[unseen] for share in tier_use(windows, problem))
-    return price(l95_ms, rate, robot, edge, cloud, 0.0, problem.objective)
+    costs[unseen] = price(l95_ms, rate, robot, edge, cloud, 0.0, problem.objective)
+    return costs
 
 
 def tier_use(windows: TableArrays, problem: Problem) -> tuple[Floats, Floats, Floats]:
@@ -306,10 +303,3 @@ def _in_time(problem: Problem) -> Problem:
         decide_cycles=None,
     )
     return replace(problem, controller=settings)
-
-
-def _switching(problem: Problem) -> Floats:
-    """Price of every move in units of J, from the row's candidate to the column's."""
-    placements = problem.candidates.values()
-    shares = [[hamming(after, before) for after in placements] for before in placements]
-    return problem.objective.weights.switching * np.array(shares, np.float64)

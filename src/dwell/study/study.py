@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from typing import TYPE_CHECKING
@@ -276,10 +276,14 @@ class Study:
         Points that differ in the controller and the objective alone are played in one item, as
         many as make `ITEM_RUNS`.
         """
+        drawn_alike: dict[Drawn | int, list[int]] = {}
+        for index, point in enumerate(self.points):
+            alike = point.problem.drawn if point.fleet is None else index
+            drawn_alike.setdefault(alike, []).append(index)
         size = max(1, ITEM_RUNS // len(self.contenders))
         groups = [
-            group[begin : begin + size]
-            for group in self._drawn_alike()
+            tuple(group[begin : begin + size])
+            for group in drawn_alike.values()
             for begin in range(0, len(group), size)
         ]
         return tuple(
@@ -288,14 +292,6 @@ class Study:
             for scenario in self.scenarios
             for group in groups
         )
-
-    def _drawn_alike(self) -> Iterator[tuple[int, ...]]:
-        """Yield points whose realisations are the same."""
-        groups: dict[Drawn | int, list[int]] = {}
-        for index, point in enumerate(self.points):
-            alike = point.problem.drawn if point.fleet is None else index
-            groups.setdefault(alike, []).append(index)
-        yield from (tuple(group) for group in groups.values())
 
 
 def _require_each_once(what: str, given: Sequence[object], remedy: str = "name each once") -> None:
@@ -318,19 +314,7 @@ def load_study(path: str | PathLike[str]) -> Study:
     ProblemError
         With every fault found in it, each with its line and field path.
     """
-    declared = read_study(path, references=REFERENCES)
-    return Study(
-        name=declared.name,
-        points=tuple(Point(point.values, point.problem, point.fleet) for point in declared.points),
-        scenarios=declared.scenarios,
-        contenders=tuple(
-            Contender(one.name, one.policy, one.estimator, one.settings)
-            for one in declared.policies
-        ),
-        seeds=declared.seeds,
-        windows=declared.windows,
-        references=declared.references,
-        labels=declared.labels,
-        metrics=declared.metrics,
-        folder=declared.folder,
-    )
+    declared = read_study(path, references=REFERENCES)._asdict()
+    points = tuple(Point(*one) for one in declared.pop("points"))
+    contenders = tuple(Contender(*one) for one in declared.pop("policies"))
+    return Study(**declared, points=points, contenders=contenders)
