@@ -136,10 +136,10 @@ def _interruptible(folder: Path, study: Study) -> Iterator[Progress]:
 
 def _measures(study: Study) -> list[Measure]:
     """Return what the terminal shows."""
-    from dwell.report.formatting import COST, MIGRATIONS, RATE, REGRET, own_measures
+    from dwell.report.formatting import COST, MIGRATIONS, ORACLE_REGRET, RATE, REGRET, own_measures
 
-    regret = [REGRET] if study.references else []
-    return [RATE, COST, MIGRATIONS, *regret, *own_measures(study.metrics)]
+    compared = [REGRET, ORACLE_REGRET] if study.references else []
+    return [RATE, COST, MIGRATIONS, *compared, *own_measures(study.metrics)]
 
 
 def _text(result: StudyResult) -> str:

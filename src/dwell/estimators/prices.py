@@ -53,7 +53,7 @@ UNSETTLED = 3.0
 #: How much more is played than seems to be needed, since the error is itself an estimate.
 AMPLE = 1.2
 #: Of how many questions the answers are kept.
-KEPT = 64
+KEPT = 512
 #: Longer windows are played as windows of so many cycles.
 LONGEST_WINDOW = 4_000
 

@@ -70,6 +70,7 @@ FINAL_L95 = L95._replace(name="L95 final")
 COST = Measure("cost", "J", decimals=2)
 MIGRATIONS = Measure("migrations", "migrations")
 REGRET = Measure("regret", "regret", "%", 100.0)
+ORACLE_REGRET = Measure("oracle_regret", "over oracle", "%", 100.0)
 
 
 def own_measures(metrics: Iterable[str]) -> list[Measure]:

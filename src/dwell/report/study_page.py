@@ -14,6 +14,7 @@ from dwell.report.formatting import (
     COST,
     L95,
     MIGRATIONS,
+    ORACLE_REGRET,
     RATE,
     REGRET,
     Measure,
@@ -65,6 +66,7 @@ def _sections(study: StudyRuns, blocks: PolicyBlocks) -> Iterator[Section]:
         figures = [blocks.tail(), blocks.measure(COST, title="J"), blocks.distribution()]
         if REGRET in _measures(study):
             figures.append(blocks.measure(REGRET, title="Regret"))
+            figures.append(blocks.measure(ORACLE_REGRET, title="J over the oracle"))
         figures += [blocks.measure(one, title=one.name) for one in own_measures(study.metrics)]
         yield Section("Figures", [*figures, *blocks.placed(), blocks.split()])
         yield Section("More numbers", [blocks.more()])
@@ -76,7 +78,7 @@ def _sections(study: StudyRuns, blocks: PolicyBlocks) -> Iterator[Section]:
 
 
 def _measures(study: StudyRuns) -> list[Measure]:
-    measures = (RATE, L95, COST, MIGRATIONS, REGRET, *own_measures(study.metrics))
+    measures = (RATE, L95, COST, MIGRATIONS, REGRET, ORACLE_REGRET, *own_measures(study.metrics))
     return [one for one in measures if one.column in study.runs.columns]
 
 

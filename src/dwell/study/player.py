@@ -40,6 +40,7 @@ COMPARED = frozenset(
         "reference_cost",
         "best_static",
         "regret",
+        "oracle_regret",
         "share_kept",
         "point",
         "costs",

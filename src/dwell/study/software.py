@@ -23,8 +23,8 @@ from dwell.study.study import Contender, Point, Study
 SOURCES = (
     *("control", "cost.py", "estimators", "kernels", "model", "policies", "sim"),
     "record/table_arrays.py",
-    *(f"study/{name}.py" for name in ("clairvoyant", "fleet_summary", "hindsight", "parts")),
-    *(f"study/{name}.py" for name in ("player", "quality", "reference", "script")),
+    *(f"study/{name}.py" for name in ("clairvoyant", "fleet_summary", "hindsight", "oracle")),
+    *(f"study/{name}.py" for name in ("parts", "player", "quality", "reference", "script")),
     *(f"study/{name}.py" for name in ("study_tables", "summary")),
 )
 

@@ -18,7 +18,7 @@ from dwell.model.fleet import Fleet
 from dwell.model.problem import Drawn
 from dwell.model.semantics import nearest
 from dwell.study.over_seeds import is_plain
-from dwell.study.reference import CLAIRVOYANT, CLAIRVOYANT_DWELL
+from dwell.study.reference import CLAIRVOYANT, REFERENCES
 
 if TYPE_CHECKING:
     from dwell.estimators import Estimator
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 #: share does not count, and few enough that little is lost with an item.
 ITEM_RUNS = 64
 
-REFERENCES = (CLAIRVOYANT, CLAIRVOYANT_DWELL)
 TAKEN = "the tables have such a column already; choose another name"
 
 
@@ -158,7 +157,7 @@ class Study:
     windows : int
         Length of every run, the warm-up included.
     references : bool
-        Whether the references in hindsight play as well.
+        Whether the references play as well.
     labels : mapping of str to str
         Names of parameters in figures and tables, by their paths; a path where there is none.
     metrics : mapping of str to str
