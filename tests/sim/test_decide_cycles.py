@@ -21,7 +21,7 @@ from dwell.record import Run
 from dwell.sim.engine import simulate_realisation
 from dwell.study.hindsight import Hindsight
 from dwell.study.judged_cost import judged_costs
-from dwell.study.reference import play_alone
+from dwell.study.reference import play_alone, references
 from tests.cells.examples import EXAMPLES
 from tests.cells.generated import random_problem
 
@@ -231,3 +231,12 @@ def test_hindsight_knows_the_last_window_at_each_decision() -> None:
         ]
         late = (latency > problem.pipeline.deadline_ns).mean()
         assert row["est_violation_rate_LOC"] == late
+
+
+def test_the_oracle_decides_as_often_as_the_cell_does() -> None:
+    problem = often(CANONICAL, 25)
+    real = dwell.draw(problem, scenario="robot-cpu-stress", seed=3, windows=10)
+    found = references(problem, real)
+    assert found.runs["oracle"].decisions.height > 3 * 10
+    assert found.runs["clairvoyant"].decisions.height == 10
+    assert found.costs["oracle"] < found.costs["LOC"]

@@ -154,7 +154,7 @@ def references(problem: Problem, realisation: Realisation) -> References:
     statics = play_alone(problem, realisation)
     costs = {name: mean_cost(run) for name, run in statics.items()}
     alone = np.stack([window_costs(run, problem, realisation) for run in statics.values()], axis=1)
-    decide_cycles, least = width, problem.controller.min_dwell
+    decide_cycles, least = problem.decide_cycles, problem.controller.min_dwell
     expected = expected_costs(problem, realisation, decide_cycles)
     sequences, runs, promised = {}, {}, {}
     for title, known, cycles, dwell in (
@@ -164,9 +164,11 @@ def references(problem: Problem, realisation: Realisation) -> References:
         (ORACLE_DWELL, expected, decide_cycles, least),
     ):
         plan, promised[title] = planned(problem, realisation, known, cycles, dwell)
-        script = Script([names[i] for i in plan.choice.tolist()], in_time, realisation, cycles)
+        settings = replace(in_time.controller, decide_cycles=cycles)
+        decided = replace(in_time, controller=settings)
+        script = Script([names[i] for i in plan.choice.tolist()], decided, realisation, cycles)
         sequences[title] = plan
-        runs[title] = simulate_realisation(in_time, realisation, policy=script, estimator="profile")
+        runs[title] = simulate_realisation(decided, realisation, policy=script, estimator="profile")
         costs[title] = mean_cost(runs[title])
     return References(
         statics=FrozenDict(statics),
