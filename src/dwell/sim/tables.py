@@ -11,8 +11,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from dwell.control import Controller, final_l95_ms
-from dwell.cost import hamming, price, tier_nodes
+from dwell.control import Controller, final_l95_ms, moved_shares, window_costs
 from dwell.kernels.arrays import CellArrays
 from dwell.kernels.realisation import Realisation
 from dwell.kernels.rows import Rows
@@ -281,19 +280,13 @@ def _costs(played: PlayedRealisation, seen: dict[str, Floats]) -> Floats:
     It is NaN where the controller's node was down at the close, and so are the metrics then.
     """
     problem, resources = played.problem, played.controller.resources
-    used = played.shares[:, 0]
-    robot, edge, cloud = (
-        used[:, [resources.index(name) for name in names]].max(axis=1, initial=0.0)
-        for names in tier_nodes(problem.objective)
-    )
-    candidates = list(problem.candidates.values())
-    moved = np.array([[hamming(there, here) for there in candidates] for here in candidates])
+    used = {name: played.shares[:, 0, i] for i, name in enumerate(resources)}
     stamps = played.arrays.tables.stamps[0].astype(np.int64)
-    switched = np.zeros(len(stamps))
-    switched[1:] = moved[stamps[:-1], stamps[1:]]
-    switching = played.by_window(switched).sum(axis=1)
-    l95_ms, rate = seen["l95_ms"], seen["violation_rate"]
-    costs: Floats = price(l95_ms, rate, robot, edge, cloud, switching, problem.objective)
+    moved = np.zeros(len(stamps))
+    moved[1:] = moved_shares(problem)[stamps[:-1], stamps[1:]]
+    switching = played.by_window(moved).sum(axis=1)
+    seen_of = seen["l95_ms"], seen["violation_rate"]
+    costs = window_costs(problem.objective, *seen_of, used, switching)
     unseen = [played.host_down(at_ns) for at_ns in played.close_ns.tolist()]
     for values in (*seen.values(), costs):
         values[unseen] = np.nan

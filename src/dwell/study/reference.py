@@ -29,8 +29,8 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.control.windows import seen_l95_ms
-from dwell.cost import hamming, price
+from dwell.control.windows import moved_shares, seen_l95_ms
+from dwell.cost import price
 from dwell.errors import SimulationError
 from dwell.estimators import Profile
 from dwell.model import FrozenDict, Problem
@@ -200,10 +200,7 @@ def planned(
     float
         Mean over the windows after the warm-up whose close the controller sees.
     """
-    placements = problem.candidates.values()
-    shares = [[hamming(after, before) for after in placements] for before in placements]
-    # From the row's candidate to the column's.
-    switching = problem.objective.weights.switching * np.array(shares, np.float64)
+    switching = problem.objective.weights.switching * moved_shares(problem)
     width = problem.window_cycles
     begin = np.arange(len(costs)) * decide_cycles
     end = np.minimum(begin + decide_cycles, realisation.cycles)
