@@ -12,7 +12,7 @@ import dwell
 from benchmarks.canonical import CELL
 from benchmarks.figures import Figure, Goal, Section
 from benchmarks.timing import Took, in_turns, shared_core, took
-from dwell.control import ClosedWindow, Controller
+from dwell.control import ClosedWindow, Controller, LookedAt
 from dwell.kernels.advance import play
 from dwell.kernels.arrays import lay_out
 from dwell.model import Problem
@@ -64,6 +64,7 @@ def _closed_windows(problem: Problem, windows: int) -> list[ClosedWindow]:
             close_ns=int(real.release_ns[first + size]),
             open_ns=int(real.release_ns[first]),
             core_ns=tables.closed[0, i] - tables.opened[0, i],
+            looked=LookedAt(i, first + size - 1, size),
         )
         for i, first in enumerate(range(0, windows * size, size))
     ]

@@ -10,7 +10,18 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from dwell.cellfile import cell_form, fleet_file
-from dwell.cellfile.forms import FormKey, ListForm, MappingForm, Shape
+from dwell.cellfile.forms import (
+    ChoiceForm,
+    FlagForm,
+    Form,
+    FormKey,
+    ListForm,
+    MappingForm,
+    NumberForm,
+    Shape,
+    TextForm,
+    WrittenForm,
+)
 
 FILES = tuple(Path(__file__).parent / name for name in ("cells.md", "fleets.md"))
 SHAPES = {
@@ -54,10 +65,39 @@ def _lines(shape: Shape) -> Iterator[str]:
         yield f"| `{key.named}` | {_value(key)} | {_usual(key)} | {key.says} |"
 
 
+def words(form: Form) -> str:
+    """Return the values that a form allows."""
+    match form:
+        case NumberForm(bound):
+            return str(bound).removeprefix("a ")
+        case TextForm(bound, known):
+            text = "text" if bound is None else str(bound).removeprefix("a ")
+            return ", ".join([*(f"`{name}`" for name in known), text])
+        case FlagForm():
+            return "`true`, `false`"
+        case ChoiceForm(choices):
+            return ", ".join(f"`{choice}`" for choice in choices)
+        case WrittenForm(ways):
+            return ways
+        case MappingForm(inner):
+            return f"name → {words(inner)}"
+        case ListForm(inner):
+            return f"list of {words(inner)}"
+        case Shape():
+            return f"`{{{', '.join(form.names)}}}`"
+        case cell_form.WordsForm(means, shape):
+            return ", ".join([*(f"`{word}`" for word in means), words(shape)])
+        case cell_form.ProcessForm():
+            return "process"
+        case fleet_file.PhasesForm():
+            return "`sync`, `even`, `random`, list of ms"
+    raise TypeError(f"no words for {form!r}")
+
+
 def _value(key: FormKey) -> str:
-    form = key.form
-    if len(form.words) <= 60 or not isinstance(form, MappingForm | ListForm | Shape):
-        return form.words
+    form, shown = key.form, words(key.form)
+    if len(shown) <= 60 or not isinstance(form, MappingForm | ListForm | Shape):
+        return shown
     if isinstance(form, Shape):
         return "keys"
     return "names" if isinstance(form, MappingForm) else "list"

@@ -84,9 +84,9 @@ parameters:
 """,
     ) == [
         "study.yaml:3: cell: unknown key 'cell'; known: dwell-study, fleet, name, windows, seeds, "
-        "policies, parameters, zip, labels, scenarios",
+        "policies, parameters, zip, metrics, labels, scenarios",
         "study.yaml:4: references: unknown key 'references'; known: dwell-study, fleet, name, "
-        "windows, seeds, policies, parameters, zip, labels, scenarios",
+        "windows, seeds, policies, parameters, zip, metrics, labels, scenarios",
         "study.yaml:5: scenarios[0]: canonical has no scenario 'robot-cpu-stres'; did you mean "
         "'robot-cpu-stress'?",
         "study.yaml:6: policies.dpt: unknown policy 'dpt'; did you mean 'dtp'? (policies here: "

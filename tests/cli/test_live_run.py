@@ -28,7 +28,7 @@ from dwell.model import Problem
 from dwell.model.document import to_document
 from dwell.testbed.playing import crowded, make_folder
 from dwell.testbed.timeline import timeline_of
-from tests.cli.small_cell import ROOT, assert_refused, call
+from tests.cli.small_cell import ROOT, call
 from tests.processes import lives
 from tests.report.live_runs import PERIOD_NS, live_run
 
@@ -308,8 +308,3 @@ def test_what_cannot_be_run_is_said(change: dict[str, Any], said: str, tmp_path:
     assert done.exit_code in (1, 2)
     assert said in done.stderr
     assert not (tmp_path / "out").exists()
-
-
-def test_the_demo_of_before_says_what_has_taken_its_place() -> None:
-    former = call("live", "demo", "--seconds", "20")
-    assert_refused(former, "dwell live run examples/visual_servoing/cell.yaml")

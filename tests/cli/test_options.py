@@ -1,4 +1,4 @@
-"""Options that mean the same are called the same, and old spellings work, with a warning."""
+"""Options that mean the same are called the same."""
 
 from __future__ import annotations
 
@@ -49,26 +49,6 @@ def test_no_command_takes_a_length_in_windows_or_seconds_alone_where_it_has_one_
     for command in (root.commands["run"], *map(testbed.commands.get, ("run", "campaign"))):
         assert command is not None
         assert {"--windows", "--seconds"} <= {name for one in options(command) for name in one.opts}
-
-
-@pytest.mark.parametrize(
-    ("arguments", "old", "today"),
-    [
-        (("profile", "--runs", "0"), "--runs", "--samples"),
-        (("profile", "--runs=0"), "--runs", "--samples"),
-        (("profile", "link", "e:1", "--count", "0"), "--count", "--samples"),
-        (("testbed", "calibrate", "no.yaml", "--out", "o.yaml", "--real", "a"), "--real", ""),
-    ],
-)
-def test_an_old_spelling_works_with_a_warning(
-    arguments: tuple[str, ...], old: str, today: str
-) -> None:
-    found = call(*arguments)
-    assert f"warning: {old} is now {today or '--real-links'}; " in found.stderr
-    assert "No such option" not in found.stderr
-    # What the option was given is judged under its name of today.
-    assert today in found.stderr
-    assert found.exit_code == 2
 
 
 def test_seconds_are_whole_windows() -> None:

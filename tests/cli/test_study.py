@@ -11,6 +11,7 @@ import pytest
 
 from dwell.report.formatting import shown_policy
 from dwell.study.parts import BATCH_RUNS
+from dwell.study.reference import REFERENCES
 from tests.cli.small_cell import assert_refused, call, interrupt_at_first_sign, read_json
 
 STUDY = """\
@@ -39,14 +40,24 @@ def test_a_study_prints_tables_and_keeps_them(study: Path) -> None:
     assert (result.exit_code, result.stderr) == (0, "")
     lines = result.stdout.splitlines()
     assert lines[0] == "Baseline (objective.weights.switching = 0)"
-    assert lines[1].split() == ["V_D", "(%)", "J", "migrations", "regret", "(%)"]
-    policies = ("LOC", "dtp", "clairvoyant", "clairvoyant-dwell")
-    for line, policy in zip(lines[2:6], policies, strict=True):
+    assert lines[1].split() == [
+        "V_D",
+        "(%)",
+        "J",
+        "migrations",
+        "regret",
+        "(%)",
+        "over",
+        "oracle",
+        "(%)",
+    ]
+    policies = ("LOC", "dtp", *REFERENCES)
+    for line, policy in zip(lines[2:8], policies, strict=True):
         assert line.startswith(f"{shown_policy(policy)} ")
     assert "Stress (objective.weights.switching = 1)" in lines
     assert lines[-1] == "tables: studies/a_small_one"
     runs = pl.read_parquet("studies/a_small_one/runs.parquet")
-    assert runs.height == 2 * 2 * 4 * 2
+    assert runs.height == 2 * 2 * 6 * 2
     again = call("study", study)
     assert (again.exit_code, again.stdout) == (0, result.stdout)
 
@@ -62,8 +73,8 @@ def test_scenarios_that_no_run_reaches_are_warned_of_once(study: Path) -> None:
 def test_a_study_as_json(study: Path) -> None:
     arguments = ("--seeds", "1", "--windows", "10", "--out", "out", "--processes", "1")
     found = read_json(call("study", study, *arguments, "--json"))
-    assert (found["study"], found["folder"], found["runs"]) == ("a small one", "out", 16)
-    assert len(found["table"]) == 16
+    assert (found["study"], found["folder"], found["runs"]) == ("a small one", "out", 24)
+    assert len(found["table"]) == 24
     row = found["table"][0]
     assert (row["parameter.objective.weights.switching"], row["policy"]) == (0, "LOC")
     assert row["seeds"] == 1
@@ -140,16 +151,3 @@ def test_an_interrupted_study_says_how_to_go_on(study: Path) -> None:
     finished = [len(part) for part in parts if "asked" not in part.columns]
     assert 0 <= sum(finished) - int(said) <= BATCH_RUNS
     assert not list(Path("out").rglob(".*"))
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["paper"],
-        ["paper", "--quick"],
-        ["paper", "--chapter", "table", "--examples", "examples"],
-        ["my-study.yaml", "--quick"],
-    ],
-)
-def test_the_old_command_for_the_paper_names_the_new_one(words: list[str]) -> None:
-    assert_refused(call("study", *words), "make paper")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import dwell
-from dwell.control import ClosedWindow, Controller, Evidence
+from dwell.control import ClosedWindow, Controller, Evidence, LookedAt
 from dwell.errors import DwellError, MetricError, ProblemError
 from dwell.estimators import Corrected, Learner, Shadow, Support
 from dwell.model import Problem, QoS
@@ -160,6 +160,7 @@ def test_neither_own_jobs_nor_shadow_jobs_are_foreign() -> None:
             close_ns=80_000_000,
             open_ns=0,
             core_ns=core_ns * 16,
+            looked=LookedAt(0, 1, 2),
         )
     )
     assert seen == [{"R": 4 / 80, "E": 4 / 80}]

@@ -18,6 +18,7 @@ from dwell.control import (
     Guard,
     Presence,
     Probation,
+    Proposal,
     parts_of,
 )
 from dwell.cost import hamming
@@ -714,7 +715,14 @@ OWN = {"R": 0.1, "E": 0.1}
 
 def decide(controller: Controller, seen: QoS = SEEN, *, proven: str | None = None) -> str:
     """Have it decide on a window, and carry that out."""
-    return controller.settle(controller.propose_by(seen, OWN), proven=proven)
+    return settle(controller, controller.propose_by(seen, OWN), proven=proven)
+
+
+def settle(controller: Controller, proposal: Proposal, *, proven: str | None = None) -> str:
+    """Carry a proposal out, and count its window."""
+    placement = controller.settle(proposal, proven=proven)
+    controller.looked = controller.looked._replace(window=controller.looked.window + 1)
+    return placement
 
 
 def where(controller: Controller) -> tuple[str, str, int]:
@@ -735,7 +743,7 @@ def test_the_guards_move_is_in_the_log_and_in_the_next_windows_cost() -> None:
     assert where(controller) == ("OFF", "LOC", 0)
     assert controller.course.by_guard
     moved = controller.propose_by(SEEN, OWN)
-    controller.settle(moved)
+    settle(controller, moved)
     assert shown(controller) == [
         (0, "LOC", "LOC", False, "dwell", 1),
         (1, "LOC", "OFF", True, "guard", 0),
@@ -813,15 +821,16 @@ def test_an_order_that_was_refused_has_moved_nothing() -> None:
     controller = Controller(replace(problem, controller=settings), policy="dtp")
     bad = replace(SEEN, l95_ms=60.0, violation_rate=1.0)
     first = controller.propose_by(bad, OWN)
-    controller.commit(first)
+    settle(controller, first)
     refused = controller.propose_by(bad, OWN)
     wanted = refused.decision.name
     assert wanted != "LOC"
     controller.reject(refused, "no answer")
+    controller.looked = controller.looked._replace(window=2)
     assert where(controller) == ("LOC", "LOC", 0)
     assert controller.decisions[-1][-1] == f"{wanted}: no answer"
     third = controller.propose_by(bad, OWN)
-    controller.commit(third)
+    settle(controller, third)
     # The same window costs the same as the first one, and the policy dwells on LOC again.
     assert third.seen == first.seen
     assert shown(controller)[1:] == [

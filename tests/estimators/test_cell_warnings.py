@@ -149,7 +149,7 @@ LINK = {"link": "R->E"}
             "candidates.SO",
             ("80% of the cores of E, of which background leave 70%",),
         ),
-        (by_priority(10), "candidates.SO", ("rest is never done", "timer of a higher priority")),
+        (by_priority(10), "candidates.SO", ("105% of the cores of E: it can never keep pace",)),
         # Wider than its node, a job is as much work under each scheduler.
         (on_one({"scheduler": "fifo"}, {"a": stage(3, threads=4)}), "candidates.SO", ("120%",)),
         (
@@ -158,7 +158,7 @@ LINK = {"link": "R->E"}
                 {"timer": stage(5, priority=1, threads=2), "rest": stage(1)},
             ),
             "candidates.SO",
-            ("rest is never done", "timer of a higher priority"),
+            ("110% of the cores of E: it can never keep pace",),
         ),
         (objective(caps={"utilisation": 98}), "objective.caps.utilisation", ("0.98 instead",)),
         (objective({"robot": 70}), "objective.targets.robot", ("0.7 instead of 70?",)),

@@ -460,7 +460,9 @@ def test_foreign_load_stays_where_it_is(
 def test_the_work_that_is_done_is_whatever_it_is_said_to_be() -> None:
     profile = Profile(BUSY, samples=10)
     work = [("SO", [("R1", 0.2), ("E", 0.9)])]
-    shares = profile.utilisation(seen(R1=0.75, E=0.25), "LOC", {"R1": 0.5, "E": 0.0}, work)
+    shares = profile.with_work(
+        profile.see(seen(R1=0.75, E=0.25), "LOC", {"R1": 0.5, "E": 0.0}), work
+    )
     assert shares == {"SO": {"R1": pytest.approx(0.45), "E": 1.0}}
 
 

@@ -21,7 +21,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from dwell.errors import DwellError
-from dwell.testbed.chaos.light_cell import HOMES, PERIOD_MS
+from dwell.testbed.chaos.light_cell import EXEC_MS, PERIOD_MS
 from dwell.testbed.chaos.stalls import StallDetector
 from dwell.testbed.chaos.strike import Outcome
 from tests.live.real_cell import FAULTS, HomeFault, RealCell, mixed, strike
@@ -61,9 +61,9 @@ def campaign(path: Path, count: int, seed: int, names: Sequence[str], until_s: f
         while time.monotonic() < until_s:
             rounds = {
                 home: min((done[f.name] for f in mixed(home) if f.name in names), default=count)
-                for home in HOMES
+                for home in EXEC_MS
             }
-            home = min(HOMES, key=rounds.__getitem__)
+            home = min(EXEC_MS, key=rounds.__getitem__)
             if rounds[home] >= count:
                 return
             with tempfile.TemporaryDirectory(prefix="dwell-faults-") as folder:
@@ -107,7 +107,7 @@ def _one_cell(
             print(_line(outcome), file=sys.stderr, flush=True)
             if outcome.wrong or broken:
                 return
-        cell.stop_controller()
+        cell.testbed.processes.stop_controller()
         wrong = cell.check_run()
         if wrong:
             print(f"run of {home}: {'; '.join(wrong)}", file=sys.stderr, flush=True)

@@ -23,6 +23,7 @@ import zenoh
 from dwell.errors import LiveError
 from dwell.live.hosting import LONGEST_SLEEP_S
 from dwell.live.transport.transport import Arrival, Lane, Receive, require_expression, require_key
+from dwell.live.wiring import Session, Wiring, session_of
 
 #: Says who may hear whom: names of sender and receiver, lane, key.
 Reach: TypeAlias = Callable[[str, str, Lane, str], bool]
@@ -542,3 +543,14 @@ class _Drive:
         if not self.end.closed:
             self.due_ns = due_ns
             self.network.call_at(due_ns, partial(self.wake, due_ns))
+
+
+def connected(wiring: Wiring, one: str, other: str) -> frozenset[Session]:
+    """Return the sessions in which two processes hear each other."""
+    pairs = (one, other), (other, one)
+    return frozenset(wire.session for wire in wiring.wires if (wire.source, wire.target) in pairs)
+
+
+def hears(wiring: Wiring, source: str, target: str, lane: Lane, key: str) -> bool:
+    """Whether a message of one process can reach another."""
+    return session_of(wiring.entry(source), lane, key) in connected(wiring, source, target)

@@ -14,7 +14,7 @@ from dwell.cellfile import from_document
 from dwell.testbed.chaos.faults import Fault, bound_of, faults_of
 from dwell.testbed.chaos.harness import CLOCK_FILE, Harness, environment_of
 from dwell.testbed.chaos.light_cell import (
-    HOMES,
+    EXEC_MS,
     MAX_AGE_MS,
     MIN_DWELL,
     PERIOD_MS,
@@ -96,8 +96,10 @@ class RealCell(Harness):
         """Return what was applied when it was too old."""
         # The gate looks a little before the actuator is called, which may be scheduled out between.
         limit_ms = MAX_AGE_MS + PERIOD_MS
-        applied = self.actuations.applied
-        return [f"cycle {s.cycle}: {s.age_ms:.0f} ms" for s in applied if s.age_ms > limit_ms]
+        ages_ms = [
+            (seen.cycle, (seen.at_ns - seen.released_ns) / 1e6) for seen in self.actuations.applied
+        ]
+        return [f"cycle {cycle}: {age_ms:.0f} ms" for cycle, age_ms in ages_ms if age_ms > limit_ms]
 
 
 def strike(
@@ -144,7 +146,7 @@ def _names(home: str) -> Iterator[str]:
 
 
 def _faults() -> Iterator[HomeFault]:
-    for home in HOMES:
+    for home in EXEC_MS:
         problem = from_document(document(home))
         known = {fault.name: fault for fault in faults_of(problem)}
         for name in _names(home):

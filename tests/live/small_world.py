@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import dwell
 from dwell.control import Controller
 from dwell.live import role as role_module
-from dwell.live.agent import Agent, CpuCount
+from dwell.live.agent import Agent
 from dwell.live.controlled_cell import ControlledCell, Recorder
 from dwell.live.keys import CONTROLLER, Keys
 from dwell.live.messages import Ask, Order, encode
@@ -28,7 +28,8 @@ from dwell.live.wiring import Role, roles, wire
 from dwell.live.worker import Job, Worker
 from dwell.model import Host, Problem, QoS
 from dwell.policies import MinimalPolicy
-from tests.live.memory_transport import Clock, MemoryTransport, Network, NetworkConditions
+from tests.live.memory_transport import Clock, MemoryTransport, Network, NetworkConditions, hears
+from tests.live.plain_launcher import PlainLauncher
 
 # All processes of a cell are here, and take the digest of one and the same.
 role_module.fingerprint = lru_cache(role_module.fingerprint)  # type: ignore[attr-defined]
@@ -278,7 +279,7 @@ class World:
         live = replace(problem.live, hosts=hosts)
         self.problem = problem = replace(problem, live=live)
         # Nobody hears anybody that it would have no connection to.
-        reach = wire(problem).hears
+        reach = partial(hears, wire(problem))
         delay_ns = round(delay_ms * MS)
         self.network = Network(seed=seed, delay_ns=delay_ns, start_ns=start_ns, reach=reach)
         self.clocks = dict(clocks or {})
@@ -463,19 +464,9 @@ class Recorded(World):
         return folder
 
 
-class IdleCpu(CpuCount):
-    """A CPU that does nothing."""
-
-    def __init__(self) -> None:
-        pass
-
-    def busy_ns(self) -> int:
-        return 0
-
-
 class Quiet(Agent):
     """An agent without processes to look after."""
 
     def __init__(self, place: RolePlace) -> None:
-        super().__init__(place, Supervisor(None, print), IdleCpu())  # type: ignore[arg-type]
+        super().__init__(place, Supervisor(None, print, PlainLauncher()), lambda: 0)  # type: ignore[arg-type]
         self.cpu_clock = lambda: 0

@@ -28,6 +28,7 @@ import psutil
 from dwell.errors import DwellError, LiveError
 from dwell.testbed.chaos.harness import Harness
 from dwell.testbed.chaos.light_cell import PERIOD_MS
+from dwell.testbed.processes import expected
 from tests.live.real_cell import RealCell
 
 HOME = "SO"
@@ -166,7 +167,7 @@ def soak(path: Path, minutes: float, every_s: float) -> None:
             writer = csv.writer(file)
             writer.writerow(["at_s", "process", *BOUNDS])
             cell.wait_for("the whole cell at home", cell.at_home, START_S)
-            names = [*cell.everybody, *cell.testbed.processes.running]
+            names = [*expected(cell.problem), *cell.testbed.processes.running]
             processes = {who: psutil.Process(cell.pid(who)) for who in dict.fromkeys(names)}
             begun_s = time.monotonic()
             before = _actuated(cell)

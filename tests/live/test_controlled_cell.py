@@ -120,7 +120,7 @@ def test_what_is_remembered_is_none_of_the_garbage_collectors_business(problem: 
 def test_decisions_that_are_recorded_are_not_kept(problem: Problem) -> None:
     world = alternating(problem)
     world.run(8_000)
-    assert world.cell.controller.window > 8
+    assert world.cell.controller.looked.window > 8
     assert len(world.cell.controller.decisions) < 2
 
 

@@ -24,6 +24,20 @@ print("has ended", flush=True)
 """
 
 
+#: Ends many times, each time by a signal that comes while the event is looked at.
+IMPATIENT = """
+import os, signal, threading
+from dwell.live.ending import end_when_told
+for i in range(2000):
+    stopped = threading.Event()
+    end_when_told(stopped, lambda: os._exit(9))
+    signal.signal(signal.SIGALRM, signal.getsignal(signal.SIGTERM))
+    signal.setitimer(signal.ITIMER_REAL, 1e-4 + i * 1e-7)
+    while not stopped.wait(0):
+        pass
+"""
+
+
 def start(*words: str) -> subprocess.Popen[str]:
     process = subprocess.Popen(
         [sys.executable, "-c", PROGRAM, *words],
@@ -49,6 +63,10 @@ def test_the_first_signal_ends_it_in_order(number: int) -> None:
         process.send_signal(signal.SIGHUP)
         assert process.communicate("\n", timeout=20)[0] == "has ended\n"
         assert process.returncode == 0
+
+
+def test_a_signal_that_comes_while_the_event_is_looked_at_ends_it() -> None:
+    subprocess.run([sys.executable, "-c", IMPATIENT], check=True, timeout=60)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

@@ -49,15 +49,6 @@ def test_who_starts_anew_is_heard_at_once() -> None:
     assert last.life == 2
 
 
-def test_who_is_silent_for_long_is_forgotten() -> None:
-    detector = FailureDetector("arm@R2", 100 * MS)
-    detector.hear(beat(0), 0)
-    detector.hear(beat(0, who="see@R1"), 900 * MS)
-    detector.forget(1_000 * MS, 500 * MS)
-    assert [who for who, _, _ in detector.everybody(1_000 * MS)] == ["see@R1"]
-    assert detector.last("plan@E") is None
-
-
 def test_whose_clock_is_set_back_is_heard_again_over_the_detour_alone() -> None:
     detector = FailureDetector("controller@E", 100 * MS)
     detector.hear(beat(9_000), 10 * MS, direct=False)

@@ -126,7 +126,7 @@ def test_a_server_ends_with_its_agent_and_leaves_what_it_has_forked(tmp_path: Pa
 
 def test_a_killed_worker_is_forked_again(server: ForkServer, tmp_path: Path) -> None:
     said: list[str] = []
-    supervisor = Supervisor(tmp_path, said.append, launcher=server)
+    supervisor = Supervisor(tmp_path, said.append, server)
     child: SupervisedProcess = supervisor.keep("worker@E", ["time.sleep(1000)"])
 
     def started(count: int) -> bool:

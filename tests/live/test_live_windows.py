@@ -89,6 +89,7 @@ def simulate(problem: Problem, scenario: str, windows: int = 25) -> Played:
             close_ns=close_ns,
             open_ns=int(self.release_ns[first]),
             core_ns=(tables.closed[0, index] - tables.opened[0, index])[:3],
+            looked=self.controller.looked,
         )
         kept[0].windows.append(window)
         assert self.evidence is not None

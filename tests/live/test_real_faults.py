@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from dwell.errors import LiveError
-from dwell.testbed.chaos.light_cell import HOMES, MAX_AGE_MS, PERIOD_MS
+from dwell.testbed.chaos.light_cell import EXEC_MS, MAX_AGE_MS, PERIOD_MS
 from dwell.testbed.chaos.stalls import StallDetector
 from dwell.testbed.chaos.strike import Outcome
 from tests.live.real_cell import FAULTS, HomeFault, RealCell, mixed, strike
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.skipif(
 SEED = 1
 #: Without these the sink gets nothing.
 WITHOUT_COMMANDS = ("control@R2", "control@R2.1")
-IN_TURN = [fault for home in HOMES for fault in mixed(home)]
+IN_TURN = [fault for home in EXEC_MS for fault in mixed(home)]
 
 
 def told_nothing(struck: Outcome) -> bool:
@@ -65,7 +65,7 @@ class Standing:
         cell, self._cell = self._cell, None
         if cell is None:
             return []
-        cell.stop_controller()
+        cell.testbed.processes.stop_controller()
         wrong = cell.check_run()
         if not (cell.runs[0] / "run.json").exists():
             wrong.append("no run.json, though the controller was told to end")

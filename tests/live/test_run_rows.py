@@ -29,7 +29,7 @@ def proposed(controller: Controller) -> Proposal:
 def test_what_was_decided_and_not_done_is_no_migration() -> None:
     done, refused = (Controller(PROBLEM, "latency-first") for _ in range(2))
     for controller in (done, refused):
-        controller.window = 5
+        controller.looked = controller.looked._replace(window=5)
     done.commit(proposed(done))
     refused.reject(proposed(refused), "nobody answered")
     rows = [decision_values(one, one.decisions[-1]) for one in (done, refused)]

@@ -54,7 +54,7 @@ def test_the_highest_cycle_outlives_its_process(tmp_path: Path) -> None:
     assert HighestFile(path).load() == (5, 999)
 
 
-@given(spoilt=st.integers(0, 39), value=st.integers(0, 255))
+@given(spoilt=st.integers(0, 63), value=st.integers(0, 255))
 def test_a_spoilt_slot_costs_one_cycle_at_most(
     tmp_path_factory: pytest.TempPathFactory, spoilt: int, value: int
 ) -> None:

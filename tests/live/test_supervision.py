@@ -20,6 +20,7 @@ from dwell.live import supervision
 from dwell.live.state_files import InFlight
 from dwell.live.supervision import SupervisedProcess, Supervisor, claim
 from dwell.testbed.chaos.disk import SmallDisk, may_mount
+from tests.live.plain_launcher import supervise
 from tests.processes import lives
 from tests.waiting import wait_until
 
@@ -33,7 +34,7 @@ def said() -> list[str]:
 
 @pytest.fixture
 def supervisor(tmp_path: Path, said: list[str]) -> Iterator[Supervisor]:
-    made = Supervisor(tmp_path, said.append)
+    made = supervise(tmp_path, said.append)
     yield made
     made.stop()
 
@@ -176,13 +177,13 @@ def test_a_process_that_may_not_have_more_memory_says_so(
 def test_processes_outlive_their_agent_and_the_next_one_adopts_them(
     tmp_path: Path, said: list[str]
 ) -> None:
-    first = Supervisor(tmp_path, said.append)
+    first = supervise(tmp_path, said.append)
     child = keep(first, "stamper@R1", "import time; time.sleep(1000)")
     until(first, lambda: child.starts == 1)
     pid = child.pid
     assert pid is not None
     # The first agent is gone; nobody has told its children.
-    second = Supervisor(tmp_path, said.append)
+    second = supervise(tmp_path, said.append)
     adopted = keep(second, "stamper@R1", "raise SystemExit")
     second.step()
     assert (adopted.pid, adopted.starts) == (pid, 0)
@@ -196,7 +197,7 @@ def test_processes_outlive_their_agent_and_the_next_one_adopts_them(
 
 def test_a_mark_of_another_process_is_not_believed(tmp_path: Path, said: list[str]) -> None:
     (tmp_path / "stamper@R1.pid").write_text(f'{{"pid": {os.getpid()}, "started": 12.5}}')
-    supervisor = Supervisor(tmp_path, said.append)
+    supervisor = supervise(tmp_path, said.append)
     child = keep(supervisor, "stamper@R1", "import time; time.sleep(1000)")
     assert child.process is None
     until(supervisor, lambda: child.starts == 1)
@@ -204,7 +205,7 @@ def test_a_mark_of_another_process_is_not_believed(tmp_path: Path, said: list[st
 
 
 def test_what_does_not_listen_is_killed(tmp_path: Path, said: list[str]) -> None:
-    supervisor = Supervisor(tmp_path, said.append)
+    supervisor = supervise(tmp_path, said.append)
     ready = tmp_path / "ready"
     deaf = (
         "import signal, time\n"
@@ -232,7 +233,7 @@ def test_what_does_not_listen_is_killed(tmp_path: Path, said: list[str]) -> None
 def test_an_agent_outlives_a_full_disk(tmp_path: Path) -> None:
     said: list[str] = []
     with SmallDisk(tmp_path / "disk") as disk:
-        supervisor = Supervisor(disk.folder, said.append)
+        supervisor = supervise(disk.folder, said.append)
         disk.fill()
         child = supervisor.keep("worker@E", [sys.executable, "-c", "import time; time.sleep(60)"])
         try:
@@ -258,7 +259,7 @@ SPEAK = "while True: print('x' * 1000, flush=True)"
 
 def test_memory_that_grows_is_reported(tmp_path: Path) -> None:
     said: list[str] = []
-    supervisor = Supervisor(tmp_path, said.append, warm_s=0.2, growth_bytes=8 << 20)
+    supervisor = supervise(tmp_path, said.append, warm_s=0.2, growth_bytes=8 << 20)
     supervisor.keep("perception@E", [sys.executable, "-c", LEAK])
     try:
         supervisor.step()
@@ -275,7 +276,7 @@ def test_memory_that_grows_is_reported(tmp_path: Path) -> None:
 
 
 def test_a_log_does_not_grow_for_ever(tmp_path: Path) -> None:
-    supervisor = Supervisor(tmp_path, print, log_bytes=100_000)
+    supervisor = supervise(tmp_path, print, log_bytes=100_000)
     child = supervisor.keep("perception@E", [sys.executable, "-c", SPEAK])
     older = tmp_path / "perception@E.log.1"
     try:
@@ -354,7 +355,7 @@ def test_what_a_dead_process_leaves_is_ended_before_it_is_started_again(
 def test_the_next_agent_ends_what_a_worker_has_left_that_died_without_one(
     tmp_path: Path, helpers: Callable[[], list[int]], said: list[str]
 ) -> None:
-    first = Supervisor(tmp_path, said.append)
+    first = supervise(tmp_path, said.append)
     child = keep(first, "worker@E", WITH_HELPERS.format(folder=str(tmp_path)))
     first.step()
     *near, apart = helpers()
@@ -363,7 +364,7 @@ def test_the_next_agent_ends_what_a_worker_has_left_that_died_without_one(
     assert child.process is not None
     os.kill(child.process.pid, signal.SIGKILL)
     child.process.wait()
-    second = Supervisor(tmp_path, said.append)
+    second = supervise(tmp_path, said.append)
     again = keep(second, "worker@E", "import time; time.sleep(60)")
     try:
         until(second, lambda: again.starts == 1)
@@ -376,7 +377,7 @@ def test_the_next_agent_ends_what_a_worker_has_left_that_died_without_one(
 def test_helpers_end_with_their_process_at_an_orderly_end(
     tmp_path: Path, helpers: Callable[[], list[int]], said: list[str]
 ) -> None:
-    supervisor = Supervisor(tmp_path, said.append)
+    supervisor = supervise(tmp_path, said.append)
     keep(supervisor, "worker@E", WITH_HELPERS.format(folder=str(tmp_path)))
     supervisor.step()
     *near, apart = helpers()
@@ -450,7 +451,7 @@ def test_a_process_marks_itself_and_is_there_once(tmp_path: Path, said: list[str
         wait_until((tmp_path / "worker@E.shadow.pid").exists)
         with pytest.raises(LiveError, match=f"runs already \\(process {first.pid}\\)"):
             claim(tmp_path, "worker@E.shadow")
-        supervisor = Supervisor(tmp_path, said.append)
+        supervisor = supervise(tmp_path, said.append)
         assert keep(supervisor, "worker@E.shadow", "raise SystemExit").pid == first.pid
     finally:
         first.kill()

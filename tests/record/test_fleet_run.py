@@ -105,7 +105,7 @@ def test_what_is_damaged_is_told(folder: Path, tmp_path: Path) -> None:
     ]
     (folder / "fleet.json").write_text("{")
     assert "HALL/fleet.json: cannot be read" in told(folder)
-    (folder / "fleet.json").write_text('{"schema_version": 2, "cells": []}')
+    (folder / "fleet.json").write_text('{"schema_version": 3, "cells": []}')
     assert told(folder) == "HALL/fleet.json: cannot be read (KeyError('fleet'))"
     (folder / "fleet.json").write_text('{"schema_version": 9}')
     assert told(folder).startswith("HALL/fleet.json: schema_version is 9; this version")

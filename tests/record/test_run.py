@@ -100,6 +100,7 @@ def test_the_columns_that_every_run_has() -> None:
     )
     decisions = [
         *["window", "incumbent", "placement", "migrated", "reason", "dwell", "delta_j"],
+        *["last_cycle", "cycles", "dwell_cycles"],
         *(f"j_{name}" for name in names),
         *(f"est_l95_ms_{name}" for name in names),
         *(f"est_violation_rate_{name}" for name in names),

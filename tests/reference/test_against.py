@@ -597,12 +597,16 @@ def play_stamped(
     arrays.tables.stamps[1] = [codes[name] for name in others]
     assert advance_to_end(arrays) == Status.FINISHED
     controller = Controller(problem, problem.initial)
+
+    def never(at_ns: int) -> bool:
+        return False
+
     metrics: list[tuple[float | None, ...]] = [
         (l95_ms, missed / problem.window_cycles, None)
-        for _, missed, l95_ms, _ in arrays.tables.seen[0].tolist()
+        for _, _, missed, l95_ms, _ in arrays.tables.seen[0].tolist()
     ]
     tables, _ = make_tables(
-        sim_tables.PlayedRealisation(problem, real, controller, CellArrays(arrays), metrics),
+        sim_tables.PlayedRealisation(problem, real, controller, CellArrays(arrays), metrics, never),
         jobs=True,
     )
     flows = [(flow.source, flow.target) for flow in ordered_flows(problem.pipeline)]

@@ -75,12 +75,15 @@ def live_run(**meta: Any) -> Run:
         }
     )
     decided = [
-        (0, "LOC", "LOC", False, "hold", 1.0, 1.2),
-        (1, "LOC", "SO", True, "migrate", 1.3, 1.1),
-        (3, "SO", "LOC", True, "guard", None, None),
-        (3, "LOC", "LOC", False, "hold", 1.0, 1.2),
+        (0, 9, "LOC", "LOC", False, "hold", 1.0, 1.2),
+        (1, 19, "LOC", "SO", True, "migrate", 1.3, 1.1),
+        (3, 31, "SO", "LOC", True, "guard", None, None),
+        (3, 41, "LOC", "LOC", False, "hold", 1.0, 1.2),
     ]
-    names = ("window", "incumbent", "placement", "migrated", "reason", "j_LOC", "j_SO")
+    names = (
+        *("window", "last_cycle", "incumbent", "placement", "migrated", "reason"),
+        *("j_LOC", "j_SO"),
+    )
     decisions = pl.DataFrame(
         {name: [row[i] for row in decided] for i, name in enumerate(names)}
     ).with_columns(j_HYB=pl.lit(1.5))

@@ -16,6 +16,7 @@ from dwell.errors import RunError
 from dwell.report import study_html
 from dwell.report.figure import printed_svg, svg
 from dwell.report.figure_files import figure_files, table_tex
+from dwell.report.formatting import shown_contender
 from dwell.report.page import Definitions
 from dwell.report.study_page import study_page
 from dwell.study import Contender, Point, Study, open_study, run_study
@@ -161,3 +162,24 @@ def test_what_cannot_be_reported_is_said(folder: Path, tmp_path: Path) -> None:
     assert "study.json: cannot be read" in said(str(unfinished))
     with pytest.raises(RunError, match="is no study"):
         open_study(tmp_path)
+
+
+def test_a_page_shows_the_references(tmp_path: Path) -> None:
+    played = replace(study((Point({}, make_problem()),)), references=True)
+    saved = run_study(played, folder=tmp_path / "there", processes=1)
+    page = study_page(saved)
+    rows = table_of(page, "results").rows
+    names = ("SO", "dtp", "clairvoyant", "clairvoyant-dwell", "oracle", "oracle-dwell")
+    assert [row["policy"] for row in rows] == 2 * [*names]
+    frame = figure_of(page, "oracle_regret").frames["rows"]
+    means = frame.filter(pl.col("mean").is_not_null(), scenario="Baseline")
+    costs = saved.runs.filter(scenario="baseline").pivot("policy", index="seed", values="cost")
+    assert dict(means.select("policy", "mean").iter_rows()) == {
+        shown_contender(name): pytest.approx(
+            100 * (costs[name].to_numpy() / costs["oracle"].to_numpy() - 1).mean()
+        )
+        for name in names
+    }
+    method = next(one for one in page.sections if one.title == "How it was made")
+    defined = [one.entries for one in method.blocks if isinstance(one, Definitions)]
+    assert any("Oracle" in entries for entries in defined)

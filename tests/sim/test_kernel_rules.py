@@ -146,6 +146,9 @@ def test_the_kernel_decides_as_the_classes_do(seed: int) -> None:
     rng = Random(seed)
     problem = random_problem(rng, orders=rng.random() < 0.9, whole_ms=rng.random() < 0.3)
     problem = replace(problem, objective=objective_of(rng, problem))
+    if seed % 2:
+        every = rng.randint(1, problem.window_cycles)
+        problem = replace(problem, controller=replace(problem.controller, decide_cycles=every))
     policy = policy_of(rng, problem)
     assert plain_rule(Controller(problem, policy)) is not None
     real = dwell.draw(problem, scenario="disturbed", seed=seed, windows=rng.randint(5, 30))

@@ -186,12 +186,12 @@ def test_what_cannot_be_answered_is_refused(quiet: Fleet) -> None:
 
 
 def test_changes_that_may_help(quiet: Fleet) -> None:
-    found = dict(what_ifs(quiet, "SO"))
+    found = dict(what_ifs(quiet.changed(policy="SO")))
     assert list(found) == ["a core more on E", "phases evenly spread", "HYB instead of SO"]
     assert found["a core more on E"].entries[0].cell.fabric.nodes["E"].cores == 9
     assert found["phases evenly spread"].phases == "even"
     assert found["HYB instead of SO"].policy == "HYB"
-    assert list(dict(what_ifs(quiet.changed(phases="even"), "HYB"))) == [
+    assert list(dict(what_ifs(quiet.changed(phases="even", policy="HYB")))) == [
         "a core more on E",
         "SO instead of HYB",
     ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -86,7 +87,7 @@ def test_distributions_are_those_of_all_seeds(result: StudyResult) -> None:
         pl.col("policy") == "dtp",
     )
     assert first["share"].to_list() == (within / cycles).tolist()
-    assert result.latencies.height == 4 * 2 * 5 * len(first)
+    assert result.latencies.height == 4 * 2 * 7 * len(first)
 
 
 def test_a_comparison_is_a_study_of_one_point() -> None:
@@ -114,7 +115,7 @@ def test_progress_counts_runs() -> None:
 
 def test_the_table_has_one_row_a_group(result: StudyResult) -> None:
     table = result.table(["cost", "regret"])
-    assert table.height == 4 * 2 * 5
+    assert table.height == 4 * 2 * 7
     assert {"cost", "cost_low", "cost_high", "regret", "seeds"} <= set(table.columns)
     assert table["seeds"].unique().to_list() == [3]
     assert "best_static" not in result.table().columns
@@ -154,12 +155,13 @@ def test_references_are_rows_and_columns(result: StudyResult) -> None:
     problem = result.study.points[0].problem
     realisation = draw(problem, scenario="network-impairment", seed=2, windows=6)
     known = references(problem, realisation)
-    mine = rows(result, scenario="network-impairment", seed=2).head(5)
+    mine = rows(result, scenario="network-impairment", seed=2).head(7)
     assert mine["policy"].to_list() == ["LOC", "dtp", "careless", *known.runs]
     assert mine["reference_cost"].unique().to_list() == [known.cost]
     assert mine["best_static"].unique().to_list() == [known.best_static]
     for row in mine.to_dicts():
         assert row["regret"] == pytest.approx(row["cost"] / known.cost - 1)
+        assert row["oracle_regret"] == pytest.approx(row["cost"] / known.costs["oracle"] - 1)
     clairvoyant = mine.filter(pl.col("policy") == "clairvoyant").row(0, named=True)
     assert clairvoyant["cost"] == known.costs["clairvoyant"]
 
@@ -202,6 +204,18 @@ def share_kept(reference: Run, run: Run, problem: Problem) -> float:
         few.append([sum(missed[at : at + width]) <= 0.05 * width for at in whole])
     both = [mine for theirs, mine in zip(*few, strict=False) if theirs]
     return sum(both) / len(both) if both else 1.0
+
+
+def test_references_are_simulated_again_after_a_stop(result: StudyResult, tmp_path: Path) -> None:
+    folder = tmp_path / "there"
+    run_study(result.study, folder=folder, processes=1)
+    names = [*(folder / "parts").glob("*.parquet")]
+    lost = [path for path in names if "oracle" in pl.read_parquet(path)["policy"].to_list()]
+    assert 0 < len(lost) < len(names)
+    for path in (*lost, folder / "runs.parquet"):
+        path.unlink()
+    again = run_study(result.study, folder=folder, processes=1)
+    assert_frame_equal(again.runs, result.runs, check_exact=True)
 
 
 def test_a_candidate_among_the_references_shows_what_it_shows_alone(result: StudyResult) -> None:

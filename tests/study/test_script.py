@@ -84,7 +84,7 @@ def test_a_script_can_be_played_twice() -> None:
         simulate_realisation(problem, realisation, policy=script).windows for _ in range(2)
     )
     assert first.equals(second)
-    assert repr(script) == f"Script({WINDOWS} windows, {WINDOWS - 1} migrations)"
+    assert repr(script) == f"Script({WINDOWS} placements, {WINDOWS - 1} migrations)"
     assert first["placement"].to_list() == TURNS
 
 

@@ -69,6 +69,11 @@ def grid(*, dwells: range, delays: range) -> tuple[Point, ...]:
             "'clairvoyant' is a reference's name",
         ),
         (
+            {"contenders": (Contender("oracle", "dtp"),), "references": True},
+            SimulationError,
+            "'oracle' is a reference's name",
+        ),
+        (
             {"points": (Point({"a": 1}, PROBLEM), Point({"b": 1}, PROBLEM))},
             SimulationError,
             "the points differ in parameters: a, and b",

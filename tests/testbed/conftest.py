@@ -9,7 +9,6 @@ import pytest
 
 import dwell
 from dwell.model import Gamma, Problem
-from dwell.testbed.calibrate import Calibrated, calibrate
 from tests.cells.known_cost import (
     ADDED_MS,
     BACKGROUND,
@@ -21,6 +20,7 @@ from tests.cells.known_cost import (
     STAGE_MS,
     observed,
 )
+from tests.testbed.calibrated import Calibrated, calibrate
 
 
 @pytest.fixture(scope="session")

@@ -13,12 +13,12 @@ from dwell.errors import RunError
 from dwell.model import Constant, Problem
 from dwell.record import Run
 from dwell.sim import draw, simulate_realisation
-from dwell.testbed.calibrate import Calibrated, calibrate
 from tests.cells.known_cost import (
     BACKGROUND,
     CELL,
     observed,
 )
+from tests.testbed.calibrated import Calibrated, calibrate
 
 
 @pytest.mark.parametrize(

@@ -80,13 +80,13 @@ def test_what_is_no_cells_does_not_cross(ends: Ends) -> None:
 
 def test_a_direction_that_is_cut_loses_what_is_sent_meanwhile(ends: Ends) -> None:
     with ends.link(Conditions()) as link:
-        link.down("R1", "E", True)
+        link.set("R1", "E", down=True)
         ends.send(numbered(1, 1))
         ends.send(numbered(2, 1), source="E")
         ends.arrive(1, at="R1")
         while not link.read(reset=False)["R1", "E"].vanished:
             time.sleep(0.001)
-        link.down("R1", "E", False)
+        link.set("R1", "E", down=False)
         ends.send(numbered(1, 2))
         assert ends.arrive(1) == [numbered(1, 2)]
 

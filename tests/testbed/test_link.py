@@ -202,13 +202,13 @@ def test_what_is_sent_while_it_is_down_vanishes(hosts: TwoHosts, link: TunLink) 
     probe.send("under-way")
     while link.read(reset=False)[AB].bursts < 1:
         time.sleep(0.001)
-    link.down(*AB, True)
+    link.set(*AB, down=True)
     probe.send("gone")
     probe.receiver.sendto(b"the other way", probe.senders[0].getsockname())
     assert probe.senders[0].recv(100) == b"the other way"
     while link.read(reset=False)[AB].vanished < 1:
         time.sleep(0.001)
-    link.down(*AB, False)
+    link.set(*AB, down=False)
     probe.send("back")
     assert probe.receive(2) == ["under-way", "back"]
     assert link.read()[AB].vanished == 1

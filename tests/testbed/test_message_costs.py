@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dwell.testbed.calibrate import calibrate
 from tests.cells.known_cost import (
     CELL,
 )
+from tests.testbed.calibrated import calibrate
 
 
 def test_links_that_nobody_emulates_have_their_own_delays(

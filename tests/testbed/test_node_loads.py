@@ -11,7 +11,6 @@ import pytest
 import dwell
 from dwell.model import Quota
 from dwell.record import Run
-from dwell.testbed.calibrate import Calibrated, calibrate
 from dwell.testbed.measured import look_at
 from dwell.testbed.node_loads import TOGETHER, wakes
 from tests.cells.known_cost import (
@@ -22,6 +21,7 @@ from tests.cells.known_cost import (
     HZ,
     INTERFERENCE,
 )
+from tests.testbed.calibrated import Calibrated, calibrate
 
 
 def test_backgrounds_and_links_are_found(calibrated: Calibrated) -> None:

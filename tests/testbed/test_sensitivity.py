@@ -63,7 +63,6 @@ def measured(
         disturbed=DisturbedPlaces(frozenset(stressed), frozenset(), frozenset(stressed)),
         placement="",
         windows=windows,
-        jobs_s=1.0,
         visits=visits,
         rates={},
         starts={},

@@ -10,11 +10,11 @@ import pytest
 
 import dwell
 from dwell.record import Run
-from dwell.testbed.calibrate import Calibrated, calibrate
 from tests.cells.known_cost import (
     MESSAGING_MS,
     STAGE_MS,
 )
+from tests.testbed.calibrated import Calibrated, calibrate
 
 
 def test_execution_times_are_found(calibrated: Calibrated) -> None:

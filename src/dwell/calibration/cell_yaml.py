@@ -41,7 +41,7 @@ def _tasks(file: Path, measurements: Sequence[Measurement]) -> Iterator[str]:
         for one in nodes:
             threads = max(1, round(one.about["cores_used"]))
             more = {"threads": threads} if threads > 1 else {}
-            on = {one.about["node"]: {"exec_ms": _trace(file, one.name), **more}}
+            on = {one.about["node"]: {"exec_ms": replay(file, one.name), **more}}
             yield f"      {_flow(on)[1:-1]}"
 
 
@@ -54,10 +54,11 @@ def _links(file: Path, measurements: Sequence[Measurement]) -> Iterator[str]:
         rate = one.about["rate_mbps"]
         # Four digits.
         more = {} if rate is None else {"rate_mbps": float(f"{rate:.4g}")}
-        yield f"  - {_flow({**ends, 'delay_ms': _trace(file, one.name), **more})}"
+        yield f"  - {_flow({**ends, 'delay_ms': replay(file, one.name), **more})}"
 
 
-def _trace(file: Path, column: str) -> dict[str, object]:
+def replay(file: Path, column: str) -> dict[str, object]:
+    """Return the process that replays a column of a profile, as a cell file has it."""
     return {"trace": {"file": file.as_posix(), "column": column, "by": "row", "wrap": True}}
 
 

@@ -65,7 +65,7 @@ class MachineCounters:
         return MachineConditions(
             load=self._load,
             cpus=os.cpu_count() or 1,
-            governor=_governor(self._cores[0]),
+            governor=_of_cpu(self._cores[0], "scaling_governor") or None,
             frequency_mhz=(self._frequency_mhz, _frequency_mhz(self._cores[0])),
             steal=steal,
             preemptions=preemptions,
@@ -79,12 +79,12 @@ def processor() -> str:
     return match[1].strip() if match else platform.machine()
 
 
-def _governor(core: int) -> str | None:
-    return _text(f"/sys/devices/system/cpu/cpu{core}/cpufreq/scaling_governor").strip() or None
+def _of_cpu(core: int, name: str) -> str:
+    return _text(f"/sys/devices/system/cpu/cpu{core}/cpufreq/{name}").strip()
 
 
 def _frequency_mhz(core: int) -> float | None:
-    kilohertz = _text(f"/sys/devices/system/cpu/cpu{core}/cpufreq/scaling_cur_freq").strip()
+    kilohertz = _of_cpu(core, "scaling_cur_freq")
     if kilohertz.isdigit():
         return int(kilohertz) / 1e3
     for block in _text("/proc/cpuinfo").split("\n\n"):

@@ -129,7 +129,6 @@ class Assembly:
             tiers=objective.tiers if objective is not None else {},
             live=live,
         )
-        self._refuse_anchored(candidates, tasks)
         self._assume(parts)
         # A record names what its machine had.
         if not self.faults.is_record:
@@ -314,21 +313,16 @@ class Assembly:
 
     # --------------------------------------------------------------------------- meaning
 
-    def _refuse_anchored(
-        self, candidates: Mapping[str, Mapping[str, str]], tasks: Mapping[str, Task | None]
-    ) -> None:
-        """Add a fault for every anchored task that a candidate places where it is anyway."""
-        for name, moves in candidates.items():
+    def _judge(self, parts: CellParts) -> None:
+        """Add the faults of meaning, but for those that other faults cause."""
+        for name, moves in parts.candidates.items():
             for task_name, node in moves.items():
-                task = tasks.get(task_name)
+                task = parts.tasks.get(task_name)
                 if task is not None and task.anchored and node in task.on:
                     self.faults.add(
                         f"candidates.{name}.{task_name}",
                         f"{task_name} is anchored to {node}, in every candidate; leave it out",
                     )
-
-    def _judge(self, parts: CellParts) -> None:
-        """Add the faults of meaning, but for those that other faults cause."""
         known = all(
             link.source in parts.nodes and link.target in parts.nodes for _, link in parts.links
         )
@@ -367,9 +361,8 @@ def is_estimator(name: str) -> bool:
 
 def unregistered(parts: CellParts, name: str) -> list[Fault]:
     """Return the faults of what a cell names: policies, estimators, columns, itself."""
-    return find_unregistered(
-        parts, name, policies.names(), estimators.names(), estimators.shadowing()
-    )
+    known = policies.names(), estimators.names(), estimators.shadowing()
+    return list(find_unregistered(parts, name, *known))
 
 
 def _forward(

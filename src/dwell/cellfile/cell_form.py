@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.forms import (
@@ -143,7 +143,6 @@ class ProcessForm(Form):
     """A number, or one named random process: an `Entry` of it, or its `Constant`."""
 
     shape: Shape
-    words: ClassVar[str] = "process"
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return a `Constant`, or the entry of the one process that is named."""
@@ -256,11 +255,6 @@ class WordsForm(Form):
     means: Mapping[str, Any]
     shape: Shape
     remedy: str
-
-    @property
-    def words(self) -> str:
-        """What it may be, as a table of the docs has it."""
-        return ", ".join([*(f"`{word}`" for word in self.means), self.shape.words])
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return what is meant."""

@@ -34,11 +34,6 @@ from dwell.model.semantics import bad_name
 class PhasesForm(Form):
     """A word, or a list of phases."""
 
-    @property
-    def words(self) -> str:
-        """What it may be, as a table of the docs has it."""
-        return "`sync`, `even`, `random`, list of ms"
-
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return the word, or the phases of a list."""
         if isinstance(value, list):

@@ -39,11 +39,6 @@ def removing(step: Step) -> str:
 class Form(ABC):
     """What may stand at a place."""
 
-    @property
-    @abstractmethod
-    def words(self) -> str:
-        """What it may be, as a table of the docs has it."""
-
     @abstractmethod
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return what a value says, or `FAULTY` beside a fault."""
@@ -81,11 +76,6 @@ class NumberForm(Form):
     """A finite number within a bound."""
 
     bound: Bound
-
-    @property
-    def words(self) -> str:
-        """What it may be, as a table of the docs has it."""
-        return str(self.bound).removeprefix("a ")
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return the number, a float where the bound is none of whole numbers."""
@@ -146,12 +136,6 @@ class TextForm(Form):
     bound: Pattern | None = None
     known: tuple[str, ...] = ()
 
-    @property
-    def words(self) -> str:
-        """What it may be, as a table of the docs has it."""
-        text = "text" if self.bound is None else str(self.bound).removeprefix("a ")
-        return ", ".join([*(f"`{name}`" for name in self.known), text])
-
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return the text; that of a key which is no text, where it stands for one."""
         if not isinstance(value, str):
@@ -173,11 +157,6 @@ class TextForm(Form):
 class FlagForm(Form):
     """A truth value."""
 
-    @property
-    def words(self) -> str:
-        """What it may be, as a table of the docs has it."""
-        return "`true`, `false`"
-
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return the truth value."""
         return value if isinstance(value, bool) else refused(value, "true or false", path, faults)
@@ -192,11 +171,6 @@ class ChoiceForm(Form):
     """One of some values."""
 
     choices: tuple[Any, ...]
-
-    @property
-    def words(self) -> str:
-        """What it may be, as a table of the docs has it."""
-        return ", ".join(f"`{choice}`" for choice in self.choices)
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return the value."""
@@ -234,11 +208,6 @@ class WrittenForm(Form):
     reader: Callable[[Any], Any]
     may_be_empty: bool = False
     shown: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def words(self) -> str:
-        """What it may be, as a table of the docs has it."""
-        return self.ways
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return what the reader makes of the value."""
@@ -301,11 +270,6 @@ class MappingForm(Form):
     keeps: bool = False
     least: int = 0
 
-    @property
-    def words(self) -> str:
-        """What it may be, as a table of the docs has it."""
-        return f"name → {self.form.words}"
-
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return a dict of what they say."""
         if not isinstance(value, dict):
@@ -333,11 +297,6 @@ class ListForm(Form):
 
     form: Form
     keeps: bool = False
-
-    @property
-    def words(self) -> str:
-        """What it may be, as a table of the docs has it."""
-        return f"list of {self.form.words}"
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return a list of what they say."""
@@ -455,11 +414,6 @@ class Shape(Form):
     keys: tuple[FormKey, ...]
     kind: Any = None
     extra: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def words(self) -> str:
-        """What it may be, as a table of the docs has it."""
-        return f"`{{{', '.join(self.names)}}}`"
 
     @property
     def names(self) -> list[str]:

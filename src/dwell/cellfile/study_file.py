@@ -10,7 +10,7 @@ import itertools
 import json
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from os import PathLike, fspath
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
@@ -41,8 +41,7 @@ Grid: TypeAlias = "Mapping[str, list[Any]]"
 Axes: TypeAlias = "Sequence[tuple[str, ...]]"
 
 
-@dataclass(frozen=True, slots=True)
-class DeclaredPolicy:
+class DeclaredPolicy(NamedTuple):
     """A policy of a study: its name in tables, what it is, and its settings of the cell."""
 
     name: str
@@ -51,8 +50,7 @@ class DeclaredPolicy:
     settings: Mapping[str, object]
 
 
-@dataclass(frozen=True, slots=True)
-class DeclaredPoint:
+class DeclaredPoint(NamedTuple):
     """A point of a study's grid: the values by their paths, and the cell, or fleet, with them."""
 
     values: Mapping[str, Value]
@@ -60,8 +58,7 @@ class DeclaredPoint:
     fleet: Fleet | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class DeclaredStudy:
+class DeclaredStudy(NamedTuple):
     """A study as its file declares it, every default filled in."""
 
     name: str
@@ -387,7 +384,7 @@ class _Reading:
                 f"policies.{declared.name}.estimator",
                 f"{declared.policy!r} names its estimator; leave {declared.estimator!r} out",
             )
-        return replace(declared, policy=policy, estimator=estimator)
+        return declared._replace(policy=policy, estimator=estimator)
 
     def _check_names(self, policy: DeclaredPolicy, problem: Problem) -> None:
         """Check that the names that a policy gives are known."""
@@ -457,7 +454,10 @@ class _FleetReading(_Reading):
         for cell in cells:
             for policy in policies:
                 self._check_names(policy, cell)
-        self._check_policy_settings(policies, fleet)
+        for policy in policies:
+            for entry in fleet.entries if policy.settings else ():
+                place = f"policies.{policy.name}"
+                self.faults.attempt(place, with_settings, entry.cell, policy.settings)
         points = tuple(DeclaredPoint(values, first.cell, one) for values, one in fleets)
         return _Plays(points, scenarios, policies, cells)
 
@@ -497,13 +497,6 @@ class _FleetReading(_Reading):
                 self.faults.add(place, fault.message)
             return None
         return fleet
-
-    def _check_policy_settings(self, policies: Sequence[DeclaredPolicy], fleet: Fleet) -> None:
-        """Check that the settings of policies are right in every cell."""
-        for policy in policies:
-            for entry in fleet.entries if policy.settings else ():
-                place = f"policies.{policy.name}"
-                self.faults.attempt(place, with_settings, entry.cell, policy.settings)
 
 
 def _combinations(grid: Grid, axes: Axes) -> Iterator[tuple[dict[str, int], dict[str, Value]]]:

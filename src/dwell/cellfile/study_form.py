@@ -119,7 +119,10 @@ STUDY = FileKind.of(
         "20",
     ),
     optional(
-        "references", FlagForm(), "Whether to play the references in hindsight as well.", "false"
+        "references",
+        FlagForm(),
+        "Whether to simulate the clairvoyant and the oracle, too.",
+        "false",
     ),
     required(
         "policies",

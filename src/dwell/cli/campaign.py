@@ -22,7 +22,7 @@ from dwell.cli.options import (
     option,
     seconds_of_runs,
 )
-from dwell.cli.output import file_name, mark_of, print_json, working, write_report
+from dwell.cli.output import file_name, interrupted, mark_of, print_json, working, write_report
 from dwell.errors import ExitCode
 from dwell.live.log import say
 from dwell.model.bounds import counted
@@ -141,12 +141,10 @@ def _run(campaign: Campaign, folder: Path, play: Play, name: str, minutes: float
             )
     except KeyboardInterrupt:
         done, planned = len(list(folder.glob("runs/*/run.json"))), len(campaign.plan())
-        typer.echo(
-            f"interrupted: {done} of {counted(planned, 'run')} are done and stay in {folder}; the "
-            "same command goes on from there",
-            err=True,
+        interrupted(
+            f"{done} of {counted(planned, 'run')} are done and stay in {folder}; the same command "
+            "goes on from there"
         )
-        raise typer.Exit(ExitCode.INTERRUPTED) from None
 
 
 def report_campaign(

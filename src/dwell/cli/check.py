@@ -53,7 +53,7 @@ def check(
         return
     if faults := tuple(class_faults(problem)):
         _refuse(faults, "\n".join(f"{cell}: {fault}" for fault in faults), as_json=as_json)
-    from dwell.estimators import Profile, warnings_of
+    from dwell.estimators import warnings_of
     from dwell.estimators.cell_warnings import unpriced
     from dwell.estimators.prices import prices_of
     from dwell.live.lint import lint
@@ -61,7 +61,7 @@ def check(
     prices = prices_of(problem, scenario)
     cycles = min(price.cycles for price in prices.values())
     warnings = (
-        *warnings_of(problem, Profile(problem)),
+        *warnings_of(problem),
         *unpriced(problem, scenario, cycles),
         *lint(problem),
     )

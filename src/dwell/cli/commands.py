@@ -17,7 +17,7 @@ from dwell.cli.fleet import fleet
 from dwell.cli.keys import keys
 from dwell.cli.live import agent, controller, live
 from dwell.cli.new import new
-from dwell.cli.options import Json, Keys, argument, respelt
+from dwell.cli.options import Json, Keys, argument
 from dwell.cli.profile import profile
 from dwell.cli.report import report
 from dwell.cli.run import run
@@ -30,10 +30,6 @@ from dwell.errors import ExitCode, line_and_code
 
 class Commands(TyperGroup):
     """All commands; an error that is meant for the user is printed and becomes an exit code."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Read the arguments; old spellings of options work, with a warning."""
-        return super().parse_args(ctx, respelt(args))
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command that the arguments name."""

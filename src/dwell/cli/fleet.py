@@ -16,6 +16,7 @@ from dwell.cli.output import (
     aligned,
     block,
     file_name,
+    interrupted,
     mark_of,
     print_json,
     progress,
@@ -26,7 +27,7 @@ from dwell.cli.output import (
 )
 from dwell.cli.run import default_folder
 from dwell.display import milliseconds
-from dwell.errors import ExitCode, Fault
+from dwell.errors import Fault
 from dwell.model.bounds import counted
 
 if TYPE_CHECKING:
@@ -105,9 +106,8 @@ def run(
 
     changes = {"policy": policy, "estimator": estimator, "coordination": coordination}
     played = _read(file, phases, **changes)
-    how = played.phases if isinstance(played.phases, str) else "listed"
-    named = [one for one in (policy, estimator) if one is not None]
-    folder = out or default_folder(played.name, *named, played.coordination, how, str(seed))
+    parts = (policy, estimator, played.coordination, played.phasing, str(seed))
+    folder = out or default_folder(played.name, *filter(None, parts))
     settings = {"seed": seed, "guard": guard, "windows": windows, "versions": None}
     offsets = phases_ms(played, seed)
     require_free_or_same(folder, describe_fleet(played, phases=offsets, **settings))
@@ -121,12 +121,10 @@ def run(
             result.save(folder)
     except KeyboardInterrupt:
         whole = sum((folder / cell.name / "run.json").is_file() for cell in played.cells)
-        typer.echo(
-            f"interrupted: {whole} of {len(played.cells)} runs are whole in {folder}; the same "
-            "command makes them all",
-            err=True,
+        interrupted(
+            f"{whole} of {len(played.cells)} runs are whole in {folder}; the same command makes "
+            "them all"
         )
-        raise typer.Exit(ExitCode.INTERRUPTED) from None
     summary = fleet_numbers(result)
     if as_json:
         print_json({**_head(result, windows), "run": folder, **summary})
@@ -228,7 +226,6 @@ def capacity(
 
 
 def _plan_text(of: Fleet, found: FleetPlan, seed: int) -> str:
-    phases = of.phases if isinstance(of.phases, str) else "listed"
     counts = Counter(found.placements.values())
     placed = ", ".join(f"{count} on {name}" for name, count in counts.most_common())
     rows = [
@@ -243,7 +240,7 @@ def _plan_text(of: Fleet, found: FleetPlan, seed: int) -> str:
         )
     ]
     lines = [
-        f"{of.name}: {counted(len(found.placements), 'cell')}; phases: {phases}; seed {seed}",
+        f"{of.name}: {counted(len(found.placements), 'cell')}; phases: {of.phasing}; seed {seed}",
         f"best: {placed}",
         f"Φ/n   {found.phi:.3f} as played, {found.table_phi:.3f} by the table of loads",
         "",
@@ -291,10 +288,10 @@ def _head(result: FleetRun, windows: int) -> dict[str, Any]:
 def _text(result: FleetRun, windows: int, summary: Mapping[str, Any]) -> str:
     fleet = result.fleet
     shared = ", ".join(fleet.shared) or "nothing"
-    phases = fleet.phases if isinstance(fleet.phases, str) else "listed"
     lines = [
-        f"{fleet.name}: {counted(len(result.cells), 'cell')}; shared: {shared}; phases: {phases}; "
-        f"coordination: {fleet.coordination}; seed {result.seed}; {counted(windows, 'window')}",
+        f"{fleet.name}: {counted(len(result.cells), 'cell')}; shared: {shared}; phases: "
+        f"{fleet.phasing}; coordination: {fleet.coordination}; seed {result.seed}; "
+        f"{counted(windows, 'window')}",
         "",
         *_cells(result, summary["cells"]),
         "",

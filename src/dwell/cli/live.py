@@ -48,8 +48,6 @@ Owner = Annotated[int | None, option("PID", "Process that this one ends with.", 
 
 NodeArgument = Annotated[str, typer.Argument(metavar="NODE", autocompletion=nodes)]
 
-Former = Annotated[list[str] | None, typer.Argument(hidden=True)]
-
 live = typer.Typer(
     no_args_is_help=True, help="Look at live cells, and have a hand in what their controller does."
 )
@@ -402,23 +400,6 @@ def units(
         "sudo systemctl daemon-reload\n"
         f"sudo systemctl enable --now {names}"
     )
-
-
-@live.command("demo", hidden=True, context_settings={"ignore_unknown_options": True})
-def former_demo(words: Former = None) -> None:
-    """Say what has taken its place."""
-    _moved("live demo", "live run examples/visual_servoing/cell.yaml")
-
-
-@live.command("chaos", hidden=True, context_settings={"ignore_unknown_options": True})
-def former_chaos(words: Former = None) -> None:
-    """Say what has taken its place."""
-    _moved("live chaos", "testbed chaos")
-
-
-def _moved(before: str, now: str) -> NoReturn:
-    typer.echo(f"error: `dwell {before}` is `dwell {now}` now", err=True)
-    raise typer.Exit(ExitCode.WRONG)
 
 
 def _ask(

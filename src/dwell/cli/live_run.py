@@ -18,7 +18,7 @@ from dwell.cli.live_view import CellState, View, live_view
 from dwell.cli.output import mark_of_run, print_json, working, write_file
 from dwell.errors import ExitCode, LiveError, ProblemError, installing, not_installed
 from dwell.live.stage_modules import require_stages
-from dwell.model import Problem, Scenario
+from dwell.model import Problem
 from dwell.model.bounds import counted
 from dwell.model.disturbed import Disturbed, disturbed
 from dwell.record import Run, open_run, seal_run
@@ -76,8 +76,11 @@ def run_live(
     if policy is not None or estimator is not None:
         names = (policy or problem.controller.policy, estimator)
         problem = problem.under("+".join(name for name in names if name is not None))
-    scenario = scenario or _first_that_disturbs(problem)
-    seconds = seconds or _length_s(problem.scenario(scenario))
+    if scenario is None:
+        disturbing = (name for name, items in problem.scenarios.items() if items)
+        scenario = next(disturbing, next(iter(problem.scenarios)))
+    ends_s = [item.end_s for item in problem.scenario(scenario) if math.isfinite(item.end_s)]
+    seconds = seconds or max(ends_s, default=USUAL_S - AFTER_S) + AFTER_S
     timeline = timeline_of(problem, scenario, seed=seed, seconds=seconds)
     if faults := tuple(class_faults(problem)):
         raise ProblemError(faults)
@@ -134,18 +137,6 @@ def _announce_left_out() -> tuple[bool, bool]:
         err=True,
     )
     return False, tables
-
-
-def _first_that_disturbs(problem: Problem) -> str:
-    """Return the first of the cell's scenarios in which something is disturbed, or the first."""
-    names = list(problem.scenarios)
-    return next((name for name in names if problem.scenarios[name]), names[0])
-
-
-def _length_s(scenario: Scenario) -> float:
-    """Return how long a scenario is played where nothing is said: until all of it is over."""
-    ends_s = [item.end_s for item in scenario if math.isfinite(item.end_s)]
-    return max(ends_s, default=USUAL_S - AFTER_S) + AFTER_S
 
 
 @dataclass(slots=True)

@@ -11,8 +11,6 @@ import typer
 from dwell.cli.completion import estimators, nodes, policies, scenarios
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from dwell.model import Problem
     from dwell.model.bounds import Bound
 
@@ -128,25 +126,6 @@ TestbedName = Annotated[
     str, typer.Option("--name", help="Of the testbed, among others on this machine.")
 ]
 Json = Annotated[bool, flag("--json", "Print JSON on stdout.")]
-
-#: Old spellings, which work until the next minor version, by the command that has them.
-OLD_SPELLINGS = {
-    "profile": {"--runs": "--samples", "--count": "--samples"},
-    "testbed": {"--real": "--real-links"},
-}
-
-
-def respelt(arguments: Sequence[str]) -> list[str]:
-    """Return a command line with today's spellings; a warning on stderr names each old one."""
-    known = OLD_SPELLINGS.get(arguments[0], {}) if arguments else {}
-    words = []
-    for argument in arguments:
-        option, equals, value = argument.partition("=")
-        today = known.get(option, option)
-        if today != option:
-            typer.echo(f"warning: {option} is now {today}; the old spelling will go", err=True)
-        words.append(f"{today}{equals}{value}")
-    return words
 
 
 def require_one_length(windows: int | None, seconds: float | None) -> None:

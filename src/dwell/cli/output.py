@@ -9,11 +9,11 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import typer
 
-from dwell.errors import RunError
+from dwell.errors import ExitCode, RunError
 from dwell.files import Content, write_whole
 from dwell.record.json_documents import json_ready
 
@@ -24,6 +24,12 @@ if TYPE_CHECKING:
     from dwell.report.page import Page
 
 BLOCKS = "▁▂▃▄▅▆▇█"
+
+
+def interrupted(message: str) -> NoReturn:
+    """Say what is finished after Ctrl-C, and exit."""
+    typer.echo(f"interrupted: {message}", err=True)
+    raise typer.Exit(ExitCode.INTERRUPTED)
 
 
 def aligned(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -160,6 +160,7 @@ def _summary(
         return f"{title}, none after the {warmup} of warm-up: nothing to sum up; ask for more"
     shares = {name: float(row[f"share_{name}"]) for name in problem.candidates}
     used = (f"{name} {row[f'node_{name}']:.0%}" for name in problem.fabric.resources)
+    unfinished = f"{row['in_flight']} of {row['cycles']}"
     lines = (
         ("missed deadlines (V_D)", f"{float(row['violation_rate']) * 100:.2f} %"),
         ("L95, mean of windows", f"{milliseconds(float(str(row['l95_ms'])), 2)} ms"),
@@ -167,7 +168,7 @@ def _summary(
         ("95th percentile of all cycles", _latency(row["p95_ms"])),
         ("cost J, mean of windows", f"{row['cost']:.3f}"),
         ("cycles lost", f"{row['lost']} of {row['cycles']}"),
-        *_unfinished(row),
+        *([("unfinished at the end", unfinished)] if row["in_flight"] else []),
         ("longest run of misses", f"{row['longest_misses']}"),
         *_control(row),
         ("migrations", f"{row['migrations']}"),
@@ -192,12 +193,6 @@ def _latency(value: object) -> str:
         if math.isfinite(latency_ms)
         else "∞: too many never finished"
     )
-
-
-def _unfinished(row: Row) -> Iterator[tuple[str, str]]:
-    """Yield how many cycles were still on their way when the run ended, where any were."""
-    if row["in_flight"]:
-        yield "unfinished at the end", f"{row['in_flight']} of {row['cycles']}"
 
 
 def _control(row: Row) -> Iterator[tuple[str, str]]:

@@ -23,8 +23,7 @@ from dwell.cli.options import (
     require_one_length,
     windows_of,
 )
-from dwell.cli.output import file_name, print_json, progress, warn, working
-from dwell.errors import ExitCode
+from dwell.cli.output import file_name, interrupted, print_json, progress, warn, working
 from dwell.model.bounds import counted
 
 if TYPE_CHECKING:
@@ -60,11 +59,6 @@ def study(
     merge: Annotated[
         bool, flag("--merge", "Put all shards in the folder together, and simulate nothing.")
     ] = False,
-    # Options of what was `dwell study paper`; they say where that is.
-    quick: Annotated[bool, typer.Option("--quick", hidden=True)] = False,
-    chapter: Annotated[list[str] | None, typer.Option(hidden=True)] = None,
-    real: Annotated[Path | None, typer.Option(hidden=True)] = None,
-    examples: Annotated[Path | None, typer.Option(hidden=True)] = None,
     as_json: Json = False,
 ) -> None:
     """Simulate every scenario, policy, parameter and seed of a study.
@@ -73,11 +67,6 @@ def study(
     have the length of the file, if neither --windows nor --seconds is given. Several computers
     share a study with --shard; copy their shards into one folder, and --merge them.
     """
-    if str(file) == "paper" or quick or chapter or real or examples:
-        raise typer.BadParameter(
-            "`dwell study paper` is now `make paper`, in the folder of Dwell's sources "
-            "(reproduction/README.md)"
-        )
     from dwell.estimators import unplayed
     from dwell.study import Shard, load_study, merge_shards, run_shard, run_study
 
@@ -139,20 +128,18 @@ def _interruptible(folder: Path, study: Study) -> Iterator[Progress]:
 
             yield count
     except KeyboardInterrupt:
-        typer.echo(
-            f"interrupted: {done} of {counted(of, 'run')} are finished and stay in "
-            f"{folder}; the same command goes on from there",
-            err=True,
+        interrupted(
+            f"{done} of {counted(of, 'run')} are finished and stay in {folder}; the same command "
+            "goes on from there"
         )
-        raise typer.Exit(ExitCode.INTERRUPTED) from None
 
 
 def _measures(study: Study) -> list[Measure]:
     """Return what the terminal shows."""
-    from dwell.report.formatting import COST, MIGRATIONS, RATE, REGRET, own_measures
+    from dwell.report.formatting import COST, MIGRATIONS, ORACLE_REGRET, RATE, REGRET, own_measures
 
-    regret = [REGRET] if study.references else []
-    return [RATE, COST, MIGRATIONS, *regret, *own_measures(study.metrics)]
+    compared = [REGRET, ORACLE_REGRET] if study.references else []
+    return [RATE, COST, MIGRATIONS, *compared, *own_measures(study.metrics)]
 
 
 def _text(result: StudyResult) -> str:

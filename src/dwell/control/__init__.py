@@ -1,6 +1,6 @@
 """The Controller: windows, estimator, policy and order, the same in both engines."""
 
-from dwell.control.controller import ClosedWindow, Controller, Proposal
+from dwell.control.controller import ClosedWindow, Controller, LookedAt, Proposal
 from dwell.control.course import Course
 from dwell.control.guard import (
     CellGuard,
@@ -12,7 +12,7 @@ from dwell.control.guard import (
     parts_of,
 )
 from dwell.control.plain_rule import plain_rule
-from dwell.control.windows import final_l95_ms
+from dwell.control.windows import final_l95_ms, moved_shares, window_costs
 from dwell.estimators import Estimator, Evidence, Instants
 from dwell.model.shadow_plan import ShadowPlan, shadow_stamps
 from dwell.policies import MinimalPolicy
@@ -28,13 +28,16 @@ __all__ = [
     "FallbackRound",
     "Guard",
     "Instants",
+    "LookedAt",
     "MinimalPolicy",
     "Presence",
     "Probation",
     "Proposal",
     "ShadowPlan",
     "final_l95_ms",
+    "moved_shares",
     "parts_of",
     "plain_rule",
     "shadow_stamps",
+    "window_costs",
 ]

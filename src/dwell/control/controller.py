@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import add
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,24 @@ Ints: TypeAlias = NDArray[np.int64]
 Floats: TypeAlias = NDArray[np.float64]
 
 
+class LookedAt(NamedTuple):
+    """The cycles that a decision looks at.
+
+    Parameters
+    ----------
+    window : int
+        Window of the last of them; of a move of the guard's the one that it begins.
+    last_cycle : int
+        The last of them.
+    cycles : int
+        Their number; 0 for a move of the guard's.
+    """
+
+    window: int
+    last_cycle: int
+    cycles: int
+
+
 @dataclass(slots=True)
 class ClosedWindow:
     """A window as an engine hands it over.
@@ -52,6 +70,8 @@ class ClosedWindow:
     core_ns : float64 array, shape (3, resources)
         Core-nanoseconds in the window: of all work, of the cell's own jobs, of its shadow jobs;
         of an accelerator, of its places. NaN where they were not measured.
+    looked : LookedAt
+        Its number, and its cycles as the record counts them.
     evidence : callable, optional
         Makes the window's `Evidence`, for estimators that learn from it.
     """
@@ -61,6 +81,7 @@ class ClosedWindow:
     close_ns: int
     open_ns: int
     core_ns: Floats
+    looked: LookedAt
     evidence: Callable[[], Evidence] | None = None
 
     def __repr__(self) -> str:
@@ -75,6 +96,7 @@ class Proposal:
     ----------
     seen : tuple of float
         L95 (ms) and violation rate of the window, and its cost.
+    looked : LookedAt
     decision : Decision
         The policy's.
     priced : tuple
@@ -88,6 +110,7 @@ class Proposal:
     """
 
     seen: tuple[float, float, float]
+    looked: LookedAt
     decision: Decision
     priced: tuple[object, ...]
     after: object
@@ -167,8 +190,8 @@ class Controller:
         self.course = Course(str(initial) if known else problem.initial)
         if coordination is not None:
             coordination.place(self.course.placement)
-        #: Number of the next window.
-        self.window = 0
+        #: What the next decision looks at, as the engine counts.
+        self.looked = LookedAt(0, problem.decide_cycles - 1, problem.decide_cycles)
         #: Rows of ``decisions``: `decision_columns`, then why it was not carried out, or None.
         self.decisions: list[tuple[object, ...]] = []
         resources = problem.fabric.resources.values()
@@ -191,7 +214,7 @@ class Controller:
         policy, estimator = type(self.policy).__name__, type(self.estimator).__name__
         return (
             f"<Controller of {self.problem.name}: {policy}, {estimator}; at "
-            f"{self.course.placement} after {self.window} windows>"
+            f"{self.course.placement}, window {self.looked.window}>"
         )
 
     @property
@@ -261,6 +284,7 @@ class Controller:
         PolicyError
             If the policy returns neither a decision nor a candidate's name.
         """
+        self.looked = window.looked
         age_ns = window.close_ns - window.release_ns
         missed = int(missed_cycles(window.latency_ns, age_ns, self._deadline_ns))
         l95_ms, uncut_ms = seen_l95_ms(window.latency_ns, age_ns, self._censor_ms)
@@ -270,7 +294,12 @@ class Controller:
         return self.propose_on(float(l95_ms), missed / len(age_ns), float(uncut_ms), shares)
 
     def propose_on(
-        self, l95_ms: float, violation_rate: float, uncut_ms: float, shares: Floats
+        self,
+        l95_ms: float,
+        violation_rate: float,
+        uncut_ms: float,
+        shares: Floats,
+        recent: Floats | None = None,
     ) -> Proposal:
         """Propose on a window that an engine has measured itself (see `propose`).
 
@@ -281,25 +310,51 @@ class Controller:
         shares : float64 array, shape (3, resources) or (4, resources)
             Busy, own and shadow share of every resource, and that of other cells of a fleet; NaN
             where they were not measured.
+        recent : float64 array, optional
+            The same since the last decision, for the estimator; `shares` where None.
         """
-        used, own, shadow, *others = shares.tolist()
-        seen = dict(zip(self.resources, used, strict=True))
+        observed = self._observed(l95_ms, violation_rate, uncut_ms, shares)
+        if recent is None:
+            return self.propose_by(observed, self._own_shares(shares))
+        since = self._observed(l95_ms, violation_rate, uncut_ms, recent)
+        return self.propose_by(observed, self._own_shares(recent), since)
+
+    def _observed(
+        self, l95_ms: float, violation_rate: float, uncut_ms: float, shares: Floats
+    ) -> QoS:
+        """Return metrics with what was busy of each resource."""
+        used = dict(zip(self.resources, shares[0].tolist(), strict=True))
+        if self._has_accelerators:
+            used = _measured(used)
+        return QoS(l95_ms, violation_rate, FrozenDict(used), uncut_ms)
+
+    def _own_shares(self, shares: Floats) -> dict[str, float]:
+        """Return the share of each resource that is not foreign."""
+        _, own, shadow, *others = shares.tolist()
         # Neither the cell's jobs nor its shadow jobs are foreign.
         mine = dict(zip(self.resources, map(add, own, shadow), strict=True))
         if others and self.coordination is not None and self.coordination.knows_others:
             mine = {name: mine[name] + share for name, share in zip(mine, *others, strict=True)}
-        if self._has_accelerators:
-            seen, mine = _measured(seen), _measured(mine)
-        return self.propose_by(QoS(l95_ms, violation_rate, FrozenDict(seen), uncut_ms), mine)
+        return _measured(mine) if self._has_accelerators else mine
 
-    def propose_by(self, observed: QoS, own: Mapping[str, float]) -> Proposal:
-        """Propose on metrics that are already aggregated (see `propose`)."""
+    def propose_by(
+        self, observed: QoS, own: Mapping[str, float], recent: QoS | None = None
+    ) -> Proposal:
+        """Propose on metrics that are already aggregated (see `propose_on`).
+
+        Parameters
+        ----------
+        own : mapping of str to float
+            Share of each resource that is not foreign, since the last decision.
+        recent : QoS, optional
+            Metrics with the utilisation since the last decision; `observed` where None.
+        """
         course = self.course
         incumbent = course.placement
         # With the switching term of the decision that led to it.
         measured = self._pricing.cost(observed, incumbent, course.previous)
-        estimates = self._estimates(observed, own)
-        with UserCall(self.policy, "decide", self.window):
+        estimates = self._estimates(observed, own, recent or observed)
+        with UserCall(self.policy, "decide", self.looked.window):
             decision, after = self._policy.propose(
                 observed=observed,
                 estimates=estimates,
@@ -307,25 +362,29 @@ class Controller:
             )
         decision = self._checked(decision)
         seen = observed.l95_ms, observed.violation_rate, measured
-        proposal = Proposal(seen, decision, self._priced(decision, estimates), after)
+        priced = self._priced(decision, estimates)
+        proposal = Proposal(seen, self.looked, decision, priced, after)
         if self.coordination is not None:
             self._consider(proposal, estimates, self.coordination)
         return proposal
 
-    def _estimates(self, observed: QoS, own: Mapping[str, float]) -> FrozenDict[str, QoS]:
+    def _estimates(
+        self, observed: QoS, own: Mapping[str, float], recent: QoS
+    ) -> FrozenDict[str, QoS]:
         """Estimate every candidate; a policy cannot change the estimates that are recorded."""
         incumbent = self.course.placement
-        with UserCall(self.estimator, "estimate", self.window):
-            known = self._estimator.estimate(observed=observed, incumbent=incumbent, own=own)
+        with UserCall(self.estimator, "estimate", self.looked.window):
+            known = self._estimator.estimate(observed=recent, incumbent=incumbent, own=own)
             estimates = dict(known)
         if not self._estimator.learns:
             # It knows no more of the incumbent than the window shows.
             estimates[incumbent] = observed
         missing = [one for one in self._names if not isinstance(estimates.get(one), QoS)]
         if missing:
+            who, window = type(self.estimator).__name__, self.looked.window
             raise MetricError(
-                f"{type(self.estimator).__name__}.estimate returned no QoS for {missing[0]} at "
-                f"window {self.window}; it must return one for each of {', '.join(self._names)}"
+                f"{who}.estimate returned no QoS for {missing[0]} at window {window}; it must "
+                f"return one for each of {', '.join(self._names)}"
             )
         return FrozenDict(estimates)
 
@@ -353,7 +412,7 @@ class Controller:
     def learn(self, evidence: Callable[[], Evidence]) -> None:
         """Have the estimator learn from a window, if it learns, before it is decided on."""
         if self._estimator.learns:
-            with UserCall(self.estimator, "learn", self.window):
+            with UserCall(self.estimator, "learn", self.looked.window):
                 self._estimator.look(evidence())
 
     def utilisation(self, window: ClosedWindow) -> Floats:
@@ -425,8 +484,7 @@ class Controller:
         course.hold(wanted.name)
 
     def miss(self) -> None:
-        """Count a window whose close was not seen, because the controller's node was down."""
-        self.window += 1
+        """Take note of a decision that was not made, because the controller's node was down."""
         self.course.miss()
 
     def adopt(self, name: str, *, left: str | None = None) -> None:
@@ -462,7 +520,8 @@ class Controller:
         self.course.fall(name, left)
         if self.coordination is not None:
             self.coordination.place(name)
-        fixed = (self.window, left, name, name != left, "guard", 0, None)
+        window, *cycles = self.looked
+        fixed = (window, left, name, name != left, "guard", 0, None, *cycles, 0)
         priced = [None] * (len(self.decision_columns) - len(fixed))
         self.decisions.append((*fixed, *priced, None))
 
@@ -493,7 +552,7 @@ class Controller:
 
     def _adopt(self, name: str) -> None:
         """Report to the policy where the cell is."""
-        with UserCall(self.policy, "adopt", self.window):
+        with UserCall(self.policy, "adopt", self.looked.window):
             self._policy.adopt(name)
 
     def _record(self, proposal: Proposal, why: str | None = None) -> None:
@@ -507,10 +566,11 @@ class Controller:
             asked = proposal.verdict.asked
             if why is None and proposal.verdict.why is not None:
                 why = f"{proposal.wished}: {proposal.verdict.why}"
-        fixed = (self.window, incumbent, name, migrated)
-        rule = (decision.reason, decision.dwell, decision.delta_j)
-        self.decisions.append((*fixed, *rule, *proposal.priced, *asked, why))
-        self.window += 1
+        window, *cycles = proposal.looked
+        dwell_cycles = decision.dwell * self.problem.decide_cycles
+        dwell = dwell_cycles // self.problem.window_cycles
+        fixed = (window, incumbent, name, migrated, decision.reason, dwell, decision.delta_j)
+        self.decisions.append((*fixed, *cycles, dwell_cycles, *proposal.priced, *asked, why))
 
     def _priced(self, decision: Decision, estimates: Mapping[str, QoS]) -> tuple[object, ...]:
         """Return what a row of ``decisions`` says of every candidate."""
@@ -544,7 +604,7 @@ class Controller:
     def _supported(self) -> list[float]:
         if not self._estimator.supports:
             return []
-        with UserCall(self.estimator, "support", self.window):
+        with UserCall(self.estimator, "support", self.looked.window):
             support = self._estimator.support()
         behind = [support[name] for name in self._names if name in support]
         if len(behind) < len(self._names):
@@ -562,7 +622,7 @@ class Controller:
         name = decision.name if isinstance(decision, Decision) else decision
         if not isinstance(name, str) or name not in candidates:
             raise PolicyError(
-                f"{who}.decide returned {decision!r} at window {self.window}; "
+                f"{who}.decide returned {decision!r} at window {self.looked.window}; "
                 f"it must be a Decision or a candidate's name: {', '.join(candidates)}"
             )
         if isinstance(decision, Decision):
@@ -571,7 +631,7 @@ class Controller:
             ):
                 raise PolicyError(
                     f"{who}.decide returned a decision for {name!r} at window "
-                    f"{self.window} whose placement or `migrated` contradicts its "
+                    f"{self.looked.window} whose placement or `migrated` contradicts its "
                     f"name (incumbent: {self.course.placement!r}; a policy that remembers it needs "
                     "adopt(name), by which it is told of moves of the guard)"
                 )

@@ -7,13 +7,17 @@ simulator's kernel (``metrics.h``).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.cost import hamming, price, tier_nodes
 from dwell.estimators.paths import l95_rank
 from dwell.model.instants import NEVER_NS
+from dwell.model.objective import Objective
+from dwell.model.problem import Problem
 
 Ints: TypeAlias = NDArray[np.int64]
 Floats: TypeAlias = NDArray[np.float64]
@@ -98,3 +102,32 @@ def utilisation(core_ns: Floats, capacity: Floats, span_ns: Ints | int) -> Float
         Length of the window.
     """
     return np.minimum(core_ns / (capacity * span_ns), 1.0)
+
+
+def moved_shares(problem: Problem) -> Floats:
+    """S of every move, shape (candidates, candidates), from the row's to the column's."""
+    placements = list(problem.candidates.values())
+    return np.array([[hamming(there, here) for there in placements] for here in placements])
+
+
+def window_costs(
+    objective: Objective,
+    l95_ms: Floats,
+    violation_rate: Floats,
+    used: Mapping[str, Floats],
+    switching: Floats,
+) -> Floats:
+    """J of windows.
+
+    Parameters
+    ----------
+    l95_ms, violation_rate, switching : float64 array, shape (windows,)
+        Switching: the sum of S over the moves that took effect in each window.
+    used : mapping of str to float64 array, shape (windows,)
+        Busy share of each resource.
+    """
+    robot, edge, cloud = (
+        np.max([used[name] for name in names], axis=0) if names else np.zeros(len(l95_ms))
+        for names in tier_nodes(objective)
+    )
+    return price(l95_ms, violation_rate, robot, edge, cloud, switching, objective)

@@ -29,23 +29,18 @@ class News(NamedTuple, Generic[T]):
 
 
 class Feed(Generic[T]):
-    """Keeps the last `most` items; whoever writes never waits for who reads."""
+    """Keeps the last `most` items; a writer never waits for a reader.
+
+    Attributes
+    ----------
+    upto : int
+        How many items it has had.
+    """
 
     def __init__(self, most: int) -> None:
         self._items: deque[T] = deque(maxlen=most)
-        self._upto = 0
+        self.upto = 0
         self._lock = threading.Lock()
-
-    def __repr__(self) -> str:
-        return f"<Feed: {len(self._items)} of {self._upto}>"
-
-    def __len__(self) -> int:
-        return len(self._items)
-
-    @property
-    def upto(self) -> int:
-        """How many items it has had."""
-        return self._upto
 
     @property
     def last(self) -> T | None:
@@ -56,11 +51,11 @@ class Feed(Generic[T]):
         """Add an item; the oldest makes room."""
         with self._lock:
             self._items.append(item)
-            self._upto += 1
+            self.upto += 1
 
     def since(self, upto: int) -> News[T]:
         """Return the items after the first `upto` ones, as far as they are kept."""
         with self._lock:
-            first = self._upto - len(self._items)
+            first = self.upto - len(self._items)
             items = list(islice(self._items, max(upto - first, 0), None))
-            return News(items, self._upto, max(first - upto, 0))
+            return News(items, self.upto, max(first - upto, 0))

@@ -97,9 +97,6 @@ class CellMetrics(Collector):
         self.counted = self._unread = 0
         self._lock, self._stopped = threading.Lock(), threading.Event()
 
-    def __repr__(self) -> str:
-        return f"<CellMetrics of {self._problem.name}>"
-
     def __enter__(self) -> CellMetrics:
         """Begin to count."""
         start_thread("metrics", self._keep_up)

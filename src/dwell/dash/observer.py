@@ -25,7 +25,7 @@ from dwell.live.cycle_ledger import Ledger, LiveCycle
 from dwell.live.failures import start_thread
 from dwell.live.local_addresses import running_elsewhere
 from dwell.live.log import printable
-from dwell.live.messages import Accepted, Beat, Stamped, decode
+from dwell.live.messages import Accepted, Stamped, decode
 from dwell.live.operator_client import OperatorClient
 from dwell.live.role import Pulse
 from dwell.live.security import Security
@@ -211,9 +211,6 @@ class Observer:
         # Moves that no answer has told the reason of yet.
         self._moves: deque[_SeenMove] = deque(maxlen=MOST_EVENTS)
 
-    def __repr__(self) -> str:
-        return f"<Observer of {self.problem.name}>"
-
     def __enter__(self) -> Observer:
         """Begin to listen."""
         self._look()
@@ -289,7 +286,8 @@ class Observer:
             case "beat":
                 beat = self._pulse.receive(sample, time.time_ns())
                 if beat is not None:
-                    self._compare_clocks(beat)
+                    for heard in beat.heard:
+                        self._offsets.sample(heard.node, beat.node, heard.beat_ns, heard.at_ns)
             case "done" | "ended":
                 done = place.completion(sample)
                 cycle = self._open.get(done.stamp.key)
@@ -297,10 +295,6 @@ class Observer:
                     cycle.take(done, None)
             case "accepted":
                 place.read(sample, Accepted, lambda _: place.stamper[0])
-
-    def _compare_clocks(self, beat: Beat) -> None:
-        for heard in beat.heard:
-            self._offsets.sample(heard.node, beat.node, heard.beat_ns, heard.at_ns)
 
     def _stamped(self, stamp: Stamped) -> None:
         before = None if self._newest is None else self._newest[0]

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,13 +29,8 @@ def recorded_page(folder: Path, beside: Path | None) -> Dash:
     RunError
         If a folder is neither, or damaged, or no run of a fleet is whole.
     """
-    read: Callable[[], dict[str, Any]] = partial(_fleet, folder)
-    if not is_fleet(folder):
-        for one in filter(None, (folder, beside)):
-            _require_run(one)
-        read = partial(_on_one_line, folder, beside)
     with ThreadPoolExecutor(1) as reader:
-        reading = reader.submit(read)
+        reading = reader.submit(_read, folder, beside)
         # Meanwhile: both take as long.
         from dwell.dash.server import Dash
 
@@ -49,7 +43,8 @@ def _require_run(folder: Path) -> None:
         return
     if is_fleet(folder):
         raise RunError(f"{folder}: a fleet; name the folder of one of its cells")
-    runs = sorted(path.relative_to(folder).as_posix() for path in _runs_in(folder))
+    below = (*folder.glob("*"), *folder.glob("runs/*"))
+    runs = sorted(path.relative_to(folder).as_posix() for path in below if is_run(path))
     if runs:
         more = f", and {len(runs) - MOST_NAMED} more" if len(runs) > MOST_NAMED else ""
         named = ", ".join(runs[:MOST_NAMED])
@@ -59,18 +54,14 @@ def _require_run(folder: Path) -> None:
         )
 
 
-def _runs_in(folder: Path) -> list[Path]:
-    return [path for path in (*folder.glob("*"), *folder.glob("runs/*")) if is_run(path)]
+def _read(folder: Path, beside: Path | None) -> dict[str, Any]:
+    """Return a fleet, or runs and the unit of their time line: cycles where these are the same."""
+    if is_fleet(folder):
+        from dwell.dash.recorded_fleet import RecordedFleet
 
-
-def _fleet(folder: Path) -> dict[str, Any]:
-    from dwell.dash.recorded_fleet import RecordedFleet
-
-    return {"fleet": RecordedFleet(folder)}
-
-
-def _on_one_line(folder: Path, beside: Path | None) -> dict[str, Any]:
-    """Return the runs, and what their time line counts: cycles where these are the same."""
+        return {"fleet": RecordedFleet(folder)}
+    for path in filter(None, (folder, beside)):
+        _require_run(path)
     from dwell.dash.recorded_cell import RecordedCell, same_realisation
 
     one = RecordedCell(folder)

@@ -53,9 +53,6 @@ class RecordedCell:
         self._size, self._read_again_s = self._bytes(), 0.0
         self._contents = self._read()
 
-    def __repr__(self) -> str:
-        return f"<RecordedCell of {str(self.folder)!r}>"
-
     def _bytes(self) -> int:
         """Return how long the folder's files are."""
         return sum(file.stat().st_size for file in self.folder.glob("*") if file.is_file())
@@ -158,14 +155,9 @@ class _Contents:
         row = int(np.searchsorted(self._release_ns, round(at_s * 1e9)))
         return float(self._cycle[min(row, len(self._cycle) - 1)])
 
-    @property
-    def end(self) -> float:
-        """Where the time line ends."""
-        period_s = self.problem.pipeline.period_ms / 1e3
-        return float(self.strip.at[-1]) + (period_s if self.unit == "s" else 1.0)
-
     def described(self) -> Plain:
         meta = self.run.meta
+        cycle = self.problem.pipeline.period_ms / 1e3 if self.unit == "s" else 1.0
         told = ("kind", "scenario", "policy", "estimator", "seed")
         return {
             **cell_document(self.problem),
@@ -174,7 +166,7 @@ class _Contents:
             "growing": self.growing,
             "unit": self.unit,
             "begin": float(self.strip.at[0]),
-            "end": self.end,
+            "end": float(self.strip.at[-1]) + cycle,
             "about": {name: str(meta[name]) for name in told if meta.get(name) is not None},
             "cycles": len(self.strip.at),
             "missed": int(self.strip.missed.sum()),

@@ -41,9 +41,6 @@ class RecordedEvents:
         self._events: Sequence[Plain] = sorted(events, key=lambda event: event["at"])
         self._at = np.array([event["at"] for event in self._events])
 
-    def __repr__(self) -> str:
-        return f"<RecordedEvents: {len(self._events)}>"
-
     def view(self, begin: float, end: float) -> Plain:
         """Return the last events between two places, and how many are before them."""
         low, high = np.searchsorted(self._at, (begin, end))

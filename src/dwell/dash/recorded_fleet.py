@@ -82,10 +82,6 @@ class _Rounds:
     after: Floats
     number: NDArray[np.int64]
 
-    def last(self, at: float) -> int:
-        """Return which was the last before a place; -1 where none was."""
-        return int(np.searchsorted(self.at, at, "right")) - 1
-
     def view(self, begin: float, end: float, bins: int, cells: int) -> Plain:
         """Return Φ a cell between two places, before and after where the ledger was asked."""
         phi = np.column_stack([self.before, self.after]).ravel() / cells
@@ -124,9 +120,6 @@ class RecordedFleet:
         self._lines = self._over_time()
         self._events = RecordedEvents(self._all_events())
         self.cell = lru_cache(MOST_OPEN)(self._open)
-
-    def __repr__(self) -> str:
-        return f"<RecordedFleet of {str(self.folder)!r}>"
 
     # --------------------------------------------------------------------- what is read
 
@@ -270,7 +263,7 @@ class RecordedFleet:
         if all(cell["health"] == UNMEASURED for cell in cells):
             health, headline = UNMEASURED, NO_WINDOW
         k = int(np.searchsorted(self._grid, at, "right")) - 1
-        row = self._rounds.last(at)
+        row = int(np.searchsorted(self._rounds.at, at, "right")) - 1
         return {
             "at": at,
             "health": health,

@@ -12,7 +12,7 @@ from dwell.dash.paged_cell import Plain, health_by
 from dwell.dash.strip import Floats, plain
 from dwell.model import Problem
 from dwell.model.live import RECENT_WINDOWS
-from dwell.record import Names, Run, TableArrays
+from dwell.record import Names, Run
 
 #: What is both estimated and seen of a window, and the columns that say what was seen.
 SEEN = {"l95_ms": "seen_l95_ms", "violation_rate": "seen_violation_rate", "cost": "cost"}
@@ -55,12 +55,13 @@ class RecordedWindows:
         opens: Callable[[NDArray[np.int64]], Floats],
         length: float,
     ) -> None:
-        self._run, self._problem = run, problem
+        self._problem = problem
         self._candidates = tuple(problem.candidates)
         windows = run.arrays("windows")
         self.number = windows["window"].astype(np.int64)
         self.opens = opens(windows["first_cycle"].astype(np.int64))
         self.closes = self.opens + length
+        self._first, self._cycle = windows["first_cycle"], length / problem.window_cycles
         self.rates = windows["violation_rate"].astype(np.float64)
         self.counts = ~windows["warmup"].astype(bool)
         self.placement = placement_codes(windows.names("placement"), self._candidates)
@@ -68,19 +69,17 @@ class RecordedWindows:
         self.used = {
             name: windows[f"u_{name}"].astype(np.float64) for name in problem.fabric.resources
         }
-        self._decide(run.arrays("decisions"))
+        self._decide(run)
 
-    def __repr__(self) -> str:
-        return f"<RecordedWindows: {len(self.number)} of {self._problem.name}>"
-
-    def _decide(self, table: TableArrays) -> None:
+    def _decide(self, run: Run) -> None:
         """Take in the decisions: those at a window's close, by window, and all of them."""
-        self.decisions = table
+        self.decisions = table = run.arrays("decisions")
         windows, reasons = table["window"].astype(np.int64), table.names("reason")
         self._reasons = reasons.to_list()
         self._target = placement_codes(table.names("placement"), self._candidates)
         self._incumbent = placement_codes(table.names("incumbent"), self._candidates)
-        self._refused = self._texts("refused")
+        refused = run.decisions["refused"].to_list() if "refused" in table else []
+        self._refused = [text or "" for text in refused] or [""] * len(self._reasons)
         at_close = ~reasons.equal("guard")
         # Of a window, the row of its decision; -1 where nothing was decided.
         self._row = np.full(len(self.number), -1)
@@ -102,12 +101,6 @@ class RecordedWindows:
         values[known] = column[self._row[known]]
         return values
 
-    def _texts(self, column: str) -> Sequence[str]:
-        """Return a column of texts of the decisions; empty where there is none."""
-        if column not in self.decisions:
-            return [""] * len(self._reasons)
-        return [text or "" for text in self._run.decisions[column].to_list()]
-
     def events(self) -> Iterator[Plain]:
         """Yield moves and refusals."""
         migrated = self.decisions["migrated"].astype(bool)
@@ -117,8 +110,8 @@ class RecordedWindows:
             if place < 0:
                 continue
             reason = self._reasons[row]
-            # The guard's move is noted under the window that follows it.
-            at = float((self.opens if reason == "guard" else self.closes)[place])
+            beyond = int(self.decisions["last_cycle"][row]) + 1 - int(self._first[place])
+            at = float(self.opens[place]) + beyond * self._cycle
             names = [self._candidates[code[row]] for code in (self._incumbent, self._target)]
             event = {"at": at, "window": int(self.number[place])}
             if refused[row]:

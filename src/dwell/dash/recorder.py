@@ -73,9 +73,6 @@ class CellRecorder:
             path.unlink()
             raise OSError(error.errno, error.strerror, str(path)) from None
 
-    def __repr__(self) -> str:
-        return f"<CellRecorder of {self._observer.problem.name} in {str(self._path)!r}>"
-
     def __enter__(self) -> CellRecorder:
         """Begin to record."""
         self._thread = start_thread("recorder", self._go_on)

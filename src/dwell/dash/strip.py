@@ -44,9 +44,6 @@ class Strip:
     placement: NDArray[np.integer[Any]]
     number: NDArray[np.int64]
 
-    def __repr__(self) -> str:
-        return f"<Strip of {len(self.at)} cycles>"
-
     def followed_by(self, other: Strip, most: int) -> Strip:
         """Return this and what comes next, in order of instants; the newest `most` of both."""
         named = [field.name for field in fields(self)]

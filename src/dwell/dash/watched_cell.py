@@ -38,9 +38,6 @@ class WatchedCell:
         self._lines: tuple[Floats, dict[str, Floats]] = (np.zeros(0), {})
         self._told = (0, 0, 0)
 
-    def __repr__(self) -> str:
-        return f"<WatchedCell of {self.problem.name}>"
-
     def _take(self) -> Strip:
         """Take in what the observer has heard since."""
         observer = self.observer
@@ -115,12 +112,14 @@ class WatchedCell:
         """See `PagedCell`; it is the present, whatever the place."""
         now = self.observer.now()
         status, window = now.status, now.status.get("window") or {}
+        ages_ms = [sink["applied_age_ms"] for sink in (status.get("sinks") or {}).values()]
         state = {
             "at": now.at_s,
             "cycle": self._strip.number[-1].item() if len(self._strip.number) else None,
             "placement": now.placement or None,
             "answer_age_ms": None if now.answer_age_s is None else round(now.answer_age_s * 1e3),
-            "age_ms": _applied_age_ms(status),
+            # The oldest age of a sink's last applied command.
+            "age_ms": None if not ages_ms or None in ages_ms else max(ages_ms),
             "cycles": dict(now.cycles),
             "missed": now.missed,
             **{name: status.get(name) for name in SHOWN},
@@ -178,12 +177,6 @@ class WatchedCell:
 def _estimate(window: Mapping[str, Any], name: str) -> Plain:
     """Return what was believed of a candidate at a window's close."""
     return {"cost": window["estimates"].get(name), **window.get("predicted", {}).get(name, {})}
-
-
-def _applied_age_ms(status: Mapping[str, Any]) -> float | None:
-    """Return the age of the oldest sink's last applied command."""
-    ages = [sink["applied_age_ms"] for sink in (status.get("sinks") or {}).values()]
-    return None if not ages or None in ages else max(ages)
 
 
 def _processes(status: Mapping[str, Any]) -> list[Plain]:

@@ -7,8 +7,8 @@ length of a run. Each says which setting it is, and what to do about it.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from collections.abc import Iterator, Sequence
+from functools import partial
 from itertools import chain, combinations
 from typing import NamedTuple
 
@@ -17,14 +17,16 @@ import numpy as np
 from dwell.cost import price, tier_utilisation
 from dwell.display import milliseconds
 from dwell.errors import Fault
+from dwell.estimators.paths import longest_path, steps_of
 from dwell.estimators.profile import Profile, mean_ms
+from dwell.estimators.slow_processes import processes_of
 from dwell.model.fabric import Link, Node
 from dwell.model.objective import TIERS, Objective
 from dwell.model.pipeline import Execution, Flow, Task
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
-from dwell.model.process import Process, Trace, TraceTable
-from dwell.model.scenario import Disturbance, LinkDisturbance, NodeDisturbance
+from dwell.model.process import Process, Trace
+from dwell.model.scenario import LinkDisturbance, NodeDisturbance, acts
 from dwell.model.servo import Servo
 
 #: Draws of a process that a percentile, or a mean of latencies, is taken of.
@@ -39,23 +41,20 @@ FASTEST_MBPS = 1e6
 LONGEST_STEP, LONGEST_SPAN = 1_000, 1_000_000
 
 
-def warnings_of(problem: Problem, profile: Profile | None = None) -> Iterator[Fault]:
-    """Yield what is allowed in a cell but seldom meant.
-
-    Parameters
-    ----------
-    profile : Profile, optional
-        Of the problem; made where None.
-    """
-    profile = profile or Profile(problem)
-    yield from _overloads(problem)
-    yield from _slow_stages(problem)
-    yield from _starved_stages(problem)
+def warnings_of(problem: Problem) -> Iterator[Fault]:
+    """Yield what is allowed in a cell but seldom meant."""
+    profile = Profile(problem)
+    for name, placement in problem.candidates.items():
+        messages = chain(
+            _overloads(problem, placement),
+            _slow_stages(problem, placement),
+            _full_links(problem, placement),
+            _over_caps(problem, placement, profile.uncut_l95_ms[name]),
+        )
+        yield from (Fault(f"candidates.{name}", message) for message in messages)
     yield from _unused_priorities(problem)
-    yield from _full_links(problem)
     yield from _fast_links(problem)
     yield from _same_placements(problem)
-    yield from _over_caps(problem, profile)
     yield from _percentages(problem)
     yield from _dominant_terms(problem, profile)
     yield from _false_alarms(problem, profile)
@@ -101,48 +100,38 @@ def unpriced(problem: Problem, scenario: str, cycles: int) -> Iterator[Fault]:
 # ------------------------------------------------------------------------------- keeping pace
 
 
-def _overloads(problem: Problem) -> Iterator[Fault]:
-    """Yield candidates whose own work is more than a node can do, or than an accelerator nearly."""
-    nodes = problem.fabric.nodes
-    for name, placement in problem.candidates.items():
-        for node in nodes.values():
-            share = _own_share(problem, node, placement)
-            left = _left_share(problem, node, placement)
-            if share > left:
-                yield Fault(
-                    f"candidates.{name}",
-                    f"its own work takes {share:.0%} of {_limit(node, left)}: it can never keep "
-                    f"pace; {_remedy(node, left)}",
-                )
-            elif node.scheduler != "fair":
-                yield from _wide_jobs(problem, name, placement, node, left)
-        for (where, kind), share in _accelerator_shares(problem, placement).items():
-            if share > NEARLY_FULL:
-                what = "it can never keep pace" if share > 1 else "its jobs wait for each other"
-                yield Fault(
-                    f"candidates.{name}",
-                    f"its own work takes {share:.0%} of {kind} of {where}: {what}; place less "
-                    f"there, or raise nodes.{where}.accelerators.{kind}",
-                )
+def _overloads(problem: Problem, placement: Placement) -> Iterator[str]:
+    """Yield where own work is more than a node can do, or than an accelerator nearly."""
+    for name, share in _own_shares(problem, placement).items():
+        resource = problem.fabric.resources[name]
+        node, kind = problem.fabric.nodes[resource.node], resource.kind
+        left = _left_share(problem, node, placement)
+        if kind and share > NEARLY_FULL:
+            what = "it can never keep pace" if share > 1 else "its jobs wait for each other"
+            yield (
+                f"its own work takes {share:.0%} of {kind} of {node.name}: {what}; place less "
+                f"there, or raise {resource.path}"
+            )
+        elif not kind and share > left:
+            limit, remedy = _limit_and_remedy(node, left)
+            yield (
+                f"its own work takes {share:.0%} of {limit}: it can never keep pace; place less "
+                f"there{remedy}"
+            )
+        elif not kind and node.scheduler != "fair":
+            yield from _wide_jobs(problem, placement, node, left)
 
 
-def _limit(node: Node, left: float) -> str:
-    """What the own work on a node must not exceed, as messages have it."""
-    has = f"the cores of {node.name}"
+def _limit_and_remedy(node: Node, left: float) -> tuple[str, str]:
+    """Return the limit on the own work on a node, and how to raise it, as messages have them."""
+    limit, remedy = f"the cores of {node.name}", ", or give the node more cores"
     if node.quota is not None and node.quota.cpu < node.cores:
-        has = f"the quota of {node.name} ({node.quota.cpu:g} of {node.cores} cores)"
+        limit = f"the quota of {node.name} ({node.quota.cpu:g} of {node.cores} cores)"
+        remedy = f", or raise nodes.{node.name}.quota.cpu"
     if left >= 1:
-        return has
+        return limit, remedy
     takers = {"background": node.background > 0, "bursts": node.bursts is not None}
-    return f"{has}, of which {' and '.join(filter(takers.get, takers))} leave {left:.0%}"
-
-
-def _remedy(node: Node, left: float) -> str:
-    if left < 1:
-        return "place less there"
-    if node.quota is not None and node.quota.cpu < node.cores:
-        return f"place less there, or raise nodes.{node.name}.quota.cpu"
-    return "place less there, or give the node more cores"
+    return f"{limit}, of which {' and '.join(filter(takers.get, takers))} leave {left:.0%}", ""
 
 
 def _on_cpu(problem: Problem, node: Node, placement: Placement) -> list[tuple[Task, Execution]]:
@@ -152,12 +141,19 @@ def _on_cpu(problem: Problem, node: Node, placement: Placement) -> list[tuple[Ta
     return [(task, execution) for task, execution in both if execution.accelerator is None]
 
 
-def _own_share(problem: Problem, node: Node, placement: Placement) -> float:
-    """Share of a node's capacity that its own work asks for."""
-    work_ms = 0.0
-    for task, execution in _on_cpu(problem, node, placement):
-        work_ms += mean_ms(problem.pipeline, task, execution) * execution.threads
-    return work_ms / (problem.pipeline.period_ms * node.capacity)
+def _own_shares(problem: Problem, placement: Placement) -> dict[str, float]:
+    """Return the share of each resource's capacity that own work asks for."""
+    work_ms = dict.fromkeys(problem.fabric.resources, 0.0)
+    for task in problem.pipeline.tasks.values():
+        execution = task.on[placement[task.name]]
+        threads = execution.threads if execution.accelerator is None else 1
+        name = _resource(task, placement)
+        work_ms[name] += mean_ms(problem.pipeline, task, execution) * threads
+    period_ms = problem.pipeline.period_ms
+    return {
+        name: work_ms[name] / (period_ms * resource.capacity)
+        for name, resource in problem.fabric.resources.items()
+    }
 
 
 def _left_share(problem: Problem, node: Node, placement: Placement) -> float:
@@ -174,41 +170,21 @@ def _left_share(problem: Problem, node: Node, placement: Placement) -> float:
     return left * (1 - bursts.share * (1 - beside / node.interference))
 
 
-def _accelerator_shares(problem: Problem, placement: Placement) -> dict[tuple[str, str], float]:
-    """Share of each accelerator that own work asks for, by node and kind."""
-    work_ms: dict[tuple[str, str], float] = {}
-    for task in problem.pipeline.tasks.values():
-        node = placement[task.name]
-        execution = task.on[node]
-        if execution.accelerator is not None:
-            place = node, execution.accelerator
-            work_ms[place] = work_ms.get(place, 0.0) + mean_ms(problem.pipeline, task, execution)
-    period_ms, nodes = problem.pipeline.period_ms, problem.fabric.nodes
-    return {
-        (node, kind): work / (period_ms * nodes[node].accelerators[kind])
-        for (node, kind), work in work_ms.items()
-    }
-
-
-def _slow_stages(problem: Problem) -> Iterator[Fault]:
+def _slow_stages(problem: Problem, placement: Placement) -> Iterator[str]:
     """Yield stages that take longer for a job than their workers have."""
-    pipeline, nodes = problem.pipeline, problem.fabric.nodes
-    for candidate, placement in problem.candidates.items():
-        for task in pipeline.tasks.values():
-            node, execution = nodes[placement[task.name]], task.on[placement[task.name]]
-            if _own_share(problem, node, placement) > 1:
-                continue
-            job_ms = mean_ms(pipeline, task, execution)
-            if execution.accelerator is None:
-                cpu = node.cores if node.quota is None else min(node.cores, node.quota.cpu)
-                job_ms *= max(1.0, execution.threads / cpu)
-            if job_ms > execution.workers * pipeline.period_ms:
-                yield Fault(
-                    f"candidates.{candidate}",
-                    f"{task.name} takes {job_ms:.4g} ms a job on {node.name}, a job comes every "
-                    f"{pipeline.period_ms:.4g} ms, and workers are {execution.workers}: it can "
-                    f"never keep pace; raise tasks.{task.name}.on.{node.name}.workers",
-                )
+    period_ms, shares = problem.pipeline.period_ms, _own_shares(problem, placement)
+    for task in problem.pipeline.tasks.values():
+        node = problem.fabric.nodes[placement[task.name]]
+        execution = task.on[node.name]
+        job_ms = mean_ms(problem.pipeline, task, execution)
+        if execution.accelerator is None:
+            job_ms *= max(1.0, execution.threads / node.capacity)
+        if shares[node.name] <= 1 and job_ms > execution.workers * period_ms:
+            yield (
+                f"{task.name} takes {job_ms:.4g} ms a job on {node.name}, a job comes every "
+                f"{period_ms:.4g} ms, and workers are {execution.workers}: it can never keep "
+                f"pace; raise tasks.{task.name}.on.{node.name}.workers"
+            )
 
 
 class _Jobs(NamedTuple):
@@ -219,9 +195,7 @@ class _Jobs(NamedTuple):
     ms: float
 
 
-def _wide_jobs(
-    problem: Problem, candidate: str, placement: Placement, node: Node, left: float
-) -> Iterator[Fault]:
+def _wide_jobs(problem: Problem, placement: Placement, node: Node, left: float) -> Iterator[str]:
     """Yield a warning if jobs on a node cannot run side by side, and together take more than P."""
     period_ms, jobs, alone_ms = problem.pipeline.period_ms, {}, 0.0
     for task, execution in _on_cpu(problem, node, placement):
@@ -237,11 +211,10 @@ def _wide_jobs(
     needed_ms = _needed_ms([*jobs.values()], node.cores) * arriving / speed
     if alone_ms <= period_ms < needed_ms * (1 - 1e-9):
         held = ", ".join(f"{name}: {of.cores}" for name, of in jobs.items())
-        yield Fault(
-            f"candidates.{candidate}",
+        yield (
             f"its jobs do not fit side by side on the {node.cores} cores of {node.name} ({held}) "
             f"and take at least {needed_ms:.4g} ms in every {period_ms:.4g} ms: it can never keep "
-            "pace; lower their threads, or place less there",
+            "pace; lower their threads, or place less there"
         )
 
 
@@ -274,30 +247,6 @@ def _needed_ms(jobs: Sequence[_Jobs], cores: int) -> float:
                 largest[held:] = np.maximum(largest[held:], largest[:-held] + count * weights)
         bounds += (total / largest[-1]).tolist() if chosen else []
     return max(bounds)
-
-
-def _starved_stages(problem: Problem) -> Iterator[Fault]:
-    """Yield stages that those of a higher priority leave no core to."""
-    pipeline, nodes = problem.pipeline, problem.fabric.nodes
-    for candidate, placement in problem.candidates.items():
-        for node in (one for one in nodes.values() if one.scheduler == "priority"):
-            tasks = [task for task, _ in _on_cpu(problem, node, placement)]
-            for task in tasks:
-                above = [other for other in tasks if other.priority > task.priority]
-                held = 0.0
-                for other in above:
-                    execution = other.on[node.name]
-                    threads = min(execution.threads, node.cores)
-                    job_ms = mean_ms(pipeline, other, execution) * execution.threads / threads
-                    busy = min(job_ms / pipeline.period_ms, execution.workers)
-                    held += busy * threads / node.cores
-                if held >= 1:
-                    names = ", ".join(other.name for other in above)
-                    yield Fault(
-                        f"candidates.{candidate}",
-                        f"{task.name} is never done: {names} of a higher priority take all of "
-                        f"{node.name}; place less there, or change tasks.{task.name}.priority",
-                    )
 
 
 def _unused_priorities(problem: Problem) -> Iterator[Fault]:
@@ -334,23 +283,19 @@ def _crossings(problem: Problem, placement: Placement) -> Iterator[tuple[Flow, L
             yield flow, problem.fabric.links[name]
 
 
-def _full_links(problem: Problem) -> Iterator[Fault]:
-    """Yield candidates that send more over a link than it carries, repetitions included."""
-    pipeline, links = problem.pipeline, problem.fabric.links
-    for candidate, placement in problem.candidates.items():
-        sent_bytes = dict.fromkeys(links, 0.0)
-        for flow, link in _crossings(problem, placement):
-            attempts = 1 if link.retransmit_ms is None else 1 / (1 - link.loss)
-            sent_bytes[link.name] += attempts * flow.payload_bytes
-        for name, count in sent_bytes.items():
-            mbps = 8e-3 * count / pipeline.period_ms
-            if mbps > links[name].rate_mbps:
-                yield Fault(
-                    f"candidates.{candidate}",
-                    f"it sends {mbps:.4g} Mbit/s over {name}, which carries "
-                    f"{links[name].rate_mbps:.4g}: messages wait ever longer; send less, or "
-                    "raise rate_mbps",
-                )
+def _full_links(problem: Problem, placement: Placement) -> Iterator[str]:
+    """Yield links over which more is sent than they carry, repetitions included."""
+    sent_bytes = dict.fromkeys(problem.fabric.links, 0.0)
+    for flow, link in _crossings(problem, placement):
+        attempts = 1 if link.retransmit_ms is None else 1 / (1 - link.loss)
+        sent_bytes[link.name] += attempts * flow.payload_bytes
+    for name, link in problem.fabric.links.items():
+        mbps = 8e-3 * sent_bytes[name] / problem.pipeline.period_ms
+        if mbps > link.rate_mbps:
+            yield (
+                f"it sends {mbps:.4g} Mbit/s over {name}, which carries {link.rate_mbps:.4g}: "
+                "messages wait ever longer; send less, or raise rate_mbps"
+            )
 
 
 def _fast_links(problem: Problem) -> Iterator[Fault]:
@@ -376,24 +321,20 @@ def _same_placements(problem: Problem) -> Iterator[Fault]:
             )
 
 
-def _over_caps(problem: Problem, profile: Profile) -> Iterator[Fault]:
-    """Yield candidates that are over a cap before anything disturbs them."""
-    cap_ms, cap = problem.objective.caps.latency_ms, problem.objective.caps.utilisation
-    for name, l95_ms in profile.uncut_l95_ms.items():
-        if l95_ms > cap_ms:
-            yield Fault(
-                f"candidates.{name}",
-                f"L95 is {milliseconds(l95_ms)} ms undisturbed, over the cap of {cap_ms:g} ms: it "
-                "is never eligible while another one is",
+def _over_caps(problem: Problem, placement: Placement, l95_ms: float) -> Iterator[str]:
+    """Yield the caps that a candidate is over before anything disturbs it."""
+    caps = problem.objective.caps
+    never = "it is never eligible while another one is"
+    if l95_ms > caps.latency_ms:
+        shown_ms = milliseconds(l95_ms)
+        yield f"L95 is {shown_ms} ms undisturbed, over the cap of {caps.latency_ms:g} ms: {never}"
+    for name, share in _own_shares(problem, placement).items():
+        resource = problem.fabric.resources[name]
+        if resource.kind and caps.utilisation < share <= 1:
+            yield (
+                f"its own work takes {share:.0%} of {resource.kind} of {resource.node}, "
+                f"over the cap of {caps.utilisation:.0%}: {never}"
             )
-    for name, placement in problem.candidates.items():
-        for (node, kind), share in _accelerator_shares(problem, placement).items():
-            if cap < share <= 1:
-                yield Fault(
-                    f"candidates.{name}",
-                    f"its own work takes {share:.0%} of {kind} of {node}, over the cap of "
-                    f"{cap:.0%}: it is never eligible while another one is",
-                )
 
 
 def _percentages(problem: Problem) -> Iterator[Fault]:
@@ -530,7 +471,9 @@ def _late_releases(problem: Problem) -> Iterator[Fault]:
 def _odd_traces(problem: Problem) -> Iterator[Fault]:
     """Yield traces by time whose instants are probably wrong, or in another unit."""
     period_ms = problem.pipeline.period_ms
-    for table in {id(table): table for table in _tables(problem.drawn)}.values():
+    processes = chain.from_iterable(map(partial(processes_of, problem), problem.scenarios.values()))
+    traces = (process for _, process in processes if isinstance(process, Trace))
+    for table in {id(trace.table): trace.table for trace in traces}.values():
         if table.time_ms is None:
             continue
         # Each group begins at 0: no positive step leads into it.
@@ -546,33 +489,21 @@ def _odd_traces(problem: Problem) -> Iterator[Fault]:
             yield Fault(table.file, f"its rows last {odd}; convert its instants to ms")
 
 
-def _tables(part: object) -> Iterator[TraceTable]:
-    """Yield the tables of the traces in a part of a cell."""
-    if isinstance(part, Trace):
-        yield part.table
-    elif isinstance(part, Mapping | tuple):
-        for inner in part.values() if isinstance(part, Mapping) else part:
-            yield from _tables(inner)
-    elif is_dataclass(part):
-        for one in fields(part):
-            yield from _tables(getattr(part, one.name))
-
-
 def _stale_commands(problem: Problem) -> Iterator[Fault]:
     """Yield a largest age of commands that is less than the latency of each cycle."""
     pipeline, age_ms = problem.pipeline, problem.live.max_age_ms
     if age_ms is None:
         return
     for candidate, placement in problem.candidates.items():
-        links, end_ms = dict(_crossings(problem, placement)), dict[str, float]()
-        for name in pipeline.topological():
-            task, ready_ms = pipeline.tasks[name], pipeline.tasks[name].offset_ms
-            for flow in pipeline.inputs(name):
-                sent_ms = _shortest(links[flow].delay_ms) if flow in links else 0.0
-                ready_ms = max(ready_ms, end_ms[flow.source] + sent_ms)
+        links = dict(_crossings(problem, placement))
+        sent_ms = [
+            _shortest(links[flow].delay_ms) if flow in links else 0.0 for flow in pipeline.flows
+        ]
+        job_ms = []
+        for name, task in pipeline.tasks.items():
             scale = 1.0 if task.scale is None else _shortest(pipeline.scales[task.scale])
-            end_ms[name] = ready_ms + scale * _shortest(task.on[placement[name]].exec_ms)
-        shortest_ms = max(end_ms.values())
+            job_ms.append(np.array(scale * _shortest(task.on[placement[name]].exec_ms)))
+        shortest_ms = float(longest_path(steps_of(pipeline), job_ms, sent_ms))
         if age_ms < shortest_ms:
             yield Fault(
                 "live.max_age_ms",
@@ -626,7 +557,7 @@ def _without_effect(problem: Problem) -> Iterator[Fault]:
     """Yield disturbances and bursts that change nothing."""
     for name, items in problem.scenarios.items():
         for index, item in enumerate(items):
-            if not _does_something(problem, item):
+            if not acts(item, problem.fabric):
                 keys = "stress_threads or down"
                 if not isinstance(item, NodeDisturbance):
                     keys = "add_delay_ms, loss, a rate_mbps below the link's, or down"
@@ -642,14 +573,3 @@ def _without_effect(problem: Problem) -> Iterator[Fault]:
             yield Fault(
                 f"links[{index}].bursts", "do nothing; give them add_delay_ms, or remove them"
             )
-
-
-def _does_something(problem: Problem, item: Disturbance) -> bool:
-    """Whether a disturbance changes anything while it is on."""
-    if item.down:
-        return True
-    if isinstance(item, NodeDisturbance):
-        return item.stress_threads > 0
-    delays = item.add_delay_ms is not None and item.add_delay_ms.expectation > 0
-    slows = item.rate_mbps < problem.fabric.links[item.link].rate_mbps
-    return delays or slows or item.loss > 0

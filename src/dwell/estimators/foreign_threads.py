@@ -68,14 +68,20 @@ class _Jobs(NamedTuple):
 class ForeignThreads:
     """Foreign threads of one node beyond those that are declared.
 
+    Parameters
+    ----------
+    node : Node
+    decisions : float
+        Decisions per window.
+
     Attributes
     ----------
     beyond : float
         How many more there are; negative where there are fewer.
     """
 
-    def __init__(self, node: Node) -> None:
-        self.node = node
+    def __init__(self, node: Node, decisions: float = 1.0) -> None:
+        self.node, self._most = node, round(WINDOWS * decisions)
         self.beyond = 0.0
         self._mean, self._windows = 0.0, 0
 
@@ -128,7 +134,7 @@ class ForeignThreads:
 
     def _see(self, seen: float, noise: float) -> bool:
         is_jump = abs(seen - self._mean) > noise or (seen == 0.0) != (self._mean == 0.0)
-        self._windows = 1 if is_jump else min(self._windows + 1, WINDOWS)
+        self._windows = 1 if is_jump else min(self._windows + 1, self._most)
         self._mean += (seen - self._mean) / self._windows
         # What drifts is taken over in steps.
         step = LEAST_SHARE / 2 * (self.node.capacity + abs(self._mean))

@@ -61,7 +61,9 @@ class Learning(Online):
         self.shadow_fraction = given
         half_life = settings.half_life_windows if half_life_windows is None else half_life_windows
         HALF_LIFE_WINDOWS.check("half_life_windows", half_life)
-        self.memory, self.unseen = self.MEMORY * half_life, self.UNSEEN * half_life
+        #: In decisions.
+        decisions = half_life * problem.decisions_per_window
+        self.memory, self.unseen = self.MEMORY * decisions, self.UNSEEN * decisions
         self.seed = seed
         self.start(problem)
 
@@ -79,6 +81,7 @@ class Learning(Online):
     def start(self, problem: Problem) -> None:
         """Forget everything but the profile."""
         super().start(problem)
+        #: Decisions that have been learnt from.
         self._window = 0
         self._pools = {
             part: Pool(reference, isinstance(part, Message))
@@ -118,7 +121,7 @@ class Learning(Online):
         return {
             name: Support(
                 min(self._pools[part].measured for part in parts),
-                self._window - min(self._pools[part].last for part in parts),
+                self._windows_since(min(self._pools[part].last for part in parts)),
             )
             for name, parts in self._parts.items()
         }
@@ -134,7 +137,11 @@ class Learning(Online):
     def _widening(self, pool: Pool) -> float:
         if pool.is_declared:
             return 0.0
-        return WIDENING * math.sqrt(max(self._window - pool.last, 0))
+        return WIDENING * math.sqrt(max(self._windows_since(pool.last), 0))
+
+    def _windows_since(self, decision: int) -> float:
+        """Return the age of what was learnt at a decision, in windows."""
+        return (self._window - decision) / self.problem.decisions_per_window
 
     def _known_error(self, name: str, rate: float) -> tuple[float, float]:
         pools = [self._pools[part] for part in self._parts[name]]

@@ -69,7 +69,10 @@ class Online(CellEstimator):
             name: tuple(dict.fromkeys(parts_of(problem.pipeline, placed)))
             for name, placed in problem.candidates.items()
         }
-        self._foreign = {name: ForeignThreads(node) for name, node in problem.fabric.nodes.items()}
+        every = problem.decisions_per_window
+        self._foreign = {
+            name: ForeignThreads(node, every) for name, node in problem.fabric.nodes.items()
+        }
         self._down: frozenset[str] = frozenset()
         self._shared: frozenset[str] = frozenset()
         #: Counts presents: changes, and every time that what is known of one has doubled.

@@ -53,7 +53,7 @@ UNSETTLED = 3.0
 #: How much more is played than seems to be needed, since the error is itself an estimate.
 AMPLE = 1.2
 #: Of how many questions the answers are kept.
-KEPT = 64
+KEPT = 512
 #: Longer windows are played as windows of so many cycles.
 LONGEST_WINDOW = 4_000
 
@@ -77,7 +77,7 @@ class Price:
         Share of each resource that the cell's jobs take: a node, or a kind of accelerator.
     foreign, foreign_deviation : mapping of str to float
         Share of each resource that neither those nor shadow jobs take, with the standard deviation
-        from window to window.
+        from decision to decision.
     cycles : int
         How many cycles were played, those at the begin that do not count included.
     lost_windows : float
@@ -130,6 +130,7 @@ class Question:
     censor_ms: float
     close_grace_ms: float
     scenario: Scenario
+    decide_cycles: int
     name: str
     seed: int
     cycles: int | None
@@ -156,6 +157,7 @@ class Question:
             censor_ms=problem.censor_ms,
             close_grace_ms=problem.controller.close_grace_ms,
             scenario=problem.scenario(scenario),
+            decide_cycles=problem.decide_cycles,
             name=scenario,
             seed=seed,
             cycles=cycles,
@@ -295,7 +297,7 @@ def price_of(
         Whether no more may be simulated, and errors have to take account of slow processes.
     """
     sent = shadows.realisation if shadows else None
-    arrays = lay_out([(problem, realisation)], shadows=[sent])
+    arrays = lay_out([(problem, realisation)], shadows=[sent], decides=True)
     index = list(problem.candidates).index(name)
     arrays.replace(stamps=stamps_of(arrays, index, shadows))
     play(arrays)
@@ -326,8 +328,11 @@ def price_of(
     open_windows = is_young.reshape(len(seen), -1).any(axis=1)
     if not open_windows.all():
         uncut_ms, is_lost = uncut_ms[~open_windows], is_lost[~open_windows]
-    busy, own, shadow, _ = np.moveaxis(tables.shares[0, first:], 1, 0)
-    foreign = np.maximum(busy - own - shadow, 0.0)
+    _, own, _, _ = np.moveaxis(tables.shares[0, first:], 1, 0)
+    foreign = _foreign(tables.shares[0, first:])
+    stretches = foreign
+    if len(looks := tables.look_shares[0, since // problem.decide_cycles :, 0]):
+        stretches = _foreign(looks)
     by_resource = partial(_by_resource, problem)
     return Price(
         l95_ms=l95_ms,
@@ -338,7 +343,7 @@ def price_of(
         latency_ms=float(finished_ms.mean()) if len(finished_ms) else math.nan,
         own=by_resource(own.mean(axis=0)),
         foreign=by_resource(foreign.mean(axis=0)),
-        foreign_deviation=by_resource(foreign.std(axis=0)),
+        foreign_deviation=by_resource(stretches.std(axis=0)),
         cycles=realisation.cycles,
         lost_windows=float(is_lost.mean()),
         is_settled=bool(slow.loops)
@@ -357,6 +362,13 @@ def _is_settled(by_window: Floats, error: float) -> bool:
     least = math.sqrt(2) * error
     off = abs(first - last) - UNSETTLED * math.hypot(max(error_1, least), max(error_2, least))
     return off <= 1e-9  # more than sums are rounded by
+
+
+def _foreign(shares: Floats) -> Floats:
+    """Share of each resource that neither own nor shadow jobs take, shape (rows, resources)."""
+    busy, own, shadow, _ = np.moveaxis(shares, 1, 0)
+    foreign: Floats = np.maximum(busy - own - shadow, 0.0)
+    return foreign
 
 
 def _by_resource(problem: Problem, shares: Floats) -> Mapping[str, float]:

@@ -128,37 +128,19 @@ class Profile(CellEstimator):
         self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
     ) -> dict[str, QoS]:
         """Estimate every candidate's metrics, the incumbent's too (see `Estimator`)."""
-        shares = self.utilisation(observed, incumbent, own, self._work)
+        shares = self.with_work(self.see(observed, incumbent, own), self._work)
         return {
             name: unchecked_qos(l95_ms, violation_rate, shares[name], cut_from_ms)
             for name, l95_ms, violation_rate, cut_from_ms in self._table
         }
 
-    def utilisation(
-        self,
-        observed: QoS,
-        incumbent: str,
-        own: Mapping[str, float],
-        work: Iterable[tuple[str, Iterable[tuple[str, float]]]],
-    ) -> dict[str, FrozenDict[str, float]]:
-        """Estimate the share of every resource that is busy under each candidate.
+    def see(self, observed: QoS, incumbent: str, own: Mapping[str, float]) -> Foreign:
+        """Tell what others took of every resource in a window, and remember what a full one showed.
 
         Parameters
         ----------
         observed, incumbent, own
             As in `estimate`.
-        work : iterable of (candidate, iterable of (resource, share))
-            What the cell itself takes under each candidate, shadow jobs included.
-
-        Raises
-        ------
-        MetricError
-            If a node's utilisation is missing.
-        """
-        return self.with_work(self.see(observed, incumbent, own), work)
-
-    def see(self, observed: QoS, incumbent: str, own: Mapping[str, float]) -> Foreign:
-        """Tell what others took of every resource in a window, and remember what a full one showed.
 
         Raises
         ------
@@ -194,7 +176,13 @@ class Profile(CellEstimator):
     def with_work(
         self, foreign: Foreign, work: Iterable[tuple[str, Iterable[tuple[str, float]]]]
     ) -> dict[str, FrozenDict[str, float]]:
-        """Add the cell's own work under each candidate to what others take (see `utilisation`)."""
+        """Estimate the share of every resource that is busy under each candidate.
+
+        Parameters
+        ----------
+        work : iterable of (candidate, iterable of (resource, share))
+            What the cell itself takes under each candidate, shadow jobs included.
+        """
         estimated = {}
         for name, takes in work:
             utilisation = {}

@@ -23,7 +23,7 @@ from dwell.kernels.realisation import Realisation
 from dwell.model.fabric import Bursts
 from dwell.model.problem import Problem
 from dwell.model.process import AR1, Constant, Process, Trace
-from dwell.model.scenario import LinkDisturbance, NodeDisturbance, Scenario
+from dwell.model.scenario import LinkDisturbance, Scenario, acts
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -155,7 +155,10 @@ class SlowProcesses:
         """
         counted = len(rates) * problem.window_cycles
         if self.has_one_loop and counted >= self.loops[0]:
-            return errors[0], self._loop_error(float(rates.mean()), counted)
+            rate = float(rates.mean())
+            # Cycles beyond whole loops count some rows once more than others.
+            more = math.fmod(counted, self.loops[0]) / counted
+            return errors[0], more * math.sqrt(rate * (1 - rate))
         places, columns = _places(problem, name), np.column_stack((l95_ms, rates))
         rest, by_times = self._by_times(problem, realisation, places, columns)
         squares = np.square(errors)
@@ -168,7 +171,10 @@ class SlowProcesses:
                 least = columns[:, 0].std() / math.sqrt(known), unseen_error(rates.mean(), known)
                 squares = np.maximum(squares, np.square(least))
         if any(counted < cycles for cycles in self.loops):
-            squares = np.maximum(squares, self._unseen_loops(problem, counted, l95_ms))
+            # Each of `STRETCHES` parts of a trace counts as one value.
+            share = unseen_error(0.0, STRETCHES) * math.sqrt(1 - counted / max(self.loops))
+            most_ms = problem.censor_ms - float(l95_ms.mean())
+            squares = np.maximum(squares, np.square((share * most_ms, share)))
         l95_error_ms, rate_error = np.sqrt(squares + by_times).tolist()
         return l95_error_ms, rate_error
 
@@ -206,22 +212,6 @@ class SlowProcesses:
             squares += np.square(effect * share_error)
         return columns, squares
 
-    def _loop_error(self, rate: float, cycles: int) -> float:
-        """Return the standard error of V_D if a single trace is all that is random.
-
-        Cycles beyond whole loops count some rows once more than others.
-        """
-        return math.fmod(cycles, self.loops[0]) / cycles * math.sqrt(rate * (1 - rate))
-
-    def _unseen_loops(self, problem: Problem, cycles: int, l95_ms: Floats) -> Floats:
-        """Return the squared errors of L95 and V_D by the parts of traces that were not replayed.
-
-        Each of `STRETCHES` parts counts as one value.
-        """
-        share = unseen_error(0.0, STRETCHES) * math.sqrt(1 - cycles / max(self.loops))
-        most_ms = problem.censor_ms - float(l95_ms.mean())
-        return np.square((share * most_ms, share))
-
     def whole_loops(self, width: int, most: int) -> int | None:
         """Return after how many windows a single trace that is all that is random was replayed.
 
@@ -250,7 +240,7 @@ class SlowProcesses:
 def slow_processes(problem: Problem, scenario: str) -> SlowProcesses:
     """Return the slow processes of a cell under a scenario."""
     items, fabric = problem.scenario(scenario), problem.fabric
-    processes = list(_processes(problem, items))
+    processes = list(processes_of(problem, items))
     tables = {id(one.table): one.table for _, one in processes if isinstance(one, Trace)}
     loops = tuple(table.loop_cycles(problem.pipeline.period_ms) for table in tables.values())
     # Where instants of rows are closer than releases, a loop does not replay each of them.
@@ -278,7 +268,7 @@ def slow_processes(problem: Problem, scenario: str) -> SlowProcesses:
     )
 
 
-def _processes(problem: Problem, scenario: Scenario) -> Iterator[tuple[frozenset[str], Process]]:
+def processes_of(problem: Problem, scenario: Scenario) -> Iterator[tuple[frozenset[str], Process]]:
     """Yield the processes that have a value for each cycle, and the nodes and links they act on."""
     pipeline, fabric = problem.pipeline, problem.fabric
     yield frozenset(fabric.nodes), pipeline.release_jitter_ms
@@ -308,7 +298,7 @@ def _on_off(problem: Problem, scenario: Scenario) -> Iterator[OnOff]:
             yield _bursts(name, link.bursts)
     for item in scenario:
         episodes = item.episodes
-        if episodes is not None and math.isinf(item.for_s) and _acts(item):
+        if episodes is not None and math.isinf(item.for_s) and acts(item, fabric):
             begin_ns = round(item.at_s * NS_PER_S)
             stream, times = f"episodes/{episodes.name}", (episodes.every_s, episodes.for_s)
             yield OnOff(stream, frozenset((item.place,)), *times, NS_PER_S, begin_ns)
@@ -317,13 +307,6 @@ def _on_off(problem: Problem, scenario: Scenario) -> Iterator[OnOff]:
 def _bursts(place: str, bursts: Bursts) -> OnOff:
     times = bursts.every_ms, bursts.for_ms
     return OnOff(f"bursts/{place}", frozenset((place,)), *times, NS_PER_MS)
-
-
-def _acts(item: NodeDisturbance | LinkDisturbance) -> bool:
-    if isinstance(item, NodeDisturbance):
-        return item.down or item.stress_threads > 0
-    slows = item.loss > 0 or math.isfinite(item.rate_mbps)
-    return item.down or slows or item.add_delay_ms is not None
 
 
 def _places(problem: Problem, name: str) -> frozenset[str]:

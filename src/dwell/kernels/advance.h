@@ -1,4 +1,4 @@
-// The event loop: one call plays a simulation to the next close of a window, or to its end.
+// The event loop: one call plays a simulation to the next decision, or to its end.
 #pragma once
 
 #include "rules.h"
@@ -49,16 +49,28 @@ void handle(S& s, i64 key, i64 now) {
       break;
     case kRelease:
       open_window(s, cell, cycle, now);
+      open_looks(s, cell, cycle, now);
       release(s, cell, cycle, now);
       break;
     case kMigrate:
     case kClose:
+    case kDecide:
     case kGuard:
       break;  // the loop's own
   }
 }
 
-// Plays events until a window closes (where `pauses` is set), or room runs out, or the budget, or
+// Has the built-in policy decide on what a decision looks at, where there is one; returns whether
+// the call ends here.
+template <class S>
+bool pauses_at(S& s, i64 index) {
+  if (s.rule.size == 0) return s.clock[0].pauses != 0;
+  if (!decide(s, index)) return true;
+  stamp_next(s);
+  return false;
+}
+
+// Plays events until a decision is due (where `pauses` is set), or room runs out, or the budget, or
 // every window has closed.
 //
 // Whatever happens often is inlined here (`flatten`): the loop takes a sixth less time.
@@ -66,7 +78,10 @@ template <class S>
 [[gnu::flatten]] Status play(S& s) {
   // How many cells wait for a close, or migrate: without any the run is over.
   i64 waiting = 0;
-  for (i64 cell = 0; cell < s.cells.size; ++cell) waiting += announce_close(s, cell);
+  for (i64 cell = 0; cell < s.cells.size; ++cell) {
+    waiting += announce_close(s, cell);
+    announce_look(s, cell);
+  }
   const i64 margin = s.clock[0].margin, end_ns = s.clock[0].end_ns;
   i64 budget = s.clock[0].budget;
   while (waiting > 0 && !s.queue.is_empty()) {
@@ -83,13 +98,17 @@ template <class S>
       if (cycle_of(event.key) != s.cell(cell).close_cycle) continue;
       const i64 window = s.cell(cell).window;
       close_window(s, cell, now);
-      if (s.rule.size > 0) {
-        if (!decide(s, window)) return kPaused;
-        stamp_next(s);
-      } else if (s.clock[0].pauses) {
-        return kPaused;
-      }
+      if (s.cell(cell).decide_cycles == 0 && pauses_at(s, window)) return kPaused;
       waiting += announce_close(s, cell) - 1;
+      continue;
+    }
+    if (kind == kDecide) {
+      // A decision that a move has put off is not due.
+      if (cycle_of(event.key) != s.cell(cell).look_cycle) continue;
+      const i64 index = s.cell(cell).look;
+      look(s, cell, now);
+      if (pauses_at(s, index)) return kPaused;
+      announce_look(s, cell);
       continue;
     }
     if (now > end_ns) break;

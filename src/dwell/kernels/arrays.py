@@ -123,7 +123,7 @@ class Arrays:
             `work`, `switching` and `tiers`.
         """
         candidates, resources = tables["work"].shape
-        windows = self.tables.seen.shape[1]
+        decisions = self.tables.looked.shape[1] or self.tables.seen.shape[1]
         rule = _table("rule", [numbers], 0)
         rows = np.zeros(candidates, row_types()["options"])
         for name, values in options.items():
@@ -135,8 +135,8 @@ class Arrays:
                 rule=rule,
                 options=rows,
                 shown=np.ones((resources, candidates)),
-                decided=np.zeros(windows, row_types()["decided"]),
-                priced=np.zeros((windows, columns)),
+                decided=np.zeros(decisions, row_types()["decided"]),
+                priced=np.zeros((decisions, columns)),
                 **tables,
             )
         )
@@ -180,6 +180,7 @@ class Arrays:
 BY_CELL = (
     *("cells", "stamps", "latency_ns", "compute_ns", "network_ns", "outcome"),
     *("opened", "closed", "seen", "shares"),
+    *("look_opened", "look_closed", "looked", "look_shares"),
 )
 
 
@@ -209,6 +210,8 @@ class CellArrays:
             rows = {name: getattr(whole, name)[own] for name in BY_CELL}
             for name in ("opened", "closed", "shares"):
                 rows[name] = rows[name][:, : part.windows, :, : part.resources]
+            for name in ("look_opened", "look_closed", "look_shares"):
+                rows[name] = rows[name][..., : part.resources]
             if len(whole.shadow_bytes):
                 rows["shadow_bytes"] = whole.shadow_bytes[part.row, cycles]
             self._tables = whole._replace(
@@ -238,6 +241,7 @@ def lay_out(
     shared: Collection[str] = (),
     log_jobs: bool = False,
     log_windows: bool = False,
+    decides: bool = False,
     shadows: Sequence[Realisation | None] = (),
 ) -> Arrays:
     """Build the tables of one or more cells.
@@ -251,11 +255,13 @@ def lay_out(
         Whether every job's instants are kept.
     log_windows : bool
         Whether those of a window are kept until it has closed.
+    decides : bool
+        Whether `look` tables are kept for decisions that come more often than windows close.
     shadows : sequence of Realisation
         By cell, draws for its shadow jobs (see `draw_shadows`): it gets a shadow then; None: it has
         none.
     """
-    return _Layout(cells, shared, log_jobs, log_windows, shadows).arrays()
+    return _Layout(cells, shared, log_jobs, log_windows, decides, shadows).arrays()
 
 
 class _Layout:
@@ -267,10 +273,18 @@ class _Layout:
         shared: Collection[str],
         logs_all: bool,
         logs_windows: bool,
+        decides: bool,
         shadows: Sequence[Realisation | None],
     ) -> None:
         self.cells, self.shared = cells, frozenset(shared)
         self.logs_all, self.logs_windows = logs_all, logs_windows
+        #: Cycles between two decisions of each cell; 0 where windows are decided on.
+        self.decide_cycles = [
+            problem.decide_cycles
+            if decides and problem.decide_cycles < problem.window_cycles
+            else 0
+            for problem, _ in cells
+        ]
         self.shadows = shadows if any(one is not None for one in shadows) else ()
         self.cycles = max(real.cycles for _, real in cells)
         self.max_tasks = max(len(problem.pipeline.tasks) for problem, _ in cells)
@@ -422,6 +436,8 @@ class _Layout:
             "longest_ms": round(problem.censor_ms * 1e6) / 1e6,
             "close_cycle": problem.window_cycles,
             "window_cycles": problem.window_cycles,
+            "decide_cycles": self.decide_cycles[index],
+            "look_cycle": self.decide_cycles[index],
             "task_0": len(self.rows["tasks"]),
             "n_tasks": part.tasks,
             "flow_0": len(self.rows["flows"]),
@@ -495,6 +511,7 @@ class _Layout:
         cells[part.row]["shadow"] = len(cells)
         # Its windows never close.
         shadow = {"candidate_0": len(self.site_of), "close_cycle": real.cycles + 1}
+        shadow["decide_cycles"] = 0
         cells.append(cells[part.row] | shadow | {"shadow": -1, "parent": part.row})
         self.parts[index] = part._replace(rows=2)
         for node, kind in list(self.server_row):
@@ -645,6 +662,10 @@ class _Layout:
             server["base"] = base
             base += max(workers, 1) + self._foreign(server, changes)
         windows, slots = max(real.windows for _, real in self.cells), self._slots()
+        looks = max(
+            real.cycles // every if every else 0
+            for (_, real), every in zip(self.cells, self.decide_cycles, strict=True)
+        )
         margin = 64 + sum(len(rows[name]) for name in ("sites", "flows", "tasks", "servers"))
         n_layers = 1 + max((layer for known in self.layers for layer in known), default=0)
         clock = {
@@ -656,6 +677,7 @@ class _Layout:
             "has_shared": len(self.cells) > 1 and bool(self.shared),
             "n_cycles": cycles,
             "n_windows": windows,
+            "n_looks": looks,
             "margin": margin,
             "budget": BUDGET,
             "logs_all": self.logs_all,
@@ -680,6 +702,11 @@ class _Layout:
             **dict.fromkeys(("stamps", "compute_ns", "network_ns", "outcome"), (cells, cycles)),
             **dict.fromkeys(("opened", "closed", "shares"), of_parts),
             "seen": (cells, windows),
+            **dict.fromkeys(
+                ("look_opened", "look_shares"), (cells, looks, 2, PARTS, self.max_resources)
+            ),
+            "look_closed": (cells, looks, PARTS, self.max_resources),
+            "looked": (cells, looks),
             "layers": (len(self.layers), n_layers),
             "following": len(rows["events"]) + room["events"],
             "days": n_days,

@@ -14,7 +14,7 @@ enum Scheduler : i8 { kFair, kFifo, kPriority, kTurns };
 // What a task is to the shadow of a cycle.
 enum ShadowPart : i8 { kShared, kShadowed, kDiscarded };
 
-// What a call ends with. `kPaused`: a window of `closed_cell` has closed; stamp the next cycles and
+// What a call ends with. `kPaused`: `closed_cell` is to be decided on; stamp the next cycles and
 // call again. `kFinished`: no window is left to close. `kGrowEvents`, `kGrowRing`: enlarge the
 // queue, or the ring of cycles in flight, and call again; nothing was lost. `kStep`: the caller's
 // event `step_key` is due at `step_ns`. `kBusy`: the budget of events is spent; call again.
@@ -38,6 +38,7 @@ enum Kind : i8 {
   kRestart,
   kMigrate,
   kClose,
+  kDecide,
   kGuard,
   kRelease,
 };

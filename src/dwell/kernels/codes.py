@@ -29,7 +29,7 @@ class ShadowPart(IntEnum):
 class Status(IntEnum):
     """What a call of the event loop ends with.
 
-    PAUSED: a window has closed; stamp the next cycles and go on. FINISHED: no window is left to
+    PAUSED: a decision is due; stamp the next cycles and go on. FINISHED: no window is left to
     close. GROW_EVENTS, GROW_RING: enlarge the queue, or the ring of cycles in flight, and go on;
     nothing was lost. STEP: the caller's event is due. BUSY: the budget of events is spent; go on.
     """
@@ -61,9 +61,10 @@ class EventKind(IntEnum):
         RESTART,
         MIGRATE,
         CLOSE,
+        DECIDE,
         GUARD,
         RELEASE,
-    ) = range(10)
+    ) = range(11)
 
 
 # A key packs (kind, cell, cycle, item), so that keys order as the tuple does. The item is a task

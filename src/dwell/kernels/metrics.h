@@ -13,21 +13,23 @@ constexpr i64 l95_rank(i64 n) { return (19 * n + 19) / 20; }
 // Whether a value at a rank, of ages among latencies, is that of a cycle that has not completed: of
 // equal values those come last.
 template <class S>
-bool is_age(const S& s, const Cell& cell, i64 row, i64 first, i64 rank, i64 value, i64 now) {
+bool is_age(const S& s, i64 cell, i64 first, i64 n, i64 value, i64 now) {
+  const Cell& of = s.cell(cell);
+  const i64 row = s.output(cell, first);
   i64 before = 0;
-  for (i64 i = 0; i < cell.window_cycles; ++i) {
+  for (i64 i = 0; i < n; ++i) {
     const i64 latency_ns = s.latency_ns[row + i];
-    const i64 age_ns = now - cell.release_ns[first + i];
+    const i64 age_ns = now - of.release_ns[first + i];
     before += std::min(latency_ns, age_ns) < value || (latency_ns == value && latency_ns <= age_ns);
   }
-  return before < rank;
+  return before < l95_rank(n);
 }
 
-// Writes what the window that closes now shows.
+// What `n` cycles show now.
 template <class S>
-void measure(S& s, i64 cell, i64 window, i64 first, i64 now) {
+Seen measure(S& s, i64 cell, i64 first, i64 n, i64 now) {
   const Cell& of = s.cell(cell);
-  const i64 n = of.window_cycles, row = s.output(cell, first), rank = l95_rank(n);
+  const i64 row = s.output(cell, first), rank = l95_rank(n);
   i64 missed = 0, unfinished = 0;
   for (i64 i = 0; i < n; ++i) {
     const i64 latency_ns = s.latency_ns[row + i];
@@ -40,18 +42,22 @@ void measure(S& s, i64 cell, i64 window, i64 first, i64 now) {
   std::nth_element(ages, ages + rank - 1, ages + n);
   const i64 l95_ns = ages[rank - 1];
   const f64 l95_ms = static_cast<f64>(l95_ns) / 1e6;
-  const bool lost = unfinished > n - rank && is_age(s, of, row, first, rank, l95_ns, now);
-  s.seen[cell * s.clock[0].n_windows + window] =
-      Seen{first, missed, std::min(l95_ms, of.longest_ms),
-           lost ? std::numeric_limits<f64>::infinity() : l95_ms};
+  const bool lost = unfinished > n - rank && is_age(s, cell, first, n, l95_ns, now);
+  return Seen{first, n, missed, std::min(l95_ms, of.longest_ms),
+              lost ? std::numeric_limits<f64>::infinity() : l95_ms};
+}
 
-  const i64 at = snapshot_row(s, cell, window), n_resources = s.clock[0].n_resources;
+// Writes the share of each resource that was used from the release of a cycle until now.
+template <class S>
+void measure_shares(const S& s, i64 cell, const f64* opened, const f64* closed, i64 first, i64 now,
+                    f64* shares) {
+  const Cell& of = s.cell(cell);
   const f64 span_ns = static_cast<f64>(now - of.release_ns[first]);
   for (i64 part = 0; part < kParts; ++part) {
     for (i64 i = 0; i < of.n_resources; ++i) {
-      const i64 place = at + part * n_resources + i;
-      const f64 used_ns = s.closed[place] - s.opened[place];
-      s.shares[place] = std::min(used_ns / (s.capacity[of.resource_0 + i] * span_ns), 1.0);
+      const i64 place = part * s.clock[0].n_resources + i;
+      const f64 used_ns = closed[place] - opened[place];
+      shares[place] = std::min(used_ns / (s.capacity[of.resource_0 + i] * span_ns), 1.0);
     }
   }
 }
@@ -60,13 +66,34 @@ void measure(S& s, i64 cell, i64 window, i64 first, i64 now) {
 template <class S>
 [[gnu::noinline]] void close_window(S& s, i64 cell, i64 now) {
   Cell& of = s.cell(cell);
-  snapshot(s, &s.closed[snapshot_row(s, cell, of.window)], cell, now);
-  measure(s, cell, of.window, of.close_cycle - of.window_cycles, now);
+  const i64 first = of.close_cycle - of.window_cycles, row = snapshot_row(s, cell, of.window);
+  snapshot(s, &s.closed[row], cell, now);
+  s.seen[cell * s.clock[0].n_windows + of.window] = measure(s, cell, first, of.window_cycles, now);
+  measure_shares(s, cell, &s.opened[row], &s.closed[row], first, now, &s.shares[row]);
   s.clock[0].closed_cell = cell;
   of.close_pending = 0;
   of.window += 1;
   of.window_first = of.close_cycle;
   of.close_cycle += of.window_cycles;
+}
+
+// Looks at the cycles that a decision is about: the last W under the placement in force, or fewer.
+template <class S>
+[[gnu::noinline]] void look(S& s, i64 cell, i64 now) {
+  Cell& of = s.cell(cell);
+  const i64 end = of.look_cycle, n = std::min(of.window_cycles, end - of.since);
+  const i64 stretch = look_row(s, cell, of.look, 0), row = look_row(s, cell, of.look, 1);
+  const i64 opened = end - n == of.since ? look_row(s, cell, of.look_0, 0) : row;
+  const f64* closed = &s.look_closed[look_end_row(s, cell, of.look)];
+  snapshot(s, &s.look_closed[look_end_row(s, cell, of.look)], cell, now);
+  s.looked[cell * s.clock[0].n_looks + of.look] = measure(s, cell, end - n, n, now);
+  measure_shares(s, cell, &s.look_opened[stretch], closed, end - of.decide_cycles, now,
+                 &s.look_shares[stretch]);
+  measure_shares(s, cell, &s.look_opened[opened], closed, end - n, now, &s.look_shares[row]);
+  s.clock[0].closed_cell = cell;
+  of.look_pending = 0;
+  of.look += 1;
+  of.look_cycle += of.decide_cycles;
 }
 
 }  // namespace dwell

@@ -42,25 +42,30 @@ struct Crossing;  // of meter.cpp
   field(i64, n_slots) field(i64, n_tasks) field(i64, n_flows) field(i64, n_layers)               \
   field(i64, n_resources) /* of a cell */                                                        \
   field(i64, has_shared) /* whether cells have servers in common */                              \
-  field(i64, n_cycles) field(i64, n_windows) field(i64, n_priced) /* columns of the outputs */    \
+  field(i64, n_cycles) field(i64, n_windows) field(i64, n_looks)                                 \
+  field(i64, n_priced) /* columns of the outputs */                                              \
   field(i64, margin) field(i64, budget)                                                          \
   field(i64, logs_all) /* whether logs are of all cycles, or of those in the ring */             \
   field(i64, n_events) field(i64, first_event) field(i64, used_events) field(i64, free_event)    \
   field(i64, n_held)                                                                             \
   field(i64, is_calendar) field(i64, day_bits) /* a day is 2^day_bits ns; see queue.h */         \
   field(i64, next_change)                                                                        \
-  field(i64, pauses) /* whether a call ends when a window closes */                              \
+  field(i64, pauses) /* whether a call ends when the cell is to be decided on */                 \
   field(i64, closed_cell)                                                                        \
   field(i64, step_key) field(i64, step_ns)                                                       \
   field(i64, end_ns) /* of the last close that any cell can have */
 
 // A window closes no earlier than `due_ns` after the release of its last cycle, and `grace_ns` after
 // that of the one beyond it. `wakes_ns` is when the guard is woken if no cycle from `waited` on has
-// been heard to complete, and `patience_ns` is g periods.
+// been heard to complete, and `patience_ns` is g periods. Decisions that come more often than
+// windows look at `decide_cycles` cycles each, the next one at those before `look_cycle`, and the
+// first `look_0` of the placement in force begins with the cycle `since`; 0 for one a window.
 #define DWELL_CELL(field)                                                                        \
   field(Times, release_ns) field(i64, due_ns) field(i64, grace_ns)                               \
   field(i64, n_cycles) field(i64, window) field(i64, window_first) field(i64, close_cycle)       \
   field(i64, close_pending) field(i64, window_cycles) field(i64, migrating)                      \
+  field(i64, decide_cycles) field(i64, since) field(i64, look_0) field(i64, look)                \
+  field(i64, look_cycle) field(i64, look_pending)                                                \
   field(i64, deadline_ns) field(f64, longest_ms) /* with which latencies beyond it count */       \
   field(i64, wakes_ns) field(i64, patience_ns) field(i64, waited)                                \
   field(i64, period_ns) field(i64, released) /* cycles */                                        \
@@ -168,9 +173,11 @@ struct Crossing;  // of meter.cpp
 #define DWELL_LOG(field)                                                                         \
   field(i64, ready_ns) field(i64, start_ns) field(i64, end_ns) field(i64, work_ns)
 
-// A closed window as it could be known then: `uncut_ms` is L95 without the cell's `longest_ms`.
+// Cycles as they could be known when a window closed, or a decision was due: `uncut_ms` is L95
+// without the cell's `longest_ms`.
 #define DWELL_SEEN(field)                                                                        \
-  field(i64, first_cycle) field(i64, missed) field(f64, l95_ms) field(f64, uncut_ms)
+  field(i64, first_cycle) field(i64, cycles) field(i64, missed)                                  \
+  field(f64, l95_ms) field(f64, uncut_ms)
 
 // What a built-in policy with the estimator `profile` decides by (rules.h): its own numbers, the
 // objective's, where the cell is, and what `ATP` has added up since its last decision. Of two
@@ -291,6 +298,7 @@ DWELL_ROWS(DWELL_STRUCT)
   table(Rule, rule) table(Option, options) table(f64, shown)                                     \
   table(i64, latency_ns) table(i64, compute_ns) table(i64, network_ns) table(i8, outcome)        \
   table(f64, opened) table(f64, closed) table(Seen, seen) table(f64, shares)                     \
+  table(f64, look_opened) table(f64, look_closed) table(Seen, looked) table(f64, look_shares)    \
   table(Decided, decided) table(f64, priced)                                                     \
   table(i64, shadow_bytes) table(Log, log) table(i8, log_outcome) table(i64, log_arrived)
 

@@ -141,9 +141,13 @@ class Tables(NamedTuple):
     closed: Floats  # (cells, windows, PARTS, resources) at closes
     seen: Rows  # (cells, windows) metrics as they could be known at closes
     shares: Floats  # (cells, windows, PARTS, resources) of the cores or places
-    decided: Rows  # (windows,)
+    look_opened: Floats  # (cells, looks, 2, PARTS, resources) since the last decision, and of W
+    look_closed: Floats  # (cells, looks, PARTS, resources) when a decision is due
+    looked: Rows  # (cells, looks) metrics of the cycles that a decision looks at
+    look_shares: Floats  # (cells, looks, 2, PARTS, resources)
+    decided: Rows  # (decisions,)
     priced: (
-        Floats  # (windows, columns) by candidate: J, L95, V_D, U of each node, is within, excess
+        Floats  # (decisions, columns) by candidate: J, L95, V_D, U of each node, is within, excess
     )
     shadow_bytes: Ints  # (N,) what the shadow of each cycle put on links, or empty
     log: Rows  # (cells * L * tasks,), L being N or the slots (`logs_all`); or empty

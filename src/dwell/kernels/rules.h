@@ -21,7 +21,7 @@ struct Used {
   f64 tier[kNoTier];
 };
 
-// The numbers of one window: a column a candidate, in the order of the table of decisions.
+// The numbers of one decision: a column a candidate, in the order of the table of decisions.
 template <class S>
 struct Priced {
   S& s;
@@ -29,10 +29,10 @@ struct Priced {
   f64* row;
   const i64 n, n_resources;
 
-  Priced(S& simulation, i64 window)
+  Priced(S& simulation, const Seen& of, i64 decision)
       : s(simulation),
-        seen(s.seen[window]),
-        row(&s.priced[window * s.clock[0].n_priced]),
+        seen(of),
+        row(&s.priced[decision * s.clock[0].n_priced]),
         n(s.options.size),
         n_resources(s.cell(0).n_resources) {}
 
@@ -75,9 +75,12 @@ Used used_by_tiers(Priced<S>& priced, i64 candidate) {
   return used;
 }
 
-// Expects of every candidate what its profile says, beside what others were seen to use.
+// Expects of every candidate what its profile says, beside what others were seen to use. The
+// incumbent's utilisation is the one of the cycles that the decision looks at.
 template <class S>
-void estimate(Priced<S>& priced, const f64* used, const f64* own, const f64* shadow) {
+void estimate(Priced<S>& priced, const f64* recent, const f64* observed) {
+  const f64 *used = recent, *own = used + priced.s.clock[0].n_resources;
+  const f64* shadow = own + priced.s.clock[0].n_resources;
   S& s = priced.s;
   const i64 incumbent = s.rule[0].incumbent, n = priced.n;
   for (i64 c = 0; c < n; ++c) {
@@ -99,7 +102,7 @@ void estimate(Priced<S>& priced, const f64* used, const f64* own, const f64* sha
       const f64 expected = std::min(foreign + s.work[c * priced.n_resources + i], 1.0);
       priced.used(i, c) = hides ? shown[c] : expected;
     }
-    priced.used(i, incumbent) = busy;
+    priced.used(i, incumbent) = observed[i];
   }
 }
 
@@ -282,15 +285,19 @@ Choice choose(Priced<S>& priced, f64 measured, f64 alone) {
   return {incumbent, kHold, NAN};
 }
 
-// Decides what follows a window that has closed; false where the caller has to carry it out.
+// Decides on a window that has closed, or on the cycles that a decision looks at; false where the
+// caller has to carry it out.
 template <class S>
-bool decide(S& s, i64 window) {
+bool decide(S& s, i64 decision) {
   Rule& rule = s.rule[0];
-  const i64 incumbent = rule.incumbent, n = s.options.size, n_resources = s.clock[0].n_resources;
-  const f64* shares = &s.shares[snapshot_row(s, 0, window)];
-  Priced<S> priced(s, window);
-  estimate(priced, shares, shares + n_resources, shares + 2 * n_resources);
-  const f64 n_cycles = static_cast<f64>(s.cell(0).window_cycles);
+  const Cell& cell = s.cell(0);
+  const i64 incumbent = rule.incumbent, n = s.options.size;
+  const bool is_window = cell.decide_cycles == 0;
+  Priced<S> priced(s, is_window ? s.seen[decision] : s.looked[decision], decision);
+  const f64* recent = is_window ? &s.shares[snapshot_row(s, 0, decision)]
+                                : &s.look_shares[look_row(s, 0, decision, 0)];
+  estimate(priced, recent, is_window ? recent : &s.look_shares[look_row(s, 0, decision, 1)]);
+  const f64 n_cycles = static_cast<f64>(priced.seen.cycles);
   priced.l95_ms(incumbent) = priced.seen.l95_ms;
   priced.violation_rate(incumbent) = static_cast<f64>(priced.seen.missed) / n_cycles;
   for (i64 c = 0; c < n; ++c) {
@@ -311,21 +318,21 @@ bool decide(S& s, i64 window) {
   rule.dwell = moves ? 0 : rule.dwell + 1;
   rule.previous = incumbent;
   rule.incumbent = choice.placement;
-  s.decided[window] = Decided{measured,
-                              choice.delta_j,
-                              rule.dwell,
-                              static_cast<i32>(incumbent),
-                              static_cast<i32>(choice.placement),
-                              choice.reason};
+  s.decided[decision] = Decided{measured,
+                                choice.delta_j,
+                                rule.dwell,
+                                static_cast<i32>(incumbent),
+                                static_cast<i32>(choice.placement),
+                                choice.reason};
   return !moves;
 }
 
-// Stamps the cycles that may be released before the decision at the next close.
+// Stamps the cycles that may be released before the next decision.
 template <class S>
 void stamp_next(S& s) {
   const Cell& cell = s.cell(0);
   Rule& rule = s.rule[0];
-  i64 reach = cell.close_cycle;
+  i64 reach = cell.decide_cycles == 0 ? cell.close_cycle : cell.look_cycle;
   if (reach <= cell.n_cycles) {
     const i64 closed_ns = close_ns(cell, reach - 1);
     if (closed_ns > cell.release_ns[reach]) {

@@ -84,6 +84,34 @@ inline i64 opens(const Cell& cell, i64 cycle) {
   return beyond % cell.window_cycles == 0 ? cell.window + 1 + beyond / cell.window_cycles : -1;
 }
 
+// Place of a snapshot in `look_opened` and `look_shares`: `part` 0 since the last decision, 1 of
+// the cycles that a decision looks at.
+template <class S>
+i64 look_row(const S& s, i64 cell, i64 look, i64 part) {
+  return ((cell * s.clock[0].n_looks + look) * 2 + part) * kParts * s.clock[0].n_resources;
+}
+
+// Place of a snapshot in `look_closed`.
+template <class S>
+i64 look_end_row(const S& s, i64 cell, i64 look) {
+  return (cell * s.clock[0].n_looks + look) * kParts * s.clock[0].n_resources;
+}
+
+// Takes the snapshots of the decisions for which a cycle is the first one, if it is for any.
+template <class S>
+void open_looks(S& s, i64 cell, i64 cycle, i64 now) {
+  const Cell& of = s.cell(cell);
+  const i64 every = of.decide_cycles, age = cycle - of.since;
+  if (every == 0 || age < 0) return;
+  // It begins the stretch up to a decision, and the W cycles that a decision looks at.
+  const i64 begun[] = {age, age + of.window_cycles - every};
+  for (i64 part = 0; part < 2; ++part) {
+    const i64 look = of.look_0 + begun[part] / every;
+    if (begun[part] % every != 0 || look >= s.clock[0].n_looks) continue;
+    snapshot(s, &s.look_opened[look_row(s, cell, look, part)], cell, now);
+  }
+}
+
 // Opens the window that a cycle is the first of, if it is.
 template <class S>
 void open_window(S& s, i64 cell, i64 cycle, i64 now) {
@@ -107,6 +135,15 @@ bool announce_close(S& s, i64 cell) {
     s.post(close_ns(of, of.close_cycle - 1), make_key(kClose, cell, of.close_cycle, 0));
   }
   return of.close_pending || of.migrating;
+}
+
+// Announces a cell's next decision, where these come more often than windows close.
+template <class S>
+void announce_look(S& s, i64 cell) {
+  Cell& of = s.cell(cell);
+  if (of.decide_cycles == 0 || of.look_pending || of.look_cycle > of.n_cycles) return;
+  of.look_pending = 1;
+  s.post(close_ns(of, of.look_cycle - 1), make_key(kDecide, cell, of.look_cycle, 0));
 }
 
 // Whether the guard is woken now: no cycle from `waited` on has been heard to complete, or the one

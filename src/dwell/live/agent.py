@@ -13,7 +13,6 @@ import psutil
 
 from dwell.errors import LiveError
 from dwell.live.continuity import SetbackDetector
-from dwell.live.control_group import ControlGroup
 from dwell.live.failures import start_thread
 from dwell.live.keys import TWICE
 from dwell.live.messages import Carried, Load, encode
@@ -35,35 +34,14 @@ GAUGE_S = 2.0
 AGENT_BEAT = 5
 
 
-class CpuCount:
-    """Core-nanoseconds that the CPUs that this process may use have been busy.
-
-    Parameters
-    ----------
-    group : ControlGroup, optional
-        Counts only what the processes of a control group have used of any CPU.
-    """
-
-    def __init__(self, group: ControlGroup | None = None) -> None:
-        self.cpus = psutil.Process().cpu_affinity() or range(psutil.cpu_count() or 1)
-        self._group = group
-
-    def busy_ns(self) -> int:
-        """Since the machine was started, with the kernel's resolution of 10 ms; a group's exactly.
-
-        Raises
-        ------
-        LiveError
-            If the group is gone.
-        """
-        if self._group is not None:
-            return self._group.used_ns()
-        times = psutil.cpu_times(percpu=True)
-        busy_s = 0.0
-        for cpu in self.cpus:
-            spent = times[cpu]
-            busy_s += sum(spent) - spent.idle - spent.iowait - spent.guest - spent.guest_nice
-        return round(busy_s * 1e9)
+def busy_ns_of(cpus: Iterable[int]) -> int:
+    """Core-nanoseconds that CPUs have been busy since the machine was started, by its 10 ms."""
+    times = psutil.cpu_times(percpu=True)
+    busy_s = 0.0
+    for cpu in cpus:
+        spent = times[cpu]
+        busy_s += sum(spent) - spent.idle - spent.iowait - spent.guest - spent.guest_nice
+    return round(busy_s * 1e9)
 
 
 class Gauge:
@@ -110,17 +88,23 @@ class Gauge:
 
 
 class Agent:
-    """See the module."""
+    """See the module.
+
+    Parameters
+    ----------
+    busy_ns : callable
+        Returns the core-nanoseconds that the node has been busy so far.
+    """
 
     def __init__(
         self,
         place: RolePlace,
         supervisor: Supervisor,
-        cpu: CpuCount,
+        busy_ns: Callable[[], int],
         accelerator: Gauge | None = None,
     ) -> None:
         self.place, self.supervisor = place, supervisor
-        self._cpu, self._accelerator = cpu, accelerator
+        self._busy_ns, self._accelerator = busy_ns, accelerator
         self.cpu_clock: Callable[[], int] = time.process_time_ns
         # No guard waits for it: it carries nothing that a cycle needs.
         self.pulse = Pulse(place, self._state, every=AGENT_BEAT)
@@ -222,7 +206,7 @@ class Agent:
             grown = cpu_ns - before if cpu_ns >= before else cpu_ns
             self._spent["shadow" if who.endswith(".shadow") else "own"] += grown
         self._read |= processes
-        busy_ns = self._cpu.busy_ns()
+        busy_ns = self._busy_ns()
         used = -1.0 if self._accelerator is None else self._accelerator.value()
         spent = busy_ns, self._spent["own"], self._spent["shadow"]
         each = *processes.items(), (place.who, self.cpu_clock())

@@ -313,6 +313,8 @@ class ControlledCell:
             self._stay(f"the placement became {placement} meanwhile")
             self.moves["guard" if by_guard else "ordered"] += 1
         if by_guard:
+            if self.windows is not None:
+                controller.looked = self.windows.between
             controller.adopt(placement, left=left)
         else:
             if placement != course.placement:
@@ -326,7 +328,6 @@ class ControlledCell:
         self._term_asked = self._number
         resume = self._recorder.open(answer.run)
         self._follow(answer)
-        self.controller.window = resume.window
         self.windows = LiveWindows(self.place.problem, self.offsets, self.controller, resume=resume)
 
     def _follow(self, answer: Accepted) -> None:

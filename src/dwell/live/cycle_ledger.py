@@ -414,7 +414,9 @@ class Ledger:
         for cycle in cycles:
             # What several sinks tell of is one job.
             for hop in {(hop.task, hop.node): hop for hop in cycle.hops}.values():
-                if hop.cpu_ns != UNKNOWN and self._on_cpu(hop):
+                execution = self._execution(hop)
+                on_cpu = execution is not None and execution.accelerator is None
+                if hop.cpu_ns != UNKNOWN and on_cpu:
                     spent[hop.node] += hop.cpu_ns
         return spent
 
@@ -450,10 +452,6 @@ class Ledger:
             names = (one.resource(node) for one, node in executions if one.accelerator is not None)
             known = self._accelerated[candidate] = frozenset(names)
         return known
-
-    def _on_cpu(self, hop: Hop) -> bool:
-        execution = self._execution(hop)
-        return execution is not None and execution.accelerator is None
 
     def _execution(self, hop: Hop) -> Execution | None:
         """Execution of a job; None where its task does not run there."""

@@ -25,8 +25,10 @@ def end_when_told(stopped: threading.Event, at_once: Callable[[], None]) -> None
         nonlocal told
         if told and number != signal.SIGHUP:
             at_once()
+        if not told:
+            # In this thread the signal may have come inside `stopped.wait`, whose lock is held.
+            threading.Thread(target=stopped.set, name="ending", daemon=True).start()
         told = True
-        stopped.set()
 
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:

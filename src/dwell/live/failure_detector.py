@@ -102,11 +102,6 @@ class FailureDetector:
             if process.direct_ns is not None
         )
 
-    def forget(self, now_ns: int, after_ns: int) -> None:
-        """Forget who has been silent for longer than `after_ns`."""
-        for who in [who for who, v in self._processes.items() if now_ns - v.at_ns > after_ns]:
-            del self._processes[who]
-
     def everybody(self, now_ns: int) -> list[tuple[str, Beat, int]]:
         """Return who was heard: name, last beat, and its age."""
         return [(who, v.beat, v.age_ns(now_ns)) for who, v in self._processes.items()]

@@ -141,7 +141,11 @@ def _symptoms(
         sink = status["sinks"][role.task]
         age_ms = status["begun_ms"] if sink["applied_age_ms"] is None else sink["applied_age_ms"]
         if _heard(status, role) and age_ms > limit_ms:
-            why = [*_kept_back(problem, sink["outcome"]), *_notes(status, [role.who])]
+            why = _notes(status, [role.who])
+            # By its last outcome, the gate lets no command through.
+            if sink["outcome"] == STALE:
+                oldest = f"max_age_ms ({problem.max_age_ms:g})"
+                why.insert(0, f"by the clocks, commands are older than {oldest} when they come")
             yield f"{role.who} has applied nothing since {_time(age_ms)}{_because(why)}"
     recent = status["recent"]
     rates = recent["violation_rates"]
@@ -166,13 +170,6 @@ def _notes(status: Mapping[str, Any], names: Sequence[str]) -> list[str]:
     """Return what some processes say of themselves, of those that are heard."""
     known = [status["processes"][who] for who in names if who in status["processes"]]
     return [one["note"] for one in known if one["heard"] and one["note"]]
-
-
-def _kept_back(problem: Problem, outcome: str | None) -> Iterator[str]:
-    """Yield why the gate lets no command through, where it has let the last one not."""
-    if outcome == STALE:
-        oldest = f"max_age_ms ({problem.max_age_ms:g})"
-        yield f"by the clocks, commands are older than {oldest} when they come"
 
 
 def _unreached(

@@ -37,47 +37,7 @@ AGAIN_S = 1.0
 Running: TypeAlias = "subprocess.Popen[bytes] | Survivor"
 
 
-class Launcher:
-    """Runs commands.
-
-    Parameters
-    ----------
-    environment : mapping of str to str, optional
-        Environment of the processes; this one's own if left out.
-    """
-
-    def __init__(self, environment: Mapping[str, str] | None = None) -> None:
-        given = os.environ if environment is None else environment
-        self.environment = {**given, "PYTHONUNBUFFERED": "1"}
-
-    def ready(self) -> bool:
-        """Return whether `start` can be called; called again and again until it can."""
-        return True
-
-    def start(self, command: Sequence[str], log: BinaryIO) -> Running:
-        """Start a process that prints into a log.
-
-        Raises
-        ------
-        OSError
-            If it cannot be started.
-        """
-        return subprocess.Popen(  # noqa: S603 - our own interpreter and module
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            env=self.environment,
-            # Ctrl-C in a terminal is for the agent; a session of its own would make each
-            # process one of the groups that share the CPU, whatever runs in it.
-            process_group=0,
-        )
-
-    def stop(self) -> None:
-        """Take note that nothing will be started any more."""
-
-
-class ForkServer(Launcher):
+class ForkServer:
     """Has processes forked; a `command` is the words that `serve` returns in the new process.
 
     The fork server ends with this process. Those that it has forked do not.
@@ -86,38 +46,50 @@ class ForkServer(Launcher):
     ----------
     program : sequence of str
         Command of the fork server; it calls `serve` with its standard input.
+    environment : mapping of str to str, optional
+        Environment of the processes; this one's own if left out.
     """
 
     def __init__(
         self, program: Sequence[str], environment: Mapping[str, str] | None = None
     ) -> None:
-        super().__init__(environment)
+        given = os.environ if environment is None else environment
+        self.environment = {**given, "PYTHONUNBUFFERED": "1"}
         self._program = list(program)
         self._server: subprocess.Popen[bytes] | None = None
         self._channel: socket.socket | None = None
         self._serves = False
         self._next_s = 0.0
         self._codes: dict[int, int] = {}
-        self._watched: set[int] = set()
+        #: Processes that the present server has forked, and whose end it will report.
+        self.watched: set[int] = set()
 
     def ready(self) -> bool:
-        """Return whether it has done its imports; starts it where it does not run."""
+        """Return whether it has done its imports; starts it where it does not run.
+
+        `start` can be called once it has.
+        """
         if self._channel is None and time.monotonic() >= self._next_s:
-            self._begin()
+            self._next_s = time.monotonic() + AGAIN_S
+            channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            with theirs:
+                # Ctrl-C in a terminal is for the agent; a session of its own would make each
+                # process one of the groups that share the CPU, whatever runs in it.
+                self._server = subprocess.Popen(  # noqa: S603 - our own interpreter and module
+                    self._program, stdin=theirs.fileno(), env=self.environment, process_group=0
+                )
+            self._channel = channel
         self.hear()
         return self._serves
 
-    def _begin(self) -> None:
-        self._next_s = time.monotonic() + AGAIN_S
-        channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with theirs:
-            self._server = subprocess.Popen(  # noqa: S603 - our own interpreter and module
-                self._program, stdin=theirs.fileno(), env=self.environment, process_group=0
-            )
-        self._channel = channel
-
     def start(self, command: Sequence[str], log: BinaryIO) -> Running:
-        """Have a process forked."""
+        """Have a process forked that prints into a log.
+
+        Raises
+        ------
+        OSError
+            If it cannot be started.
+        """
         deadline = time.monotonic() + PATIENCE_S
         if self._channel is not None:
             self._channel.settimeout(PATIENCE_S)
@@ -126,7 +98,7 @@ class ForkServer(Launcher):
         while self._channel is not None and (left_s := deadline - time.monotonic()) > 0:
             reply = self._receive(left_s)
             if "forked" in reply:
-                self._watched.add(reply["forked"])
+                self.watched.add(reply["forked"])
                 return _Forked(self, reply["forked"])
             if "refused" in reply:
                 raise OSError(reply["refused"], os.strerror(reply["refused"]))
@@ -163,13 +135,9 @@ class ForkServer(Launcher):
         self.hear()
         return self._codes.pop(pid, None)
 
-    def watches(self, pid: int) -> bool:
-        """Return whether the server that has forked a process is there, and will tell its end."""
-        return pid in self._watched
-
     def _end(self) -> None:
         channel, self._channel, self._serves = self._channel, None, False
-        self._watched.clear()
+        self.watched.clear()
         if channel is not None:
             channel.close()
         if self._server is not None:
@@ -194,13 +162,10 @@ class Survivor:
 
     def poll(self) -> int | None:
         """Return `UNKNOWN_CODE` when it has ended; None while it runs."""
-        try:
-            process = self._process
-            runs = process is not None and process.is_running()
-            if process is not None and runs and process.status() != psutil.STATUS_ZOMBIE:
+        process = self._process
+        with suppress(psutil.NoSuchProcess):
+            if process and process.is_running() and process.status() != psutil.STATUS_ZOMBIE:
                 return None
-        except psutil.NoSuchProcess:
-            pass
         return UNKNOWN_CODE
 
     def wait(self) -> int:
@@ -222,7 +187,7 @@ class _Forked(Survivor):
         """Return its exit code, negative for a signal; None while it runs."""
         if self._code is None:
             self._code = self._server.code(self.pid)
-        if self._code is None and not self._server.watches(self.pid):
+        if self._code is None and self.pid not in self._server.watched:
             self._code = super().poll()
         return self._code
 
@@ -258,7 +223,10 @@ def serve(stdin: int = 0) -> list[str] | None:
             ready, _, _ = select.select([channel.fileno(), woken], [], [])
             if woken in ready:
                 os.read(woken, LONGEST_BYTES)
-                _tell_of_ended(channel)
+                with suppress(ChildProcessError):
+                    while (ended := os.waitpid(-1, os.WNOHANG)) != (0, 0):
+                        code = os.waitstatus_to_exitcode(ended[1])
+                        _tell(channel, {"ended": ended[0], "code": code})
             if channel.fileno() in ready and (words := _fork(channel)) is not None:
                 return words
     except (EOFError, ConnectionError):
@@ -273,14 +241,6 @@ def serve(stdin: int = 0) -> list[str] | None:
 
 def _tell(channel: socket.socket, what: Mapping[str, int]) -> None:
     channel.sendall(json.dumps(what).encode())
-
-
-def _tell_of_ended(channel: socket.socket) -> None:
-    """Tell how processes have ended that were forked."""
-    with suppress(ChildProcessError):
-        while (ended := os.waitpid(-1, os.WNOHANG)) != (0, 0):
-            pid, status = ended
-            _tell(channel, {"ended": pid, "code": os.waitstatus_to_exitcode(status)})
 
 
 def _fork(channel: socket.socket) -> list[str] | None:

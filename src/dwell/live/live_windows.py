@@ -22,7 +22,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from dwell.control import ClosedWindow, Controller
+from dwell.control import ClosedWindow, Controller, LookedAt
 from dwell.errors import LiveError
 from dwell.live.cycle_ledger import Ledger, LiveCycle, told, violation_rate
 from dwell.live.loads import ProcessLoads
@@ -371,6 +371,7 @@ class LiveWindows:
             close_ns=close_ns,
             open_ns=int(release_ns[0]),
             core_ns=self._ledger.core_ns(cycles, close_ns),
+            looked=LookedAt(self._next_window, cycles[-1].row, self._size),
             evidence=partial(self._ledger.evidence, cycles, release_ns, close_ns, shadows=shadows),
         )
         bound_ns = max(cycle.bound_ns for cycle in cycles)
@@ -391,6 +392,11 @@ class LiveWindows:
         self._next_window += 1
         self._lead = 0
         return closed
+
+    @property
+    def between(self) -> LookedAt:
+        """What a move of the guard's looks at: nothing, and the next window begins with it."""
+        return LookedAt(self._next_window, self.record.next_row - 1, 0)
 
     def _drop(self, count: int) -> None:
         """Leave cycles at the line's beginning to no window."""

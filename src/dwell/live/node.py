@@ -9,11 +9,12 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 from dwell.control import Controller
 from dwell.errors import KernelError, LiveError
-from dwell.live.agent import Agent, CpuCount, Gauge
+from dwell.live.agent import Agent, Gauge, busy_ns_of
 from dwell.live.control_group import own_group
 from dwell.live.controlled_cell import ControlledCell
 from dwell.live.hosting import PLAIN, Hosted, Platform, keep_collections_short, take_turns
@@ -87,14 +88,14 @@ def run_agent(
     security.remind(say, stopped)
     transport = platform.transport(security, who, node)
     launcher = ForkServer(program, environment)
-    supervisor = Supervisor(make_folder(folder), say, launcher=launcher)
+    supervisor = Supervisor(make_folder(folder), say, launcher)
     try:
         for role in wiring.on(node):
             if role.kind not in ("agent", "controller"):
                 supervisor.keep(role.who, words(role.who))
         place = security.place(who, node, transport, Log(say))
         gauge = None if accelerator is None else Gauge(accelerator)
-        agent = Agent(place, supervisor, _cpu_count(problem, node, say), gauge)
+        agent = Agent(place, supervisor, _busy_clock(problem, node, say), gauge)
         clock, complain = platform.clock(problem, node), place.complain
         hosted = Hosted(agent, transport, clock, stopped=stopped, complain=complain)
         keep_collections_short()
@@ -118,17 +119,16 @@ def _unused_hook(problem: Problem, node: str) -> str:
     return f"node {node} has {has} in the cell: what --accelerator returns counts for nothing"
 
 
-def _cpu_count(problem: Problem, node: str, say: Callable[[str], None]) -> CpuCount:
+def _busy_clock(problem: Problem, node: str, say: Callable[[str], None]) -> Callable[[], int]:
     """Count the node's CPUs; of a node with a quota, what its own control group uses of them."""
-    if problem.fabric.nodes[node].quota is None:
-        return CpuCount()
-    group = own_group()
-    if group is None:
+    if problem.fabric.nodes[node].quota is not None:
+        if (group := own_group()) is not None:
+            return group.used_ns
         say(
             f"node {node} has a quota, but this agent is in no control group of its own: its "
             "utilisation counts all that its CPUs do"
         )
-    return CpuCount(group=group)
+    return partial(busy_ns_of, sorted(os.sched_getaffinity(0)))
 
 
 def run_controller(
@@ -179,7 +179,12 @@ def run_controller(
     names = [problem.name for problem in problems]
     if len(set(names)) < len(names):
         raise LiveError(f"two cells have one name: {', '.join(sorted(names))}")
-    _require_runs(out)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        # A disk that is full may have room later.
+        if error.errno in MISTAKEN:
+            raise LiveError(f"{out}: cannot be made ({error.strerror})") from None
     name = name or f"controller-{os.getpid()}"
     # No message waits for long while a window closes.
     sys.setswitchinterval(0.0005)
@@ -238,15 +243,6 @@ class _AsSeen:
     ) -> Mapping[str, QoS]:
         """Expect the window of all (see `Estimator`)."""
         return dict.fromkeys(self._names, observed)
-
-
-def _require_runs(out: Path) -> None:
-    """Raise a LiveError where runs can never be kept; a disk that is full may have room later."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        if error.errno in MISTAKEN:
-            raise LiveError(f"{out}: cannot be made ({error.strerror})") from None
 
 
 def _finished(recorder: RunRecorder, cell: ControlledCell) -> Path | None:

@@ -65,7 +65,11 @@ def write_payload(payload: object) -> tuple[str, bytes | memoryview]:
         data = np.ascontiguousarray(payload).reshape(-1).view(np.uint8)
         return f"array:{payload.dtype.str}:{shape}", data.data
     if isinstance(payload, msgspec.Struct):
-        return f"struct:{type(payload).__name__}", _encoded(payload)
+        try:
+            text = msgspec.msgpack.encode(payload, enc_hook=_number)
+        except Exception as error:  # the user's objects
+            raise LiveError(_unsendable(payload, error)) from None
+        return f"struct:{type(payload).__name__}", text
     what = type(payload).__name__
     raise LiveError(f"a {what} cannot be sent; send bytes, an array, or a msgspec.Struct")
 
@@ -76,13 +80,6 @@ def _flat(view: memoryview) -> bytes | memoryview:
         return view.cast("B")
     except (TypeError, ValueError):  # with gaps, empty, or of another byte order
         return view.tobytes()
-
-
-def _encoded(payload: msgspec.Struct) -> bytes:
-    try:
-        return msgspec.msgpack.encode(payload, enc_hook=_number)
-    except Exception as error:  # the user's objects
-        raise LiveError(_unsendable(payload, error)) from None
 
 
 def _number(value: object) -> bool | int | float:

@@ -6,7 +6,7 @@ and people. A key that is not listed is nobody's.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection
 
 from dwell.live.keys import CONTROLLER, MAIN, SHADOW, TWICE, Keys
 from dwell.live.trust.roster import Roster
@@ -75,24 +75,17 @@ def _of_stages(problem: Problem, keys: Keys) -> dict[str, frozenset[str]]:
 def subjects(problem: Problem, roster: Roster) -> dict[str, Collection[str]]:
     """Return who of a roster may put, by key."""
     keys = Keys(problem.name)
-    of_role: Mapping[str, Iterable[str]] = {
-        role: [subject.name for subject in roster.of_role(role)]
-        for role in ("controller", "operator", "observer")
+    everybody = roster.subjects.values()
+    # The roster has to have each name in the role that the cell file takes it for.
+    known = {
+        one.name
+        for one in everybody
+        if one.role == ("controller" if one.name == CONTROLLER else "node")
     }
-    known = {subject.name: subject.role for subject in roster.subjects.values()}
-
-    def allowed(names: Iterable[str]) -> frozenset[str]:
-        """Return the names that the roster has, in the role that the cell file takes them for."""
-        return frozenset(
-            name
-            for name in names
-            if known.get(name) == ("controller" if name == CONTROLLER else "node")
-        )
-
     by_key: dict[str, Collection[str]] = {
-        key: allowed(names) for key, names in senders(problem).items()
+        key: names & known for key, names in senders(problem).items()
     }
-    people = [*of_role["controller"], *of_role["operator"]]
-    by_key[keys.ask()] = frozenset(people)
-    by_key[keys.look()] = frozenset([*people, *of_role["observer"]])
+    people = frozenset(one.name for one in everybody if one.role in ("controller", "operator"))
+    by_key[keys.ask()] = people
+    by_key[keys.look()] = people.union(one.name for one in everybody if one.role == "observer")
     return by_key

@@ -169,7 +169,9 @@ def _work(
         if job is None:
             inflight.end()
         else:
-            inflight.begin(_written(job))
+            # So that another process can try the job's inputs again.
+            inputs = [(header, bytes(payload)) for header, payload, _ in job.inputs.values()]
+            inflight.begin(msgspec.msgpack.encode([job.shadow, inputs]))
 
     work(
         *(worker, place.transport),
@@ -189,13 +191,6 @@ class _Broken(Pulse):
 
     def receive(self, sample: Arrival, now_ns: int) -> None:
         super().receive(sample, now_ns)
-
-
-def _written(job: Job) -> bytes:
-    """Write a job's inputs so that another process can try them again."""
-    return msgspec.msgpack.encode(
-        [job.shadow, [(header, bytes(payload)) for header, payload, _ in job.inputs.values()]]
-    )
 
 
 def _retry_suspect(worker: Worker, path: Path, clock: Clock) -> None:

@@ -91,11 +91,10 @@ class Security:
             keyring = _keyring(Path(folder), problem, role)
             _require_own(keyring, role)
             return cls(problem, keyring)
-        open_cell = cls(problem)
         faults = list(exposed(problem))
         if faults and given.get(INSECURE, "") != "1":
             raise LiveError("\n".join(map(str, faults)))
-        return open_cell
+        return cls(problem)
 
     def remember(self, folder: Path) -> None:
         """Take note of the roster in a node's folder; it never goes back to an earlier one.

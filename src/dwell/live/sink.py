@@ -23,11 +23,9 @@ class Highest(Protocol):
 
     def load(self) -> tuple[int, int]:
         """Return run and cycle; (-1, -1) if there is none."""
-        ...
 
     def store(self, run: int, cycle: int) -> None:
         """Remember them before the actuator is called."""
-        ...
 
 
 class Sink:

@@ -56,7 +56,6 @@ class Stage(Protocol):
 
         A source task gets an empty mapping's worth: one message from ``stamper`` without payload.
         """
-        ...
 
 
 @runtime_checkable
@@ -65,11 +64,9 @@ class Stateful(Protocol):
 
     def snapshot(self) -> bytes:
         """Write the state as it is after the last call of `process`."""
-        ...
 
     def restore(self, state: bytes) -> None:
         """Take a state over."""
-        ...
 
 
 class Actuator(Protocol):
@@ -80,15 +77,12 @@ class Actuator(Protocol):
 
     def apply(self, command: Message) -> None:
         """Apply a command."""
-        ...
 
     def hold(self) -> None:
         """Stay as it is: no command came for too long."""
-        ...
 
     def zero(self) -> None:
         """Stop: no command came for too long."""
-        ...
 
 
 class CellStage(ABC):

@@ -9,8 +9,6 @@ import shlex
 import stat
 import struct
 import zlib
-from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
 import msgspec
@@ -18,11 +16,10 @@ import msgspec
 from dwell.errors import LiveError
 from dwell.live.stamper import StamperState
 
-# Run and cycle, and a checksum of the two.
-_SLOT = struct.Struct("<qqI")
+_CYCLE = struct.Struct("<qq")
 _LENGTH = struct.Struct("<QI")
-# How often the book had been written, the length of what was, and a checksum of both.
-_PAGE = struct.Struct("<QII")
+# Number of writes, length of the content, and a checksum of both.
+_SLOT = struct.Struct("<QII")
 _BOOK_BYTES = 2_048
 #: Bits of a folder's mode by which its group, or everybody, may change what is in it.
 OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
@@ -105,75 +102,70 @@ def _required(path: Path, size: int) -> mmap.mmap:
         raise LiveError(f"{path}: {why}") from None
 
 
-class BookFile:
-    """A stamper's `StamperState`, in two slots of mapped memory written in turn.
+class _Slots:
+    """Two slots of mapped memory, written in turn.
 
-    A disk that is full keeps nobody from writing it, and a process that dies while it writes spoils
-    the slot only that was not the last.
+    Mapped memory outlives its process, and a full disk does not stop a write. A process that dies
+    during a write spoils only the slot that was not the last.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._map = _required(path, 2 * _BOOK_BYTES)
-        self._number = max((number for number, _ in self._good()), default=0)
+    def __init__(self, path: Path, size: int) -> None:
+        self._size = _SLOT.size + size
+        self._map = _required(path, 2 * self._size)
+        self._number = 0
+        self.content = b""
+        for begin in (0, self._size):
+            number, length, check = _SLOT.unpack_from(self._map, begin)
+            content = self._map[begin + _SLOT.size : begin + _SLOT.size + length]
+            if number > self._number and zlib.crc32(content, number & 0xFFFFFFFF) == check:
+                self._number, self.content = number, content
 
-    def _good(self) -> Iterator[tuple[int, StamperState]]:
-        """Yield the good slots: how often it had been written then, and what was."""
-        for slot in (0, 1):
-            begin = slot * _BOOK_BYTES
-            number, length, check = _PAGE.unpack_from(self._map, begin)
-            text = self._map[begin + _PAGE.size : begin + _PAGE.size + length]
-            if not number or zlib.crc32(text, number & 0xFFFFFFFF) != check:
-                continue
-            with suppress(msgspec.MsgspecError):
-                yield number, msgspec.json.decode(text, type=StamperState)
+    def write(self, content: bytes) -> None:
+        """Write the slot that was not the last."""
+        self._number, self.content = self._number + 1, content
+        begin = self._number % 2 * self._size
+        place = begin + _SLOT.size
+        self._map[place : place + len(content)] = content
+        check = zlib.crc32(content, self._number & 0xFFFFFFFF)
+        _SLOT.pack_into(self._map, begin, self._number, len(content), check)
+
+
+class BookFile:
+    """A stamper's `StamperState`."""
+
+    def __init__(self, path: Path) -> None:
+        self._slots = _Slots(path, _BOOK_BYTES)
 
     def read(self) -> StamperState | None:
         """Return what was written last; None where nothing was, or it cannot be read."""
-        found = max(self._good(), key=lambda one: one[0], default=None)
-        return None if found is None else found[1]
+        try:
+            return msgspec.json.decode(self._slots.content, type=StamperState)
+        except msgspec.MsgspecError:
+            return None
 
     def write(self, entry: StamperState) -> None:
-        """Write the slot that was not the last."""
+        """Write it."""
         text = msgspec.json.encode(entry)
-        number = self._number + 1
-        begin = number % 2 * _BOOK_BYTES
-        place = begin + _PAGE.size
-        if place + len(text) > begin + _BOOK_BYTES:
+        if len(text) > _BOOK_BYTES:
             raise LiveError(f"the placement's name is too long: {entry.placement[:40]}...")
-        self._map[place : place + len(text)] = text
-        check = zlib.crc32(text, number & 0xFFFFFFFF)
-        _PAGE.pack_into(self._map, begin, number, len(text), check)
-        self._number = number
+        self._slots.write(text)
 
 
 class HighestFile:
-    """The highest cycle actuated, in two slots of mapped memory written in turn.
-
-    Mapped memory outlives its process; a process that dies while it writes spoils one slot only.
-    """
+    """The highest cycle actuated."""
 
     def __init__(self, path: Path) -> None:
-        self._map = _required(path, 2 * _SLOT.size)
-        self._slot = 0
+        self._slots = _Slots(path, _CYCLE.size)
 
     def load(self) -> tuple[int, int]:
-        """Return the highest run and cycle of the good slots; (-1, -1) where none is."""
-        highest = (-1, -1)
-        for slot in (0, 1):
-            run, cycle, check = _SLOT.unpack_from(self._map, slot * _SLOT.size)
-            if check and check == _checksum(run, cycle) and (run, cycle) > highest:
-                highest, self._slot = (run, cycle), 1 - slot
-        return highest
+        """Return its run and number; (-1, -1) where none is known."""
+        content = self._slots.content
+        run, cycle = _CYCLE.unpack(content) if content else (-1, -1)
+        return run, cycle
 
     def store(self, run: int, cycle: int) -> None:
-        """Write the slot that holds the lower one."""
-        offset = self._slot * _SLOT.size
-        _SLOT.pack_into(self._map, offset, run, cycle, _checksum(run, cycle))
-        self._slot = 1 - self._slot
-
-
-def _checksum(run: int, cycle: int) -> int:
-    return zlib.crc32(struct.pack("<qq", run, cycle)) | 1
+        """Write them."""
+        self._slots.write(_CYCLE.pack(run, cycle))
 
 
 class InFlight:

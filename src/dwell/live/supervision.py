@@ -20,7 +20,7 @@ import psutil
 
 from dwell.errors import LiveError
 from dwell.files import write_whole
-from dwell.live.launcher import UNKNOWN_CODE, Launcher, Running, Survivor
+from dwell.live.launcher import UNKNOWN_CODE, ForkServer, Running, Survivor
 from dwell.live.log import printable
 from dwell.live.process_group import ProcessGroup
 from dwell.live.state_files import InFlight, open_own
@@ -108,26 +108,26 @@ class Supervisor:
         Takes a line for the log of the agent.
     warm_s, growth_bytes, log_bytes
         From when on, and from what on, memory that grows is reported; length of a log.
-    launcher : Launcher, optional
-        Starts the processes; runs their commands if left out.
+    launcher : ForkServer
+        Starts the processes.
     """
 
     def __init__(
         self,
         folder: Path,
         say: Callable[[str], None],
+        launcher: ForkServer,
         *,
         warm_s: float = WARM_S,
         growth_bytes: int = GROWTH_BYTES,
         log_bytes: int = LOG_BYTES,
-        launcher: Launcher | None = None,
     ) -> None:
         self.folder = folder
         self._warm_s, self._growth_bytes, self._log_bytes = warm_s, growth_bytes, log_bytes
         self.children: list[SupervisedProcess] = []
         self._say = say
         self._oom_kills = _oom_kills()
-        self._launcher = Launcher() if launcher is None else launcher
+        self._launcher = launcher
 
     def keep(self, who: str, command: Sequence[str]) -> SupervisedProcess:
         """Have a process run from now on."""
@@ -233,7 +233,10 @@ class Supervisor:
         child.starts += 1
         child.started_s = time.monotonic()
         try:
-            self._run(child)
+            with open(child.file("log"), "ab", opener=open_own) as log:
+                child.log_begins = log.tell()
+                child.process = self._launcher.start(child.command, log)
+                child.group = ProcessGroup.of(child.process.pid)
         except OSError as error:
             self._died(child, f"could not be started ({error.strerror})")
             return
@@ -247,12 +250,6 @@ class Supervisor:
             write_mark(child.file("pid"), child.group)
         except OSError as error:
             self._say(f"{child.who}: its mark cannot be written ({error.strerror})")
-
-    def _run(self, child: SupervisedProcess) -> None:
-        with open(child.file("log"), "ab", opener=open_own) as log:
-            child.log_begins = log.tell()
-            child.process = self._launcher.start(child.command, log)
-            child.group = ProcessGroup.of(child.process.pid)
 
     def tend(self) -> None:
         """Look how much memory the processes have taken, and how much they have printed."""
@@ -368,10 +365,8 @@ class Supervisor:
 
 
 def _signal(process: psutil.Process, number: int) -> None:
-    try:
+    with suppress(psutil.Error):
         process.send_signal(number)
-    except psutil.Error:
-        return
 
 
 def write_mark(mark: Path, group: ProcessGroup | None) -> None:

@@ -16,7 +16,7 @@ from dwell.errors import LiveError
 from dwell.live.local_addresses import running_elsewhere
 from dwell.live.messages import MAX_CONTROL_BYTES, MAX_HEADER_BYTES
 from dwell.live.transport.transport import Lane
-from dwell.model import Flow, FrozenDict, Problem
+from dwell.model import FrozenDict, Problem
 
 Kind: TypeAlias = Literal[
     "stamper", "sink", "agent", "worker", "shadow", "standby", "controller", "visitor"
@@ -153,20 +153,10 @@ class Wiring:
         """Processes of a node."""
         return tuple(entry.role for entry in self.entries.values() if entry.role.node == node)
 
-    def connected(self, one: str, other: str) -> frozenset[Session]:
-        """Sessions in which two processes hear each other."""
-        pairs = (one, other), (other, one)
-        return frozenset(wire.session for wire in self.wires if (wire.source, wire.target) in pairs)
-
     def peers(self, who: str) -> int:
         """Return how many processes a process is connected to, in the session with most of them."""
         counts = Counter(w.session for w in self.wires if who in (w.source, w.target))
         return max(counts.values(), default=0)
-
-    def hears(self, source: str, target: str, lane: Lane, key: str) -> bool:
-        """Whether what one process puts can reach another at all."""
-        entry = self.entry(source)
-        return session_of(entry, lane, key) in self.connected(source, target)
 
     def visitor(self, who: str, *to: str) -> WiringEntry:
         """Return the endpoints of a process outside the cell that talks to processes of it."""
@@ -229,7 +219,11 @@ def wire(problem: Problem, *, protocol: str = "tcp") -> Wiring:
     _require_hosts(problem, everybody)
     hosts = problem.live.hosts
     rank = {role.who: i for i, role in enumerate(everybody)}
-    places = _places(everybody)
+    # Place of everybody on its node, from 0.
+    counts, places = Counter[str](), dict[str, int]()
+    for role in everybody:
+        places[role.who] = counts[role.node]
+        counts[role.node] += 1
 
     def locator(who: str, session: Session, seen_from: str | None = None) -> Locator:
         host = hosts[everybody[rank[who]].node]
@@ -334,12 +328,15 @@ def _wires(problem: Problem, everybody: Sequence[Role]) -> list[tuple[Session, f
     """Every pair that has to hear each other, by session; each once, in a fixed order."""
     pairs: dict[tuple[Session, frozenset[str]], None] = {}
     for one, other in combinations(everybody, 2):
-        if _meet(problem, one, other):
+        # Small things to say to each other, stages' messages aside.
+        if _calls(problem, one, other) or _calls(problem, other, one):
             pairs["control", frozenset((one.who, other.who))] = None
     for flow in problem.pipeline.flows:
         for one in _workers(everybody, flow.source):
             for other in _workers(everybody, flow.target):
-                session = _session(flow, one, other)
+                session: Session = lane_of(flow.payload_bytes)
+                if session == "images" and one.node == other.node:
+                    session = "local"
                 pairs[session, frozenset((one.who, other.who))] = None
     for task in problem.pipeline.tasks.values():
         state = lane_of(task.state_bytes)
@@ -351,17 +348,6 @@ def _wires(problem: Problem, everybody: Sequence[Role]) -> list[tuple[Session, f
 
 def _workers(everybody: Iterable[Role], task: str) -> list[Role]:
     return [role for role in everybody if role.works and role.task == task]
-
-
-def _session(flow: Flow, one: Role, other: Role) -> Session:
-    if lane_of(flow.payload_bytes) == "control":
-        return "control"
-    return "local" if one.node == other.node else "images"
-
-
-def _meet(problem: Problem, one: Role, other: Role) -> bool:
-    """Whether two processes have small things to say to each other, stages' messages aside."""
-    return any(_calls(problem, *pair) for pair in ((one, other), (other, one)))
 
 
 def _calls(problem: Problem, one: Role, other: Role) -> bool:
@@ -383,16 +369,6 @@ def _calls(problem: Problem, one: Role, other: Role) -> bool:
             stops = not problem.pipeline.outputs(other.task)
             return stops or (other.kind == "worker" and not task.anchored)
     return False
-
-
-def _places(everybody: Iterable[Role]) -> dict[str, int]:
-    """Place of everybody on its node, from 0."""
-    counts: dict[str, int] = {}
-    places = {}
-    for role in everybody:
-        places[role.who] = counts.get(role.node, 0)
-        counts[role.node] = places[role.who] + 1
-    return places
 
 
 def _require_hosts(problem: Problem, everybody: Sequence[Role]) -> None:

@@ -328,7 +328,11 @@ class Worker:
 
     def _about_state(self, sample: Arrival) -> None:
         if "/snapshot/" in sample.key:
-            self._asked_for(self.place.read(sample, Snapshot, lambda _: CONTROLLER))
+            asked = self.place.read(sample, Snapshot, lambda _: CONTROLLER)
+            if asked.task == self.task and asked.node == self.place.node:
+                self._asked = asked
+            elif asked.task == self.task and asked.to == self.place.node:
+                self._awaited = asked
             return
         state = decode(sample.header, State)
         if state.task != self.task:
@@ -340,13 +344,6 @@ class Worker:
             raise LiveError(f"{self.task}: a state of {length} bytes; at most {longest} are taken")
         kept = self._answers if state.number else self._checkpoints
         kept[state.node] = state, sample.payload
-
-    def _asked_for(self, asked: Snapshot) -> None:
-        """Take note that a state is to go from here, or to come here."""
-        if asked.task == self.task and asked.node == self.place.node:
-            self._asked = asked
-        elif asked.task == self.task and asked.to == self.place.node:
-            self._awaited = asked
 
     @property
     def _restoring(self) -> tuple[State, bytes] | None:

@@ -11,6 +11,8 @@ GUARD_CYCLES = Bound(2, MAX_COUNT, whole=True)
 PROBE_CYCLES = Bound(1, MAX_COUNT, whole=True)
 HALF_LIFE_WINDOWS = Bound(0, MAX_COUNT, above=True)
 SHADOW_FRACTION = Bound(0, 1)
+DECIDE_CYCLES = Bound(1, MAX_COUNT, whole=True)
+MIN_DWELL_CYCLES = Bound(0, MAX_COUNT, whole=True)
 
 
 @declared()
@@ -26,7 +28,18 @@ class ControllerSettings:
         default="dtp",
     )
     initial: str | None = key("Candidate to start with.", default=None, usual="the first")
+    decide_cycles: int | None = key(
+        "Cycles between two decisions, at most W.",
+        DECIDE_CYCLES,
+        default=None,
+        usual="W: one decision per window",
+    )
     min_dwell: int = key("Windows that a placement stays at least (N_min).", MIN_DWELL, default=3)
+    min_dwell_cycles: int = key(
+        "Cycles that a placement stays at least, where N_min windows are fewer.",
+        MIN_DWELL_CYCLES,
+        default=0,
+    )
     min_improvement: float = key(
         "Improvement of J that a migration must promise (Delta_min).",
         MIN_IMPROVEMENT,

@@ -136,6 +136,11 @@ class Fleet:
         """What every cell is, by its name."""
         return {cell.name: cell.problem for cell in self.cells}
 
+    @property
+    def phasing(self) -> str:
+        """When cells begin, in a word: ``listed`` if each has a phase of its own."""
+        return self.phases if isinstance(self.phases, str) else "listed"
+
     def changed(
         self,
         *,

@@ -80,6 +80,9 @@ class Problem(Displayed):
         require_length(1, self.window_cycles, self.pipeline.period_ms, "window_cycles")
         if self.servo is not None:
             self.servo.require_seen(self.pipeline.period_ms)
+        every, bound = self.decide_cycles, f"at most window_cycles = {self.window_cycles}"
+        holds = every <= self.window_cycles
+        require(holds, "controller.decide_cycles", every, f"{bound}; lower it, or raise that")
         phased = self.pipeline.first_release_ms > 0 and self.live.release == "frames"
         bound = "timer in a cell with a phase_ms, which a camera's frames do not keep"
         require(not phased, "live.release", self.live.release, bound)
@@ -195,6 +198,24 @@ class Problem(Displayed):
     def window_ms(self) -> float:
         """Length of a window: W P."""
         return self.window_cycles * self.pipeline.period_ms
+
+    @property
+    def decide_cycles(self) -> int:
+        """Cycles between two decisions."""
+        given = self.controller.decide_cycles
+        return self.window_cycles if given is None else given
+
+    @property
+    def decisions_per_window(self) -> float:
+        """W over the cycles between two decisions: 1 or more."""
+        return self.window_cycles / self.decide_cycles
+
+    @property
+    def min_dwell_decisions(self) -> int:
+        """Decisions that a placement stays at least: of N_min windows, or `min_dwell_cycles`."""
+        settings = self.controller
+        cycles = max(settings.min_dwell * self.window_cycles, settings.min_dwell_cycles)
+        return -(-cycles // self.decide_cycles)
 
     @property
     def censor_ms(self) -> float:

@@ -338,43 +338,22 @@ class TraceTable:
         """
         import numpy as np
 
-        ends = np.append(self.starts[1:], self.rows)
-        if self.by == "row" or self.time_ms is None:
-            return self._replay_rows(rng, len(release_ms), ends, wraps or self.wrap)
+        ends, time_ms = np.append(self.starts[1:], self.rows), self.time_ms
+        wraps = wraps or self.wrap
+        if self.by == "row" or time_ms is None:
+            return self._replay_rows(rng, len(release_ms), ends, wraps)
         elapsed_ms = release_ms - release_ms[0]
-        return self._replay_time(rng, elapsed_ms, self.time_ms, ends, wraps or self.wrap)
-
-    def _replay_rows(
-        self, rng: np.random.Generator, cycles: int, ends: NDArray[np.int64], wraps: bool
-    ) -> NDArray[np.int64]:
-        import numpy as np
-
-        if wraps:
-            # The whole file is one loop, so that every row is used and groups keep their order.
-            return (rng.integers(self.rows) + np.arange(cycles)) % self.rows
-        slack = np.maximum(ends - self.starts - cycles + 1, 0)
-        before = np.cumsum(slack)
-        if before[-1] == 0:
-            longest = int((ends - self.starts).max())
-            raise self._too_short(counted(longest, "row"), counted(cycles, "cycle"))
-        pick = int(rng.integers(before[-1]))
-        group = int(np.searchsorted(before, pick, side="right"))
-        first = int(self.starts[group]) + pick - int(before[group] - slack[group])
-        return np.arange(first, first + cycles)
-
-    def _replay_time(
-        self,
-        rng: np.random.Generator,
-        elapsed_ms: Floats,
-        time_ms: Floats,
-        ends: NDArray[np.int64],
-        wraps: bool,
-    ) -> NDArray[np.int64]:
-        import numpy as np
-
         spans = time_ms[ends - 1]
         if wraps:
-            return self._wrap_time(rng, elapsed_ms, time_ms, spans, ends - self.starts)
+            counts = ends - self.starts
+            lengths = _lasting_ms(spans, counts)
+            total = float(lengths.sum())
+            if total == 0:  # every row has the same instant: their order is all there is
+                return self._replay_rows(rng, len(elapsed_ms), np.array([self.rows]), True)
+            begin = np.concatenate(([0.0], np.cumsum(lengths)[:-1]))
+            instants = np.repeat(begin, counts) + time_ms
+            phase = (rng.uniform(0, total) + elapsed_ms) % total
+            return np.asarray(np.searchsorted(instants, phase, side="right") - 1, np.int64)
         needs = float(elapsed_ms[-1])
         # Releases are whole nanoseconds: a trace that ends within one of them is long enough.
         long_enough = spans + NS >= needs
@@ -393,24 +372,23 @@ class TraceTable:
         inside = np.searchsorted(time_ms[rows], offset + elapsed_ms, side="right") - 1
         return np.asarray(inside + int(self.starts[group]), np.int64)
 
-    def _wrap_time(
-        self,
-        rng: np.random.Generator,
-        elapsed_ms: Floats,
-        time_ms: Floats,
-        spans: Floats,
-        counts: NDArray[np.int64],
+    def _replay_rows(
+        self, rng: np.random.Generator, cycles: int, ends: NDArray[np.int64], wraps: bool
     ) -> NDArray[np.int64]:
         import numpy as np
 
-        lengths = _lasting_ms(spans, counts)
-        total = float(lengths.sum())
-        if total == 0:  # every row has the same instant: their order is all there is
-            return self._replay_rows(rng, len(elapsed_ms), np.array([self.rows]), True)
-        begin = np.concatenate(([0.0], np.cumsum(lengths)[:-1]))
-        instants = np.repeat(begin, counts) + time_ms
-        phase = (rng.uniform(0, total) + elapsed_ms) % total
-        return np.asarray(np.searchsorted(instants, phase, side="right") - 1, np.int64)
+        if wraps:
+            # The whole file is one loop, so that every row is used and groups keep their order.
+            return (rng.integers(self.rows) + np.arange(cycles)) % self.rows
+        slack = np.maximum(ends - self.starts - cycles + 1, 0)
+        before = np.cumsum(slack)
+        if before[-1] == 0:
+            longest = int((ends - self.starts).max())
+            raise self._too_short(counted(longest, "row"), counted(cycles, "cycle"))
+        pick = int(rng.integers(before[-1]))
+        group = int(np.searchsorted(before, pick, side="right"))
+        first = int(self.starts[group]) + pick - int(before[group] - slack[group])
+        return np.arange(first, first + cycles)
 
     def loop_cycles(self, period_ms: float) -> float:
         """Return the number of cycles after which a replay that wraps is back at its start."""

@@ -11,6 +11,7 @@ from typing import Any, TypeAlias
 
 from dwell.model.bounds import FOREIGN_THREADS, LARGEST, RATE_MBPS, Bound, require
 from dwell.model.declaration import declared, key
+from dwell.model.fabric import Fabric
 from dwell.model.process import Process, require_mean
 
 # Equal steps in which a ramp reaches its full strength. Their number has that many binary digits,
@@ -170,3 +171,12 @@ def is_always_on(item: Disturbance) -> bool:
     """Whether a disturbance is on, at its full strength, from the first cycle to the last."""
     whole = item.at_s == 0 and math.isinf(item.for_s)
     return whole and item.episodes is None and not item.ramp_s
+
+
+def acts(item: Disturbance, fabric: Fabric) -> bool:
+    """Whether a disturbance changes anything while it is on."""
+    if isinstance(item, NodeDisturbance):
+        return item.down or item.stress_threads > 0
+    delays = item.add_delay_ms is not None and item.add_delay_ms.expectation > 0
+    slows = item.rate_mbps < fabric.links[item.link].rate_mbps
+    return item.down or delays or slows or item.loss > 0

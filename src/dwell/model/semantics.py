@@ -122,8 +122,8 @@ def find_unregistered(
     policies: Sequence[str],
     estimators: Sequence[str],
     shadowing: Collection[str],
-) -> list[Fault]:
-    """Return the faults of names that only a cell file has: who makes an object has a class.
+) -> Iterator[Fault]:
+    """Yield the faults of names that only a cell file has: who makes an object has a class.
 
     Parameters
     ----------
@@ -132,12 +132,25 @@ def find_unregistered(
     policies, estimators, shadowing : collection of str
         Those that there are, and the estimators that send shadow jobs.
     """
-    message = bad_name(name)
-    return [
-        *([Fault("name", message)] if message else []),
-        *_registered(parts, policies, estimators, shadowing),
-        *_columns(parts),
-    ]
+    if message := bad_name(name):
+        yield Fault("name", message)
+    for candidate in parts.candidates:
+        if candidate in policies:
+            message = f"the name {candidate!r} is a policy's; choose another for the placement"
+            yield Fault(f"candidates.{candidate}", message)
+    settings = parts.controller
+    if settings is not None:
+        names = [*parts.candidates, *parts.broken_candidates]
+        if settings.policy not in parts.candidates and not CLASS_PATH.holds(settings.policy):
+            known = [*policies, *names]
+            yield from _unknown("controller.policy", "policy", settings.policy, known)
+        if not CLASS_PATH.holds(settings.estimator):
+            path = "controller.estimator"
+            yield from _unknown(path, "estimator", settings.estimator, estimators)
+        given = settings.shadow_fraction if settings.estimator in shadowing else None
+        if given is not None and (message := too_many_shadows(given, len(names))):
+            yield Fault("controller.shadow_fraction", message)
+    yield from _columns(parts)
 
 
 def _unknown(path: str, what: str, word: str, known: Collection[str]) -> Iterator[Fault]:
@@ -395,31 +408,6 @@ def _controller(parts: CellParts) -> Iterator[Fault]:
         yield from _unknown(f"controller.fallbacks[{index}]", "candidate", name, names)
     if settings.migration == "cold" and parts.links_complete:
         yield from _state_transfers(parts)
-
-
-def _registered(
-    parts: CellParts,
-    policies: Sequence[str],
-    estimators: Sequence[str],
-    shadowing: Collection[str],
-) -> Iterator[Fault]:
-    for name in parts.candidates:
-        if name in policies:
-            message = f"the name {name!r} is a policy's; choose another for the placement"
-            yield Fault(f"candidates.{name}", message)
-    settings = parts.controller
-    if settings is None:
-        return
-    names = [*parts.candidates, *parts.broken_candidates]
-    if settings.policy not in parts.candidates and not CLASS_PATH.holds(settings.policy):
-        known = [*policies, *names]
-        yield from _unknown("controller.policy", "policy", settings.policy, known)
-    if not CLASS_PATH.holds(settings.estimator):
-        path = "controller.estimator"
-        yield from _unknown(path, "estimator", settings.estimator, estimators)
-    given = settings.shadow_fraction if settings.estimator in shadowing else None
-    if given is not None and (message := too_many_shadows(given, len(names))):
-        yield Fault("controller.shadow_fraction", message)
 
 
 def _live(parts: CellParts) -> Iterator[Fault]:

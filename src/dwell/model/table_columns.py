@@ -179,12 +179,12 @@ WINDOWS = (
     Column("closed_unix_ns", "Int64", "Time of day of its close.", "ns", of=LIVE),
 )
 DECISIONS = (
-    Column("window", "Int64", "The window that it was made on."),
+    Column("window", "Int64", "The window of the last cycle that it looked at, or the next one."),
     Column("incumbent", "candidate", "The placement before."),
     Column("placement", "candidate", "The placement after."),
     Column("migrated", "Boolean", "Whether they differ."),
     Column("reason", "reason", "Which rule made it."),
-    Column("dwell", "Int64", "n_d after it: windows since the last migration."),
+    Column("dwell", "Int64", "n_d after it: whole windows of W since the last migration."),
     Column(
         "delta_j",
         "Float64",
@@ -192,6 +192,9 @@ DECISIONS = (
         "candidate.",
         null="the policy computes none",
     ),
+    Column("last_cycle", "Int64", "The last cycle that it looked at."),
+    Column("cycles", "Int64", "How many cycles it looked at; 0: a move of the guard's."),
+    Column("dwell_cycles", "Int64", "n_d in cycles."),
     Column(
         "j_{candidate}",
         "Float64",

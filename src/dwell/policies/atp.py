@@ -14,8 +14,8 @@ abstract. What is from where:
   the cell's objective, violations not among them; thresholds default to the targets; a dwell as in
   DTP.
 
-Windows are taken together until `every_ms` is reached, max(1, round(every_ms / (W P))) of them. At
-the close of the last of them, with means over them, and unless the dwell goes on:
+Decisions are taken together until `every_ms` is reached, max(1, round(every_ms / (d P))) of them, d
+cycles apart. At the last of them, with means over them, and unless the dwell goes on:
 
 1. *Question.* On the robot, is L95 or U_r above its threshold; offloaded, L95 or U_e (U_c where the
    objective weighs cloud nodes apart)? If not, it stays.
@@ -129,8 +129,8 @@ class ATP(ATPThresholds):
     def start(self, problem: Problem) -> None:
         """Begin again: the initial candidate, n_d = 0, and no window seen."""
         super().start(problem)
-        window_ms = problem.window_ms
-        self.every_windows = max(1, round(self.every_ms / window_ms))
+        decision_ms = problem.decide_cycles * problem.pipeline.period_ms
+        self.every_windows = max(1, round(self.every_ms / decision_ms))
 
     def _blank(self) -> tuple[_Window, ...]:
         return ()

@@ -143,7 +143,7 @@ class ATPThresholds(PricingPolicy):
             objective=problem.objective,
             local=pair.local if pair else None,
             offload=pair.offload if pair else None,
-            min_dwell=problem.controller.min_dwell,
+            min_dwell=problem.min_dwell_decisions,
         )
 
     def __repr__(self) -> str:

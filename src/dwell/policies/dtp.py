@@ -27,12 +27,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
+from typing import Self
 
 from dwell.cost import exceeds, excess
 from dwell.errors import MetricError
 from dwell.model.bounds import MIN_DWELL, MIN_IMPROVEMENT
 from dwell.model.objective import Objective
 from dwell.model.placement import Placement
+from dwell.model.problem import Problem
 from dwell.model.qos import Decision, QoS
 from dwell.policies.incumbent import PricingPolicy, check_parameter
 
@@ -49,7 +51,8 @@ class DTP(PricingPolicy):
     objective : Objective
         Weights, targets, caps and tiers of J.
     min_dwell : int
-        N_min, windows; 0 lets every window migrate.
+        N_min, calls of `decide`; 0 lets every call migrate. `from_problem` turns the cell's windows
+        into calls.
     min_improvement : float
         Delta_min, in units of J: an improvement must exceed it, and the margin of the estimates.
     escape : bool
@@ -64,9 +67,7 @@ class DTP(PricingPolicy):
 
     by_price = True
 
-    SETTINGS = MappingProxyType(
-        {"min_dwell": "min_dwell", "min_improvement": "min_improvement", "escape": "escape"}
-    )
+    SETTINGS = MappingProxyType({"min_improvement": "min_improvement", "escape": "escape"})
 
     def __init__(
         self,
@@ -82,6 +83,13 @@ class DTP(PricingPolicy):
         self.min_dwell = check_parameter("min_dwell", min_dwell, MIN_DWELL)
         self.min_improvement = check_parameter("min_improvement", min_improvement, MIN_IMPROVEMENT)
         self.escape = escape
+
+    @classmethod
+    def from_problem(cls, problem: Problem) -> Self:
+        """Make the policy with the parameters of ``problem.controller``."""
+        policy = super().from_problem(problem)
+        policy.min_dwell = problem.min_dwell_decisions
+        return policy
 
     def __repr__(self) -> str:
         return (

@@ -42,12 +42,7 @@ class LatencyFirst(CandidatePolicy):
             raise
         costs = self._costs(known)
         here, there = known[now], known[best]
-        if best == now or not exceeds(here.l95_ms - lowest, _margin_ms(here, there)):
+        errors = [(one.error or NO_ERROR)[0] for one in (here, there)]
+        if best == now or not exceeds(here.l95_ms - lowest, margin(*errors)):
             return self._stay("hold", costs), None
         return self._move(best, "migrate", costs), None
-
-
-def _margin_ms(one: QoS, other: QoS) -> float:
-    if one.error is None and other.error is None:
-        return 0.0
-    return margin((one.error or NO_ERROR)[0], (other.error or NO_ERROR)[0])

@@ -47,6 +47,7 @@ from dwell.cost import exceeds
 from dwell.model.frozen import FrozenDict
 from dwell.model.objective import Objective
 from dwell.model.placement import Placement
+from dwell.model.problem import Problem
 from dwell.model.qos import Decision, QoS
 from dwell.policies.incumbent import PricingPolicy
 
@@ -84,11 +85,18 @@ class WorkFunction(PricingPolicy):
     ) -> None:
         super().__init__(candidates=candidates, initial=initial, objective=objective)
         self._index = {name: i for i, name in enumerate(self.candidates)}
+        #: Windows that a decision serves.
+        self._served = 1.0
         weight = objective.weights.switching
         self._distances = tuple(
             tuple(weight * moved for moved in self._pricing.switching(name).values())
             for name in self.candidates
         )
+
+    def start(self, problem: Problem) -> None:
+        """Begin again; a decision serves its share of a window."""
+        super().start(problem)
+        self._served = 1 / problem.decisions_per_window
 
     @property
     def work(self) -> FrozenDict[str, float]:
@@ -116,7 +124,8 @@ class WorkFunction(PricingPolicy):
         now, pricing = self.incumbent, self._pricing
         costs = pricing.estimated(estimates, now)
         # From a candidate to itself: J of a window that no move preceded.
-        window = [pricing.cost(estimates[name], name, name) for name in self.candidates]
+        served_by = (pricing.cost(estimates[name], name, name) for name in self.candidates)
+        window = [cost * self._served for cost in served_by]
         served = list(map(add, self._work, window))
         # Subtracted before distances are added: large costs then round off nothing of w_k.
         least = min(served)

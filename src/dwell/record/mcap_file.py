@@ -190,7 +190,9 @@ def _instants(run: Run) -> tuple[int | None, dict[str, pl.DataFrame]]:
     tables = {
         "cycles": run.cycles.with_columns(pl.col("release_ns").alias(AT)),
         "windows": windows,
-        "decisions": run.decisions.sort("window").join_asof(closes, on="window"),
+        "decisions": run.decisions.sort("last_cycle").join_asof(
+            releases.rename({"cycle": "last_cycle"}), on="last_cycle"
+        ),
     }
     if run.has_jobs:
         tables["jobs"] = run.jobs.with_columns(pl.col("ready_ns").alias(AT))

@@ -312,12 +312,10 @@ def require_free(path: str | os.PathLike[str]) -> None:
     target = Path(path)
     if (target / JOURNAL).is_file() and not (target / "run.json").is_file():
         raise RunError(f"{target} holds a live run that has not been sealed; choose another folder")
-    if target.exists() and not (target / "run.json").is_file() and _occupied(target):
+    if target.exists() and not (target / "run.json").is_file():
+        if target.is_dir() and not any(target.iterdir()):
+            return
         raise RunError(f"{target} exists and is not a run; choose another folder")
-
-
-def _occupied(target: Path) -> bool:
-    return not target.is_dir() or any(target.iterdir())
 
 
 def _replace(draft: Path, target: Path) -> None:
@@ -429,15 +427,15 @@ def write_table(table: pl.DataFrame, file: Path) -> None:
         raise OSError(str(error)) from None
 
 
-def read_table(file: Path) -> Callable[[], pl.DataFrame]:
-    """Return the function that reads a table."""
+def read_table(file: Path, remedy: str = "") -> Callable[[], pl.DataFrame]:
+    """Return the function that reads a table; `remedy` ends the message where it cannot."""
 
     def read() -> pl.DataFrame:
         import polars as pl
 
         try:
-            return pl.read_parquet(file)
+            return pl.read_parquet(file, glob=False)
         except (OSError, pl.exceptions.PolarsError) as error:
-            raise RunError(f"{file}: cannot be read ({error})") from None
+            raise RunError(f"{file}: cannot be read ({error}){remedy}") from None
 
     return read

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import polars as pl
 
 #: Version of the folders of runs and fleets; no other version is read.
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 
 #: What became of a cycle or a job. Their order is that of the kernels' codes.
 OUTCOMES = ("in_flight", "done", "dropped", "replaced", "node_down", "not_applied")

@@ -428,7 +428,10 @@ def _panels(
     def draw(width: float) -> Spec:
         room_px = width - (NAMES_PX if tallest_px is None else AXIS_PX)
         fitting = max(1, min(most, len(facets), int((room_px + GAP_PX) // (PANEL_PX + GAP_PX))))
-        columns = _in_rows(len(values.get("panel", ())), fitting)
+        panels = len(values.get("panel", ()))
+        # Scenarios begin with a row.
+        whole_rows = (n for n in range(fitting, 1, -1) if not (panels % n and n % panels))
+        columns = next(whole_rows, fitting)
         across_px = max(60, int((room_px - (columns - 1) * GAP_PX) / columns))
         height_px = ROW_PX * max(len(policies), 1)
         if tallest_px is not None:
@@ -447,8 +450,3 @@ def _panels(
         return {"data": {"name": "rows"}, **above, **spec, "params": params}
 
     return draw
-
-
-def _in_rows(panels: int, most: int) -> int:
-    """Return how many panels stand beside each other so that scenarios begin with a row."""
-    return next((n for n in range(most, 1, -1) if not (panels % n and n % panels)), most)

@@ -103,8 +103,9 @@ def _sections(
             "V_D by the deadline, and by how long perception takes on R1",
             [_deadlines(deadlines, blocks)],
         )
-    shown = _shown_in_time(comparison)
-    if shown is not None and comparison.examples:
+    moving = [name for name in comparison.policies if name not in comparison.statics]
+    if moving and comparison.examples:
+        shown = DTP if DTP in moving else moving[0]
         timelines = [_timeline(comparison, blocks, one, shown) for one in comparison.scenarios]
         yield Section(
             f"{shown_policy(shown)} through time",
@@ -145,12 +146,6 @@ def predictions_table(comparison: Comparison, blocks: PolicyBlocks) -> Table:
         "whole 95 % interval over seeds says so; else it is open.",
         blocks.palette,
     )
-
-
-def _shown_in_time(comparison: Comparison) -> str | None:
-    """Which policy the timelines show: DTP, else the first that moves."""
-    moving = [name for name in comparison.policies if name not in comparison.statics]
-    return DTP if DTP in moving else next(iter(moving), None)
 
 
 def _timeline(comparison: Comparison, blocks: PolicyBlocks, scenario: str, policy: str) -> Figure:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from functools import cache
 from typing import TYPE_CHECKING
 
-from dwell.report.figure import COLUMN_PT, Figure, pdf, printed_svg
+from dwell.report.figure import COLUMN_PT, pdf, printed_svg
 from dwell.report.formatting import SYMBOL
 from dwell.report.page import Page, environment
 from dwell.report.table import Table, Text
@@ -45,38 +45,30 @@ def figure_files(page: Page) -> Iterator[tuple[str, bytes | str]]:
         A file's name and what it holds: of a figure ``SLUG.pdf``, ``SLUG.svg`` and a CSV for each
         of its tables of data; of a table ``SLUG.csv`` and ``SLUG.tex``.
     """
-    yield from _figures(page.figures)
-    yield from _tables(page.tables)
-
-
-def _figures(figures: Iterator[Figure]) -> Iterator[tuple[str, bytes | str]]:
-    for one in figures:
-        slug = _file_name(one.slug)
-        yield f"{slug}.pdf", pdf(one)
-        yield f"{slug}.svg", printed_svg(one)
-        for name, frame in one.frames.items():
-            end = "" if len(one.frames) == 1 else f"-{name}"
-            yield f"{slug}{end}.csv", frame.write_csv()
-
-
-def _tables(tables: Iterator[Table]) -> Iterator[tuple[str, bytes | str]]:
     import polars as pl
 
-    for one in tables:
-        if not one.rows:
+    for figure in page.figures:
+        slug = _file_name(figure.slug)
+        yield f"{slug}.pdf", pdf(figure)
+        yield f"{slug}.svg", printed_svg(figure)
+        for name, frame in figure.frames.items():
+            end = "" if len(figure.frames) == 1 else f"-{name}"
+            yield f"{slug}{end}.csv", frame.write_csv()
+    for table in page.tables:
+        if not table.rows:
             continue
-        slug = _file_name(one.slug)
-        names = [one.group.column] if one.group is not None else []
-        names += [column.column for column in one.columns]
+        slug = _file_name(table.slug)
+        names = [table.group.column] if table.group is not None else []
+        names += [column.column for column in table.columns]
         ends = [f"{name}{end}" for name in names for end in ("", "_low", "_high")]
-        known = {key for row in one.rows for key in row}
+        known = {key for row in table.rows for key in row}
         columns = [name for name in dict.fromkeys(ends) if name in known]
-        rows = [[row.get(name) for name in columns] for row in one.rows]
+        rows = [[row.get(name) for name in columns] for row in table.rows]
         frame = pl.DataFrame(
             rows, schema=columns, orient="row", infer_schema_length=None, strict=False
         )
         yield f"{slug}.csv", frame.write_csv()
-        yield f"{slug}.tex", table_tex(one)
+        yield f"{slug}.tex", table_tex(table)
 
 
 def _file_name(slug: str) -> str:

@@ -78,7 +78,7 @@ class _FleetPage:
                     counted(len(self.cells), "cell"),
                     f"sharing {', '.join(fleet.shared) or 'nothing'}",
                     f"coordination: {fleet.coordination}",
-                    f"phases: {self._phases}",
+                    f"phases: {fleet.phasing}",
                     f"seed {self.run.seed}",
                     f"{counted(windows, 'window')} of each",
                 )
@@ -86,11 +86,6 @@ class _FleetPage:
             facts=list(self._facts()),
             sections=list(self._sections()),
         )
-
-    @property
-    def _phases(self) -> str:
-        phases = self.run.fleet.phases
-        return phases if isinstance(phases, str) else "listed"
 
     def _facts(self) -> Iterator[Fact]:
         worst, numbers = self.cells[0], self.numbers
@@ -282,7 +277,7 @@ class _FleetPage:
                 f"{one.count} {one.cell.name} ({one.scenario})" for one in fleet.entries
             ),
             "shared": ", ".join(fleet.shared) or "nothing",
-            "phases": PHASES.get(self._phases, "as listed"),
+            "phases": PHASES.get(fleet.phasing, "as listed"),
             "coordination": fleet.coordination
             + (f", objective {fleet.objective}" if asks_a_ledger else ""),
             "policy": ", ".join(dict.fromkeys(str(meta.get("policy")) for meta in metas)),

@@ -70,6 +70,7 @@ FINAL_L95 = L95._replace(name="L95 final")
 COST = Measure("cost", "J", decimals=2)
 MIGRATIONS = Measure("migrations", "migrations")
 REGRET = Measure("regret", "regret", "%", 100.0)
+ORACLE_REGRET = Measure("oracle_regret", "over oracle", "%", 100.0)
 
 
 def own_measures(metrics: Iterable[str]) -> list[Measure]:
@@ -200,13 +201,9 @@ def _shown(name: str, remark: str = "") -> str:
 
 def shown_scenario(name: str) -> str:
     """``robot-cpu-stress`` as ``Robot CPU stress``."""
-    text = shown_in_sentence(name)
+    words = name.replace("_", "-").split("-")
+    text = " ".join(ABBREVIATIONS.get(word, word) for word in words)
     return text[:1].upper() + text[1:]
-
-
-def shown_in_sentence(name: str) -> str:
-    """``robot-cpu-stress`` as ``robot CPU stress``."""
-    return " ".join(ABBREVIATIONS.get(word, word) for word in name.replace("_", "-").split("-"))
 
 
 def listed(items: Iterable[str], last: str = "and") -> str:

@@ -63,6 +63,7 @@ def cell_definitions(problem: Problem) -> dict[str, str]:
         "cost": _cost(problem),
         "caps": _caps(problem),
         "controller": f"on {problem.controller_node}, begins with {problem.initial}",
+        "decisions": f"every {counted(problem.decide_cycles, 'cycle')}",
         "N_min": counted(controller.min_dwell, "window"),
         "Δ_min": f"{controller.min_improvement:g}",
         "estimator": controller.estimator,

@@ -76,6 +76,13 @@ FAMILIES = {
         "Best static is no policy either: of the placements that never move, the one "
         "that turns out to be the cheapest on the same realisation.",
     ),
+    "oracle": registry.PolicyEntry(
+        "",
+        "Oracle",
+        "muted",
+        "Oracle is a reference: it knows when each disturbance is on, and no other random numbers. "
+        "It follows the sequence with the least expected J.",
+    ),
 }
 COLOURS = {
     name: {"ink": INK, "muted": MUTED}.get(one.colour, one.colour) for name, one in FAMILIES.items()

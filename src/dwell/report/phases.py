@@ -93,7 +93,8 @@ def phase_rows(run: Run, header: RunHeader) -> list[PhaseRow]:
     if cycles.is_empty():
         return []
     released_s = cycles["release_ns"].to_numpy() / 1e9
-    found = phases(header.disturbed, float(released_s[-1]) + header.period_ms / 1e3)
+    period_s = header.problem.pipeline.period_ms / 1e3
+    found = phases(header.disturbed, float(released_s[-1]) + period_s)
     if len(found) > MOST:
         return []
     moved_s = _moves(cycles)

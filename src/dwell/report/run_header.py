@@ -74,24 +74,9 @@ class RunHeader(NamedTuple):
         )
 
     @property
-    def period_ms(self) -> float:
-        """Time between the releases of two cycles."""
-        return self.problem.pipeline.period_ms
-
-    @property
     def deadline_ms(self) -> float:
         """D."""
         return self.problem.pipeline.deadline_ms
-
-    @property
-    def window_cycles(self) -> int:
-        """W."""
-        return self.problem.window_cycles
-
-    @property
-    def nodes(self) -> tuple[str, ...]:
-        """Names of the cell's nodes, in the order of its file."""
-        return tuple(self.problem.fabric.nodes)
 
     @property
     def policy_name(self) -> str:

@@ -84,7 +84,7 @@ def run_html(run: Run, *, static: bool = False) -> str:
 def run_page(run: Run, *, sections: int | None = None) -> Page:
     """Return what there is to show of a run; its first `sections` only, the answer first."""
     header = RunHeader.of(run)
-    counted = count_in(run, header.window_cycles)
+    counted = count_in(run, header.problem.window_cycles)
     return _RunPage(run, header, counted, sections).page()
 
 
@@ -106,15 +106,15 @@ class _RunPage:
 
     def page(self) -> Page:
         header, windows = self.header, self.counted.windows.height
-        minutes = self.counted.cycles.height * header.period_ms / 60e3
+        width = counted(header.problem.window_cycles, "cycle")
+        minutes = self.counted.cycles.height * header.problem.pipeline.period_ms / 60e3
         return Page(
             title=f"{self._policy()} on {header.problem.name}",
             subtitle=" · ".join(
                 (
                     header.kind if header.live else f"{header.kind}, seed {header.seed}",
                     f"scenario {shown_scenario(header.scenario)}",
-                    f"{counted(windows, 'window')} of {counted(header.window_cycles, 'cycle')} "
-                    "after the warm-up",
+                    f"{counted(windows, 'window')} of {width} after the warm-up",
                     f"{write_number(minutes, decimals_for(minutes, 1))} minutes",
                 )
             ),
@@ -221,7 +221,7 @@ class _RunPage:
 
         first = int(str(window["first_cycle"]))
         cycles = self.run.cycles.filter(
-            pl.col("cycle").is_between(first, first + self.header.window_cycles - 1)
+            pl.col("cycle").is_between(first, first + self.header.problem.window_cycles - 1)
         )
         frame = cycles.select(
             "cycle",
@@ -357,8 +357,8 @@ class _RunPage:
 
     def _shadows(self) -> Table:
         windows = self.counted.windows
-        cycles = windows.height * self.header.window_cycles
-        seconds = cycles * self.header.period_ms / 1e3
+        cycles = windows.height * self.header.problem.window_cycles
+        seconds = cycles * self.header.problem.pipeline.period_ms / 1e3
         sent = float(windows["shadow_bytes"].sum())
         resources = resources_in(windows, self.header.problem)
         used = {f"shadow_{name}": windows[f"shadow_{name}"].mean() for name in resources}
@@ -453,6 +453,7 @@ class _RunPage:
 
     def _about(self) -> Definitions:
         header = self.header
+        period = write_ms(header.problem.pipeline.period_ms)
         return Definitions(
             {
                 "cell": header.problem.name,
@@ -460,8 +461,8 @@ class _RunPage:
                 "record": f"{header.kind}, seed {header.seed}",
                 "policy": header.policy,
                 "estimator": header.estimator,
-                "window": f"{counted(header.window_cycles, 'cycle')} of "
-                f"{write_ms(header.period_ms)}, deadline {write_ms(header.deadline_ms)}",
+                "window": f"{counted(header.problem.window_cycles, 'cycle')} of {period}, deadline "
+                f"{write_ms(header.deadline_ms)}",
                 "versions": ", ".join(f"{name} {text}" for name, text in header.versions.items()),
             }
         )
@@ -470,7 +471,7 @@ class _RunPage:
 def _begins(run: Run, header: RunHeader) -> NDArray[np.float64]:
     """When every window began, seconds; a live run's cycles do not come by their numbers."""
     if not header.live:
-        return begins_by_number(run.windows, header.period_ms)
+        return begins_by_number(run.windows, header.problem.pipeline.period_ms)
     released = dict(zip(run.cycles["cycle"], run.cycles["release_ns"], strict=True))
     return np.array([released[cycle] / 1e9 for cycle in run.windows["first_cycle"]], np.float64)
 

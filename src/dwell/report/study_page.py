@@ -8,12 +8,13 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 from dwell.model.bounds import counted
-from dwell.report.charts import NO_LIMIT, Limit, curves
+from dwell.report.charts import NO_LIMIT, curves
 from dwell.report.figure import Figure
 from dwell.report.formatting import (
     COST,
     L95,
     MIGRATIONS,
+    ORACLE_REGRET,
     RATE,
     REGRET,
     Measure,
@@ -65,6 +66,7 @@ def _sections(study: StudyRuns, blocks: PolicyBlocks) -> Iterator[Section]:
         figures = [blocks.tail(), blocks.measure(COST, title="J"), blocks.distribution()]
         if REGRET in _measures(study):
             figures.append(blocks.measure(REGRET, title="Regret"))
+            figures.append(blocks.measure(ORACLE_REGRET, title="J over the oracle"))
         figures += [blocks.measure(one, title=one.name) for one in own_measures(study.metrics)]
         yield Section("Figures", [*figures, *blocks.placed(), blocks.split()])
         yield Section("More numbers", [blocks.more()])
@@ -76,7 +78,7 @@ def _sections(study: StudyRuns, blocks: PolicyBlocks) -> Iterator[Section]:
 
 
 def _measures(study: StudyRuns) -> list[Measure]:
-    measures = (RATE, L95, COST, MIGRATIONS, REGRET, *own_measures(study.metrics))
+    measures = (RATE, L95, COST, MIGRATIONS, REGRET, ORACLE_REGRET, *own_measures(study.metrics))
     return [one for one in measures if one.column in study.runs.columns]
 
 
@@ -170,17 +172,15 @@ def _curve(means: pl.DataFrame, blocks: PolicyBlocks, view: _View, measure: Meas
     frame = named(rows.select(columns))
     if at.dtype.is_numeric():
         frame = frame.sort("at", maintain_order=True)
-    limit = _limits(view.study, blocks).get(measure.column, NO_LIMIT)
+    limits = {RATE.column: THE_AIM}
+    if not set(DEADLINES) & set(view.study.parameters):
+        limits[L95.column] = blocks.deadline
     remark = f"averaged over {view.shown_averaged}" if view.averaged else ""
-    draw = curves(frame, measure, blocks.styles, view.shown, limit, remark)
+    draw = curves(
+        frame, measure, blocks.styles, view.shown, limits.get(measure.column, NO_LIMIT), remark
+    )
     title = f"{measure.name} by {view.shown}"
     return Figure(f"{measure.column}-{view.place}", title, {"rows": frame}, draw)
-
-
-def _limits(study: StudyRuns, blocks: PolicyBlocks) -> dict[str, Limit]:
-    """Return the lines of measures; the deadline where it is the same at every point."""
-    one_deadline = not set(DEADLINES) & set(study.parameters)
-    return {RATE.column: THE_AIM, **({L95.column: blocks.deadline} if one_deadline else {})}
 
 
 def _pivot(means: pl.DataFrame, blocks: PolicyBlocks, view: _View, measure: Measure) -> Table:

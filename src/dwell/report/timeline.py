@@ -111,10 +111,11 @@ def run_timeline(
     if tracking is not None:
         errors = [tracking.rms(begin, begin + length_s)[0] for begin in begin_s.tolist()]
         frame = frame.with_columns(error=pl.Series(errors, dtype=pl.Float64))
+    timed = _timed(windows, decisions, begin_s, length_s / problem.window_cycles)
     frames = {
         "windows": _binned(frame, each),
-        "estimates": _estimates(windows, decisions, begin_s + length_s, [*placements], each),
-        "moves": _moves(windows, decisions, begin_s, length_s),
+        "estimates": _estimates(timed, [*placements], each),
+        "moves": _moves(timed),
         "spans": _spans(windows, disturbed, begin_s, length_s, end_s),
         "nodes": _used(windows, begin_s + length_s / 2, resources, each),
     }
@@ -184,7 +185,8 @@ def fleet_timeline(
         # A window that follows a move begins a little later than others do.
         bins = ((pl.col("begin") / step_s).round() // each).alias("bin")
         rates.append(frame.group_by(bins).agg(pl.col("cell").first(), pl.col("v_d").mean()))
-        moved = _moves(windows, run.cells[name].decisions, begin_s, length_s[name])
+        cycle_s = problems[name].pipeline.period_ms / 1e3
+        moved = _moves(_timed(windows, run.cells[name].decisions, begin_s, cycle_s))
         moves.append(moved.with_columns(move=pl.format("{}: {}", pl.lit(name), "move")))
     resources = [name[2:] for name in run.load.columns if name.startswith("u_")]
     load_s = (run.load["start_ns"] / 1e9 + step_s / 2).to_numpy()
@@ -289,23 +291,14 @@ def _used(
     return _binned(long, each, ["node"])
 
 
-def _estimates(
-    windows: pl.DataFrame,
-    decisions: pl.DataFrame,
-    close_s: NDArray[np.float64],
-    candidates: Sequence[str],
-    each: int,
-) -> pl.DataFrame:
-    """Return J of the candidates that were not active, as estimated at the close of windows.
+def _estimates(timed: pl.DataFrame, candidates: Sequence[str], each: int) -> pl.DataFrame:
+    """Return J of the candidates that were not active, as decisions estimated it.
 
     Of several windows in a mark, the median.
     """
     import polars as pl
 
-    closes = pl.DataFrame({"window": windows["window"], "time": close_s})
-    priced = decisions.filter(pl.col("reason").cast(pl.String) != "guard").join(
-        closes, on="window", how="inner"
-    )
+    priced = timed.filter(pl.col("reason").cast(pl.String) != "guard")
     parts = [
         priced.select(
             "time",
@@ -324,22 +317,27 @@ def _estimates(
     return means.agg(pl.col("time").mean(), pl.col("j").median()).select(found.columns)
 
 
-def _moves(
-    windows: pl.DataFrame, decisions: pl.DataFrame, begin_s: NDArray[np.float64], length_s: float
+def _timed(
+    windows: pl.DataFrame, decisions: pl.DataFrame, begin_s: NDArray[np.float64], cycle_s: float
 ) -> pl.DataFrame:
-    """Return when moves were decided; those of the guard stand under the window that follows."""
+    """Return the decisions in the windows, with the `time` after the last cycle looked at."""
     import polars as pl
 
-    began = dict(zip(windows["window"].to_list(), begin_s.tolist(), strict=True))
-    rows = []
-    for move in decisions.filter(decisions["migrated"]).iter_rows(named=True):
-        guard = str(move["reason"]) == "guard"
-        at_s = began.get(move["window"])
-        if at_s is not None:
-            name = f"{move['incumbent']} → {move['placement']}"
-            rows.append((at_s if guard else at_s + length_s, name, str(move["reason"])))
-    schema = {"time": pl.Float64, "move": pl.String, "reason": pl.String}
-    return pl.DataFrame(rows, schema=schema, orient="row")
+    columns = {"window": windows["window"], "first": windows["first_cycle"], "begin": begin_s}
+    after = (pl.col("last_cycle") + 1 - pl.col("first")) * cycle_s
+    joined = decisions.join(pl.DataFrame(columns), on="window", maintain_order="left")
+    return joined.with_columns(time=pl.col("begin") + after)
+
+
+def _moves(timed: pl.DataFrame) -> pl.DataFrame:
+    """Return when moves were decided, of decisions with their times."""
+    import polars as pl
+
+    return timed.filter("migrated").select(
+        "time",
+        pl.format("{} → {}", "incumbent", "placement").alias("move"),
+        pl.col("reason").cast(pl.String),
+    )
 
 
 def _spans(

@@ -53,7 +53,7 @@ def trace_events(run: Run) -> dict[str, Any]:
             *_names(header, jobs),
             *_job_events(header, jobs),
             *_cycle_events(run.cycles, jobs),
-            *_migration_events(run, header),
+            *_migration_events(run),
         ],
         "displayTimeUnit": "ms",
         "otherData": {
@@ -127,12 +127,11 @@ def _cycle_events(cycles: pl.DataFrame, jobs: pl.DataFrame) -> Iterator[TraceEve
         yield from _span(name, "cycle", CELL, key, (release_ns, end_ns), about)
 
 
-def _migration_events(run: Run, header: RunHeader) -> Iterator[TraceEvent]:
-    """Decisions that migrate, at the close of the window they were made after."""
+def _migration_events(run: Run) -> Iterator[TraceEvent]:
+    """Decisions that migrate, at the release of the first cycle that they did not look at."""
     import polars as pl
 
-    closes = run.windows.select("window", cycle=pl.col("first_cycle") + header.window_cycles)
-    moves = run.decisions.filter(pl.col("migrated")).join(closes, on="window")
+    moves = run.decisions.filter(pl.col("migrated")).with_columns(cycle=pl.col("last_cycle") + 1)
     for move in moves.join(run.cycles, on="cycle", suffix="_of_cycle").iter_rows(named=True):
         yield {
             "name": f"{move['incumbent']} → {move['placement']}",
@@ -147,7 +146,7 @@ def _migration_events(run: Run, header: RunHeader) -> Iterator[TraceEvent]:
 
 
 def _processes(header: RunHeader) -> dict[str, int]:
-    return {node: pid for pid, node in enumerate(header.nodes, start=CELL + 1)}
+    return {node: pid for pid, node in enumerate(header.problem.fabric.nodes, start=CELL + 1)}
 
 
 def _threads(jobs: pl.DataFrame) -> dict[str, int]:

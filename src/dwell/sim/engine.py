@@ -15,6 +15,7 @@ from dwell.control import (
     Estimator,
     Evidence,
     Instants,
+    LookedAt,
     MinimalPolicy,
     ShadowPlan,
     plain_rule,
@@ -38,7 +39,7 @@ from dwell.sim.tables import PlayedRealisation, make_tables
 from dwell.sim.versions import versions
 
 #: Columns of the kernel's table `seen`.
-SEEN = "first_cycle", "missed", "l95_ms", "uncut_ms"
+SEEN = "first_cycle", "cycles", "missed", "l95_ms", "uncut_ms"
 
 
 def simulate(
@@ -213,6 +214,7 @@ def play_cells(
         shared=shared,
         log_jobs=jobs,
         log_windows=any(cell.controller.learns for cell in cells),
+        decides=True,
         shadows=[
             # Probes may be of any cycle.
             draw_shadows(cell.problem, cell.realisation, plan.sent, others=cell.guarded)
@@ -229,7 +231,7 @@ def play_cells(
     if len(cells) == 1 and not (cells[0].guarded or by_window or any(first.host_down)):
         first.leave_to_kernel()
     by_row = {stamper.arrays.part.row: stamper for stamper in stampers}
-    closed, total = 0, sum(cell.realisation.windows for cell in cells)
+    total = sum(cell.realisation.windows for cell in cells)
     while (status := play(whole)) != Status.FINISHED:
         clock = whole.tables.clock[0]
         if status == Status.STEP:
@@ -237,15 +239,19 @@ def play_cells(
             stamper.step()
         else:
             stamper = by_row[int(clock["closed_cell"])]
-            stamper.close_window()
-            closed += 1
+            stamper.decide()
             if progress is not None:
-                progress(closed, total)
+                progress(sum(one.closed.item(0) for one in stampers), total)
         if stamper.lacks_shadow:
             return None
     return [
         PlayedRealisation(
-            cell.problem, cell.realisation, cell.controller, stamper.arrays, stamper.metrics
+            cell.problem,
+            cell.realisation,
+            cell.controller,
+            stamper.arrays,
+            stamper.metrics,
+            stamper.host_is_down,
         )
         for cell, stamper in zip(cells, stampers, strict=True)
     ]
@@ -297,7 +303,9 @@ class _Stamper:
         self.controller, self.arrays = controller, arrays
         self.release_ns = realisation.release_ns
         self.cycles = realisation.cycles
-        self.window_cycles = problem.window_cycles
+        self.window_cycles, self.every = problem.window_cycles, problem.decide_cycles
+        #: Whether decisions come more often than windows close.
+        self.looks = self.every < self.window_cycles
         self.names = tuple(problem.candidates)
         self.code = {name: i for i, name in enumerate(self.names)}
         settings = problem.controller
@@ -317,20 +325,23 @@ class _Stamper:
         #: Whether probes are wanted of a run that was laid out without a shadow.
         self.lacks_shadow = False
         self.course = controller.course
-        #: L95 (ms), violation rate and cost of every window, as the controller saw them.
+        #: L95 (ms), violation rate and cost of every window, as the controller saw them; none where
+        #: decisions come more often.
         self.metrics: list[tuple[float | None, ...]] = []
         self.evidence = _evidence(problem, realisation, arrays) if controller.learns else None
-        # What every close reads; these tables never grow.
+        # What every decision reads; these tables never grow.
         tables = arrays.tables
-        self.stamps, self.shares = tables.stamps, tables.shares
-        self.closed = tables.cells["window"]
-        self.seen = [tables.seen[name] for name in SEEN]
-        self.first, self.close_cycle = tables.cells["window_first"], tables.cells["close_cycle"]
+        self.stamps, self.cell = tables.stamps, tables.cells[0]
+        self.closed, self.firsts = tables.cells["window"], tables.seen["first_cycle"]
+        seen = tables.looked if self.looks else tables.seen
+        self.seen = [seen[name] for name in SEEN]
+        self.made = tables.cells["look" if self.looks else "window"]
+        self.shares = tables.look_shares if self.looks else tables.shares
         #: Incumbent and stamped cycles of the kernel's rule, where it decides.
         self.decided = self.rule_stamped = np.zeros(0, np.int64)
         tables.clock[0]["pauses"] = 1
         self.watch = SimulatedGuard(problem, realisation, arrays) if guarded else None
-        self.stamped = self._reach(self.window_cycles)
+        self.stamped = self._reach(self.every)
         self._stamp(0, self.stamped)
 
     def _stamp(self, start: int, stop: int, placement: str | None = None) -> None:
@@ -383,17 +394,20 @@ class _Stamper:
         rule = self.arrays.tables.rule
         self.decided, self.rule_stamped = rule["incumbent"], rule["stamped"]
 
-    def close_window(self) -> None:
-        """Carry out what was decided for the window that has just closed, or have it decided."""
-        index = self.closed.item(0) - 1
-        boundary = self.seen[0].item(0, index) + self.window_cycles
+    def decide(self) -> None:
+        """Carry out what was decided on what has just been seen, or have it decided."""
+        index = self.made.item(0) - 1
+        cycles = self.seen[1].item(0, index)
+        boundary = self.seen[0].item(0, index) + cycles
         close_ns = self._close_ns(boundary)
         left = self.course.placement
+        self.controller.looked = LookedAt(self._window_of(boundary - 1), boundary - 1, cycles)
         if len(self.decided):
             self.course.move(self.names[self.decided.item(0)])
-        elif self._host_down(close_ns):
+        elif self.host_is_down(close_ns):
             self.controller.miss()
-            self.metrics.append((None, None, None))
+            if not self.looks:
+                self.metrics.append((None, None, None))
         else:
             self._decide(index, boundary, close_ns)
         if left == self.course.placement:
@@ -401,20 +415,32 @@ class _Stamper:
             return
         earliest = self._takes_effect(boundary, close_ns)
         # Where no window can follow, the run is over, and it does not matter when tasks are ready.
-        if earliest + self.window_cycles > self.cycles or not self._begin(left, boundary, close_ns):
+        over = not self.looks and earliest + self.window_cycles > self.cycles
+        if over or not self._begin(left, boundary, close_ns):
             self._stamp(self.stamped, earliest, left)
-            self._move(earliest)
+            self._move(earliest, begins_window=not self.looks)
+
+    def _window_of(self, cycle: int) -> int:
+        """Return the number of windows that have ended by a cycle: that of its own, if any."""
+        window: int = self.closed.item(0)
+        while window and self.firsts.item(0, window - 1) + self.window_cycles > cycle:
+            window -= 1
+        return window
 
     def _decide(self, index: int, boundary: int, close_ns: int) -> None:
         """Ask the controller, and send the probes that it wants."""
         watch, controller = self.watch, self.controller
         if self.evidence is not None:
-            first = boundary - self.window_cycles
+            first = boundary - self.every
             controller.learn(partial(self.evidence, first, boundary, close_ns))
-        _, missed, l95_ms, uncut_ms = [column.item(0, index) for column in self.seen]
-        seen = l95_ms, missed / self.window_cycles, uncut_ms, self.shares[0, index]
-        proposal = controller.propose_on(*seen)
-        self.metrics.append(proposal.seen)
+        _, cycles, missed, l95_ms, uncut_ms = [column.item(0, index) for column in self.seen]
+        seen = l95_ms, missed / cycles, uncut_ms
+        shares = self.shares[0, index]
+        if self.looks:
+            proposal = controller.propose_on(*seen, shares[1], recent=shares[0])
+        else:
+            proposal = controller.propose_on(*seen, shares)
+            self.metrics.append(proposal.seen)
         if watch is None or not self.course.by_guard:
             controller.commit(proposal)
             return
@@ -427,19 +453,30 @@ class _Stamper:
             self._stamp(min(first, self.stamped), self.stamped)
 
     def _go_on(self, boundary: int) -> None:
-        """Stamp the next window with the placement that stays."""
-        start, self.stamped = self.stamped, self._reach(boundary + self.window_cycles)
+        """Stamp the cycles up to the next decision with the placement that stays."""
+        start, self.stamped = self.stamped, self._reach(boundary + self.every)
         self._stamp(start, self.stamped)
 
-    def _move(self, following: int) -> None:
-        """Begin the next window under the placement that has been ordered."""
+    def _move(self, following: int, *, begins_window: bool = True) -> None:
+        """Go on under the placement that has been ordered, from a cycle on."""
         if self.watch is not None:
             self.watch.moved(following)
-        self.first[0] = following
-        self.close_cycle[0] = following + self.window_cycles
-        self.stamped = self._reach(following + self.window_cycles)
+        self._place(following, begins_window=begins_window)
         self._stamp(following, self.stamped)
         self.rule_stamped[:] = self.stamped
+
+    def _place(self, following: int, *, begins_window: bool) -> None:
+        """Count decisions, and windows if one begins, from the first cycle under a placement."""
+        cell = self.cell
+        if begins_window:
+            cell["window_first"] = following
+            cell["close_cycle"] = following + self.window_cycles
+            cell["close_pending"] = 0
+        if self.looks:
+            cell["since"], cell["look_0"] = following, cell["look"]
+            cell["look_cycle"] = following + self.every
+            cell["look_pending"] = 0
+        self.stamped = self._reach(following + self.every)
 
     def _begin(self, left: str, boundary: int, close_ns: int) -> bool:
         """Begin a cold migration, which ends with `step`; False if no task has to be waited for."""
@@ -448,9 +485,10 @@ class _Stamper:
             self.arrays, left, self.course.placement, boundary, arrival_ns
         ):
             return False
-        cell = self.arrays.tables.cells[0]
-        # No window closes before the migration is over.
-        cell["window_first"] = cell["close_cycle"] = self.cycles + 1
+        cell = self.cell
+        # No window closes, and nothing is decided, before the migration is over.
+        cell["window_first"] = cell["close_cycle"] = cell["look_cycle"] = self.cycles + 1
+        cell["close_pending"] = cell["look_pending"] = 0
         cell["migrating"] = 1
         self._stamp(self.stamped, self.cycles, left)
         return True
@@ -473,26 +511,24 @@ class _Stamper:
         fallback = watch.wake(now)
         if fallback is None:
             return
-        cell = tables.cells[0]
         if self.cold is not None:
             self.cold.stop()
-        cell["migrating"] = cell["close_pending"] = 0
-        cell["window_first"] = first
-        cell["close_cycle"] = first + self.window_cycles
+        self.cell["migrating"] = 0
+        self._place(first, begins_window=True)
         if first + self.window_cycles > self.cycles:
             # No window can follow, so that the run ended with the last close.
             return
+        self.controller.looked = LookedAt(self.closed.item(0), first - 1, 0)
         self.controller.adopt(fallback, left=active)
-        self.stamped = self._reach(first + self.window_cycles)
         self._stamp(first, self.stamped)
 
     def _carry_on(self) -> None:
         """Carry a cold migration on; when its last task is ready, the order takes effect."""
-        tables, cold = self.arrays.tables, self.cold
+        cold = self.cold
         if cold is None or not cold.step(self.arrays):
             return
-        tables.cells[0]["migrating"] = 0
-        ready_ns = int(tables.clock[0]["step_ns"])
+        self.cell["migrating"] = 0
+        ready_ns = int(self.arrays.tables.clock[0]["step_ns"])
         self.stamped = self._takes_effect(cold.boundary, ready_ns - self.delay_ns)
         self._move(self.stamped)
 
@@ -503,7 +539,8 @@ class _Stamper:
             return first
         return int(self.release_ns[: self.cycles].searchsorted(arrived_ns))
 
-    def _host_down(self, at_ns: int) -> bool:
+    def host_is_down(self, at_ns: int) -> bool:
+        """Whether the controller's node is down at an instant."""
         i = bisect.bisect_right(self.host_at_ns, at_ns) - 1
         return i >= 0 and bool(self.host_down[i])
 

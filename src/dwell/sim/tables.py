@@ -11,7 +11,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from dwell.control import Controller, final_l95_ms
+from dwell.control import Controller, final_l95_ms, moved_shares, window_costs
 from dwell.kernels.arrays import CellArrays
 from dwell.kernels.realisation import Realisation
 from dwell.kernels.rows import Rows
@@ -38,7 +38,10 @@ class PlayedRealisation:
         As they were used.
     metrics : list of tuple
         L95 (ms), violation rate and cost of every window as the controller saw them, None where
-        its node was down; empty where the kernel decided.
+        its node was down; empty where the kernel decided, or decisions come more often than windows
+        close.
+    host_down : function of int
+        Whether the controller's node is down at an instant, ns.
     """
 
     problem: Problem
@@ -46,6 +49,18 @@ class PlayedRealisation:
     controller: Controller
     arrays: CellArrays
     metrics: list[tuple[float | None, ...]]
+    host_down: Callable[[int], bool]
+
+    @property
+    def looks(self) -> bool:
+        """Whether decisions come more often than windows close."""
+        return self.problem.decide_cycles < self.problem.window_cycles
+
+    @cached_property
+    def looked(self) -> Rows:
+        """The cycles that every decision has looked at."""
+        tables = self.arrays.tables
+        return tables.looked[0, : tables.cells[0]["look"]] if self.looks else self.seen
 
     @cached_property
     def seen(self) -> Rows:
@@ -244,17 +259,38 @@ def _shadow_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray
 def _seen(played: PlayedRealisation) -> dict[str, Floats]:
     """Metrics of windows as they could be known, NaN where the controller's node was down."""
     tables, window_cycles = played.arrays.tables, played.problem.window_cycles
-    if played.by_kernel:
+    if played.looks or played.by_kernel:
         seen = {
             "l95_ms": played.seen["l95_ms"],
             "violation_rate": played.seen["missed"] / window_cycles,
-            "cost": tables.decided["measured"][: len(played.seen)],
         }
+        seen["cost"] = (
+            _costs(played, seen) if played.looks else tables.decided["measured"][: len(played.seen)]
+        )
     else:
         metrics = np.array(played.metrics, np.float64).reshape(-1, 3)
         seen = dict(zip(("l95_ms", "violation_rate", "cost"), metrics.T, strict=True))
     used = played.shares[:, 0]
     return seen | {f"u_{name}": used[:, i] for i, name in enumerate(played.controller.resources)}
+
+
+def _costs(played: PlayedRealisation, seen: dict[str, Floats]) -> Floats:
+    """J of windows, with the switching term of every move that took effect in one of them.
+
+    It is NaN where the controller's node was down at the close, and so are the metrics then.
+    """
+    problem, resources = played.problem, played.controller.resources
+    used = {name: played.shares[:, 0, i] for i, name in enumerate(resources)}
+    stamps = played.arrays.tables.stamps[0].astype(np.int64)
+    moved = np.zeros(len(stamps))
+    moved[1:] = moved_shares(problem)[stamps[:-1], stamps[1:]]
+    switching = played.by_window(moved).sum(axis=1)
+    seen_of = seen["l95_ms"], seen["violation_rate"]
+    costs = window_costs(problem.objective, *seen_of, used, switching)
+    unseen = [played.host_down(at_ns) for at_ns in played.close_ns.tolist()]
+    for values in (*seen.values(), costs):
+        values[unseen] = np.nan
+    return costs
 
 
 def _decisions(controller: Controller) -> TableArrays:
@@ -279,15 +315,19 @@ def _decisions(controller: Controller) -> TableArrays:
 def _decided_by_kernel(played: PlayedRealisation) -> TableArrays:
     """Decisions that the kernel has made."""
     controller, tables = played.controller, played.arrays.tables
-    count, names = len(played.seen), tuple(played.problem.candidates)
+    names, looked = tuple(played.problem.candidates), played.looked
+    count, last = len(looked), looked["first_cycle"] + looked["cycles"] - 1
     decided = tables.decided[:count]
     columns: dict[str, object] = {
-        "window": np.arange(count),
+        "window": np.searchsorted(played.first + played.problem.window_cycles, last, side="right"),
+        "last_cycle": last,
+        "cycles": looked["cycles"],
         "incumbent": Names(decided["incumbent"], names),
         "placement": Names(decided["placement"], names),
         "migrated": decided["incumbent"] != decided["placement"],
         "reason": Names(decided["reason"], REASONS),
-        "dwell": decided["dwell"],
+        "dwell": decided["dwell"] * played.problem.decide_cycles // played.problem.window_cycles,
+        "dwell_cycles": decided["dwell"] * played.problem.decide_cycles,
         "delta_j": decided["delta_j"],
     }
     # It decides by estimates without errors alone.

@@ -179,12 +179,13 @@ class FleetPlayer:
         if self.placements:
             static = StaticFleet(self.placements, seed=unit.seed, windows=self.windows)
             return [float(static.violation_rates(fleet).max()) for fleet in fleets]
-        return [self._worst(fleet, unit.seed) for fleet in fleets]
-
-    def _worst(self, fleet: Fleet, seed: int) -> float:
-        runs = simulate_fleet(fleet, seed=seed, windows=self.windows).cells.values()
-        tables = [run.arrays("windows") for run in runs]
-        return max(float(one["violation_rate"][~one["warmup"]].mean()) for one in tables)
+        worst = []
+        for fleet in fleets:
+            runs = simulate_fleet(fleet, seed=unit.seed, windows=self.windows).cells.values()
+            tables = [run.arrays("windows") for run in runs]
+            rates = [float(one["violation_rate"][~one["warmup"]].mean()) for one in tables]
+            worst.append(max(rates))
+        return worst
 
     def limiting(self, robots: int, seeds: Sequence[int]) -> Limiting | None:
         """Return what the cycles that missed have waited for most; None where for nothing."""
@@ -245,7 +246,9 @@ def capacity_of(
     fleet = fleet.changed(policy=policy, phases=phases)
     _require_capacity(fleet)
     fleet.with_count(most)
-    player = FleetPlayer(fleet, _windows(fleet, cycles), _placements(fleet))
+    counted = ((one.warmup_windows, one.window_cycles) for one in fleet.problems.values())
+    windows = max(warmup + -(-cycles // width) for warmup, width in counted)
+    player = FleetPlayer(fleet, windows, _placements(fleet))
     together = TOGETHER if player.placements else 1
     units = [
         Sizes(first, min(first + together - 1, most), seed)
@@ -339,11 +342,6 @@ def policy_of(fleet: Fleet, entry: FleetEntry) -> str:
     return entry.policy or fleet.policy or entry.cell.controller.policy
 
 
-def _windows(fleet: Fleet, cycles: int) -> int:
-    cells = [entry.cell for entry in fleet.entries]
-    return max(cell.warmup_windows + -(-cycles // cell.window_cycles) for cell in cells)
-
-
 def _placements(fleet: Fleet) -> dict[str, str]:
     """Return the candidate of every cell by the name of its file; nothing where some may move."""
     known: dict[str, str] = {}
@@ -381,13 +379,12 @@ def _require_capacity(fleet: Fleet) -> None:
         raise ProblemError(faults)
 
 
-def what_ifs(fleet: Fleet, policy: str | None = None) -> Iterator[tuple[str, Fleet]]:
+def what_ifs(fleet: Fleet) -> Iterator[tuple[str, Fleet]]:
     """Yield changes that may take more robots, in words, and the fleet with each.
 
     A core more on every shared node, phases that are evenly spread, and every other candidate of
     the first entry that uses a shared node.
     """
-    fleet = fleet.changed(policy=policy)
     for node in fleet.shared:
         cores = fleet.entries[0].cell.fabric.nodes[node].cores + 1
         entries = [

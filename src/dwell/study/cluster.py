@@ -55,8 +55,32 @@ def spread_on_dask(
     dask = _distributed()
     with _quiet():
         client = _connect(dask, address)
+
+        def send(those: Sequence[Unit]) -> dict[Any, Unit]:
+            futures = client.map(operator.call, [everywhere] * len(those), those, pure=False)
+            return dict(zip(futures, those, strict=True))
+
         try:
-            _work(dask, client, task, units, take, rest)
+            # Sent to each worker once, like the task of a local process.
+            everywhere = client.scatter(task, broadcast=True, hash=False)
+            waiting = send(units)
+            ready = dask.as_completed(list(waiting), loop=client.loop)
+            for future in ready:
+                unit, result = waiting.pop(future), future.result()
+                take(unit, result)
+                if (left := rest(result)) is not None:
+                    waiting |= (more := send([left]))
+                    ready.update(more)
+        except dask.KilledWorker:
+            raise SimulationError(
+                "workers of the Dask cluster ended again and again before their work was done; "
+                "look at their logs, and at their memory"
+            ) from None
+        except dask.client.FutureCancelledError:
+            raise SimulationError(
+                "the Dask cluster was lost on the way: its scheduler, or all of its workers at a "
+                "time"
+            ) from None
         finally:
             # The scheduler forgets what waits: nobody else asks for it.
             client.close(timeout=ANSWER_S)
@@ -119,39 +143,3 @@ def _ask(dask: Any, address: str) -> None:
             ) from None
     if found.get("type") != "Scheduler":
         raise SimulationError(f"{address} is a Dask {found.get('type')}; name the scheduler")
-
-
-def _work(
-    dask: Any,
-    client: Any,
-    task: Callable[[Unit], Result],
-    units: Sequence[Unit],
-    take: Callable[[Unit, Result], None],
-    rest: Callable[[Result], Unit | None],
-) -> None:
-    """Send all units, and take their results as they come."""
-    # Sent to each worker once, like the task of a local process.
-    everywhere = client.scatter(task, broadcast=True, hash=False)
-
-    def send(those: Sequence[Unit]) -> dict[Any, Unit]:
-        futures = client.map(operator.call, [everywhere] * len(those), those, pure=False)
-        return dict(zip(futures, those, strict=True))
-
-    waiting = send(units)
-    ready = dask.as_completed(list(waiting), loop=client.loop)
-    try:
-        for future in ready:
-            unit, result = waiting.pop(future), future.result()
-            take(unit, result)
-            if (left := rest(result)) is not None:
-                waiting |= (more := send([left]))
-                ready.update(more)
-    except dask.KilledWorker:
-        raise SimulationError(
-            "workers of the Dask cluster ended again and again before their work was done; look "
-            "at their logs, and at their memory"
-        ) from None
-    except dask.client.FutureCancelledError:
-        raise SimulationError(
-            "the Dask cluster was lost on the way: its scheduler, or all of its workers at a time"
-        ) from None

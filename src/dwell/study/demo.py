@@ -198,13 +198,10 @@ def _compare_all(
     progress: Progress | None,
 ) -> tuple[Comparison, ...]:
     """Compare on one problem after another, counting the runs of all together."""
-    contenders: list[list[str | Contender]] = [
-        [*problem.candidates, *POLICIES] for problem in problems
-    ]
-    sizes = [
-        len(problem.scenarios) * len(policies) * seeds
-        for problem, policies in zip(problems, contenders, strict=True)
-    ]
+    policies: list[list[str | Contender]]
+    policies = [[*problem.candidates, *POLICIES] for problem in problems]
+    pairs = zip(problems, policies, strict=True)
+    sizes = [len(problem.scenarios) * len(those) * seeds for problem, those in pairs]
 
     def count(before: int, done: int, _: int) -> None:
         if progress is not None:
@@ -213,11 +210,11 @@ def _compare_all(
     return tuple(
         compare(
             problem,
-            policies=policies,
+            policies=policies[index],
             seeds=range(1, seeds + 1),
             windows=longest_run(problem, windows),
             processes=processes,
             progress=partial(count, sum(sizes[:index])),
         )
-        for index, (problem, policies) in enumerate(zip(problems, contenders, strict=True))
+        for index, problem in enumerate(problems)
     )

@@ -206,8 +206,11 @@ def same_run(runs: pl.DataFrame, pair: Contrast) -> bool:
     Parameters
     ----------
     runs : DataFrame
-        One row per run.
+        One row per run. A table that was made of runs, and has no digest of their cycles, says
+        nothing: this is False.
     """
+    if PLAYED not in runs.columns:
+        return False
     first, second = (_group(runs, labels).select("seed", PLAYED) for labels in pair)
     return first.equals(second, null_equal=False)
 

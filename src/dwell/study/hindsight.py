@@ -106,14 +106,14 @@ class Hindsight:
                 "and elsewhere `Hindsight(statics)` does"
             )
         self._deadline_ns = problem.pipeline.deadline_ns
-        self._censor_ms = problem.censor_ms
+        self._censor_ms, self._width = problem.censor_ms, problem.window_cycles
         self._candidates = tuple(problem.candidates)
 
     def learn(self, evidence: Evidence) -> None:
-        """Look up the cycles of a window."""
+        """Look up the last W cycles."""
+        last_ns, close_ns = int(evidence.release_ns[-1]), evidence.close_ns
         self._seen = {
-            name: self._metrics(self._alone[name], evidence.release_ns, evidence.close_ns)
-            for name in self._candidates
+            name: self._metrics(self._alone[name], last_ns, close_ns) for name in self._candidates
         }
 
     def estimate(
@@ -122,9 +122,10 @@ class Hindsight:
         """Return what every candidate alone showed in the window (see `Estimator`)."""
         return dict(self._seen)
 
-    def _metrics(self, alone: _Alone, release_ns: Ints, close_ns: int) -> QoS:
-        first = int(np.searchsorted(alone.release_ns, release_ns[0]))
-        latency_ns = alone.latency_ns[first : first + len(release_ns)]
+    def _metrics(self, alone: _Alone, last_ns: int, close_ns: int) -> QoS:
+        end = int(np.searchsorted(alone.release_ns, last_ns)) + 1
+        first = max(end - self._width, 0)
+        release_ns, latency_ns = alone.release_ns[first:end], alone.latency_ns[first:end]
         age_ns = close_ns - release_ns
         l95_ms, uncut_ms = seen_l95_ms(latency_ns, age_ns, self._censor_ms)
         missed = int(missed_cycles(latency_ns, age_ns, self._deadline_ns))

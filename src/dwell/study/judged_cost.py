@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 
 from dwell.cost import hamming, price
 from dwell.model import Problem
+from dwell.record import Names
 from dwell.study.reference import tier_use
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def judged_cost(run: Run, problem: Problem) -> float:
 
 
 def judged_costs(run: Run, problem: Problem) -> Floats:
-    """J of every window by a problem's objective, with the switching term of the move to it.
+    """J of every window by a problem's objective, with the switching terms of moves in it.
 
     Parameters
     ----------
@@ -51,8 +51,19 @@ def judged_costs(run: Run, problem: Problem) -> Floats:
         NaN where the controller did not see the window.
     """
     windows = run.arrays("windows")
-    names = [problem.candidates[name] for name in windows.names("placement").to_list()]
-    moved = [0.0, *(hamming(now, then) for then, now in itertools.pairwise(names))]
+    if problem.decide_cycles < problem.window_cycles:
+        moved = _moves(run.arrays("cycles").names("placement"), problem)
+        first, width = windows["first_cycle"], problem.window_cycles
+        switching = np.array([moved[at : at + width].sum() for at in first.tolist()])
+    else:
+        switching = _moves(windows.names("placement"), problem)
     l95_ms, rate = windows["seen_l95_ms"], windows["seen_violation_rate"]
-    switching = np.array(moved[: len(names)])
     return price(l95_ms, rate, *tier_use(windows, problem), switching, problem.objective)
+
+
+def _moves(placed: Names, problem: Problem) -> Floats:
+    """S of each placement after the one before it; 0 of the first."""
+    known = [problem.candidates[name] for name in placed.known]
+    moved = np.array([[hamming(now, then) for now in known] for then in known])
+    places = placed.places
+    return np.concatenate((np.zeros(min(len(places), 1)), moved[places[:-1], places[1:]]))

@@ -18,10 +18,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from dwell.cellfile.work_folder import unwritable
-from dwell.errors import RunError
 from dwell.files import write_whole
 from dwell.study.player import Batch, PlayedBatch, Player
-from dwell.study.study import Item, Study
+from dwell.study.study import Study
 from dwell.study.summary import Summary
 
 if TYPE_CHECKING:
@@ -65,7 +64,8 @@ class Parts:
 
     def __init__(self, folder: Path, study: Study, digests: Mapping[str, str], span: range) -> None:
         self.folder, self.study, self.digests, self.span = folder, study, digests, span
-        self.items = study.items()
+        items = study.items()
+        self.points = [0, *itertools.accumulate(len(item.points) for item in items)]
         self.look()
 
     def look(self) -> None:
@@ -81,25 +81,17 @@ class Parts:
                 if not known or part.first >= known[-1].end:
                     known.append(part)
 
-    def add(self, batch: Batch) -> None:
-        """Know the parts of a batch that has been written."""
-        for name in batch.players:
-            self.known[name].append(PartName(self.digests[name], batch.first, batch.end))
-
     @property
     def total(self) -> int:
         """Number of runs that belong into the folder."""
-        items = self.items[self.span.start : self.span.stop]
-        return runs_of(self.study, items, self.study.players)
+        points = self.points[self.span.stop] - self.points[self.span.start]
+        return points * len(self.study.contenders)
 
     @property
     def done(self) -> int:
         """Number of runs that are there."""
-        return sum(
-            runs_of(self.study, self.items[part.first : part.end], (name,))
-            for name, parts in self.known.items()
-            for part in parts
-        )
+        parts = (part for one in self.study.contenders for part in self.known[one.name])
+        return sum(self.points[part.end] - self.points[part.first] for part in parts)
 
     @property
     def files(self) -> list[Path]:
@@ -121,12 +113,6 @@ class Parts:
             path.unlink(missing_ok=True)
 
 
-def runs_of(study: Study, items: Sequence[Item], players: Sequence[str]) -> int:
-    """Return how many runs some contenders have in some items."""
-    contenders = len({one.name for one in study.contenders}.intersection(players))
-    return contenders * sum(len(item.points) for item in items)
-
-
 def batches_of(study: Study, left: Mapping[int, tuple[str, ...]], processes: int) -> list[Batch]:
     """Return batches of items that follow each other and that the same players have left.
 
@@ -138,7 +124,7 @@ def batches_of(study: Study, left: Mapping[int, tuple[str, ...]], processes: int
         How many share the batches.
     """
     items = study.items()
-    most = max((runs_of(study, [items[place]], study.players) for place in left), default=1)
+    most = len(study.contenders) * max((len(items[place].points) for place in left), default=1)
     size = max(1, min(-(-len(left) // (BATCHES * processes)), BATCH_RUNS // most))
     # Places that follow each other are as far apart as their numbers in the order.
     stretches = itertools.groupby(
@@ -197,22 +183,6 @@ def write_parquet(path: Path, frame: pl.DataFrame, *, statistics: bool = True) -
         write_whole(path, data.getvalue())
     except OSError as error:
         raise unwritable(path, error) from None
-
-
-def read_parquet(path: Path, remedy: str = "") -> pl.DataFrame:
-    """Read a table.
-
-    Raises
-    ------
-    RunError
-        If it cannot be read.
-    """
-    import polars as pl
-
-    try:
-        return pl.read_parquet(path, glob=False)
-    except (OSError, pl.exceptions.PolarsError) as error:
-        raise RunError(f"{path}: cannot be read ({error}){remedy}") from None
 
 
 def frame_of(summaries: Sequence[tuple[int, Summary]]) -> pl.DataFrame:

@@ -19,7 +19,7 @@ from dwell.model.bounds import counted
 from dwell.study.hindsight import Hindsight
 from dwell.study.judged_cost import judged_cost
 from dwell.study.own_metrics import own_metric
-from dwell.study.reference import CLAIRVOYANT, References, few_misses, play_alone, references
+from dwell.study.reference import CLAIRVOYANT, few_misses, play_alone, references
 from dwell.study.software import software
 from dwell.study.study import TAKEN, Contender, Item, Study
 from dwell.study.summary import Summary, summarise
@@ -40,6 +40,7 @@ COMPARED = frozenset(
         "reference_cost",
         "best_static",
         "regret",
+        "oracle_regret",
         "share_kept",
         "point",
         "costs",
@@ -207,41 +208,36 @@ class Player:
             first.problem, scenario=item.scenario, seed=item.seed, windows=self.study.windows
         )
         for point in item.points:
-            problem = self.study.points[point].problem
-            known = None
+            problem, known, alone = self.study.points[point].problem, None, None
             if self.study.references and CLAIRVOYANT in players:
                 known = references(problem, realisation)
-            for contender, run in self._runs(contenders, point, realisation, known):
+                alone = known.statics
+            elif any(map(_in_hindsight, contenders)):
+                alone = play_alone(problem, realisation)
+            for contender in contenders:
+                seen = self._problem(contender, point)
+                # Candidates alone are played with the estimator `profile`, without shadow jobs.
+                is_static = contender.is_candidate(seen) and seen.controller.estimator == "profile"
+                if known is not None and is_static:
+                    run = known.statics[str(contender.policy)]
+                else:
+                    run = self._simulate(contender, point, realisation, alone)
                 summary = self._summary(run, problem, _labels(item, contender.name))
-                if self._problem(contender, point).objective != problem.objective:
+                if seen.objective != problem.objective:
                     cost = judged_cost(run, problem)
                     summary = replace(summary, row={**summary.row, "cost": cost})
                 yield contender.name, point, run, summary
             if known is None:
                 continue
-            found = _compared(known, problem)
+            found: dict[str, float | str | bytes] = {
+                "reference_cost": known.cost,
+                "best_static": known.best_static,
+                "asked": few_misses(known.run, problem).tobytes(),
+            }
             for name, run in known.runs.items():
                 summary = self._summary(run, problem, _labels(item, name))
                 compared = {**summary.compared, **found}
                 yield CLAIRVOYANT, point, run, replace(summary, compared=compared)
-
-    def _runs(
-        self,
-        contenders: Sequence[Contender],
-        point: int,
-        realisation: Realisation,
-        known: References | None,
-    ) -> Iterator[tuple[Contender, Run]]:
-        """Yield the runs of contenders at a point."""
-        problem = self.study.points[point].problem
-        alone = known.statics if known is not None else None
-        if alone is None and any(map(_in_hindsight, contenders)):
-            alone = play_alone(problem, realisation)
-        for contender in contenders:
-            if known is not None and self._is_static(contender, point):
-                yield contender, known.statics[str(contender.policy)]
-            else:
-                yield contender, self._simulate(contender, point, realisation, alone)
 
     def _play_fleets(
         self, item: Item, contenders: Sequence[Contender]
@@ -304,14 +300,6 @@ class Player:
             estimator=estimator,
         )
 
-    def _is_static(self, contender: Contender, point: int) -> bool:
-        """Whether a contender's run is a candidate's alone.
-
-        Those are played with the estimator ``profile``: shadow jobs would be load.
-        """
-        problem = self._problem(contender, point)
-        return contender.is_candidate(problem) and problem.controller.estimator == "profile"
-
     def _problem(self, contender: Contender, point: int) -> Problem:
         """Return the problem of a point as a contender sees it."""
         key = (point, contender.name)
@@ -322,15 +310,6 @@ class Player:
 
 def _labels(item: Item, policy: str) -> dict[str, str | int]:
     return {"scenario": item.scenario, "policy": policy, "seed": item.seed}
-
-
-def _compared(known: References, problem: Problem) -> dict[str, float | str | bytes]:
-    """Return what tables need of the references to compare runs with them."""
-    return {
-        "reference_cost": known.cost,
-        "best_static": known.best_static,
-        "asked": few_misses(known.run, problem).tobytes(),
-    }
 
 
 def _in_hindsight(contender: Contender) -> bool:

@@ -1,20 +1,22 @@
-"""References of a realisation in hindsight: every candidate alone, and the clairvoyant's sequences.
+"""References of a realisation: every candidate alone, and sequences planned beforehand.
 
-The clairvoyant knows what every candidate, simulated alone, costs in every window of the same
-realisation. It plans the cheapest sequence of them, once with the dwell of Algorithm 1 and once
-without any, and the sequences are simulated. What they cost there counts, not what was promised.
+Each reference is planned by dynamic programming, once with the dwell of Algorithm 1 and once
+without a dwell. The plans are simulated on the same realisation, and the simulated cost counts.
 
-It is no bound. A window that follows one under another candidate does not cost what it costs when
-its candidate runs alone: work still queued comes along, and a node that is left alone recovers, so
-that taking turns may beat two overloaded nodes. Regret is therefore measured against the cheapest
-run of all, candidates alone and sequences, and may be negative.
+The clairvoyant plans with the J of every window of every candidate that was simulated alone on
+this realisation: it knows all random numbers. The oracle plans with expected costs: it knows when
+each disturbance is on, and no other random numbers (`dwell.study.oracle`).
 
-Whoever knows the future sends orders in time, and has a moved task ready when it is due: the
-sequences move at the boundary of the windows they were planned for, without ``order_delay_ms``,
-``order_lead_cycles`` or a cold start. (Orders that are given late shift all later windows by the
-cycles that they take, and after some tens of migrations the plan is about other cycles than those
-it is applied to.) Where ``close_grace_ms`` is set, or releases jitter, windows close after the
-release of the first cycle beyond them, and a migration still comes that much late.
+Neither is a bound. J of a window depends on the windows before it: queued work is carried over to
+another candidate, and a node that is left alone recovers, so taking turns may beat two overloaded
+nodes. Regret is measured against the cheapest of the candidates alone and the clairvoyant's
+sequences, and may be negative.
+
+Orders of both come in time, and a moved task is ready when it is due: the sequences move at the
+planned boundaries, without ``order_delay_ms``, ``order_lead_cycles`` or a cold start. (Late orders
+shift all later windows, and after some tens of migrations the plan is about other cycles.) With
+``close_grace_ms``, or if releases jitter, a window closes after the first release beyond it, and a
+migration is late by that time.
 """
 
 from __future__ import annotations
@@ -27,14 +29,15 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.control.windows import seen_l95_ms
-from dwell.cost import hamming, price
+from dwell.control.windows import moved_shares, seen_l95_ms
+from dwell.cost import price
 from dwell.errors import SimulationError
 from dwell.estimators import Profile
 from dwell.model import FrozenDict, Problem
 from dwell.model.window_close import window_close_ns
 from dwell.study.clairvoyant import Sequence, clairvoyant, priced
-from dwell.study.script import Script
+from dwell.study.oracle import expected_costs
+from dwell.study.script import Script, is_up
 from dwell.study.summary import busiest, mean_of, used_in
 
 if TYPE_CHECKING:
@@ -46,9 +49,12 @@ Mask: TypeAlias = NDArray[np.bool_]
 
 CLAIRVOYANT = "clairvoyant"
 CLAIRVOYANT_DWELL = "clairvoyant-dwell"
+ORACLE = "oracle"
+ORACLE_DWELL = "oracle-dwell"
+REFERENCES = (CLAIRVOYANT, CLAIRVOYANT_DWELL, ORACLE, ORACLE_DWELL)
 
-#: How much J of a warm-up window counts in a plan: enough to choose between sequences that are
-#: equal after the warm-up.
+#: How much J of the warm-up counts in a plan: enough to choose between sequences that are equal
+#: after the warm-up.
 WARMUP_SHARE = 1e-6
 
 
@@ -61,13 +67,13 @@ class References:
     statics : mapping of str to Run
         Every candidate alone.
     runs : mapping of str to Run
-        The sequences, simulated: ``clairvoyant`` (no dwell) and ``clairvoyant-dwell``.
+        The sequences of `REFERENCES`, simulated.
     sequences : mapping of str to Sequence
         As they were planned; candidates by their place in the order.
     costs : mapping of str to float
         Mean J of each static and each sequence (see `mean_cost`).
     promised : mapping of str to float
-        The same mean of each sequence as it was planned, over windows of candidates alone.
+        Mean J of each sequence as it was planned; of the oracle's, expected J.
     """
 
     statics: Mapping[str, Run]
@@ -78,8 +84,9 @@ class References:
 
     @property
     def name(self) -> str:
-        """The static or sequence that costs least; a static where it ties with a sequence."""
-        return min(self.costs, key=self.costs.__getitem__)
+        """The cheapest static or clairvoyant sequence; a static if it ties with a sequence."""
+        known = (*self.statics, CLAIRVOYANT, CLAIRVOYANT_DWELL)
+        return min(known, key=self.costs.__getitem__)
 
     @property
     def cost(self) -> float:
@@ -120,9 +127,9 @@ def play_alone(problem: Problem, realisation: Realisation) -> dict[str, Run]:
 
 
 def references(problem: Problem, realisation: Realisation) -> References:
-    """Simulate every candidate alone, plan with what they cost, and simulate the plans.
+    """Simulate every candidate alone, plan the sequences, and simulate them.
 
-    All of it with the estimator ``profile``: nobody here needs estimates, and shadow jobs would be
+    All runs have the estimator ``profile``: no reference needs estimates, and shadow jobs would be
     load.
 
     Parameters
@@ -134,38 +141,35 @@ def references(problem: Problem, realisation: Realisation) -> References:
     ------
     SimulationError
         If the controller sees no window after the warm-up, or a candidate has the name of a
-        sequence.
+        reference.
     """
     from dwell.sim import simulate_realisation
 
-    dwells = {CLAIRVOYANT: 0, CLAIRVOYANT_DWELL: problem.controller.min_dwell}
     names = tuple(problem.candidates)
-    if taken := dwells.keys() & set(names):
+    if taken := set(REFERENCES) & set(names):
         raise SimulationError(
             f"candidates.{min(taken)} has the name of a reference; call it something else"
         )
-    in_time = _in_time(problem)
+    in_time, width = _in_time(problem), problem.window_cycles
     statics = play_alone(problem, realisation)
     costs = {name: mean_cost(run) for name, run in statics.items()}
     alone = np.stack([window_costs(run, problem, realisation) for run in statics.values()], axis=1)
-    switching = _switching(problem)
-    windows = statics[names[0]].arrays("windows")
-    seen, warmup = ~np.isnan(windows["cost"]), windows["warmup"]
+    decide_cycles, least = problem.decide_cycles, problem.controller.min_dwell
+    expected = expected_costs(problem, realisation, decide_cycles)
     sequences, runs, promised = {}, {}, {}
-    for title, dwell in dwells.items():
-        plan = clairvoyant(
-            alone,
-            switching,
-            initial=names.index(problem.initial),
-            min_dwell=dwell,
-            counts=np.where(warmup, WARMUP_SHARE, 1.0),
-            decides=seen,
-        )
-        script = Script([names[i] for i in plan.choice.tolist()], in_time, realisation)
+    for title, known, cycles, dwell in (
+        (CLAIRVOYANT, alone, width, 0),
+        (CLAIRVOYANT_DWELL, alone, width, least),
+        (ORACLE, expected, decide_cycles, 0),
+        (ORACLE_DWELL, expected, decide_cycles, least),
+    ):
+        plan, promised[title] = planned(problem, realisation, known, cycles, dwell)
+        settings = replace(in_time.controller, decide_cycles=cycles)
+        decided = replace(in_time, controller=settings)
+        script = Script([names[i] for i in plan.choice.tolist()], decided, realisation, cycles)
         sequences[title] = plan
-        runs[title] = simulate_realisation(in_time, realisation, policy=script, estimator="profile")
+        runs[title] = simulate_realisation(decided, realisation, policy=script, estimator="profile")
         costs[title] = mean_cost(runs[title])
-        promised[title] = float(np.mean(priced(plan.choice, alone, switching)[seen & ~warmup]))
     return References(
         statics=FrozenDict(statics),
         runs=FrozenDict(runs),
@@ -173,6 +177,47 @@ def references(problem: Problem, realisation: Realisation) -> References:
         costs=FrozenDict(costs),
         promised=FrozenDict(promised),
     )
+
+
+def planned(
+    problem: Problem, realisation: Realisation, costs: Floats, decide_cycles: int, min_dwell: int
+) -> tuple[Sequence, float]:
+    """Plan the cheapest sequence, and return it with its mean J of a window.
+
+    Parameters
+    ----------
+    costs : float64 array, shape (stretches, candidates)
+        J of every stretch between decisions, in windows' J: half of a window has half of its J.
+    decide_cycles : int
+        Cycles of a stretch; the last one may be shorter.
+    min_dwell : int
+        N_min, windows.
+
+    Returns
+    -------
+    Sequence
+        A candidate for each stretch.
+    float
+        Mean over the windows after the warm-up whose close the controller sees.
+    """
+    switching = problem.objective.weights.switching * moved_shares(problem)
+    width = problem.window_cycles
+    begin = np.arange(len(costs)) * decide_cycles
+    end = np.minimum(begin + decide_cycles, realisation.cycles)
+    last_ns, beyond_ns = realisation.release_ns[end - 1], realisation.release_ns[end]
+    seen = is_up(problem, realisation, window_close_ns(problem, last_ns, beyond_ns))
+    warmup = begin < problem.warmup_windows * width
+    plan = clairvoyant(
+        costs,
+        switching,
+        initial=tuple(problem.candidates).index(problem.initial),
+        min_dwell=min(-(-min_dwell * width // decide_cycles), len(costs)),
+        counts=np.where(warmup, WARMUP_SHARE, 1.0),
+        decides=seen,
+    )
+    counted = seen & ~warmup
+    windows = (end - begin)[counted].sum() / width
+    return plan, float(priced(plan.choice, costs, switching)[counted].sum() / windows)
 
 
 def regret(run_cost: float, reference_cost: float) -> float:
@@ -265,18 +310,11 @@ def window_costs(run: Run, problem: Problem, realisation: Realisation) -> Floats
     -------
     float64 array, shape (windows,)
     """
-    costs: Floats = run.arrays("windows")["cost"].copy()
-    unseen = np.isnan(costs)
-    if unseen.any():
-        costs[unseen] = _unseen_costs(run, unseen, problem, realisation)
-    return costs
-
-
-def _unseen_costs(
-    run: Run, unseen: NDArray[np.bool_], problem: Problem, realisation: Realisation
-) -> Floats:
-    """J of the windows that the controller did not see, in their order."""
     windows = run.arrays("windows")
+    costs: Floats = windows["cost"].copy()
+    unseen = np.isnan(costs)
+    if not unseen.any():
+        return costs
     rows = windows["first_cycle"][unseen][:, None] + np.arange(problem.window_cycles)
     latency_ns = run.arrays("cycles")["latency_ns"][rows]
     release_ns = realisation.release_ns
@@ -285,7 +323,8 @@ def _unseen_costs(
     l95_ms, _ = seen_l95_ms(latency_ns, age_ns, problem.censor_ms)
     rate = windows["violation_rate"][unseen]
     robot, edge, cloud = (share[unseen] for share in tier_use(windows, problem))
-    return price(l95_ms, rate, robot, edge, cloud, 0.0, problem.objective)
+    costs[unseen] = price(l95_ms, rate, robot, edge, cloud, 0.0, problem.objective)
+    return costs
 
 
 def tier_use(windows: TableArrays, problem: Problem) -> tuple[Floats, Floats, Floats]:
@@ -294,15 +333,15 @@ def tier_use(windows: TableArrays, problem: Problem) -> tuple[Floats, Floats, Fl
 
 
 def _in_time(problem: Problem) -> Problem:
-    """Return the same problem with a controller whose orders take effect as windows close."""
+    """Return the same problem with a controller whose orders take effect as windows close.
+
+    It decides once per window, since the sequences have one placement per window.
+    """
     settings = replace(
-        problem.controller, order_delay_ms=0.0, order_lead_cycles=0, migration="warm"
+        problem.controller,
+        order_delay_ms=0.0,
+        order_lead_cycles=0,
+        migration="warm",
+        decide_cycles=None,
     )
     return replace(problem, controller=settings)
-
-
-def _switching(problem: Problem) -> Floats:
-    """Price of every move in units of J, from the row's candidate to the column's."""
-    placements = problem.candidates.values()
-    shares = [[hamming(after, before) for after in placements] for before in placements]
-    return problem.objective.weights.switching * np.array(shares, np.float64)

@@ -49,7 +49,8 @@ class StudyRuns(Displayed):
         that begin with `PARAMETER`, ``scenario``, ``policy``, ``seed``, and what
         `dwell.study.summary` makes of the run. ``cost`` is J by the objective of the point,
         whatever the settings of the contender. With references, also ``reference_cost``,
-        ``best_static``, ``regret``, and ``share_kept`` (see `dwell.study.reference.kept`).
+        ``best_static``, ``regret``, ``oracle_regret``, and ``share_kept`` (see
+        `dwell.study.reference`).
     costs : DataFrame
         One row a run and candidate: mean J ``estimated`` while it was not active (against the
         incumbent, switching term included), mean J ``measured`` while it was, both by the

@@ -17,13 +17,12 @@ from typing import TYPE_CHECKING, Any
 from dwell.cellfile.work_folder import open_work_folder
 from dwell.errors import SimulationError
 from dwell.model.progress import Progress
+from dwell.record.run import read_table
 from dwell.study.parts import (
     Parts,
     batches_of,
     frame_of,
     play_and_write,
-    read_parquet,
-    runs_of,
     write_parquet,
     write_parts,
 )
@@ -132,7 +131,7 @@ def play_in_memory(
         nonlocal done
         frames.extend(map(frame_of, played.summaries.values()))
         examples.update(played.examples)
-        done += runs_of(study, played.batch.items, played.batch.players)
+        done += len(study.contenders) * sum(len(item.points) for item in played.batch.items)
         if progress is not None:
             progress(done, study.runs)
 
@@ -214,22 +213,19 @@ def play_parts(
     progress: Progress | None = None,
 ) -> None:
     """Play what a folder misses; see `run_study`."""
-    study, folder, done = parts.study, parts.folder, parts.done
-    workers = _workers(processes, dask)
+    folder, workers = parts.folder, _workers(processes, dask)
     missing = parts.missing(workers)
 
-    def count(more: int = 0) -> None:
-        nonlocal done
-        done += more
+    def look() -> None:
+        parts.look()
         if progress is not None:
-            progress(done, parts.total)
+            progress(parts.done, parts.total)
 
     def take(_: Batch, played: PlayedBatch) -> None:
         write_parts(folder, parts.digests, played)
-        parts.add(played.batch)
-        count(runs_of(study, played.batch.items, played.batch.players))
+        look()
 
-    count()
+    look()
     if not missing:
         return
     for name in TABLES:
@@ -241,9 +237,7 @@ def play_parts(
         _spread(task, missing, workers, dask, take)
     except KeyboardInterrupt:
         # Workers have finished the batches that they had begun.
-        parts.look()
-        done = parts.done
-        count()
+        look()
         raise
     parts.clear()
 
@@ -260,7 +254,7 @@ def write_tables(parts: Parts) -> Tables:
     """
     # From the files in any case: a study that was stopped makes its tables of the same.
     remedy = "; remove it and run the study again"
-    tables = tables_of(parts.study, (read_parquet(file, remedy) for file in parts.files))
+    tables = tables_of(parts.study, (read_table(file, remedy)() for file in parts.files))
     for name, table in tables.items():
         write_parquet(parts.folder / f"{name}.parquet", table)
     return tables

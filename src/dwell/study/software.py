@@ -23,8 +23,8 @@ from dwell.study.study import Contender, Point, Study
 SOURCES = (
     *("control", "cost.py", "estimators", "kernels", "model", "policies", "sim"),
     "record/table_arrays.py",
-    *(f"study/{name}.py" for name in ("clairvoyant", "fleet_summary", "hindsight", "parts")),
-    *(f"study/{name}.py" for name in ("player", "quality", "reference", "script")),
+    *(f"study/{name}.py" for name in ("clairvoyant", "fleet_summary", "hindsight", "oracle")),
+    *(f"study/{name}.py" for name in ("parts", "player", "quality", "reference", "script")),
     *(f"study/{name}.py" for name in ("study_tables", "summary")),
 )
 
@@ -82,8 +82,8 @@ def describe(study: Study) -> dict[str, Any]:
         "parameters": list(study.parameters),
         "points": [list(point.values.values()) for point in study.points],
         "cell": cells[0],
-        "cells": hashlib.sha256(json.dumps(cells).encode()).hexdigest(),
-        **({"fleets": hashlib.sha256(json.dumps(fleets).encode()).hexdigest()} if fleets else {}),
+        "cells": _digest(cells),
+        **({"fleets": _digest(fleets)} if fleets else {}),
         **({"metrics": dict(study.metrics)} if study.metrics else {}),
     }
 
@@ -147,13 +147,15 @@ def part_digests(description: Mapping[str, Any], sources: Sources) -> dict[str, 
     """
     policies = description["policies"]
     common = {name: value for name, value in description.items() if name != "policies"}
-    shared = hashlib.sha256(json.dumps(common).encode()).hexdigest()
+    shared = _digest(common)
     return {
-        name: hashlib.sha256(
-            json.dumps([shared, name, policies.get(name), used]).encode()
-        ).hexdigest()[:16]
+        name: _digest([shared, name, policies.get(name), used])[:16]
         for name, used in sources.items()
     }
+
+
+def _digest(document: object) -> str:
+    return hashlib.sha256(json.dumps(document).encode()).hexdigest()
 
 
 def _contender(contender: Contender) -> Mapping[str, Any]:

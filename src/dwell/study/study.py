@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from typing import TYPE_CHECKING
@@ -18,7 +18,7 @@ from dwell.model.fleet import Fleet
 from dwell.model.problem import Drawn
 from dwell.model.semantics import nearest
 from dwell.study.over_seeds import is_plain
-from dwell.study.reference import CLAIRVOYANT, CLAIRVOYANT_DWELL
+from dwell.study.reference import CLAIRVOYANT, REFERENCES
 
 if TYPE_CHECKING:
     from dwell.estimators import Estimator
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 #: share does not count, and few enough that little is lost with an item.
 ITEM_RUNS = 64
 
-REFERENCES = (CLAIRVOYANT, CLAIRVOYANT_DWELL)
 TAKEN = "the tables have such a column already; choose another name"
 
 
@@ -158,7 +157,7 @@ class Study:
     windows : int
         Length of every run, the warm-up included.
     references : bool
-        Whether the references in hindsight play as well.
+        Whether the references play as well.
     labels : mapping of str to str
         Names of parameters in figures and tables, by their paths; a path where there is none.
     metrics : mapping of str to str
@@ -276,10 +275,14 @@ class Study:
         Points that differ in the controller and the objective alone are played in one item, as
         many as make `ITEM_RUNS`.
         """
+        drawn_alike: dict[Drawn | int, list[int]] = {}
+        for index, point in enumerate(self.points):
+            alike = point.problem.drawn if point.fleet is None else index
+            drawn_alike.setdefault(alike, []).append(index)
         size = max(1, ITEM_RUNS // len(self.contenders))
         groups = [
-            group[begin : begin + size]
-            for group in self._drawn_alike()
+            tuple(group[begin : begin + size])
+            for group in drawn_alike.values()
             for begin in range(0, len(group), size)
         ]
         return tuple(
@@ -288,14 +291,6 @@ class Study:
             for scenario in self.scenarios
             for group in groups
         )
-
-    def _drawn_alike(self) -> Iterator[tuple[int, ...]]:
-        """Yield points whose realisations are the same."""
-        groups: dict[Drawn | int, list[int]] = {}
-        for index, point in enumerate(self.points):
-            alike = point.problem.drawn if point.fleet is None else index
-            groups.setdefault(alike, []).append(index)
-        yield from (tuple(group) for group in groups.values())
 
 
 def _require_each_once(what: str, given: Sequence[object], remedy: str = "name each once") -> None:
@@ -318,19 +313,7 @@ def load_study(path: str | PathLike[str]) -> Study:
     ProblemError
         With every fault found in it, each with its line and field path.
     """
-    declared = read_study(path, references=REFERENCES)
-    return Study(
-        name=declared.name,
-        points=tuple(Point(point.values, point.problem, point.fleet) for point in declared.points),
-        scenarios=declared.scenarios,
-        contenders=tuple(
-            Contender(one.name, one.policy, one.estimator, one.settings)
-            for one in declared.policies
-        ),
-        seeds=declared.seeds,
-        windows=declared.windows,
-        references=declared.references,
-        labels=declared.labels,
-        metrics=declared.metrics,
-        folder=declared.folder,
-    )
+    declared = read_study(path, references=REFERENCES)._asdict()
+    points = tuple(Point(*one) for one in declared.pop("points"))
+    contenders = tuple(Contender(*one) for one in declared.pop("policies"))
+    return Study(**declared, points=points, contenders=contenders)

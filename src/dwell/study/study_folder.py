@@ -11,7 +11,8 @@ from dwell.cellfile.forms import not_allowed
 from dwell.cellfile.work_folder import FolderMark
 from dwell.errors import DwellError, Fault, ProblemError, RunError
 from dwell.record.json_documents import read_document
-from dwell.study.parts import PARTS, read_parquet
+from dwell.record.run import read_table
+from dwell.study.parts import PARTS
 from dwell.study.results import StudyRuns
 
 #: Folders of shards, by their names.
@@ -98,7 +99,7 @@ def open_study(folder: str | Path) -> StudyRuns:
                 f"{folder}: the study is not finished: there is no {table.name}; run "
                 "`dwell study` with its file again"
             )
-        tables[name] = read_parquet(table)
+        tables[name] = read_table(table)()
     software = {name: one for name, one in known.get("software", {}).items() if name != "sources"}
     return StudyRuns(
         name=str(known.get("name", folder.name)),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from dwell.study.parts import LABELS
-from dwell.study.reference import CLAIRVOYANT, regret, share_kept
+from dwell.study.reference import CLAIRVOYANT, ORACLE, regret, share_kept
 from dwell.study.results import PARAMETER
 from dwell.study.study import Study
 from dwell.study.study_folder import TABLES
@@ -76,17 +76,20 @@ def _place(column: str, names: Sequence[object]) -> pl.Expr:
 
 
 def _compared(ordered: pl.DataFrame) -> pl.DataFrame:
-    """Compare every run with the cheapest reference of its realisation."""
+    """Compare every run with the cheapest reference and the oracle of its realisation."""
     import polars as pl
 
     keys = ["point", "scenario", "seed"]
     found = ["reference_cost", "best_static", "asked"]
     known = ordered.filter(policy=CLAIRVOYANT).select(*keys, *found)
+    oracle = ordered.filter(policy=ORACLE).select(*keys, oracle_cost="cost")
     joined = ordered.drop(found).join(known, on=keys, how="left", maintain_order="left")
+    joined = joined.join(oracle, on=keys, how="left", maintain_order="left")
     masks = joined.select("kept", "asked").iter_rows()
     kept = [share_kept(*(np.frombuffer(one, np.bool_) for one in both)) for both in masks]
     costs = joined.select("cost", "reference_cost").iter_rows()
-    return joined.drop("kept", "asked").with_columns(
+    return joined.drop("kept", "asked", "oracle_cost").with_columns(
+        oracle_regret=joined["cost"] / joined["oracle_cost"] - 1.0,
         regret=pl.Series([regret(*both) for both in costs], dtype=pl.Float64),
         share_kept=pl.Series(kept, dtype=pl.Float64),
     )

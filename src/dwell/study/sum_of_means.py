@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from dwell.estimators.paths import Floats, longest_path, steps_of
 from dwell.model import Problem
 from dwell.model.fabric import Link, Node
 from dwell.model.placement import Placement
@@ -37,30 +38,21 @@ def sum_of_means(
         Messages that are lost are left out, and so are nodes and links that are down.
     """
     items = problem.scenario(scenario)
-    tasks, links = problem.pipeline.tasks, problem.fabric.links
-    done_ms: dict[str, float] = {}
-
-    def done(name: str) -> float:
-        if name in done_ms:
-            return done_ms[name]
-        ready = 0.0
-        for flow in problem.pipeline.inputs(name):
-            arrived = done(flow.source)
-            source, target = placement[flow.source], placement[name]
-            if source != target:
-                link = links[f"{source}->{target}"]
-                disturbed = _on(items, link.name, begin_s, end_s)
-                arrived += _message_ms(link, flow.payload_bytes, disturbed)
-            ready = max(ready, arrived)
-        task, node = tasks[name], problem.fabric.nodes[placement[name]]
+    pipeline, fabric = problem.pipeline, problem.fabric
+    executed: list[Floats] = []
+    for name, task in pipeline.tasks.items():
+        node = fabric.nodes[placement[name]]
         mean_ms = task.on[node.name].exec_ms.expectation
         if task.scale is not None:
-            mean_ms *= problem.pipeline.scales[task.scale].expectation
+            mean_ms *= pipeline.scales[task.scale].expectation
         slower = _slow_down(node, _on(items, node.name, begin_s, end_s))
-        done_ms[name] = ready + task.offset_ms + mean_ms * slower
-        return done_ms[name]
-
-    return max(done(name) for name in tasks)
+        executed.append(np.array(mean_ms * slower))
+    sent = []
+    for flow in pipeline.flows:
+        link = fabric.links.get(f"{placement[flow.source]}->{placement[flow.target]}")
+        on = [] if link is None else _on(items, link.name, begin_s, end_s)
+        sent.append(0.0 if link is None else _message_ms(link, flow.payload_bytes, on))
+    return float(longest_path(steps_of(pipeline), executed, sent))
 
 
 def sums_of_shares(
@@ -99,10 +91,7 @@ def _on(
             continue
         share = overlap / (end_s - begin_s)
         if item.episodes is not None:
-            on_s, off_s = (
-                item.episodes.for_s.expectation,
-                item.episodes.every_s.expectation,
-            )
+            on_s, off_s = item.episodes.for_s.expectation, item.episodes.every_s.expectation
             share *= on_s / (on_s + off_s)
         found.append((item, share))
     return found
@@ -117,7 +106,6 @@ def _slow_down(node: Node, on: Iterable[tuple[Disturbance, float]]) -> float:
 
 
 def _message_ms(link: Link, size_bytes: int, on: Iterable[tuple[Disturbance, float]]) -> float:
-    on = list(on)
     mean_ms = link.delay_ms.expectation
     rate_mbps = link.rate_mbps
     for item, share in on:

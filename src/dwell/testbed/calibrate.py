@@ -10,12 +10,13 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from dwell.calibration.cell_yaml import replay
 from dwell.calibration.profile_file import Measurement, link_name, stamp, task_name, write_profile
 from dwell.calibration.speeds import Usual, at_speed_of
 from dwell.cellfile.yaml_text import yaml_of
@@ -57,28 +58,6 @@ NODE_LINES = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Calibrated:
-    """Files that were written, and what is in them.
-
-    Parameters
-    ----------
-    problem : Problem
-        As read from the new cell file.
-    report : dict
-        As in the sidecar.
-    missing : tuple of str
-        Tasks and links that no run has visited, and that are as they were.
-    """
-
-    cell: Path
-    samples: Path
-    sidecar: Path
-    problem: Problem
-    report: dict[str, Any]
-    missing: tuple[str, ...]
-
-
 def calibrate(
     cell: Path,
     runs: Sequence[Path],
@@ -86,7 +65,7 @@ def calibrate(
     *,
     emulated: bool = True,
     say: Callable[[str], None] = print,
-) -> Calibrated:
+) -> None:
     """Write a cell with the execution times, delays and backgrounds that runs have shown.
 
     Parameters
@@ -141,10 +120,11 @@ def calibrate(
     document = _document(cell, out)
     samples = out.with_name(f"{out.stem}.samples.parquet")
     _write_samples(samples, costs, columns, delays_ms, measured, added_ms)
-    _put_in(document, samples.name, costs, delays_ms, nodes)
-    _write_cell(out, document, cell, runs)
+    _put_in(document, Path(samples.name), costs, delays_ms, nodes)
+    head = f"# {cell.name} with what was measured of it, by `dwell testbed calibrate`.\n"
+    head += f"# Runs: {', '.join(path.resolve().name for path in runs)}\n"
+    write_whole(out, head + yaml_of(document))
     written = load(out)
-    missing = _missing(problem, costs, delays_ms)
     report = {
         "runs": [one.name for one in measured],
         "ids": [one.run.run_id for one in measured if one.run.run_id is not None],
@@ -162,13 +142,19 @@ def calibrate(
             {task_name(*site): value for site, value in usual.sensitivity.items()}
         ),
         "check": [row for one in measured if (row := _check(one, written, usual)) is not None],
-        "missing": list(missing),
+        "missing": [
+            *(
+                task_name(task.name, node)
+                for task in problem.pipeline.tasks.values()
+                for node in task.on
+                if (task.name, node) not in costs
+            ),
+            *(link for link in problem.fabric.links if link not in delays_ms),
+        ],
     }
-    sidecar = out.with_name(f"{out.stem}.calibration.json")
-    write_whole(sidecar, json.dumps(report, indent=2) + "\n")
+    write_whole(out.with_name(f"{out.stem}.calibration.json"), json.dumps(report, indent=2) + "\n")
     for line in _lines(report):
         say(line)
-    return Calibrated(out, samples, sidecar, written, report, missing)
 
 
 def _cpus(measured: Sequence[Measured]) -> dict[str, tuple[int, ...]]:
@@ -332,19 +318,15 @@ def _document(cell: Path, out: Path) -> dict[str, Any]:
 
 def _put_in(
     document: dict[str, Any],
-    file: str,
+    file: Path,
     costs: Mapping[SiteName, TaskCost],
     delays_ms: Mapping[str, Floats],
     nodes: Mapping[str, Mapping[str, Any]],
 ) -> None:
     """Put findings on tasks, on nodes by key, and on links into a cell's document."""
-
-    def replay(column: str) -> dict[str, Any]:
-        return {"trace": {"file": file, "column": column, "by": "row", "wrap": True}}
-
     for (task, node), of in costs.items():
         on = document["tasks"][task]["on"][node]
-        on["exec_ms"] = replay(task_name(task, node))
+        on["exec_ms"] = replay(file, task_name(task, node))
         on |= {"before_ms": _short(of.before_ms), "after_ms": _short(of.after_ms)}
         # The samples have what the task shares with others already.
         document["tasks"][task].pop("scale", None)
@@ -364,29 +346,10 @@ def _put_in(
             one = {name: value for name, value in entry.items() if name != "both_ways"}
             one |= {"from": source, "to": target}
             if f"{source}->{target}" in delays_ms:
-                one["delay_ms"] = replay(f"{source}->{target}")
+                one["delay_ms"] = replay(file, f"{source}->{target}")
             links.append(one)
     if links:
         document["links"] = links
-
-
-def _write_cell(out: Path, document: dict[str, Any], cell: Path, runs: Sequence[Path]) -> None:
-    names = ", ".join(path.resolve().name for path in runs)
-    head = f"# {cell.name} with what was measured of it, by `dwell testbed calibrate`.\n"
-    head += f"# Runs: {names}\n"
-    write_whole(out, head + yaml_of(document))
-
-
-def _missing(
-    problem: Problem, costs: Mapping[SiteName, TaskCost], delays_ms: Mapping[str, Floats]
-) -> tuple[str, ...]:
-    tasks = (
-        task_name(task.name, node)
-        for task in problem.pipeline.tasks.values()
-        for node in task.on
-        if (task.name, node) not in costs
-    )
-    return *tasks, *(link for link in problem.fabric.links if link not in delays_ms)
 
 
 # ------------------------------------------------------------------------------ the report

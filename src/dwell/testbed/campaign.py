@@ -121,16 +121,11 @@ class Campaign:
             self.problem.scenario(scenario)
         for one in self.entrants:
             by_name(one.policy, one.problem(self.problem))
-        least = (self.problem.warmup_windows + 1) * self.window_s
+        least = (self.problem.warmup_windows + 1) * self.problem.window_ms / 1e3
         if not self.seconds >= least:
             raise ProblemError(
                 f"runs of {self.seconds:g} s are too short: warm-up and one window take {least:g} s"
             )
-
-    @property
-    def window_s(self) -> float:
-        """Length of a window."""
-        return self.problem.window_ms / 1e3
 
     def plan(self) -> tuple[Planned, ...]:
         """Return all runs in their order: blocks of one repetition, each shuffled by itself."""

@@ -21,7 +21,6 @@ class CellObserver(Protocol):
 
     def look(self, now_ns: int) -> Mapping[str, float]:
         """Return values seen now, by names with units: ``error_mm``; NaN where unknown."""
-        ...
 
     def told(self, origin_ns: int) -> Mapping[str, object]:
         """Return notes for the run's record, ready for JSON.
@@ -31,11 +30,9 @@ class CellObserver(Protocol):
         origin_ns : int
             First release of the run: where its time begins.
         """
-        ...
 
     def close(self) -> None:
         """Look no more."""
-        ...
 
 
 def load_observer(name: str, problem: Problem, folder: Path, begin_ns: int) -> CellObserver:

@@ -12,7 +12,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
-from types import TracebackType
 from typing import Any, Self
 
 from dwell.errors import DwellError, LiveError
@@ -23,6 +22,21 @@ ANSWER_S = 20.0
 STOP_S = 2.0
 #: How often a child looks for its parent, beside the end of their connection.
 PARENT_CHECK_S = 0.5
+
+
+def run_command(*words: str, given: str = "") -> str:
+    """Run a command of the system to its end; returns its output.
+
+    Raises
+    ------
+    LiveError
+        If it fails, with its words and its reason.
+    """
+    done = subprocess.run(words, input=given, capture_output=True, text=True, check=False)  # noqa: S603 - no shell
+    if done.returncode:
+        reason = done.stderr.strip() or f"status {done.returncode}"
+        raise LiveError(f"{' '.join(words)}: {reason}")
+    return done.stdout
 
 
 class Started(ABC):
@@ -60,12 +74,7 @@ class Started(ABC):
         self.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """End it."""
         self.stop()
 

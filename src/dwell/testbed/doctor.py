@@ -84,12 +84,12 @@ def examine(problems: Sequence[Problem] = (), *, watch_s: float = 0.0) -> list[F
     """
     return [
         _root(),
-        _command("ip", "iproute2", "ip"),
-        _command("nsenter", "util-linux", "nsenter"),
+        _command("ip", "iproute2"),
+        _command("nsenter", "util-linux"),
         *_tried(),
         _pinning(),
         _cores(problems),
-        _stress_ng(),
+        _command(STRESS_NG[0], STRESS_NG[0], "; stress is a loop of Dwell's own", needed=False),
         _pressure(),
         _fifo(),
         *([_standstill(problems, watch_s)] if watch_s > 0 else ()),
@@ -102,10 +102,11 @@ def _root() -> Finding:
     return Finding("root", False, f"user {os.geteuid()}", "sudo dwell testbed ...")
 
 
-def _command(name: str, package: str, command: str) -> Finding:
-    if where := shutil.which(command):
-        return Finding(name, True, where)
-    return Finding(name, False, "not installed", f"apt-get install {package}")
+def _command(name: str, package: str, instead: str = "", *, needed: bool = True) -> Finding:
+    if where := shutil.which(name):
+        return Finding(name, True, where, needed=needed)
+    found = f"not installed{instead}"
+    return Finding(name, False, found, f"apt-get install {package}", needed=needed)
 
 
 # ------------------------------------------------------------------------- what is tried
@@ -215,14 +216,6 @@ def _cores(problems: Sequence[Problem]) -> Finding:
         f"{node} on {','.join(map(str, share.cpus))}" for node, share in shares.items()
     )
     return Finding("CPUs", True, f"{found}: {told}")
-
-
-def _stress_ng() -> Finding:
-    command = STRESS_NG[0]
-    if where := shutil.which(command):
-        return Finding(command, True, where, needed=False)
-    found = "not installed; stress is a loop of Dwell's own"
-    return Finding(command, False, found, f"apt-get install {command}", needed=False)
 
 
 def _pressure() -> Finding:

@@ -25,7 +25,6 @@ class Watched(Protocol):
 
     def ready(self) -> None:
         """Read the descriptor, which has something to be read, or has failed."""
-        ...
 
 
 class Loop:

@@ -53,7 +53,6 @@ class Play(Protocol):
         jobs: bool,
     ) -> Path:
         """Return the folder of the run, somewhere below `out`."""
-        ...
 
 
 class State(NamedTuple):

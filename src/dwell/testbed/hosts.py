@@ -12,7 +12,6 @@ import fcntl
 import os
 import shutil
 import struct
-import subprocess
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -21,7 +20,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from dwell.errors import LiveError
-from dwell.testbed.child import Started
+from dwell.testbed.child import Started, run_command
 from dwell.testbed.groups import kill_all
 
 #: Bytes of the largest packet: IPv4 takes 65 535, and a message of 64 kB is one packet.
@@ -205,17 +204,7 @@ def remove_namespace(namespace: str) -> None:
 def _ip(*words: str, given: str = "") -> str:
     if shutil.which("ip") is None:
         raise LiveError("network namespaces need the command ip: apt-get install iproute2")
-    done = subprocess.run(  # noqa: S603 - no shell
-        ["ip", *words],  # noqa: S607 - wherever iproute2 is
-        input=given,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if done.returncode:
-        reason = done.stderr.strip() or f"status {done.returncode}"
-        raise LiveError(f"ip {' '.join(words)}: {reason}")
-    return done.stdout
+    return run_command("ip", *words, given=given)
 
 
 def _set() -> None:

@@ -104,18 +104,13 @@ def wait_until_idle(
     while True:
         sleep(quiet.for_s)
         now = read()
-        busy, waiting = _between(before, now)
+        passed, elapsed_s = now.all - before.all, now.at_s - before.at_s
+        busy = (now.busy - before.busy) / passed if passed > 0 else 0.0
+        waiting = None
+        if before.waited_s is not None and now.waited_s is not None and elapsed_s > 0:
+            waiting = round((now.waited_s - before.waited_s) / elapsed_s, 4)
         idle = busy <= quiet.busy and (waiting is None or waiting <= quiet.waiting)
         waited_s = now.at_s - begun.at_s
         if idle or waited_s >= quiet.patience_s:
             return Idle(idle, round(waited_s, 1), round(busy, 4), waiting)
         before = now
-
-
-def _between(before: Counters, now: Counters) -> tuple[float, float | None]:
-    passed = now.all - before.all
-    busy = (now.busy - before.busy) / passed if passed > 0 else 0.0
-    elapsed_s = now.at_s - before.at_s
-    if before.waited_s is None or now.waited_s is None or elapsed_s <= 0:
-        return busy, None
-    return busy, round((now.waited_s - before.waited_s) / elapsed_s, 4)

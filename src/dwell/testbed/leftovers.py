@@ -78,7 +78,8 @@ class Claim(Started):
             raise LiveError(f"{self._lock}: {error.strerror}") from None
         self._clear()
         self._require_free()
-        self._write()
+        record = json.dumps({"pid": os.getpid(), "namespaces": self._namespaces})
+        write_whole(self._record, record, durable=False)
 
     def stop(self) -> None:
         """Give the name back, after removing any remains."""
@@ -87,7 +88,9 @@ class Claim(Started):
         try:
             self._clear()
         finally:
-            self._release()
+            self._lock.unlink(missing_ok=True)  # while it is locked: nobody else has it
+            os.close(self._handle)
+            self._handle = None
 
     def _open(self) -> int:
         while True:
@@ -110,12 +113,6 @@ class Claim(Started):
                 os.close(handle)
                 raise
             os.close(handle)  # its owner has just removed it
-
-    def _release(self) -> None:
-        if self._handle is not None:
-            self._lock.unlink(missing_ok=True)  # while it is locked: nobody else has it
-            os.close(self._handle)
-            self._handle = None
 
     def _clear(self) -> None:
         """Remove the hosts and groups that the record lists, and then the record."""
@@ -145,10 +142,6 @@ class Claim(Started):
                 f"the name {self.name!r} is taken, by none that a testbed of this name left: "
                 f"{'; '.join(taken)}; remove these, or use another name"
             )
-
-    def _write(self) -> None:
-        record = json.dumps({"pid": os.getpid(), "namespaces": self._namespaces})
-        write_whole(self._record, record, durable=False)
 
 
 def _same(handle: int, path: Path) -> bool:

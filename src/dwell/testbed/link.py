@@ -21,11 +21,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from dwell.errors import LiveError
+from dwell.model import FrozenDict
 from dwell.testbed.child import Child
 from dwell.testbed.conditions import Conditions, Scheduling, changed, fields_of
 from dwell.testbed.forwarder import Passed
-
-NO_CONDITIONS: Mapping[tuple[str, str], Conditions] = {}
 
 
 class TunLink(Child):
@@ -55,25 +54,24 @@ class TunLink(Child):
         self,
         nodes: tuple[str, str],
         descriptors: Mapping[str, int],
-        usual: Mapping[tuple[str, str], Conditions] = NO_CONDITIONS,
+        usual: Mapping[tuple[str, str], Conditions] = FrozenDict(),
         *,
-        retransmit_ms: Mapping[tuple[str, str], float] | None = None,
+        retransmit_ms: Mapping[tuple[str, str], float] = FrozenDict(),
         seed: int = 0,
     ) -> None:
         if nodes[0] == nodes[1] or set(descriptors) != set(nodes):
             raise LiveError(f"link {'-'.join(nodes)}: needs one device each of two nodes")
         files = [descriptors[node] for node in nodes]
-        timeouts = dict(retransmit_ms or {})
         self.nodes, self.name = nodes, f"link {nodes[0]}-{nodes[1]}"
-        for source, target in timeouts:
+        for source, target in retransmit_ms:
             self._require(source, target)
-        self._repeats = frozenset(source for source, _ in timeouts)
+        self._repeats = frozenset(source for source, _ in retransmit_ms)
         self._conditions = dict.fromkeys(self.ways, Conditions())
         for way, conditions in usual.items():
             self._change(*way, fields_of(conditions))
         settings = (
             *(nodes, files, {source: now for (source, _), now in self._conditions.items()}),
-            {source: round(ms * 1e6) for (source, _), ms in timeouts.items()},
+            {source: round(ms * 1e6) for (source, _), ms in retransmit_ms.items()},
             seed,
         )
         super().__init__("dwell.testbed.forwarder", self.name, settings, descriptors=files)
@@ -98,7 +96,7 @@ class TunLink(Child):
         at_ns : int, optional
             When, by the monotonic clock; at once if left out or past.
         **changes
-            Fields of `Conditions`.
+            Fields of `Conditions`. Packets on their way arrive in spite of `down`.
 
         Returns
         -------
@@ -114,10 +112,6 @@ class TunLink(Child):
         news = self._change(source, target, changes)
         since_ns: int = self.ask(("set", source, news, at_ns or 0))
         return since_ns
-
-    def down(self, source: str, target: str, down: bool, *, at_ns: int | None = None) -> int:
-        """Begin or end an outage of a direction: packets on their way arrive; returns as `set`."""
-        return self.set(source, target, at_ns=at_ns, down=down)
 
     def read(self, *, reset: bool = True) -> dict[tuple[str, str], Passed]:
         """Return counts of each direction since they were last read.

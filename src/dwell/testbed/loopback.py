@@ -72,8 +72,6 @@ class Loopback(LocalTestbed):
         Variables that all processes get as well.
     clocks : Path, optional
         File of a `ClockFile`, which says what is wrong with the nodes' clocks.
-    more : sequence of str
-        Further arguments of the controller.
 
     Attributes
     ----------
@@ -95,7 +93,6 @@ class Loopback(LocalTestbed):
         seed: int = 0,
         environment: Mapping[str, str] | None = None,
         clocks: Path | None = None,
-        more: Sequence[str] = (),
     ) -> None:
         super().__init__()
         self.problem, self.folder, self.cpus, self.seed = problem, folder, cpus, seed
@@ -106,17 +103,20 @@ class Loopback(LocalTestbed):
             folder,
             environment={"DWELL_WORLD": str(self.world), **(environment or {})},
             cpus=cpus,
-            more=more,
             program=program(links=folder / LINK_FILE, clocks=clocks),
         )
         links = problem.fabric.links.items()
-        self._conditions = {name: usual_conditions(link) for name, link in links}
+        self.conditions = {name: usual_conditions(link) for name, link in links}
         self._threads: dict[str, int] = {}
 
     def _start(self) -> None:
         """Start everything, and wait until every process is ready; the run began before that."""
         self.processes.write()
-        self._start_links()
+        nodes, links = tuple(self.problem.fabric.nodes), tuple(self.problem.fabric.links.values())
+        self._links = LinkFile(self.folder / LINK_FILE, nodes, links, seed=self.seed)
+        self._stack.callback(self._links.close)
+        for link in links:
+            self._links.set(link.source, link.target, **fields_of(self.conditions[link.name]))
         for cpu in sorted(set(self.cpus.values())):
             burner = self._stack.enter_context(Burner([cpu]))
             for node in (node for node, its in self.cpus.items() if its == cpu):
@@ -130,13 +130,6 @@ class Loopback(LocalTestbed):
         status = self._came_up()
         self.begun_ns = int(status.get("origin_ns") or clock_of(self.problem)())
 
-    def _start_links(self) -> None:
-        nodes, links = tuple(self.problem.fabric.nodes), tuple(self.problem.fabric.links.values())
-        self._links = LinkFile(self.folder / LINK_FILE, nodes, links, seed=self.seed)
-        self._stack.callback(self._links.close)
-        for link in links:
-            self._links.set(link.source, link.target, **fields_of(self._conditions[link.name]))
-
     def _apply_to_node(self, node: str, state: NodeState) -> None:
         self._threads[node] = state.threads
         burner = self.burners[node]
@@ -144,7 +137,7 @@ class Loopback(LocalTestbed):
         burner.set(sum(self._threads.get(node, 0) for node in nodes))
 
     def _apply_to_link(self, name: str, now: Conditions) -> None:
-        link, self._conditions[name] = self.problem.fabric.links[name], now
+        link, self.conditions[name] = self.problem.fabric.links[name], now
         self._links.set(link.source, link.target, **fields_of(now))
 
     def cut(self, source: str, target: str, at_ns: int) -> int:

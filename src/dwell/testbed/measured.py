@@ -99,8 +99,6 @@ class Measured:
         Candidate of all its windows; empty where it moved.
     windows : int
         Number of the windows used.
-    jobs_s : float
-        Time in which the jobs of the used windows became due, seconds.
     visits : dict of (str, str) to Visit
         By task and node.
     rates : dict of (str, str) to float
@@ -135,7 +133,6 @@ class Measured:
     disturbed: DisturbedPlaces
     placement: str
     windows: int
-    jobs_s: float
     visits: dict[SiteName, Visit]
     rates: dict[tuple[str, str], float]
     starts: dict[tuple[str, str, bool], float]
@@ -207,7 +204,6 @@ def look_at(name: str, run: Run, problem: Problem) -> Measured:
         disturbed=DisturbedPlaces.of(run),
         placement=placements.pop() if len(placements) == 1 else "",
         windows=windows.height,
-        jobs_s=jobs_s,
         visits=visits,
         rates=_rates(run, windows, problem),
         starts=starts,

@@ -161,15 +161,17 @@ class Way:
             # Attempts that are all lost are none: the message waits as while the link is down.
             if conditions.down or conditions.loss == 1:
                 return LOST if self._retransmit_ms is None else HELD
-            sent_ns = self._transmitted(size_bytes, now_ns)
+            sent_ns, took_ns = now_ns, transmission_ns(size_bytes, conditions.rate_mbps)
+            if math.isfinite(conditions.rate_mbps):
+                sent_ns = self._later(_FREE_NS, now_ns, took_ns, round(LONGEST_WAIT_S * 1e9))
             if sent_ns - now_ns > LONGEST_WAIT_S * 1e9:
                 return LOST
             for _ in range(MOST_ATTEMPTS):
                 if not self._draws.lose():
-                    return self._arrived(sent_ns + self._draws.delay_ns())
+                    arrival_ns = sent_ns + self._draws.delay_ns()
+                    return self._later(_LAST_NS, arrival_ns, 0) if self._in_order else arrival_ns
                 if self._retransmit_ms is None:
                     return LOST
-                took_ns = transmission_ns(size_bytes, self._draws.conditions.rate_mbps)
                 sent_ns += round(self._retransmit_ms * 1e6) + took_ns
             return LOST
 
@@ -182,18 +184,6 @@ class Way:
         conditions, self._retransmit_ms, self._in_order = pickle.loads(state)  # noqa: S301 (our own)
         self._draws.apply(conditions)
         self._seen = count
-
-    def _transmitted(self, size_bytes: int, now_ns: int) -> int:
-        """Take the direction for the message; returns when its transmission has ended."""
-        rate_mbps = self._draws.conditions.rate_mbps
-        if not math.isfinite(rate_mbps):
-            return now_ns
-        took_ns = transmission_ns(size_bytes, rate_mbps)
-        return self._later(_FREE_NS, now_ns, took_ns, round(LONGEST_WAIT_S * 1e9))
-
-    def _arrived(self, arrival_ns: int) -> int:
-        """Return when a message arrives: not before its predecessor, where order is kept."""
-        return self._later(_LAST_NS, arrival_ns, 0) if self._in_order else arrival_ns
 
     def _later(self, field: int, at_ns: int, more_ns: int, most_ns: int | None = None) -> int:
         """Set an instant that all processes share to max(it, at) + more, and return it."""

@@ -117,7 +117,7 @@ class NetnsTestbed(LocalTestbed):
         self._usual = problem.fabric.links
         self._more = tuple(more)
         self._environment, self._clocks = dict(environment or {}), clocks
-        self._conditions = {name: usual_conditions(link) for name, link in self._usual.items()}
+        self.conditions = {name: usual_conditions(link) for name, link in self._usual.items()}
         self._down: set[str] = set()
         self._claim = Claim(name, list(self.nodes))
 
@@ -247,15 +247,12 @@ class NetnsTestbed(LocalTestbed):
                 self._start_stress(node)
             self.stress[node].set(state.threads)
             if was_down:
-                self._start_processes(node)
-
-    def _start_processes(self, node: str) -> None:
-        self.processes.start_agent(node)
-        if node == self.problem.controller_node:
-            self.processes.start_controller()
+                self.processes.start_agent(node)
+                if node == self.problem.controller_node:
+                    self.processes.start_controller()
 
     def _apply_to_link(self, name: str, now: Conditions) -> None:
-        link, self._conditions[name] = self._usual[name], now
+        link, self.conditions[name] = self._usual[name], now
         if link.retransmit_ms is None:
             self._losses.set(link.source, link.target, loss=now.loss)
             now = replace(now, loss=0.0)
@@ -265,11 +262,11 @@ class NetnsTestbed(LocalTestbed):
     def cut(self, source: str, target: str, at_ns: int) -> int:
         """Cut a direction of a link; returns when that was."""
         way = self.links[frozenset((source, target))]
-        return way.down(source, target, True, at_ns=at_ns)
+        return way.set(source, target, at_ns=at_ns, down=True)
 
     def heal(self, source: str, target: str) -> None:
         """End a cut."""
-        self.links[frozenset((source, target))].down(source, target, False)
+        self.links[frozenset((source, target))].set(source, target, down=False)
 
     # ---------------------------------------------------------------------------- facts
 

@@ -206,8 +206,6 @@ def play(
     now_s: Callable[[], float],
     apply: Callable[[Change], None],
     look: Callable[[float], None],
-    *,
-    every_s: float = LOOK_S,
 ) -> None:
     """Make the changes of a scenario at their times.
 
@@ -222,7 +220,7 @@ def play(
     apply : callable
         Makes a change.
     look : callable
-        Takes the time; called after every change, and at every multiple of `every_s`.
+        Takes the time; called after every change, and at every multiple of `LOOK_S`.
     """
     waiting = list(changes)
     while (at_s := now_s()) < seconds:
@@ -230,7 +228,7 @@ def play(
             apply(waiting.pop(0))
         look(at_s)
         # Looks do not drift, and what begins or ends in between does so in time.
-        following_s = min((math.floor(at_s / every_s) + 1) * every_s, seconds)
+        following_s = min((math.floor(at_s / LOOK_S) + 1) * LOOK_S, seconds)
         if waiting:
             following_s = min(following_s, waiting[0].at_s)
         time.sleep(max(following_s - now_s(), 0.0))

@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from dwell.errors import ExitCode, line_and_code
@@ -85,13 +85,12 @@ def _run_node(command: str, words: Sequence[str], platform: Platform) -> int:
     """Run an agent or a controller."""
     from dwell.live import node_command
 
-    parser = _agent_parser() if command == "agent" else _controller_parser()
-    options = vars(parser.parse_args(words))
+    run: Callable[..., None] = node_command.agent
+    parser = _agent_parser()
+    if command == "controller":
+        run, parser = node_command.controller, _controller_parser()
     try:
-        if command == "agent":
-            node_command.agent(**options, platform=platform)
-        else:
-            node_command.controller(**options, platform=platform)
+        run(**vars(parser.parse_args(words)), platform=platform)
     except node_command.OptionError as error:
         parser.error(str(error))
     except Exception as error:

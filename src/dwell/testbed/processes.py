@@ -44,14 +44,6 @@ def without_keys() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if name != KEYS}
 
 
-def _module_path(problem: Problem) -> dict[str, str]:
-    """Return the variable by which processes find modules beside the cell file."""
-    if problem.folder is None:
-        return {}
-    paths = [problem.folder, *filter(None, [os.environ.get("PYTHONPATH")])]
-    return {"PYTHONPATH": os.pathsep.join(paths)}
-
-
 def expected(problem: Problem, node: str | None = None) -> list[str]:
     """Return the agent of a node and all that it starts; those of all nodes if none is named."""
     return [
@@ -128,7 +120,10 @@ class Processes:
     ) -> None:
         self.problem, self.folder, self.file = problem, folder, folder / "cell.yaml"
         self.running: dict[str, subprocess.Popen[bytes]] = {}
-        self.environment = {**_module_path(problem), **(environment or {})}
+        # Processes find modules beside the cell file.
+        paths = [problem.folder, os.environ.get("PYTHONPATH")] if problem.folder else []
+        modules = {"PYTHONPATH": os.pathsep.join(filter(None, paths))} if paths else {}
+        self.environment = {**modules, **(environment or {})}
         self._program = tuple(program)
         self._popen = popen
         self._owner = str(os.getpid()) if owner is None else owner

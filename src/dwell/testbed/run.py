@@ -105,11 +105,11 @@ def run_once(
     if policy is not None:
         problem = problem.under(policy)
     by_name(problem.controller.policy, problem)
-    estimators.by_name(problem.controller.estimator, problem)
     timeline = timeline_of(problem, scenario, seed=seed, seconds=seconds, outages=True)
     arguments = ["--jobs"] if jobs else []
     testbed = NetnsTestbed(problem, out, name=name, seed=seed, more=arguments)
     require_machine(problem)
+    estimators.by_name(problem.controller.estimator, problem)
     played = Played(problem, scenario, seed, timeline)
     samplers: list[Sampler] = []
     try:

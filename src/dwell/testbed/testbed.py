@@ -178,15 +178,12 @@ class LocalTestbed(Testbed):
     ----------
     own_cpus : bool
         Whether every node has CPU time of its own, which foreign threads can load.
+    conditions : dict of str to Conditions
+        Conditions that hold now, by link.
     """
 
     own_cpus: bool
-    #: Those that hold now, by link.
-    _conditions: dict[str, Conditions]
-
-    def conditions(self, name: str) -> Conditions:
-        """Return the conditions of a link that hold now."""
-        return self._conditions[name]
+    conditions: dict[str, Conditions]
 
     def _restart_stamper(self) -> None:
         node = self.problem.stamper_node

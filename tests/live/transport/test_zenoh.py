@@ -230,7 +230,7 @@ def test_a_full_pool_falls_back_to_a_copy() -> None:
 
 def test_no_pool_where_there_is_no_room_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
     assert _Pool.of(1 << 50) is None
-    monkeypatch.setattr("dwell.live.transport.zenoh._SHARED_MEMORY", "/nowhere/at/all")
+    monkeypatch.setattr("dwell.live.transport.zenoh.SHARED_MEMORY", "/nowhere/at/all")
     assert _Pool.of() is None
 
 

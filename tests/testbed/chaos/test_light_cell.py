@@ -8,7 +8,7 @@ import yaml
 import dwell
 from dwell.cellfile import from_document
 from dwell.model import Problem
-from dwell.testbed.chaos.light_cell import CANDIDATES, HOMES, PATIENT_MS, document
+from dwell.testbed.chaos.light_cell import CANDIDATES, EXEC_MS, PATIENT_MS, document
 
 
 def cell(home: str, **more: object) -> Problem:
@@ -16,7 +16,7 @@ def cell(home: str, **more: object) -> Problem:
     return from_document(yaml.safe_load(text))
 
 
-@pytest.mark.parametrize("home", HOMES)
+@pytest.mark.parametrize("home", EXEC_MS)
 def test_its_controller_stays_at_home(home: str) -> None:
     problem = cell(home)
     assert (problem.initial, set(problem.candidates)) == (home, set(CANDIDATES))
@@ -25,7 +25,7 @@ def test_its_controller_stays_at_home(home: str) -> None:
     assert not run.cycles["missed"].any()
 
 
-@pytest.mark.parametrize("home", HOMES)
+@pytest.mark.parametrize("home", EXEC_MS)
 def test_its_work_is_within_its_quotas(home: str) -> None:
     problem = cell(home, quotas=True, period_ms=PATIENT_MS)
     for placement in problem.candidates.values():

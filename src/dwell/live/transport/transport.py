@@ -60,7 +60,6 @@ class Transport(Protocol):
 
         Does nothing once it is closed.
         """
-        ...
 
     def subscribe(self, key: str, receive: Receive) -> None:
         """Have `receive` called with every message under a key expression (``*``, ``**``).
@@ -68,11 +67,9 @@ class Transport(Protocol):
         It is called from a thread of the transport's, one message after another for one lane, and
         must not block.
         """
-        ...
 
     def close(self) -> None:
         """Send and deliver nothing more; safe to call twice."""
-        ...
 
 
 @lru_cache(1_024)

@@ -21,8 +21,8 @@ import zlib
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
-from typing import TYPE_CHECKING, Any, TypeAlias
+from functools import lru_cache, partial
+from typing import TYPE_CHECKING, Any
 
 from dwell.errors import LiveError, describe_raised, installing
 from dwell.live.failures import start_thread
@@ -30,6 +30,7 @@ from dwell.live.local_addresses import why_not_listen
 from dwell.live.transport.abandoned import AbandonedConnections
 from dwell.live.transport.forked import SessionDescriptors
 from dwell.live.transport.no_linger import Connections
+from dwell.live.transport.orphans import SHARED_MEMORY
 from dwell.live.transport.transport import Arrival, Lane, Receive, require_expression, require_key
 from dwell.live.wiring import Session, WiringEntry, session_of
 from dwell.model import FrozenDict
@@ -65,7 +66,6 @@ MARK = b"\xc1"
 MARKED_BYTES = 5
 
 _LOG = logging.getLogger(__name__)
-_SHARED_MEMORY = "/dev/shm"  # noqa: S108 - where Linux keeps it
 #: Different failures of receivers that are logged.
 MOST_FAILURES = 100
 #: Publishers kept declared; more keys than a process ever puts, answers to questions aside.
@@ -82,9 +82,6 @@ _PRIORITIES = (
     "data_low",
     "background",
 )
-
-
-_Put: TypeAlias = Callable[..., None]
 
 
 @lru_cache(maxsize=1_024)
@@ -199,12 +196,12 @@ class ZenohTransport:
             self._declare(name, session, key, receive)
 
     def _declare(self, name: Session, session: zenoh.Session, key: str, receive: Receive) -> None:
-        deliver = self._deliver(receive, "control" if name == "control" else "images")
+        lock = self._locks["control" if name == "control" else "images"]
         # Called in the thread that read the message: one hand-over less, and a receiver that
         # is behind makes its senders drop instead of growing a queue here.
         session.declare_subscriber(
             key,
-            self._zenoh.handlers.Callback(self._logging_failures(deliver), indirect=False),
+            self._zenoh.handlers.Callback(partial(self._deliver, receive, lock), indirect=False),
             allowed_origin=self._zenoh.Locality.REMOTE,
         )
 
@@ -330,47 +327,30 @@ class ZenohTransport:
             if not (self._closed or route.closed):
                 raise
 
-    def _deliver(self, receive: Receive, lane: Lane) -> Callable[[zenoh.Sample], None]:
-        lock = self._locks[lane]
-
-        def deliver(sample: zenoh.Sample) -> None:
-            _keep_thread_state()
-            attachment, key = sample.attachment, str(sample.key_expr)
-            header = b"" if attachment is None else attachment.to_bytes()
-            if header.startswith(MARK):
-                if not header.startswith(_mark(key)):
-                    self._note_misrouted(key)
-                    return
-                header = header[MARKED_BYTES:]
-            message = Arrival(key, sample.payload.to_bytes(), header)
+    def _deliver(self, receive: Receive, lock: threading.RLock, sample: zenoh.Sample) -> None:
+        """Hand a message to a receiver, in Zenoh's thread; log each kind of failure once."""
+        _keep_thread_state()
+        attachment, key = sample.attachment, str(sample.key_expr)
+        header = b"" if attachment is None else attachment.to_bytes()
+        if header.startswith(MARK):
+            if not header.startswith(_mark(key)):
+                self.misled += 1
+                if self.misled == 1:
+                    who = self.entry.role.who
+                    _LOG.warning("%s: heard under %s what was put elsewhere", who, key)
+                return
+            header = header[MARKED_BYTES:]
+        message = Arrival(key, sample.payload.to_bytes(), header)
+        try:
             with lock:
                 if not self._closed:
                     receive(message)
-
-        return deliver
-
-    def _logging_failures(
-        self, deliver: Callable[[zenoh.Sample], None]
-    ) -> Callable[[zenoh.Sample], None]:
-        """Have the log say once of each message that nobody could handle, in Zenoh's thread."""
-        who = self.entry.role.who
-
-        def guarded(sample: zenoh.Sample) -> None:
-            try:
-                deliver(sample)
-            except Exception as error:
-                what = describe_raised(error)
-                self.failed += 1
-                if what not in self._failures and len(self._failures) < MOST_FAILURES:
-                    self._failures.add(what)
-                    _LOG.exception("%s: a receiver of %s failed", who, sample.key_expr)
-
-        return guarded
-
-    def _note_misrouted(self, key: str) -> None:
-        self.misled += 1
-        if self.misled == 1:
-            _LOG.warning("%s: heard under %s what was put elsewhere", self.entry.role.who, key)
+        except Exception as error:
+            what = describe_raised(error)
+            self.failed += 1
+            if what not in self._failures and len(self._failures) < MOST_FAILURES:
+                self._failures.add(what)
+                _LOG.exception("%s: a receiver of %s failed", self.entry.role.who, key)
 
 
 _kept = threading.local()
@@ -390,7 +370,7 @@ def _keep_thread_state() -> None:
 class _Route:
     """How messages of a key and lane go out."""
 
-    put: _Put
+    put: Callable[..., None]
     pool: _Pool | None
     #: Once there is one, everything goes through it, so that the order stays.
     sender: _Sender | None = None
@@ -457,14 +437,14 @@ class _Pool:
     def of(cls, pool_bytes: int = POOL_BYTES) -> _Pool | None:
         """Return a pool, or None where there is no shared memory for it."""
         try:
-            room = os.statvfs(_SHARED_MEMORY)
+            room = os.statvfs(SHARED_MEMORY)
         except OSError:
             return None
         # The file is sparse: writing to one that does not fit would kill the process.
         if room.f_bavail * room.f_frsize < 2 * pool_bytes:
             _LOG.warning(
                 "%s has less than %d bytes free: images are copied through sockets",
-                _SHARED_MEMORY,
+                SHARED_MEMORY,
                 2 * pool_bytes,
             )
             return None

@@ -43,9 +43,8 @@ def access_control(
     # Keys of the same senders share a rule.
     together: dict[frozenset[str], list[str]] = {}
     for expression, names in may_put.items():
-        senders = frozenset(
-            roster.subjects[name].common_name for name in names if name in roster.subjects
-        )
+        known = (name for name in names if name in roster.subjects)
+        senders = frozenset(roster.subjects[name].common_name for name in known)
         if senders:
             together.setdefault(senders, []).append(expression)
     for number, (senders, expressions) in enumerate(together.items()):

@@ -47,9 +47,6 @@ class Authority:
     ) -> None:
         self.folder, self._key, self.certificate, self.roster = folder, key, certificate, roster
 
-    def __repr__(self) -> str:
-        return f"Authority({str(self.folder)!r}, cell {self.roster.cell!r})"
-
     @classmethod
     def create(cls, folder: Path, cell: str, *, days: int = DAYS) -> Authority:
         """Make an authority with a key of its own, and nobody yet.

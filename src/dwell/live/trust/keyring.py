@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import stat
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -34,10 +34,7 @@ class Keyring:
     own: Subject
     roster: Roster
     expires: datetime
-    _key: Ed25519PrivateKey
-
-    def __repr__(self) -> str:
-        return f"Keyring({str(self.folder)!r}, {self.own.common_name})"
+    _key: Ed25519PrivateKey = field(repr=False)
 
     @classmethod
     def open(cls, folder: Path, *, cell: str | None = None) -> Keyring:
@@ -54,7 +51,10 @@ class Keyring:
             If something is missing, readable by others, damaged, revoked, expired, or another's.
         """
         authority, certificate, key = _read(folder)
-        roster = Roster.read(folder / "roster.json", _public(authority, folder / "ca.pem"))
+        public = authority.public_key()
+        if not isinstance(public, Ed25519PublicKey):
+            raise TrustError(f"{folder / 'ca.pem'}: has no Ed25519 key")
+        roster = Roster.read(folder / "roster.json", public)
         if cell is not None and roster.cell != cell:
             raise TrustError(f"{folder}: keys of cell {roster.cell!r}, not of {cell!r}")
         try:
@@ -115,10 +115,3 @@ def _read(folder: Path) -> tuple[x509.Certificate, x509.Certificate, Ed25519Priv
     if not isinstance(key, Ed25519PrivateKey):
         raise TrustError(f"{folder / 'key.pem'}: is no Ed25519 key")
     return authority, certificate, key
-
-
-def _public(certificate: x509.Certificate, path: Path) -> Ed25519PublicKey:
-    key = certificate.public_key()
-    if not isinstance(key, Ed25519PublicKey):
-        raise TrustError(f"{path}: has no Ed25519 key")
-    return key

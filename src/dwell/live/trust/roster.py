@@ -105,10 +105,6 @@ class Roster:
     subjects: Mapping[str, Subject]
     revoked: tuple[int, ...] = ()
 
-    def of_role(self, role: Role) -> list[Subject]:
-        """Return the subjects of a role."""
-        return [subject for subject in self.subjects.values() if subject.role == role]
-
     def signed(self, key: Ed25519PrivateKey) -> str:
         """Return it as JSON, signed by the authority."""
         document = self._document()

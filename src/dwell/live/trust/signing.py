@@ -27,9 +27,6 @@ class Seals:
         self._keys: dict[str, Ed25519PublicKey] = {}
         self._good: dict[tuple[str, str, bytes], None] = {}
 
-    def __repr__(self) -> str:
-        return f"Seals({self._keyring!r})"
-
     def seal(self, word: str, data: bytes) -> bytes:
         """Return a message with this process's signature before it.
 

@@ -48,11 +48,6 @@ class Seen:
         where = _PLACEMENTS.get((NODES[perception], NODES[planning]), "?")
         return cls(what, where, pid, *numbers)
 
-    @property
-    def age_ms(self) -> float:
-        """Time since the release."""
-        return (self.at_ns - self.released_ns) / 1e6
-
 
 class Actuations:
     """Calls that the actuator has written down, as far as they have been read."""

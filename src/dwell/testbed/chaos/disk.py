@@ -15,7 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from dwell.errors import LiveError
-from dwell.testbed.child import Started
+from dwell.testbed.child import Started, run_command
 
 NAME = "dwell-chaos"
 #: Of a small disk while it is not full.
@@ -48,7 +48,7 @@ class SmallDisk(Started):
     def _start(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
         options = f"size={ROOMY_BYTES},mode=700"
-        _run(["mount", "-t", "tmpfs", "-o", options, NAME, str(self.folder)])
+        run_command("mount", "-t", "tmpfs", "-o", options, NAME, str(self.folder))
         self._stack.callback(self._unmount)
 
     def fill(self) -> None:
@@ -73,21 +73,15 @@ class SmallDisk(Started):
         (self.folder / "filler").unlink(missing_ok=True)
 
     def _resize(self, size: int) -> None:
-        _run(["mount", "-o", f"remount,size={size}", str(self.folder)])
+        run_command("mount", "-o", f"remount,size={size}", str(self.folder))
 
     def _unmount(self) -> None:
         """Take it away; its files stay."""
         kept = self.folder.with_name(f"{self.folder.name}.kept")
         shutil.copytree(self.folder, kept, dirs_exist_ok=True)
-        _run(["umount", "--lazy", str(self.folder)])
+        run_command("umount", "--lazy", str(self.folder))
         shutil.copytree(kept, self.folder, dirs_exist_ok=True)
         shutil.rmtree(kept)
-
-
-def _run(words: list[str]) -> None:
-    done = subprocess.run(words, capture_output=True, text=True, check=False)  # noqa: S603 - no shell
-    if done.returncode:
-        raise LiveError(f"{' '.join(words)}: {done.stderr.strip()}")
 
 
 def unmount_leftovers(folder: Path) -> None:
@@ -97,7 +91,7 @@ def unmount_leftovers(folder: Path) -> None:
         ours = f"{folder.resolve()}/"
         for kind, where, *_ in (line.split() for line in mounts):
             if kind == NAME and where.startswith(ours):
-                _run(["umount", "--lazy", where])
+                run_command("umount", "--lazy", where)
 
 
 def limit_file_size(pid: int, longest: int | None) -> None:

@@ -125,17 +125,13 @@ class Result:
     seconds: float = 0.0
     means: dict[str, str] = field(default_factory=dict)
 
-    def counts(self) -> dict[str, int]:
-        """Return how many faults of each kind there were."""
-        return dict(sorted(Counter(one.fault.kind for one, _ in self.outcomes).items()))
-
     def document(self) -> dict[str, Any]:
         """Return it ready for JSON."""
         bounded = [o for _, o in self.outcomes if o.bound is not None]
         return {
             "seed": self.seed,
             "faults": len(self.outcomes),
-            "kinds": self.counts(),
+            "kinds": dict(sorted(Counter(one.fault.kind for one, _ in self.outcomes).items())),
             "bounded": len(bounded),
             "most_lost_where_bounded": max((max(o.lost, o.lost_after) for o in bounded), default=0),
             "slowest_recovery_ms": max((o.recovery_ms for _, o in self.outcomes), default=0.0),
@@ -244,7 +240,7 @@ class FaultCampaign:
                     self._count(cell, observer)
                     return next(plan, None)
             self._count(cell, observer)
-            cell.stop_controller()
+            cell.testbed.processes.stop_controller()
             self.result.wrong += [f"record: {wrong}" for wrong in _unread(cell)]
         return None
 

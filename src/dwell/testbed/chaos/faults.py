@@ -74,8 +74,9 @@ def faults_of(problem: Problem, *, disks: bool = True, stages: bool = True) -> I
         for node in nodes:
             yield Fault(f"{how} all of {node}", how, (f"*{node}",), kind=f"{how} node")
     yield Fault(f"lose relay agent@{relay}", "kill", (f"agent@{relay}",), kind="relay")
+    linked = {(link.source, link.target) for link in problem.fabric.links.values()}
     for one, other in combinations(nodes, 2):
-        if not {(one, other), (other, one)} & _linked(problem):
+        if linked.isdisjoint(((one, other), (other, one))):
             continue
         yield Fault(f"cut {one}-{other}", "cut", (f"{one}->{other}", f"{other}->{one}"))
         for a, b in ((one, other), (other, one)):
@@ -96,10 +97,6 @@ def faults_of(problem: Problem, *, disks: bool = True, stages: bool = True) -> I
         for node in nodes:
             yield Fault(f"fill the disk of {node}", "fill", (node,))
     yield Fault("write to the same disk", "hog", ("runs",))
-
-
-def _linked(problem: Problem) -> set[tuple[str, str]]:
-    return {(link.source, link.target) for link in problem.fabric.links.values()}
 
 
 def _slow_links(problem: Problem) -> Iterator[Fault]:

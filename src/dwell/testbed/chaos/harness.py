@@ -45,12 +45,6 @@ def environment_of(folder: Path, exec_ms: Mapping[str, object], **more: object) 
     return {TOLD: json.dumps({**files, "exec_ms": exec_ms, **more})}
 
 
-def pid_of(mark: Path) -> int | None:
-    """Return the process that an agent's mark tells of, if it lives."""
-    process = survivor(mark)
-    return None if process is None else process.pid
-
-
 def away_from_home(
     problem: Problem,
     home: str | None,
@@ -168,28 +162,19 @@ class Harness(Started):
         folder = self.folder / "runs"
         return sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
 
-    def expected(self, node: str) -> list[str]:
-        """Return the processes of a node that its agent starts, and the agent."""
-        return expected(self.problem, node)
-
-    @property
-    def everybody(self) -> list[str]:
-        """All processes but the controller."""
-        return [who for node in self.problem.fabric.nodes for who in self.expected(node)]
-
     def _marked(self) -> list[int]:
-        found = (pid_of(mark) for mark in self.folder.glob("*/*.pid"))
-        return [pid for pid in found if pid is not None]
+        found = (survivor(mark) for mark in self.folder.glob("*/*.pid"))
+        return [process.pid for process in found if process is not None]
 
     def pid(self, who: str) -> int:
         """Process id of one of the cell's processes."""
         if who in self.testbed.processes.running:
             return self.testbed.processes.running[who].pid
         node = who.partition("@")[2].partition(".")[0]
-        pid = pid_of(self.folder / node / f"{who}.pid")
-        if pid is None:
+        process = survivor(self.folder / node / f"{who}.pid")
+        if process is None:
             raise LiveError(f"{who} does not run")
-        return pid
+        return process.pid
 
     def _running(self) -> dict[str, int]:
         """Return the process ids of all that run, the controller included."""
@@ -211,11 +196,6 @@ class Harness(Started):
             if who not in ended and running.get(who) != pid
         ]
 
-    def signal(self, names: Sequence[str], number: int) -> None:
-        """Send a signal to processes, all at once."""
-        for pid in [self.pid(who) for who in names]:
-            _send(pid, number)
-
     def start_again(self, who: str) -> None:
         """Start an agent or the controller again, as an init system does."""
         process = self.testbed.processes.running.pop(who, None)
@@ -227,14 +207,10 @@ class Harness(Started):
         else:
             self.testbed.processes.start_controller()
 
-    def stop_controller(self) -> None:
-        """End the controller and wait until it has written its run."""
-        self.testbed.processes.stop_controller()
-
     def _all_of(self, node: str) -> list[str]:
         """Return the processes of a node, its controller included."""
         controller = [f"controller@{node}"] if node == self.problem.controller_node else []
-        return [*self.expected(node), *controller]
+        return [*expected(self.problem, node), *controller]
 
     # ------------------------------------------------------------------------- clocks
 
@@ -322,7 +298,7 @@ class Harness(Started):
         for what in fault.whom:
             match fault.how:
                 case "slow":
-                    self._usual[what] = usual = self.testbed.conditions(what)
+                    self._usual[what] = usual = self.testbed.conditions[what]
                     slow = replace(usual, rate_mbps=fault.amount)
                     self.testbed.apply(Change(0, what, slow))
                 case "fail":
@@ -352,7 +328,8 @@ class Harness(Started):
             case "fail":
                 (self.folder / FAILING).unlink()
             case "freeze":
-                self.signal(struck(self.problem, fault), signal.SIGCONT)
+                for pid in [self.pid(who) for who in struck(self.problem, fault)]:
+                    _send(pid, signal.SIGCONT)
             case "kill":
                 for who in struck(self.problem, fault):
                     if who.startswith(("agent", "controller")):

@@ -11,8 +11,7 @@ GUARD_CYCLES = 3
 MAX_AGE_MS = 120
 MIN_DWELL = 2
 WINDOW_CYCLES = 3
-#: Where each cell's controller wants to be, and what makes it want that.
-HOMES = ("SO", "LOC")
+#: By the candidate that a cell's controller wants, its home: what makes the controller want it.
 #: Links, which cost no CPU, tell the placements apart; the stages leave one CPU room enough, and a
 #: quota of half of one.
 EXEC_MS = {

@@ -28,12 +28,6 @@ _HEAD = struct.Struct("<QIII")
 HEARD_S = 20.0
 
 
-def heard(keys: Keys) -> tuple[str, ...]:
-    """Return the key expressions that are listened to."""
-    plain = keys.stamped(), keys.order(), keys.accepted(), keys.done("*")
-    return (*plain, keys.inputs("*", "*", "*"))
-
-
 def entry_for(wiring: Wiring, nodes: Sequence[str]) -> WiringEntry:
     """Return the endpoints of a listener to all processes of some nodes."""
     connect: dict[Session, list[Any]] = {}
@@ -63,11 +57,6 @@ class Wiretap(Child):
         name = f"tap at {','.join(nodes)}"
         settings = cell, nodes, out
         super().__init__("dwell.testbed.chaos.wiretap", name, settings, prefix=prefix)
-
-    def peers(self) -> int:
-        """Return how many sessions it is connected to now."""
-        count: int = self.ask(None)
-        return count
 
 
 class Records:
@@ -139,7 +128,7 @@ def main() -> None:
 
     with ExitStack() as stack:
 
-        def begin(settings: tuple[Path, Sequence[str], Path]) -> Callable[[None], int]:
+        def begin(settings: tuple[Path, Sequence[str], Path]) -> Callable[[None], None]:
             cell, nodes, out = settings
             os.environ[INSECURE] = "1"
             problem = load(cell)
@@ -147,7 +136,8 @@ def main() -> None:
             transport = ZenohTransport(entry_for(wire(problem), nodes))
             stack.callback(transport.close)
             lock = threading.Lock()
-            inputs = Keys(problem.name).inputs("", "", "").rstrip("/")
+            keys = Keys(problem.name)
+            inputs = keys.inputs("", "", "").rstrip("/")
 
             def write(sample: Arrival) -> None:
                 at_ns = time.monotonic_ns()
@@ -158,9 +148,10 @@ def main() -> None:
                 with lock:
                     file.write(_HEAD.pack(at_ns, *lengths) + key + payload + header)
 
-            for key in heard(Keys(problem.name)):
+            for key in (keys.stamped(), keys.order(), keys.accepted(), keys.done("*")):
                 transport.subscribe(key, write)
-            return lambda _: sum(transport.peers.values())
+            transport.subscribe(keys.inputs("*", "*", "*"), write)
+            return lambda _: None
 
         Parent().serve(begin)
 

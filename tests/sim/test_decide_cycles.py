@@ -1,0 +1,242 @@
+"""Decisions that come more often than windows close."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from itertools import pairwise
+from random import Random
+from typing import Any
+
+import numpy as np
+import pytest
+
+import dwell
+from dwell.control.windows import missed_cycles, seen_l95_ms
+from dwell.cost import cost, hamming
+from dwell.errors import ProblemError
+from dwell.model import FrozenDict, Problem, QoS
+from dwell.model.window_close import window_close_ns
+from dwell.record import Run
+from dwell.sim.engine import simulate_realisation
+from dwell.study.hindsight import Hindsight
+from dwell.study.judged_cost import judged_costs
+from dwell.study.reference import play_alone, references
+from tests.cells.examples import EXAMPLES
+from tests.cells.generated import random_problem
+
+CANONICAL = dwell.load(EXAMPLES / "canonical.yaml")
+
+
+def often(problem: Problem, every: int | None, **settings: Any) -> Problem:
+    controller = replace(problem.controller, decide_cycles=every, **settings)
+    return replace(problem, controller=controller)
+
+
+class Walker:
+    """A policy that moves at given calls, and keeps what it was shown."""
+
+    def __init__(self, moves: Mapping[int, str]) -> None:
+        self.moves, self.calls = dict(moves), 0
+        self.incumbent = "LOC"
+        self.seen: list[QoS] = []
+
+    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
+        """Move if this call is one of the given."""
+        self.seen.append(observed)
+        self.incumbent = self.moves.get(self.calls, self.incumbent)
+        self.calls += 1
+        return self.incumbent
+
+    def adopt(self, name: str) -> None:
+        """Be there."""
+        self.incumbent = name
+
+
+def walked(problem: Problem, moves: Mapping[int, str], windows: int = 6, seed: int = 3) -> Run:
+    real = dwell.draw(problem, scenario="baseline", seed=seed, windows=windows)
+    return simulate_realisation(problem, real, policy=Walker(moves), estimator="profile")
+
+
+def switched(run: Run, problem: Problem) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """S of the move that takes effect with each cycle."""
+    names = run.cycles["placement"].cast(str).to_list()
+    places = problem.candidates
+    moved = [0.0, *(hamming(places[b], places[a]) for a, b in pairwise(names))]
+    return np.array(moved)
+
+
+def begins(run: Run, row: Mapping[str, Any]) -> int:
+    """Return the first cycle under the placement that a decision looks at."""
+    names = run.cycles["placement"].cast(str).to_list()
+    cycle: int = row["last_cycle"]
+    while cycle and names[cycle - 1] == names[cycle]:
+        cycle -= 1
+    return cycle
+
+
+def test_windows_run_on_over_moves_and_pay_for_them() -> None:
+    problem = often(CANONICAL, 25)
+    run = walked(problem, {1: "SO", 6: "HYB", 7: "LOC"})
+    width, windows = problem.window_cycles, run.windows
+    assert windows["first_cycle"].to_list() == [width * i for i in range(6)]
+    assert not run.cycles["lead"].any()
+    assert windows["mixed"].to_list() == [True, True, True, False, False, False]
+    moved = switched(run, problem).reshape(6, width).sum(axis=1)
+    assert moved[3:].tolist() == [0.0, 0.0, 0.0]
+    resources, weight = problem.fabric.resources, problem.objective.weights.switching
+    for row, switching in zip(windows.iter_rows(named=True), moved, strict=True):
+        used = FrozenDict({name: row[f"u_{name}"] for name in resources})
+        qos = QoS(row["seen_l95_ms"], row["seen_violation_rate"], used)
+        alone = cost(qos, problem.candidates["LOC"], problem.candidates["LOC"], problem.objective)
+        assert row["cost"] == pytest.approx(alone + weight * switching, abs=1e-12)
+
+
+def test_cycles_before_an_orders_first_stamp_belong_to_windows() -> None:
+    problem = often(CANONICAL, 20, order_lead_cycles=7)
+    run = walked(problem, {0: "SO"})
+    decision = run.decisions.row(0, named=True)
+    assert (decision["last_cycle"], decision["cycles"], decision["migrated"]) == (19, 20, True)
+    placed = run.cycles["placement"].cast(str).to_list()
+    assert placed.index("SO") == 27
+    # The next decision looks at 20 cycles from there on.
+    following = run.decisions.row(1, named=True)
+    assert (following["last_cycle"], following["cycles"]) == (46, 20)
+    assert run.windows["violation_rate"][0] == run.cycles["missed"][:100].mean()
+
+
+@pytest.mark.parametrize("every", [25, 30, 99])
+def test_a_decision_looks_at_the_last_window_under_its_placement(every: int) -> None:
+    problem = often(CANONICAL, every)
+    run = walked(problem, {4: "SO"}, windows=8)
+    width = problem.window_cycles
+    latency, release = run.cycles["latency_ns"].to_numpy(), run.cycles["release_ns"].to_numpy()
+    releases = np.append(release, release[-1] + problem.pipeline.period_ns)
+    walker = Walker({4: "SO"})
+    real = dwell.draw(problem, scenario="baseline", seed=3, windows=8)
+    again = simulate_realisation(problem, real, policy=walker, estimator="profile")
+    assert again.decisions.equals(run.decisions)
+    for row in run.decisions.iter_rows(named=True):
+        last, begin = row["last_cycle"], begins(run, row)
+        assert last == begin + every * ((last - begin + 1) // every) - 1
+        assert row["cycles"] == min(width, last + 1 - begin)
+        looked = slice(last + 1 - row["cycles"], last + 1)
+        close_ns = int(window_close_ns(problem, releases[last], releases[last + 1]))
+        age = close_ns - release[looked]
+        l95_ms, _ = seen_l95_ms(latency[looked], age, problem.censor_ms)
+        missed = missed_cycles(latency[looked], age, problem.pipeline.deadline_ns)
+        assert row[f"est_l95_ms_{row['incumbent']}"] == float(l95_ms)
+        assert row[f"est_violation_rate_{row['incumbent']}"] == missed / row["cycles"]
+        assert row["window"] == last // width
+
+
+def test_only_the_first_decision_after_a_move_pays_for_it() -> None:
+    problem = often(CANONICAL, 25, min_dwell=0, min_improvement=0.0)
+    real = dwell.draw(problem, scenario="baseline", seed=3, windows=10)
+    run = simulate_realisation(problem, real, policy="dtp", estimator="profile")
+    paid = run.decisions.filter(run.decisions["migrated"].shift(1, fill_value=False))
+    assert paid.height > 2
+    for row in paid.iter_rows(named=True):
+        # Delta J has the switching term of the incumbent's own move; J of the candidates has not.
+        assert row["delta_j"] > row[f"j_{row['incumbent']}"] - min(
+            row[f"j_{name}"] for name in problem.candidates
+        )
+
+
+@pytest.mark.parametrize("policy", ["dtp", "atp"])
+@pytest.mark.parametrize("every", [7, 25, 100])
+def test_a_placement_stays_for_the_dwell_and_one_decision_more(policy: str, every: int) -> None:
+    for dwell_windows, dwell_cycles in ((0, 0), (1, 0), (0, 110), (2, 310)):
+        problem = often(
+            CANONICAL,
+            every,
+            min_dwell=dwell_windows,
+            min_dwell_cycles=dwell_cycles,
+            min_improvement=0.0,
+        )
+        least = max(100 * dwell_windows, dwell_cycles)
+        scenario = "network-impairment"
+        run = dwell.simulate(problem, scenario=scenario, policy=policy, seed=2, windows=40)
+        moves = 0
+        for row in run.decisions.iter_rows(named=True):
+            since = row["last_cycle"] + 1 - begins(run, row)
+            assert row["dwell_cycles"] == (0 if row["migrated"] else since)
+            assert row["dwell"] == row["dwell_cycles"] // 100
+            if row["migrated"]:
+                assert since >= least + every
+                moves += 1
+        cycles = 40 * 100
+        assert moves <= cycles // (-(-least // every) * every + every)
+        assert moves > 0 or policy == "atp"
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_cells_at_random_are_decided_on_in_time(seed: int) -> None:
+    rng = Random(seed)
+    problem = random_problem(rng, orders=True)
+    every = rng.randint(1, max(problem.window_cycles - 1, 1))
+    problem = often(problem, every)
+    run = dwell.simulate(problem, scenario="disturbed", policy="cusum", seed=seed, windows=20)
+    last = run.decisions["last_cycle"].to_numpy()
+    assert (np.diff(last) >= every).all()
+    if problem.controller.migration == "warm" and every < problem.window_cycles:
+        assert run.windows.height == 20
+        stays = ~run.decisions["migrated"].to_numpy()[:-1]
+        # Decisions that the controller missed, because its node was down, have no row.
+        assert (np.diff(last)[stays] % every == 0).all()
+
+
+def test_one_decision_per_window_is_the_rule_of_windows() -> None:
+    for policy in ("dtp", "cusum", "work-function", "atp", "latency-first"):
+        for estimator in ("profile", "corrected"):
+            runs = [
+                dwell.simulate(
+                    often(CANONICAL, every),
+                    scenario="edge-cpu-stress",
+                    policy=policy,
+                    estimator=estimator,
+                    seed=4,
+                    windows=12,
+                )
+                for every in (None, CANONICAL.window_cycles)
+            ]
+            for table in ("cycles", "windows", "decisions"):
+                one, other = (getattr(run, table) for run in runs)
+                assert one.equals(other)
+
+
+def test_it_is_at_most_a_window() -> None:
+    with pytest.raises(ProblemError, match=r"controller\.decide_cycles: 101 is not allowed.*100"):
+        often(CANONICAL, 101)
+    with pytest.raises(ProblemError, match=r"decide_cycles"):
+        often(CANONICAL, 0)
+
+
+@pytest.mark.parametrize("every", [25, 100])
+def test_a_judge_of_a_run_counts_the_moves_of_each_window(every: int) -> None:
+    problem = often(CANONICAL, every)
+    run = walked(problem, {1: "SO", 3: "HYB", 4: "LOC"})
+    assert judged_costs(run, problem) == pytest.approx(run.windows["cost"].to_numpy(), abs=1e-12)
+
+
+def test_hindsight_knows_the_last_window_at_each_decision() -> None:
+    problem = often(CANONICAL, 25)
+    real = dwell.draw(problem, scenario="baseline", seed=3, windows=4)
+    alone = play_alone(problem, real)
+    run = simulate_realisation(problem, real, policy="LOC", estimator=Hindsight(alone))
+    for row in run.decisions.iter_rows(named=True):
+        # It never moves, so it is what was seen, of the last 100 cycles or fewer.
+        latency = run.cycles["latency_ns"][
+            row["last_cycle"] + 1 - row["cycles"] : row["last_cycle"] + 1
+        ]
+        late = (latency > problem.pipeline.deadline_ns).mean()
+        assert row["est_violation_rate_LOC"] == late
+
+
+def test_the_oracle_decides_as_often_as_the_cell_does() -> None:
+    problem = often(CANONICAL, 25)
+    real = dwell.draw(problem, scenario="robot-cpu-stress", seed=3, windows=10)
+    found = references(problem, real)
+    assert found.runs["oracle"].decisions.height > 3 * 10
+    assert found.runs["clairvoyant"].decisions.height == 10
+    assert found.costs["oracle"] < found.costs["LOC"]
