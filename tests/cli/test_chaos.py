@@ -1,10 +1,10 @@
-"""`dwell testbed chaos` from the command line: what it refuses, and its name of before."""
+"""`dwell testbed chaos` from the command line: what it refuses."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from tests.cli.small_cell import ROOT, assert_refused, call
+from tests.cli.small_cell import ROOT, call
 
 
 def test_a_folder_with_something_else_is_left_alone(tmp_path: Path) -> None:
@@ -22,7 +22,3 @@ def test_a_cell_without_an_actuator_is_refused(tmp_path: Path) -> None:
     done = call(*words, "--out", tmp_path / "out")
     assert done.exit_code
     assert "one sink" in done.output
-
-
-def test_the_command_of_before_says_what_has_taken_its_place() -> None:
-    assert_refused(call("live", "chaos", "--minutes", "2"), "`dwell testbed chaos`")

@@ -51,7 +51,9 @@ def example(folder: Path, stages: str, runs: Mapping[str, str], **live: object) 
     for name in (stages, "stages"):
         shutil.copy(EXAMPLE / "stages.py", folder / f"{name}.py")
     file = folder / "cell.yaml"
-    file.write_text(yaml.safe_dump({**known, "live": live}, sort_keys=False))
+    # No cell of this name runs here, whatever other tests run.
+    changed = {**known, "name": folder.name, "live": live}
+    file.write_text(yaml.safe_dump(changed, sort_keys=False))
     return file
 
 
