@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -122,7 +123,7 @@ class Reference:
             Cycles for which stretches go on deviating so, at most.
         """
         # Steps of √2, so that few stretches are looked at.
-        count = int(2 ** (math.floor(2 * math.log2(size)) / 2))
+        count = math.isqrt(1 << ((size * size).bit_length() - 1))
         key = count, max(cycles // size, 1), deviations
         if key not in self._extremes:
             self._extremes[key] = self._search(*key)
@@ -312,7 +313,7 @@ class Pool:
         """Whether a window, or all that is held with it, is of another regime."""
         reference = self.reference
         # The chance of a deviation beyond x falls with exp(-x²/2).
-        least = math.sqrt(SHIFTED**2 + 2.0 * math.log(tests))
+        least = _least(tests)
         if declared.is_large and reference.deviations(declared, cycles) >= least:
             largest, _ = reference.extremes(declared.size, cycles, least)
             if declared.largest > MARGIN * largest:
@@ -477,7 +478,8 @@ def _inflation(likeness: float, together: float) -> float:
 def _mean_log(size: int, deviations: float) -> float:
     """Return the `PlaceSums.largest` of so many independent values with so many deviations."""
     part = 1.0 / (9.0 * size)
-    return float((1.0 - part + deviations * math.sqrt(part)) ** 3)
+    root = 1.0 - part + deviations * math.sqrt(part)
+    return float(root * root * root)
 
 
 class _Doubt(NamedTuple):
@@ -548,3 +550,9 @@ def middle(values: Floats) -> float:
     """Median of the values that are not lost; infinite where all are."""
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if len(finite) else math.inf
+
+
+@cache
+def _least(tests: float) -> float:
+    """Deviations that are another regime, where parts are compared so many times in a window."""
+    return math.sqrt(SHIFTED * SHIFTED + 2.0 * float(logarithms(np.array([tests]))[0]))
