@@ -49,7 +49,7 @@ void handle(S& s, i64 key, i64 now) {
       break;
     case kRelease:
       open_window(s, cell, cycle, now);
-      open_looks(s, cell, cycle, now);
+      if (s.cell(cell).decide_cycles != 0) open_looks(s, cell, cycle, now);
       release(s, cell, cycle, now);
       break;
     case kMigrate:
@@ -63,7 +63,7 @@ void handle(S& s, i64 key, i64 now) {
 // Has the built-in policy decide on what a decision looks at, where there is one; returns whether
 // the call ends here.
 template <class S>
-bool pauses_at(S& s, i64 index) {
+[[gnu::noinline]] bool pauses_at(S& s, i64 index) {
   if (s.rule.size == 0) return s.clock[0].pauses != 0;
   if (!decide(s, index)) return true;
   stamp_next(s);

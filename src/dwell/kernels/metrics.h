@@ -27,7 +27,7 @@ bool is_age(const S& s, i64 cell, i64 first, i64 n, i64 value, i64 now) {
 
 // What `n` cycles show now.
 template <class S>
-Seen measure(S& s, i64 cell, i64 first, i64 n, i64 now) {
+[[gnu::noinline]] Seen measure(S& s, i64 cell, i64 first, i64 n, i64 now) {
   const Cell& of = s.cell(cell);
   const i64 row = s.output(cell, first), rank = l95_rank(n);
   i64 missed = 0, unfinished = 0;

@@ -99,10 +99,10 @@ i64 look_end_row(const S& s, i64 cell, i64 look) {
 
 // Takes the snapshots of the decisions for which a cycle is the first one, if it is for any.
 template <class S>
-void open_looks(S& s, i64 cell, i64 cycle, i64 now) {
+[[gnu::noinline]] void open_looks(S& s, i64 cell, i64 cycle, i64 now) {
   const Cell& of = s.cell(cell);
   const i64 every = of.decide_cycles, age = cycle - of.since;
-  if (every == 0 || age < 0) return;
+  if (age < 0) return;
   // It begins the stretch up to a decision, and the W cycles that a decision looks at.
   const i64 begun[] = {age, age + of.window_cycles - every};
   for (i64 part = 0; part < 2; ++part) {
