@@ -12,7 +12,7 @@ from dwell.control.guard import (
     parts_of,
 )
 from dwell.control.plain_rule import plain_rule
-from dwell.control.windows import final_l95_ms, moved_shares, window_costs
+from dwell.control.windows import final_l95_ms, moved_shares, seen_costs
 from dwell.estimators import Estimator, Evidence, Instants
 from dwell.model.shadow_plan import ShadowPlan, shadow_stamps
 from dwell.policies import MinimalPolicy
@@ -38,6 +38,6 @@ __all__ = [
     "moved_shares",
     "parts_of",
     "plain_rule",
+    "seen_costs",
     "shadow_stamps",
-    "window_costs",
 ]

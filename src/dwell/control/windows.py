@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from dwell.cost import hamming, price, tier_nodes
 from dwell.estimators.paths import l95_rank
 from dwell.model.instants import NEVER_NS
-from dwell.model.objective import Objective
 from dwell.model.problem import Problem
 
 Ints: TypeAlias = NDArray[np.int64]
@@ -110,8 +109,24 @@ def moved_shares(problem: Problem) -> Floats:
     return np.array([[hamming(there, here) for there in placements] for here in placements])
 
 
-def window_costs(
-    objective: Objective,
+def busiest(used: Mapping[str, Floats], problem: Problem) -> tuple[Floats, Floats, Floats]:
+    """Utilisation of the busiest of each tier, robot, edge and cloud, in every window.
+
+    Parameters
+    ----------
+    used : mapping of str to float64 array, shape (windows,)
+        Utilisation of every resource; NaN where it was not measured. A tier without nodes has 0.
+    """
+    none = np.zeros(len(next(iter(used.values()))))
+    robot, edge, cloud = (
+        np.fmax.reduce([used[name] for name in names]) if names else none
+        for names in tier_nodes(problem.objective)
+    )
+    return robot, edge, cloud
+
+
+def seen_costs(
+    problem: Problem,
     l95_ms: Floats,
     violation_rate: Floats,
     used: Mapping[str, Floats],
@@ -126,8 +141,5 @@ def window_costs(
     used : mapping of str to float64 array, shape (windows,)
         Busy share of each resource.
     """
-    robot, edge, cloud = (
-        np.max([used[name] for name in names], axis=0) if names else np.zeros(len(l95_ms))
-        for names in tier_nodes(objective)
-    )
-    return price(l95_ms, violation_rate, robot, edge, cloud, switching, objective)
+    robot, edge, cloud = busiest(used, problem)
+    return price(l95_ms, violation_rate, robot, edge, cloud, switching, problem.objective)

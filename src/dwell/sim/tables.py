@@ -11,7 +11,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from dwell.control import Controller, final_l95_ms, moved_shares, window_costs
+from dwell.control import Controller, final_l95_ms, moved_shares, seen_costs
 from dwell.kernels.arrays import CellArrays
 from dwell.kernels.realisation import Realisation
 from dwell.kernels.rows import Rows
@@ -286,7 +286,7 @@ def _costs(played: PlayedRealisation, seen: dict[str, Floats]) -> Floats:
     moved[1:] = moved_shares(problem)[stamps[:-1], stamps[1:]]
     switching = played.by_window(moved).sum(axis=1)
     seen_of = seen["l95_ms"], seen["violation_rate"]
-    costs = window_costs(problem.objective, *seen_of, used, switching)
+    costs = seen_costs(problem, *seen_of, used, switching)
     unseen = [played.host_down(at_ns) for at_ns in played.close_ns.tolist()]
     for values in (*seen.values(), costs):
         values[unseen] = np.nan

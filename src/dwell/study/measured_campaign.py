@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dwell.cellfile import from_document
+from dwell.control.windows import busiest
 from dwell.errors import RunError
 from dwell.model import Problem
 from dwell.record import Run, arrays_of, open_run
@@ -22,7 +23,7 @@ from dwell.study.comparison import Comparison
 from dwell.study.job_times import jobs_of, links_of, profiles_of
 from dwell.study.measured_run import excluded_windows
 from dwell.study.player import Example
-from dwell.study.summary import Row, busiest, latency_grid_ms, summarise, used_in
+from dwell.study.summary import Row, latency_grid_ms, summarise, used_in
 
 if TYPE_CHECKING:
     import polars as pl

@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.control.windows import moved_shares, seen_l95_ms
+from dwell.control.windows import busiest, moved_shares, seen_l95_ms
 from dwell.cost import price
 from dwell.errors import SimulationError
 from dwell.estimators import Profile
@@ -38,7 +38,7 @@ from dwell.model.window_close import window_close_ns
 from dwell.study.clairvoyant import Sequence, clairvoyant, priced
 from dwell.study.oracle import expected_costs
 from dwell.study.script import Script, is_up
-from dwell.study.summary import busiest, mean_of, used_in
+from dwell.study.summary import mean_of, used_in
 
 if TYPE_CHECKING:
     from dwell.record import Run, TableArrays

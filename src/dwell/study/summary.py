@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.cost import tier_nodes
+from dwell.control.windows import busiest
 from dwell.errors import SimulationError
 from dwell.model import FrozenDict, Problem
 from dwell.model.instants import NEVER_NS
@@ -337,22 +337,6 @@ def _percentiles(latencies: Latencies) -> dict[str, float]:
 def used_in(windows: TableArrays, problem: Problem) -> dict[str, Floats]:
     """Utilisation of every resource in every window."""
     return {name: windows[f"u_{name}"] for name in problem.fabric.resources}
-
-
-def busiest(used: Mapping[str, Floats], problem: Problem) -> tuple[Floats, Floats, Floats]:
-    """Utilisation of the busiest of each tier, robot, edge and cloud, in every window.
-
-    Parameters
-    ----------
-    used : mapping of str to float64 array, shape (windows,)
-        Utilisation of every resource; NaN where it was not measured. A tier without nodes has 0.
-    """
-    none = np.zeros(len(next(iter(used.values()))))
-    robot, edge, cloud = (
-        np.fmax.reduce([used[name] for name in names]) if names else none
-        for names in tier_nodes(problem.objective)
-    )
-    return robot, edge, cloud
 
 
 def _utilisation(used: Mapping[str, Floats], problem: Problem) -> dict[str, float]:
