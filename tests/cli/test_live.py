@@ -53,6 +53,7 @@ def test_frames_begin_the_cycles(cell: RealCell) -> None:
 
 
 def test_status_says_who_is_there(cell: RealCell) -> None:
+    cell.until(lambda status: status["health"] == "ok")
     code, stdout, _ = invoke("live", "status", "--cell", cell.file)
     assert code == 0
     lines = stdout.splitlines()
