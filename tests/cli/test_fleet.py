@@ -33,9 +33,7 @@ def test_a_fleet_is_played_saved_and_summed_up(fleet: Path) -> None:
     result = call("fleet", "run", fleet, "--windows", "12", "--policy", "OFF")
     assert (result.exit_code, result.stderr) == (0, "")
     first, *_ = result.stdout.splitlines()
-    assert first == (
-        "pair: 2 cells; shared: E; phases: even; coordination: none; seed 1; 12 windows"
-    )
+    assert first == ("pair: 2 cells; shared: E; phases: even; coordination: none; seed 1; 2.4 s")
     assert "saved to runs/pair-OFF-none-even-1" in result.stdout
     run = open_fleet("runs/pair-OFF-none-even-1")
     assert [one.windows.height for one in run.cells.values()] == [12, 12]
@@ -94,6 +92,13 @@ def test_a_shared_node_that_nobody_uses_is_warned_of(fleet: Path) -> None:
     result = call("fleet", "run", fleet, "--windows", "6", "--policy", "LOC")
     assert result.exit_code == 0
     assert "shared.E: no candidate of any cell uses this node" in result.stderr
+
+
+def test_a_length_in_seconds(fleet: Path) -> None:
+    found = read_json(call("fleet", "run", fleet, "--seconds", "1.25", "--json"))
+    assert found["seconds"] == 1.25
+    text = call("fleet", "run", fleet, "--seconds", "0.1")
+    assert_refused(text, "seconds: 0.1 is not allowed; it must be at least the longest window, 0.2")
 
 
 @pytest.mark.parametrize(

@@ -53,7 +53,7 @@ def test_every_size_of_it_in_any_order(canonical: Problem, scenario: str, phases
         FleetEntry(replace(canonical, pipeline=jitter), 1),
     )
     fleet = Fleet("hall", entries, ("E",), phases=phases, coordination="none")
-    static = StaticFleet({"canonical": "SO"}, seed=2, windows=8)
+    static = StaticFleet({"canonical": "SO"}, seed=2, duration_ns=fleet.duration_ns(8))
     for count in (3, 1, 2):
         sized = fleet.with_count(count)
         assert static.violation_rates(sized) == pytest.approx(shown(sized, "SO"), abs=1e-12)
@@ -62,7 +62,7 @@ def test_every_size_of_it_in_any_order(canonical: Problem, scenario: str, phases
 @pytest.mark.parametrize("phases", PHASES)
 def test_what_is_replayed_goes_by_the_phase(traced: Problem, phases: Any) -> None:
     fleet = Fleet("hall", (FleetEntry(traced, 1),), ("E",), phases=phases, coordination="none")
-    static = StaticFleet({traced.name: "LOC"}, seed=2, windows=8)
+    static = StaticFleet({traced.name: "LOC"}, seed=2, duration_ns=fleet.duration_ns(8))
     for count in (2, 4, 3):
         sized = fleet.with_count(count)
         rates = static.violation_rates(sized)
@@ -74,5 +74,6 @@ def test_cells_of_several_files(canonical: Problem) -> None:
     slower = replace(canonical, name="slower", pipeline=replace(canonical.pipeline, period_ms=50.0))
     entries = (FleetEntry(canonical, 2), FleetEntry(slower, 2, phase_ms=7.0))
     fleet = Fleet("hall", entries, ("E",), phases="even", coordination="none")
-    static = StaticFleet({"canonical": "SO", "slower": "SO"}, seed=2, windows=8)
+    placed = {"canonical": "SO", "slower": "SO"}
+    static = StaticFleet(placed, seed=2, duration_ns=fleet.duration_ns(8))
     assert static.violation_rates(fleet) == pytest.approx(shown(fleet, "SO"), abs=1e-12)

@@ -83,7 +83,10 @@ Phases = Annotated[
 def run(
     file: FleetArgument,
     seed: Seed = 1,
-    windows: Annotated[int, option("N", "Length in windows, the warm-up included.", min=1)] = 100,
+    windows: Annotated[
+        int, option("N", "Length in windows of the cell whose windows are longest.", min=1)
+    ] = 100,
+    seconds: Annotated[float | None, option("S", "Length in place of --windows.")] = None,
     policy: Policy = None,
     estimator: Estimator = None,
     coordination: Coordination = None,
@@ -101,21 +104,22 @@ def run(
 ) -> None:
     """Simulate the cells of a fleet together, save a run a cell, sum them up."""
     from dwell.record.fleet_run import describe_fleet, require_free_or_same
-    from dwell.sim.fleet import phases_ms
+    from dwell.sim.fleet import duration_of, phases_ms
     from dwell.study.fleet_summary import fleet_numbers
 
     changes = {"policy": policy, "estimator": estimator, "coordination": coordination}
     played = _read(file, phases, **changes)
     parts = (policy, estimator, played.coordination, played.phasing, str(seed))
     folder = out or default_folder(played.name, *filter(None, parts))
-    settings = {"seed": seed, "guard": guard, "windows": windows, "versions": None}
+    duration_s = duration_of(played, windows, seconds) / 1e9
+    settings = {"seed": seed, "guard": guard, "seconds": duration_s, "versions": None}
     offsets = phases_ms(played, seed)
     require_free_or_same(folder, describe_fleet(played, phases=offsets, **settings))
     cells = counted(len(played.cells), "cell")
     try:
-        with progress(f"simulating {cells}, {counted(windows, 'window')} of each") as shown:
+        with progress(f"simulating {cells} for {duration_s:g} s") as shown:
             result = dwell.simulate_fleet(
-                played, seed=seed, windows=windows, guard=guard, jobs=jobs, progress=shown
+                played, seed=seed, seconds=duration_s, guard=guard, jobs=jobs, progress=shown
             )
         with working(f"writing {cells}"):
             result.save(folder)
@@ -127,9 +131,9 @@ def run(
         )
     summary = fleet_numbers(result)
     if as_json:
-        print_json({**_head(result, windows), "run": folder, **summary})
+        print_json({**_head(result), "run": folder, **summary})
     else:
-        typer.echo(_text(result, windows, summary))
+        typer.echo(_text(result, summary))
         typer.echo(f"\nsaved to {folder}")
 
 
@@ -269,12 +273,12 @@ def _read(file: Path, phases: str | None, **changes: str | None) -> Fleet:
     return fleet.changed(phases=read_phases(phases), **changes)
 
 
-def _head(result: FleetRun, windows: int) -> dict[str, Any]:
+def _head(result: FleetRun) -> dict[str, Any]:
     fleet = result.fleet
     return {
         "fleet": fleet.name,
         "seed": result.seed,
-        "windows": windows,
+        "seconds": result.seconds,
         "coordination": fleet.coordination,
         "phases": fleet.phases,
         "phases_ms": result.phases_ms,
@@ -285,13 +289,13 @@ def _head(result: FleetRun, windows: int) -> dict[str, Any]:
 # --------------------------------------------------------------------------- on a terminal
 
 
-def _text(result: FleetRun, windows: int, summary: Mapping[str, Any]) -> str:
+def _text(result: FleetRun, summary: Mapping[str, Any]) -> str:
     fleet = result.fleet
     shared = ", ".join(fleet.shared) or "nothing"
     lines = [
         f"{fleet.name}: {counted(len(result.cells), 'cell')}; shared: {shared}; phases: "
         f"{fleet.phasing}; coordination: {fleet.coordination}; seed {result.seed}; "
-        f"{counted(windows, 'window')}",
+        f"{result.seconds:g} s",
         "",
         *_cells(result, summary["cells"]),
         "",

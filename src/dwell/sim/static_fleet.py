@@ -14,7 +14,7 @@ from dwell.kernels.random_draws import Drawing
 from dwell.kernels.realisation import Realisation
 from dwell.model import Problem
 from dwell.model.fleet import Fleet
-from dwell.sim.fleet import draw_cell, phased
+from dwell.sim.fleet import cycles_within, draw_cell, phased
 from dwell.sim.waiting import Waiting, waiting_of
 
 
@@ -27,11 +27,13 @@ class StaticFleet:
     ----------
     placements : mapping of str to str
         Candidate of every cell, by the name of its file.
-    seed, windows : int
+    seed : int
+    duration_ns : int
+        Length of the run.
     """
 
-    def __init__(self, placements: Mapping[str, str], *, seed: int, windows: int) -> None:
-        self.placements, self.seed, self.windows = placements, seed, windows
+    def __init__(self, placements: Mapping[str, str], *, seed: int, duration_ns: int) -> None:
+        self.placements, self.seed, self.duration_ns = placements, seed, duration_ns
         self._drawn: dict[tuple[object, ...], tuple[float, Realisation]] = {}
 
     def __repr__(self) -> str:
@@ -39,14 +41,13 @@ class StaticFleet:
 
     def violation_rates(self, fleet: Fleet) -> NDArray[np.float64]:
         """Return V_D of every cell after the warm-up, as its controller would see it."""
-        cells = self._play(fleet)
-        warmup = [cell.problem.warmup_windows for cell in fleet.cells]
+        problems = [*phased(fleet, self.seed)]
         rates = [
-            float(cell.tables.seen[0, first : self.windows]["missed"].mean())
-            for cell, first in zip(cells, warmup, strict=True)
+            float(cell.tables.seen[0, problem.warmup_windows : closed]["missed"].mean())
+            for cell, problem in zip(self._play(fleet), problems, strict=True)
+            for closed in [cell.tables.cells[0]["window"]]
         ]
-        sizes = [cell.problem.window_cycles for cell in fleet.cells]
-        return np.array(rates) / sizes
+        return np.array(rates) / [problem.window_cycles for problem in problems]
 
     def waiting(self, fleet: Fleet) -> Waiting:
         """Return where the cycles that missed have waited, of all cells."""
@@ -70,20 +71,22 @@ class StaticFleet:
     def _realisations(self, fleet: Fleet) -> tuple[list[Problem], list[Realisation]]:
         problems = [*phased(fleet, self.seed)]
         reals = []
-        for i, (cell, problem) in enumerate(zip(fleet.cells, problems, strict=True)):
-            key = (problem.name, cell.copy, cell.entry.scenario, i == 0)
+        for cell, problem in zip(fleet.cells, problems, strict=True):
+            key = (problem.name, cell.copy, cell.entry.scenario)
             phase_ms = problem.pipeline.first_release_ms
             known = self._drawn.get(key)
             if known is None or (known[1].trace_starts and known[0] != phase_ms):
-                real = draw_cell(fleet, cell, problem, self.seed, self.windows, is_first=i == 0)
+                real = draw_cell(fleet, cell, problem, self.seed, self.duration_ns)
                 known = phase_ms, real
                 self._drawn[key] = known
             drawn_at_ms, real = known
-            reals.append(real if drawn_at_ms == phase_ms else _released_at(problem, real))
+            if drawn_at_ms != phase_ms:
+                real = _released_at(fleet, problem, real)
+            reals.append(real.until(cycles_within(problem, self.duration_ns)))
         return problems, reals
 
 
-def _released_at(problem: Problem, real: Realisation) -> Realisation:
+def _released_at(fleet: Fleet, problem: Problem, real: Realisation) -> Realisation:
     """Return a realisation without traces with another phase; jobs and messages take the same."""
     drawing = Drawing(
         problem,
@@ -91,6 +94,8 @@ def _released_at(problem: Problem, real: Realisation) -> Realisation:
         seed=real.seed or 0,
         windows=real.windows,
         streams=real.streams,
+        shared=fleet.shared,
+        disturbances=fleet.disturbances,
     )
     node_changes, link_segments = drawing.changes
     return replace(

@@ -132,8 +132,9 @@ class PlayedRealisation:
         """Whether each cycle missed: later than D, or unfinished when its window closed."""
         latency_ns = self.arrays.tables.latency_ns[0, : self.released]
         missed: NDArray[np.bool_] = latency_ns > self.problem.pipeline.deadline_ns
-        # The run has ended before the windows of the last cycles could close.
-        missed[self.counted :] = False
+        if not self.realisation.is_cut(self.problem):
+            # The run has ended before the windows of the last cycles could close.
+            missed[self.counted :] = False
         age_ns = self.close_ns[:, None] - self.by_window(self.realisation.release_ns)
         late = self.by_window(latency_ns) > age_ns
         if self.whole:

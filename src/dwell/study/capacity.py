@@ -163,25 +163,26 @@ class FleetPlayer:
 
     Parameters
     ----------
-    windows : int
-        Of every cell.
+    duration_ns : int
+        Length of a run.
     placements : mapping of str to str
         Candidate of every cell by the name of its file; empty where some may move.
     """
 
     fleet: Fleet
-    windows: int
+    duration_ns: int
     placements: Mapping[str, str]
 
     def __call__(self, unit: Sizes) -> list[float]:
         """Return V_D of the worst cell of every size."""
         fleets = [self.fleet.with_count(size) for size in range(unit.first, unit.last + 1)]
         if self.placements:
-            static = StaticFleet(self.placements, seed=unit.seed, windows=self.windows)
+            static = StaticFleet(self.placements, seed=unit.seed, duration_ns=self.duration_ns)
             return [float(static.violation_rates(fleet).max()) for fleet in fleets]
         worst = []
         for fleet in fleets:
-            runs = simulate_fleet(fleet, seed=unit.seed, windows=self.windows).cells.values()
+            seconds = self.duration_ns / 1e9
+            runs = simulate_fleet(fleet, seed=unit.seed, seconds=seconds).cells.values()
             tables = [run.arrays("windows") for run in runs]
             rates = [float(one["violation_rate"][~one["warmup"]].mean()) for one in tables]
             worst.append(max(rates))
@@ -193,10 +194,10 @@ class FleetPlayer:
         fleet = self.fleet.with_count(robots)
         for seed in seeds[:WAITING_SEEDS]:
             if self.placements:
-                static = StaticFleet(self.placements, seed=seed, windows=self.windows)
+                static = StaticFleet(self.placements, seed=seed, duration_ns=self.duration_ns)
                 waited += static.waiting(fleet)
             else:
-                waited += waiting_in_fleet(fleet, seed=seed, windows=self.windows)
+                waited += waiting_in_fleet(fleet, seed=seed, duration_ns=self.duration_ns)
         if not waited:
             return None
         (kind, name), most = max(waited.items(), key=lambda item: item[1])
@@ -246,9 +247,7 @@ def capacity_of(
     fleet = fleet.changed(policy=policy, phases=phases)
     _require_capacity(fleet)
     fleet.with_count(most)
-    counted = ((one.warmup_windows, one.window_cycles) for one in fleet.problems.values())
-    windows = max(warmup + -(-cycles // width) for warmup, width in counted)
-    player = FleetPlayer(fleet, windows, _placements(fleet))
+    player = FleetPlayer(fleet, _duration_ns(fleet, cycles), _placements(fleet))
     together = TOGETHER if player.placements else 1
     units = [
         Sizes(first, min(first + together - 1, most), seed)
@@ -335,6 +334,12 @@ class _Curve:
         rate = point.violation_rate
         # One seed gives no interval.
         return (end(rate) if rate.known else rate.value) > self.bound
+
+
+def _duration_ns(fleet: Fleet, cycles: int) -> int:
+    """Return how long a fleet is played so that each cell counts so many cycles, in windows."""
+    cells = [entry.cell for entry in fleet.entries]
+    return fleet.warmup_ns + max(-(-cycles // c.window_cycles) * c.window_ns for c in cells)
 
 
 def policy_of(fleet: Fleet, entry: FleetEntry) -> str:
