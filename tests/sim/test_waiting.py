@@ -34,16 +34,15 @@ def test_one_after_another_each_waits_for_those_before() -> None:
     fleet = fleet_of((within(one_job(), 3.0), 3))
     fleet = fleet.changed(policy="OFF", estimator="profile")
     waited = waiting_in_fleet(fleet, seed=1, duration_ns=fleet.duration_ns(2))
-    assert ms(waited) == {("node", "E"): pytest.approx(40 * (2 + 4))}
+    assert ms(waited) == {("resource", "E"): pytest.approx(40 * (2 + 4))}
 
 
 def test_a_static_fleet_waits_the_same() -> None:
     fleet = fleet_of((within(one_job(scheduler="fair"), 3.0), 3), phases="even")
     fleet = replace(fleet, entries=(replace(fleet.entries[0], count=4),))
     length = {"seed": 1, "duration_ns": fleet.duration_ns(2)}
-    static = StaticFleet({"one": "OFF"}, **length).waiting(fleet)
-    moving = fleet.changed(policy="OFF", estimator="profile")
-    assert static == waiting_in_fleet(moving, **length)
+    fleet = fleet.changed(policy="OFF", estimator="profile")
+    assert StaticFleet(**length).waiting(fleet) == waiting_in_fleet(fleet, **length)
 
 
 def test_a_message_behind_others_waits_for_its_link() -> None:

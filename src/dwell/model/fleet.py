@@ -143,6 +143,15 @@ class Fleet:
         """What every cell is, by its name."""
         return {cell.name: cell.problem for cell in self.cells}
 
+    def policy_of(self, entry: FleetEntry) -> str:
+        """Return the policy of the cells of an entry."""
+        return entry.policy or self.policy or entry.cell.controller.policy
+
+    def candidate_of(self, entry: FleetEntry) -> str | None:
+        """Return the candidate that the cells of an entry never leave; None where they may move."""
+        name, _ = entry.cell.policy_and_estimator(self.policy_of(entry))
+        return name if name in entry.cell.candidates else None
+
     @property
     def disturbances(self) -> Scenario:
         """What the scenarios of its cells do to shared nodes; equal ones count once."""

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.errors import SimulationError
 from dwell.kernels.advance import play
 from dwell.kernels.arrays import CellArrays, lay_out
 from dwell.kernels.random_draws import Drawing
@@ -18,36 +20,64 @@ from dwell.sim.fleet import cycles_within, draw_cell, phased
 from dwell.sim.waiting import Waiting, waiting_of
 
 
+class StaticRun(NamedTuple):
+    """What a fleet came to after the warm-up.
+
+    Parameters
+    ----------
+    missed : list of bool array, shape (cycles,)
+        Of every cell: whether each of its cycles missed.
+    used : mapping of str to float
+        Utilisation of the shared resources.
+    """
+
+    missed: list[NDArray[np.bool_]]
+    used: Mapping[str, float]
+
+
 class StaticFleet:
-    """Plays a fleet in several sizes under one seed; what cells have in common is drawn once.
+    """Plays a fleet in several sizes under one seed; a cell of several sizes is drawn once.
 
     It gives what `simulate_fleet` does under static policies.
 
     Parameters
     ----------
-    placements : mapping of str to str
-        Candidate of every cell, by the name of its file.
     seed : int
     duration_ns : int
         Length of the run.
     """
 
-    def __init__(self, placements: Mapping[str, str], *, seed: int, duration_ns: int) -> None:
-        self.placements, self.seed, self.duration_ns = placements, seed, duration_ns
+    def __init__(self, *, seed: int, duration_ns: int) -> None:
+        self.seed, self.duration_ns = seed, duration_ns
         self._drawn: dict[tuple[object, ...], tuple[float, Realisation]] = {}
 
     def __repr__(self) -> str:
-        return f"<StaticFleet under {dict(self.placements)}: seed {self.seed}>"
+        return f"<StaticFleet: seed {self.seed}>"
 
-    def violation_rates(self, fleet: Fleet) -> NDArray[np.float64]:
-        """Return V_D of every cell after the warm-up, as its controller would see it."""
-        problems = [*phased(fleet, self.seed)]
-        rates = [
-            float(cell.tables.seen[0, problem.warmup_windows : closed]["missed"].mean())
-            for cell, problem in zip(self._play(fleet), problems, strict=True)
-            for closed in [cell.tables.cells[0]["window"]]
-        ]
-        return np.array(rates) / [problem.window_cycles for problem in problems]
+    def play(self, fleet: Fleet) -> StaticRun:
+        """Play a fleet, and return what it came to.
+
+        Raises
+        ------
+        SimulationError
+            If some cell may move.
+        """
+        problems, cells = [*phased(fleet, self.seed)], self._play(fleet)
+        missed, used = [], {}
+        for problem, cell in zip(problems, cells, strict=True):
+            width, closed = problem.window_cycles, int(cell.tables.cells[0]["window"])
+            first, last = problem.warmup_windows, closed
+            latency_ns = cell.tables.latency_ns[0, first * width : last * width]
+            missed.append(latency_ns > problem.pipeline.deadline_ns)
+            if not used:
+                shares = cell.tables.shares[0, first:last, 0].mean(axis=0).tolist()
+                resources = problem.fabric.resources.values()
+                used = {
+                    one.name: share
+                    for one, share in zip(resources, shares, strict=False)
+                    if one.node in fleet.shared
+                }
+        return StaticRun(missed, used)
 
     def waiting(self, fleet: Fleet) -> Waiting:
         """Return where the cycles that missed have waited, of all cells."""
@@ -62,9 +92,11 @@ class StaticFleet:
         problems, reals = self._realisations(fleet)
         pairs = [*zip(problems, reals, strict=True)]
         whole = lay_out(pairs, shared=fleet.shared, log_jobs=jobs)
-        for row, problem in enumerate(problems):
-            candidates = list(problem.candidates)
-            whole.tables.stamps[row] = candidates.index(self.placements[problem.name])
+        for row, (cell, problem) in enumerate(zip(fleet.cells, problems, strict=True)):
+            placed = fleet.candidate_of(cell.entry)
+            if placed is None:
+                raise SimulationError(f"{cell.name} may move")
+            whole.tables.stamps[row] = list(problem.candidates).index(placed)
         play(whole)
         return [CellArrays(whole, i) for i in range(len(problems))]
 
