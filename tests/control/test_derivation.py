@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from random import Random
 from typing import Any, TypeAlias
 
 import pytest
@@ -52,6 +53,8 @@ class Record:
         self.rows = list(run.decisions.iter_rows(named=True))
         self.windows = {row["window"]: row for row in run.windows.iter_rows(named=True)}
         document = self.meta["problem"]
+        self.width: int = document["window_cycles"]
+        self.every: int = document["controller"].get("decide_cycles", self.width)
         self.parameters = self.meta["parameters"]
         first = {name: next(iter(task["on"])) for name, task in document["tasks"].items()}
         self.places = {name: {**first, **moves} for name, moves in document["candidates"].items()}
@@ -105,9 +108,13 @@ class Record:
         used = max(row[f"est_u_{one}_{name}"] for one in (*self.nodes, *self.accelerators))
         return self.excess(row[f"est_l95_ms_{name}"], used)
 
+    def seen(self, row: Row) -> Row:
+        """Metrics that a decision looked at: its own, or those of its window."""
+        return row if "seen_l95_ms" in row else self.windows[row["window"]]
+
     def is_seen_over(self, row: Row) -> bool:
-        """Whether the window that a decision was made on showed more than a cap."""
-        seen = self.windows[row["window"]]
+        """Whether the cycles that a decision looked at showed more than a cap."""
+        seen = self.seen(row)
         used = max(seen[f"u_{one}"] for one in (*self.nodes, *self.accelerators))
         over = self.excess(seen["seen_l95_ms"], used)
         return over is not None and over > 0
@@ -224,8 +231,8 @@ class Hindsight(Rule):
         return float(weight * self.record.moved(one, other))
 
     def wants(self, row: Row) -> tuple[str, str]:
-        record, now = self.record, self.now
-        served = {n: self.work[n] + record.cost(row, n, n) for n in record.names}
+        record, now, share = self.record, self.now, self.record.every / self.record.width
+        served = {n: self.work[n] + share * record.cost(row, n, n) for n in record.names}
         self.work = {
             name: min(served[other] + self.distance(other, name) for other in record.names)
             for name in record.names
@@ -237,7 +244,7 @@ class Hindsight(Rule):
         ties = [n for n in names if totals[n] <= bound]
         away = [n for n in ties if self.distance(n, now) > 1e-9] if now in ties else ties
         best = away[0] if away else now
-        margin = record.margin(row, best)
+        margin = share * record.margin(row, best)
         saved = served[now] - least - totals[best]
         if best == now or (now in names and margin > 0 and saved <= margin + GAIN_TOLERANCE):
             return now, "hold" if within else "infeasible"
@@ -271,8 +278,7 @@ class Thresholds(Rule):
 
     def observed(self) -> tuple[float, float, float]:
         """Means of what the windows showed."""
-        windows = [self.record.windows[row["window"]] for row in self.seen]
-        return self.means(windows, "seen_l95_ms", "u_{}")
+        return self.means([self.record.seen(row) for row in self.seen], "seen_l95_ms", "u_{}")
 
     def means(self, rows: Sequence[Row], l95_ms: str, used: str) -> tuple[float, float, float]:
         def mean(columns: list[str]) -> float:
@@ -305,8 +311,8 @@ class Thresholds(Rule):
         document = self.record.meta["problem"]
         size = 1
         if self.cost_answers:
-            window_ms = document["window_cycles"] * document["period_ms"]
-            size = max(1, round(set_to["every_ms"] / window_ms))
+            decision_ms = self.record.every * document["period_ms"]
+            size = max(1, round(set_to["every_ms"] / decision_ms))
         stays = "dwell" if self.dwelt < set_to["min_dwell"] else "hold"
         self.seen.append(row)
         if len(self.seen) < size:
@@ -352,6 +358,8 @@ RULES: dict[str, type[Rule]] = {
 def derive(record: Record, rule: Rule) -> Iterator[tuple[Row, str, str]]:
     """Yield every row with the placement and the reason that follow from it."""
     for row in record.rows:
+        assert row["dwell_cycles"] % record.every == 0
+        assert row["dwell"] == row["dwell_cycles"] // record.width
         assert row["incumbent"] == rule.now or row["reason"] == "guard"
         if row[f"est_l95_ms_{rule.now}"] is None:
             yield row, row["placement"], "guard"
@@ -386,10 +394,23 @@ def capped(problem: Problem, caps: str) -> Problem:
     return replace(problem, objective=replace(problem.objective, caps=given))
 
 
+def deciding_often(problem: Problem, rng: Random) -> Problem:
+    """Draw how often it decides, and for how long a placement has to stay."""
+    width = problem.window_cycles
+    controller = replace(
+        problem.controller,
+        decide_cycles=rng.choice([1, 7, width // 4, width - 1, rng.randint(1, width)]),
+        min_dwell=rng.choice([0, 0, 1, 3]),
+        min_dwell_cycles=rng.choice([0, rng.randint(0, 3 * width)]),
+    )
+    return replace(problem, controller=controller)
+
+
 @pytest.mark.parametrize("policy", RULES)
 @pytest.mark.parametrize("caps", CAPS)
+@pytest.mark.parametrize("often", [False, True], ids=["windows", "between"])
 def test_every_decision_follows_from_its_row(
-    canonical: Problem, policy: str, caps: str, tmp_path: Path
+    canonical: Problem, policy: str, caps: str, often: bool, tmp_path: Path
 ) -> None:
     problem = capped(canonical, caps)
     for seed, (scenario, estimator) in enumerate(
@@ -401,6 +422,8 @@ def test_every_decision_follows_from_its_row(
         ]
     ):
         folder = tmp_path / str(seed)
+        if often:
+            problem = deciding_often(problem, Random(f"{policy}, {caps}, {seed}"))
         run = dwell.simulate(
             problem, scenario=scenario, policy=policy, estimator=estimator, seed=seed, windows=25
         )
@@ -443,11 +466,14 @@ class Doubting:
 
 @pytest.mark.parametrize(("policy", "escape"), [*((p, False) for p in RULES), ("dtp", True)])
 @pytest.mark.parametrize("caps", ["own", "latency"])
+@pytest.mark.parametrize("every", [None, 17, 25])
 def test_a_learners_decision_follows_from_its_row_with_its_errors(
-    canonical: Problem, policy: str, caps: str, escape: bool, tmp_path: Path
+    canonical: Problem, policy: str, caps: str, escape: bool, every: int | None, tmp_path: Path
 ) -> None:
     problem = capped(canonical, caps)
-    controller = replace(problem.controller, escape=escape, min_dwell=1, min_improvement=0.02)
+    controller = replace(
+        problem.controller, decide_cycles=every, escape=escape, min_dwell=1, min_improvement=0.02
+    )
     problem = replace(problem, controller=controller)
     moves = {}
     for share in (0.0, 0.2):

@@ -139,9 +139,9 @@ class WorkFunction(PricingPolicy):
         return self._move(best, reason, costs), work
 
     def _unsure(self, best: str, served: list[float], estimates: Mapping[str, QoS]) -> bool:
-        """Whether what a move saves in the sums is no more than the margin of the estimates."""
+        """Whether a move saves no more in the sums than the margin of what was just served."""
         now = self.incumbent
-        least = self._pricing.margin(estimates[best], estimates[now])
+        least = self._served * self._pricing.margin(estimates[best], estimates[now])
         here, there = self._index[now], self._index[best]
         saved = served[here] - served[there] - self._distances[here][there]
         # Without errors a tie is a move.
