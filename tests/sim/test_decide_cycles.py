@@ -10,12 +10,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from polars.testing import assert_frame_equal
 
 import dwell
 from dwell.control.windows import missed_cycles, seen_l95_ms
 from dwell.cost import cost, hamming
 from dwell.errors import ProblemError
 from dwell.model import FrozenDict, Problem, QoS
+from dwell.model.fleet import Fleet, FleetEntry
 from dwell.model.window_close import window_close_ns
 from dwell.record import Run
 from dwell.sim.engine import simulate_realisation
@@ -240,3 +242,67 @@ def test_the_oracle_decides_as_often_as_the_cell_does() -> None:
     assert found.runs["oracle"].decisions.height > 3 * 10
     assert found.runs["clairvoyant"].decisions.height == 10
     assert found.costs["oracle"] < found.costs["LOC"]
+
+
+# ------------------------------------------------------------------------------------- fleets
+
+TABLES = ("cycles", "windows", "decisions")
+
+
+def hall(problems: list[Problem], coordination: str, scenario: str = "robot-cpu-stress") -> Fleet:
+    entries = tuple(FleetEntry(problem, 1, scenario) for problem in problems)
+    return Fleet("hall", entries, ("E",), phases="random", coordination=coordination)  # type: ignore[arg-type]
+
+
+def named(name: str, every: int | None, **settings: Any) -> Problem:
+    return replace(often(CANONICAL, every, **settings), name=name)
+
+
+@pytest.mark.parametrize("guard", [False, True])
+@pytest.mark.parametrize("every", [17, 25])
+def test_a_fleet_of_one_decides_as_its_cell_alone(every: int, guard: bool) -> None:
+    problem = often(CANONICAL, every, on="E", min_dwell=0)
+    settings: dict[str, Any] = {"policy": "dtp+corrected", "seed": 3, "windows": 8, "guard": guard}
+    alone = dwell.simulate(problem, scenario="edge-cpu-stress", **settings)
+    fleet = replace(hall([problem], "none", "edge-cpu-stress"), phases="sync")
+    (run,) = dwell.simulate_fleet(fleet, **settings).cells.values()
+    for table in TABLES:
+        assert_frame_equal(getattr(run, table), getattr(alone, table))
+
+
+def test_cells_of_a_fleet_that_share_nothing_decide_as_alone() -> None:
+    problems = [named(f"cell-{every}", every) for every in (10, 25, 60, 99)]
+    fleet = replace(hall(problems, "none"), shared=(), phases="sync")
+    together = dwell.simulate_fleet(fleet, policy="cusum+corrected", seed=2, windows=6)
+    for problem, run in zip(problems, together.cells.values(), strict=True):
+        alone = dwell.simulate(
+            problem, scenario="robot-cpu-stress", policy="cusum+corrected", seed=2, windows=6
+        )
+        for table in TABLES:
+            assert_frame_equal(getattr(run, table), getattr(alone, table))
+
+
+@pytest.mark.parametrize("coordination", ["none", "random", "ledger"])
+def test_each_cell_of_a_fleet_decides_at_its_own_interval(coordination: str) -> None:
+    intervals = (10, 25, 60, 100)
+    problems = [named(f"cell-{every}", every, min_dwell=0) for every in intervals]
+    fleet = hall(problems, coordination)
+    played = dwell.simulate_fleet(fleet, policy="dtp+corrected", seed=1, windows=8)
+    rounds = []
+    for every, run in zip(intervals, played.cells.values(), strict=True):
+        if every < 100:
+            assert run.windows["first_cycle"].to_list() == [100 * i for i in range(8)]
+        release_ns = run.cycles["release_ns"]
+        for row in run.decisions.iter_rows(named=True):
+            begin = begins(run, row)
+            assert (row["last_cycle"] + 1 - begin) % every == 0
+            assert row["cycles"] == min(100, row["last_cycle"] + 1 - begin)
+            if coordination == "ledger":
+                at_ns = release_ns[row["last_cycle"]] + run.problem.pipeline.period_ns
+                rounds.append((at_ns, row["round"], row["phi_before"] is not None))
+    assert played.decisions["migrated"].sum() > 0
+    # A round takes the cells that decide, in the order of their instants.
+    rounds.sort()
+    assert [number for _, number, _ in rounds] == sorted(number for _, number, _ in rounds)
+    asked = [number for _, number, was_asked in rounds if was_asked]
+    assert asked == sorted(set(asked))
