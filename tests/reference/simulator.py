@@ -1939,11 +1939,11 @@ def control(
     guarded: bool = False,
     fickle: bool = False,
 ) -> Result:
-    """Play a realisation under a controller that orders one name of a script at each close.
+    """Play a realisation under a controller that orders one name of a script at each decision.
 
     `fraction` is the share of cycles that are also sent through each alternative. If it is
     `guarded`, the cell's guard acts, and `shadows` are what its probes meet; a name that it holds
-    back is said again at the next close, unless the controller is `fickle`.
+    back is said again at the next decision, unless the controller is `fickle`.
     """
     return Simulation(
         problem,

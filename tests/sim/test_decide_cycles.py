@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import pairwise
@@ -13,6 +14,7 @@ import pytest
 from polars.testing import assert_frame_equal
 
 import dwell
+from dwell.cellfile.overrides import load_with
 from dwell.control.windows import missed_cycles, seen_l95_ms
 from dwell.cost import cost, hamming
 from dwell.errors import ProblemError
@@ -26,6 +28,8 @@ from dwell.study.judged_cost import judged_costs
 from dwell.study.reference import play_alone, references
 from tests.cells.examples import EXAMPLES
 from tests.cells.generated import random_problem
+from tests.reference.algorithm_1 import price
+from tests.reference.algorithm_1 import switching as moved_share
 
 CANONICAL = dwell.load(EXAMPLES / "canonical.yaml")
 
@@ -105,6 +109,38 @@ def test_cycles_before_an_orders_first_stamp_belong_to_windows() -> None:
     following = run.decisions.row(1, named=True)
     assert (following["last_cycle"], following["cycles"]) == (46, 20)
     assert run.windows["violation_rate"][0] == run.cycles["missed"][:100].mean()
+
+
+@pytest.mark.parametrize(("lead", "delay_ms"), [(0, 0.0), (7, 0.0), (0, 90.0)])
+@pytest.mark.parametrize("scenario", ["robot-cpu-stress", "network-impairment"])
+def test_j_counted_again_over_fixed_stretches(scenario: str, lead: int, delay_ms: float) -> None:
+    problem = often(
+        CANONICAL, 25, min_dwell=0, order_lead_cycles=lead, order_delay_ms=delay_ms, on="R2"
+    )
+    run = dwell.simulate(problem, scenario=scenario, policy="cusum", seed=5, windows=20)
+    width, objective = problem.window_cycles, problem.objective
+    cycles = list(run.cycles.iter_rows(named=True))
+    moves = 0
+    for i, row in enumerate(run.windows.iter_rows(named=True)):
+        stretch = cycles[i * width : (i + 1) * width]
+        close_ns = stretch[-1]["release_ns"] + problem.pipeline.period_ns
+        ages = [(one["latency_ns"] or math.inf, close_ns - one["release_ns"]) for one in stretch]
+        seen = sorted(min(latency, age) for latency, age in ages)
+        l95_ms = min(seen[math.ceil(0.95 * width) - 1] / 1e6, problem.censor_ms)
+        deadline_ns = problem.pipeline.deadline_ms * 1e6
+        missed = sum(latency > min(age, deadline_ns) for latency, age in ages) / width
+        used = FrozenDict({name: row[f"u_{name}"] for name in problem.fabric.resources})
+        placed = [one["placement"] for one in cycles[max(i * width - 1, 0) : (i + 1) * width]]
+        switched = [
+            moved_share(problem.candidates[b], problem.candidates[a]) for a, b in pairwise(placed)
+        ]
+        moves += sum(share > 0 for share in switched)
+        here = problem.candidates[placed[-1]]
+        J = price(QoS(l95_ms, missed, used), here, here, objective)
+        J += objective.weights.switching * sum(switched)
+        assert row["cost"] == pytest.approx(J, rel=1e-9)
+    assert moves == run.decisions["migrated"].sum() > 1
+    assert len(cycles) == 20 * width
 
 
 @pytest.mark.parametrize("every", [25, 30, 99])
@@ -212,6 +248,24 @@ def test_it_is_at_most_a_window() -> None:
         often(CANONICAL, 101)
     with pytest.raises(ProblemError, match=r"decide_cycles"):
         often(CANONICAL, 0)
+
+
+@pytest.mark.parametrize("given", ["0", "-1", "2.5", "101", "true", "often", "[5]", ".nan"])
+def test_a_cell_file_with_another_interval_is_refused(given: str) -> None:
+    with pytest.raises(ProblemError) as caught:
+        load_with(EXAMPLES / "canonical.yaml", [f"controller.decide_cycles={given}"])
+    (fault,) = caught.value.faults
+    assert "decide_cycles" in fault.path
+
+
+@pytest.mark.parametrize("every", [1, 25])
+def test_without_a_least_improvement_a_gain_of_nothing_moves_no_cell(every: int) -> None:
+    problem = often(CANONICAL, every, min_dwell=0, min_improvement=0.0)
+    run = dwell.simulate(problem, policy="dtp", estimator="profile", seed=1, windows=5)
+    for row in run.decisions.filter("migrated").iter_rows(named=True):
+        assert row["delta_j"] > 0
+    moves = run.decisions["migrated"].sum()
+    assert moves <= len(run.decisions) < 5 * 100 / every + 1
 
 
 @pytest.mark.parametrize("every", [25, 100])
