@@ -8,6 +8,7 @@ differences are taken seed by seed. `--seeds N` plays N seeds of each scenario.
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -26,6 +27,8 @@ from dwell.study import mean_interval
 IMAGES = Path(__file__).parent / "images"
 DATA, DRAWING = IMAGES / "decide-cycles.csv", IMAGES / "decide-cycles.svg"
 WINDOWS = 300
+#: Intervals in the order in which they are played, the default first.
+PASSES = ((25,), (5, 10, 50, 100))
 #: Panels of the figure, and what each of them shows.
 PANELS = {
     "missed_less": "V_D, points",
@@ -39,14 +42,13 @@ CALM, MOST_UNDONE, MOST_COST = ("baseline", "flapping"), 2.0, 0.5
 def rows(seeds: int) -> pl.DataFrame:
     """Return the figures of all runs, and play those that are missing."""
     known = pl.read_csv(DATA) if DATA.exists() else pl.DataFrame()
-    for seed in range(1, seeds + 1):
-        for scenario in SCENARIOS:
-            if known.height and known.filter(scenario=scenario, seed=seed).height:
-                continue
-            print(f"{scenario}, seed {seed} ...", file=sys.stderr, flush=True)
-            new = pl.DataFrame([asdict(row) for row in compared(scenario, seed, WINDOWS)])
-            known = pl.concat([known, new], how="diagonal_relaxed")
-            known.write_csv(DATA, float_precision=6)
+    for intervals, seed, scenario in itertools.product(PASSES, range(1, seeds + 1), SCENARIOS):
+        if known.height and known.filter(scenario=scenario, seed=seed, every=intervals[0]).height:
+            continue
+        print(f"{scenario}, seed {seed} ...", file=sys.stderr, flush=True)
+        new = pl.DataFrame([asdict(row) for row in compared(scenario, seed, WINDOWS, intervals)])
+        known = pl.concat([known, new], how="diagonal_relaxed").sort("scenario", "every", "seed")
+        known.write_csv(DATA, float_precision=6)
     return known.filter(pl.col("seed") <= seeds)
 
 
@@ -62,7 +64,7 @@ def summarised(runs: pl.DataFrame) -> pl.DataFrame:
                     {
                         "scenario": heading,
                         "policy": scenario,
-                        "at": every,
+                        "at": str(every),
                         "mean": mean,
                         "low": low,
                         "high": high,
