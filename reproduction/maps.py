@@ -18,8 +18,9 @@ LABELS = ("panel", "row", "column")
 #: Words with a column of their own in a table of counts: with the range of effects, and without.
 CLEAR, OTHERS = ("lower", "higher"), (WITHIN, "same cycles", "same run")
 
-#: Readable on white and on black.
-INK, COLOURS = "#808080", {"lower": "#0072b2", "higher": "#d55e00"}
+#: Readable on white and on black; cells of these colours have white text.
+INK, COLOURS = "#808080", {"lower": "#0072b2", "higher": "#b84f00", WITHIN: "#00785a"}
+FAINT = "#80808022"
 STEP_PX, ROW_PX = 74, 24
 
 
@@ -58,7 +59,8 @@ def _told(group: pl.DataFrame, word: str) -> str:
 
 def number(value: float) -> str:
     """Write an effect: one decimal, two below 1."""
-    return f"{value:.{1 if abs(value) >= 1 else 2}f}".replace("-", "−")
+    places = 1 if abs(value) >= 0.995 else 2
+    return f"{round(value, places) + 0.0:.{places}f}".replace("-", "−")
 
 
 def svg(cells: pl.DataFrame) -> str:
@@ -73,10 +75,17 @@ def svg(cells: pl.DataFrame) -> str:
             "labelLimit": 200,
             "labelFontSize": 12,
         },
-        "title": {"color": INK, "anchor": "start", "fontWeight": "normal"},
+        "title": {"color": INK, "anchor": "start", "fontWeight": "normal", "limit": 0},
         "legend": {"labelColor": INK, "labelFontSize": 12},
     }
-    drawing = {"vconcat": panels, "background": "transparent", "config": style}
+    # Fonts of browsers may be wider than the font that the drawing is laid out by.
+    room = {"left": 24, "right": 24, "top": 5, "bottom": 5}
+    drawing = {
+        "vconcat": panels,
+        "padding": room,
+        "background": "transparent",
+        "config": style,
+    }
     return re.sub(r' (?:role|aria-[\w-]+)="[^"]*"', "", vl_convert.vegalite_to_svg(drawing))
 
 
@@ -88,8 +97,8 @@ def _panel(cells: pl.DataFrame) -> dict[str, object]:
     ]
     data = shown.with_columns(text=pl.Series(texts, dtype=pl.String))
     words = list(dict.fromkeys(data["word"]))
-    clear = "indexof(['lower', 'higher'], datum.word) >= 0"
-    colours = [COLOURS.get(word, INK) for word in words]
+    colours = [COLOURS.get(word, FAINT) for word in words]
+    is_coloured = f"indexof({list(COLOURS)}, datum.word) >= 0"
     places = {
         channel: {
             "field": field,
@@ -106,22 +115,17 @@ def _panel(cells: pl.DataFrame) -> dict[str, object]:
     fill = {
         "field": "word",
         "scale": {"domain": words, "range": colours},
-        "legend": {"title": None, "orient": "bottom", "columns": 3} if any(words) else None,
+        "legend": {"title": None, "orient": "bottom", "columnPadding": 24} if any(words) else None,
     }
-    opacity = {"condition": {"test": clear, "value": 1}, "value": 0.12}
-    ink = {"condition": {"test": clear, "value": "white"}, "value": INK}
+    ink = {"condition": {"test": is_coloured, "value": "white"}, "value": INK}
     return {
         "title": data["panel"][0],
         "width": {"step": STEP_PX},
         "height": {"step": ROW_PX},
         "data": {"values": data.to_dicts()},
         "encoding": places,
-        "resolve": {"scale": {"color": "independent"}},
         "layer": [
-            {
-                "mark": {"type": "rect", "cornerRadius": 2},
-                "encoding": {"fill": fill, "opacity": opacity},
-            },
+            {"mark": {"type": "rect", "cornerRadius": 2}, "encoding": {"fill": fill}},
             {
                 "mark": {"type": "text", "fontSize": 12},
                 "encoding": {"text": {"field": "text"}, "color": ink},

@@ -64,7 +64,7 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
 
 def _label(row: dict[str, str]) -> tuple[str, str, str]:
     estimator, dwell, rule = row["first"].split(", ")
-    panel = f"Migrations a run: penalty less threshold; {estimator}, {dwell}"
+    panel = f"Migrations: {estimator}, {dwell}"
     return panel, f"α_S = {rule.removeprefix(PENALTY)}", row["scenario"]
 
 

@@ -120,7 +120,7 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
 def _label(row: dict[str, str]) -> tuple[str, str, str]:
     stress, _, place = row["scenario"].partition(" + ")
     robot, _, load = stress.partition(" ")
-    return f"V_D, points, {robot} stressed", f"threads: {load}", place or "no fault"
+    return f"V_D, points: {robot} stressed, threads", load, place or "no fault"
 
 
 def stress_scenarios(cell: Problem) -> dict[str, Scenario]:

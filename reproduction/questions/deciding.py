@@ -21,9 +21,9 @@ MARGIN = 0.005
 METRICS = ("violation_rate", "cost", "returns")
 #: Metrics as panels, with the factor of their unit.
 PANELS = {
-    "violation_rate": ("V_D, points, less a decision every 100 cycles", 100.0),
-    "cost": ("J, the same", 1.0),
-    "returns": ("Moves that undo the one before, in a run, the same", 1.0),
+    "violation_rate": ("V_D, points", 100.0),
+    "cost": ("J", 1.0),
+    "returns": ("Moves that undo the one before", 1.0),
 }
 
 

@@ -97,8 +97,12 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
     }
     verdicts = claims(runs, METRICS, scenarios, asked, whole, margin=MARGIN)
     keys = ("scenario", "policy", "seed")
+    # Where the latencies are those of the rule without HYB, nothing is changed.
+    alike = pl.col("latencies") == pl.col("latencies_right")
     changes = having.join(lacking, on=keys).select(
-        *keys, *(pl.col(name) - pl.col(f"{name}_right") for name in METRICS)
+        *keys,
+        *(pl.col(name) - pl.col(f"{name}_right") for name in METRICS),
+        latencies=pl.when(alike).then(pl.lit("alike")).otherwise(pl.format("{} {}", *keys[:2])),
     )
     changes = changes.rename(dict(zip(METRICS, CHANGES, strict=True)))
     calm = pl.concat(
@@ -130,9 +134,9 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
 def _label(row: dict[str, str]) -> tuple[str, str, str]:
     place, _, condition = row["scenario"].partition(" + ")
     load = LOADS[list(CONDITIONS).index(condition)]
-    panel = "V_D, points: with HYB less without it; threads a core"
+    panel = "V_D with HYB less without, points; threads a core"
     if row["metric"] in CHANGES:
-        panel = "The same, less what HYB changes under that load without a fault"
+        panel = "The same, less its control without a fault"
     return panel, place, load
 
 

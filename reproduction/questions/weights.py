@@ -69,7 +69,7 @@ def cells_of(swept: pl.DataFrame, design: str) -> pl.DataFrame:
     """Return the total indices of V_D, and what V_D spans over the weights, as a map."""
     rates = swept.filter(metric=OUTPUTS[0])
     shares = rates.select(
-        panel=pl.lit("Share of the variance of V_D in which a weight takes part (S_T)"),
+        panel=pl.lit("S_T: share of the variance of V_D"),
         row="scenario",
         column="weight",
         effect="ST",
@@ -77,7 +77,7 @@ def cells_of(swept: pl.DataFrame, design: str) -> pl.DataFrame:
         high="ST_high",
     )
     spans = rates.unique("scenario", maintain_order=True).select(
-        panel=pl.lit("V_D, points: from the 5th to the 95th percentile of all settings"),
+        panel=pl.lit("V_D, points: 5th to 95th percentile"),
         row="scenario",
         column=pl.lit("all five"),
         effect=100 * (pl.col("high") - pl.col("low")),
