@@ -9,10 +9,11 @@ from .demo import longest_run as longest_run
 from .demo import real_demo as real_demo
 from .demo import stored_deadlines as stored_deadlines
 from .demo import tenants_demo as tenants_demo
+from .family import SAME_CYCLES as SAME_CYCLES
 from .family import SAME_RUN as SAME_RUN
 from .family import UNTOLD as UNTOLD
 from .family import Family as Family
-from .family import same_run as same_run
+from .family import played_alike as played_alike
 from .family import untold as untold
 from .hindsight import Hindsight as Hindsight
 from .intervals import Interval as Interval
