@@ -440,11 +440,17 @@ class Recorded(World):
     """A cell in memory whose controller keeps its runs in a folder."""
 
     def __init__(
-        self, problem: Problem, out: Path, *, policy: str = "LOC", **recording: Any
+        self,
+        problem: Problem,
+        out: Path,
+        *,
+        policy: str = "LOC",
+        exec_ms: Mapping[str, float] = EXEC_MS,
+        **recording: Any,
     ) -> None:
         self.out, self.recording = out, recording
         self.log: list[str] = []
-        super().__init__(problem, policy=policy)
+        super().__init__(problem, policy=policy, exec_ms=exec_ms)
 
     def recorder_of(self, controller: Controller) -> Recorder:
         kept = self.out, self.problem, controller, self.log.append
