@@ -47,9 +47,12 @@ def _canonical() -> Problem:
 def canonical(window_cycles: int | None = None, **settings: Any) -> Problem:
     """Return the canonical cell with other windows, and settings of its controller."""
     cell = _canonical()
-    if window_cycles is not None:
-        cell = replace(cell, window_cycles=window_cycles, warmup_windows=0)
-    return replace(cell, controller=replace(cell.controller, **settings))
+    # Tests that decide more often say so.
+    settings = {"decide_cycles": window_cycles or cell.window_cycles, **settings}
+    controller = replace(cell.controller, **settings)
+    if window_cycles is None:
+        return replace(cell, controller=controller)
+    return replace(cell, controller=controller, window_cycles=window_cycles, warmup_windows=0)
 
 
 def on(problem: Problem, candidate: str) -> Problem:
