@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
@@ -14,9 +15,11 @@ from dwell.cli.output import aligned, print_json, warn
 from dwell.display import milliseconds
 from dwell.errors import ExitCode, Fault, PolicyError, ProblemError
 from dwell.model.bounds import counted
+from dwell.model.controller_settings import AUTO
 
 if TYPE_CHECKING:
     from dwell.estimators.prices import Price
+    from dwell.estimators.shadow_price import ShadowPrice
     from dwell.model import Problem
 
 
@@ -56,9 +59,11 @@ def check(
     from dwell.estimators import warnings_of
     from dwell.estimators.cell_warnings import unpriced
     from dwell.estimators.prices import prices_of
+    from dwell.estimators.shadow_price import affordable
     from dwell.live.lint import lint
 
-    prices = prices_of(problem, scenario)
+    prices, tried = prices_of(problem, scenario), _shadow_prices(problem)
+    fractions = {name: affordable(problem, shadows) for name, shadows in tried.items()}
     cycles = min(price.cycles for price in prices.values())
     warnings = (
         *warnings_of(problem),
@@ -68,9 +73,14 @@ def check(
     if as_json:
         rows = [_fault(warning) for warning in warnings]
         contents = {"valid": True, **_contents(problem), "priced_under": scenario}
-        print_json(contents | {"candidates": _priced(problem, prices), "warnings": rows})
+        candidates = _priced(problem, prices)
+        for name, fraction in fractions.items():
+            candidates[name]["shadow_fraction"] = fraction
+            candidates[name]["shadow_prices"] = [asdict(one) for one in tried[name]]
+        print_json(contents | {"candidates": candidates, "warnings": rows})
     else:
-        typer.echo(_summary(problem, prices, scenario))
+        notes = _shadow_notes(problem, tried, fractions)
+        typer.echo("\n".join((_summary(problem, prices, scenario), *notes)))
         warn(cell, warnings)
 
 
@@ -179,6 +189,34 @@ def _summary(problem: Problem, prices: Mapping[str, Price], scenario: str) -> st
             *(f"{name}: {note}" for name, price in prices.items() for note in _notes(price)),
         )
     )
+
+
+def _shadow_prices(problem: Problem) -> Mapping[str, Sequence[ShadowPrice]]:
+    """Return the prices that the shares of shadows follow from; nothing where they do not."""
+    from dwell.estimators.registry import shadowing
+    from dwell.estimators.shadow_price import shadow_prices
+
+    settings = problem.controller
+    is_priced = settings.estimator in shadowing() and settings.shadow_fraction == AUTO
+    return shadow_prices(problem) if is_priced else {}
+
+
+def _shadow_notes(
+    problem: Problem, tried: Mapping[str, Sequence[ShadowPrice]], fractions: Mapping[str, float]
+) -> Iterator[str]:
+    """Yield the shares of shadows, and why they are not larger."""
+    most = problem.shadow_fraction
+    if free := [name for name, fraction in fractions.items() if fraction == most]:
+        yield f"shadows: {most:g} under {', '.join(free)}"
+    for name, fraction in fractions.items():
+        if fraction == most:
+            continue
+        too_dear = tried[name][0 if fraction else -1]
+        more = f"miss {too_dear.violation_rate * 100:.1f} points more"
+        if problem.objective.weights.violations * too_dear.violation_rate < too_dear.cost / 2:
+            more = f"have an L95 {milliseconds(too_dear.l95_ms)} ms longer"
+        alone = "" if fraction else f"; under {name} the estimator learns from the incumbent alone"
+        yield f"shadows: {fraction:g}; at {too_dear.fraction:g} {name} would {more}{alone}"
 
 
 def _notes(price: Price) -> Iterator[str]:

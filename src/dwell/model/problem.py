@@ -236,10 +236,11 @@ class Problem(Displayed):
     def shadow_fraction(self) -> float:
         """Share of the cycles also sent through each alternative, of an estimator with shadows.
 
-        Where none is given 0.05, or all cycles over the number of alternatives where that is less.
+        Where none is given 0.05, or all cycles over the number of alternatives where that is less;
+        the same is the largest share where it is `auto` (see `dwell.estimators.shadow_price`).
         """
         given = self.controller.shadow_fraction
-        if given is not None:
+        if given is not None and not isinstance(given, str):
             return given
         return min(SHADOWED, 1 / max(len(self.candidates) - 1, 1))
 

@@ -148,7 +148,7 @@ def find_unregistered(
             path = "controller.estimator"
             yield from _unknown(path, "estimator", settings.estimator, estimators)
         given = settings.shadow_fraction if settings.estimator in shadowing else None
-        if given is not None and (message := too_many_shadows(given, len(names))):
+        if isinstance(given, float | int) and (message := too_many_shadows(given, len(names))):
             yield Fault("controller.shadow_fraction", message)
     yield from _columns(parts)
 
