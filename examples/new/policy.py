@@ -20,7 +20,7 @@ class Patient:
     @classmethod
     def from_problem(cls, problem: Problem) -> Patient:
         """Make it for a cell: what the cell file says is in `problem`."""
-        return cls(problem.initial, problem.controller.min_dwell)
+        return cls(problem.initial)
 
     def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
         """Choose the placement for the next window, by name.

@@ -20,6 +20,7 @@ from dwell.errors import Fault, MetricError, PolicyError, ProblemError
 from dwell.estimators import Estimator, Evidence
 from dwell.estimators import by_name as estimator_by_name
 from dwell.estimators.protocol import CellEstimator
+from dwell.estimators.registry import resolved
 from dwell.estimators.user_estimator import as_started
 from dwell.model import Caps, Decision, FrozenDict, Objective, Problem, QoS
 from dwell.model.bounds import CLASS_PATH
@@ -166,11 +167,13 @@ class Controller:
         estimator: Estimator | str | None = None,
         coordination: Coordination | None = None,
     ) -> None:
-        self.problem, self.coordination = problem, coordination
         if isinstance(policy, str):
             policy, estimator = _without_estimator(policy, estimator, problem)
         policy = policy or problem.controller.policy
         estimator = estimator or problem.controller.estimator
+        problem = resolved(problem, estimator)
+        #: The cell, with the N_min that it has with this estimator.
+        self.problem, self.coordination = problem, coordination
         #: Names of the policy and the estimator where these are classes of a user's own, else None.
         self._own = tuple(one if CLASS_PATH.holds(one) else None for one in (policy, estimator))
         decider = policy_by_name(policy, problem) if isinstance(policy, str) else policy

@@ -13,6 +13,8 @@ HALF_LIFE_WINDOWS = Bound(0, MAX_COUNT, above=True)
 SHADOW_FRACTION = Bound(0, 1)
 DECIDE_CYCLES = Bound(1, MAX_COUNT, whole=True)
 MIN_DWELL_CYCLES = Bound(0, MAX_COUNT, whole=True)
+#: N_min where a cell gives none and the estimator states no errors.
+USUAL_DWELL = 3
 
 
 @declared()
@@ -34,7 +36,12 @@ class ControllerSettings:
         default=None,
         usual="W: one decision per window",
     )
-    min_dwell: int = key("Windows that a placement stays at least (N_min).", MIN_DWELL, default=3)
+    min_dwell: int | None = key(
+        "Windows that a placement stays at least (N_min).",
+        MIN_DWELL,
+        default=None,
+        usual="0 with an estimator that states its errors, else 3",
+    )
     min_dwell_cycles: int = key(
         "Cycles that a placement stays at least, where N_min windows are fewer.",
         MIN_DWELL_CYCLES,

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from dwell.display import Displayed
 from dwell.errors import Fault, ProblemError
 from dwell.model.bounds import MAX_COUNT, Bound, counted, require
-from dwell.model.controller_settings import ControllerSettings
+from dwell.model.controller_settings import USUAL_DWELL, ControllerSettings
 from dwell.model.declaration import declared, key
 from dwell.model.fabric import Fabric
 from dwell.model.frozen import FrozenDict, shortened
@@ -80,9 +80,9 @@ class Problem(Displayed):
         require_length(1, self.window_cycles, self.pipeline.period_ms, "window_cycles")
         if self.servo is not None:
             self.servo.require_seen(self.pipeline.period_ms)
-        every, bound = self.decide_cycles, f"at most window_cycles = {self.window_cycles}"
-        holds = every <= self.window_cycles
-        require(holds, "controller.decide_cycles", every, f"{bound}; lower it, or raise that")
+        every, width = self.decide_cycles, self.window_cycles
+        bound = f"at most window_cycles = {width}; lower decide_cycles, or raise window_cycles"
+        require(every <= width, "controller.decide_cycles", every, bound)
         phased = self.pipeline.first_release_ms > 0 and self.live.release == "frames"
         bound = "timer in a cell with a phase_ms, which a camera's frames do not keep"
         require(not phased, "live.release", self.live.release, bound)
@@ -211,11 +211,20 @@ class Problem(Displayed):
         return self.window_cycles / self.decide_cycles
 
     @property
+    def min_dwell(self) -> int:
+        """N_min, windows; where the cell gives none, as with an estimator that states no errors."""
+        given = self.controller.min_dwell
+        return USUAL_DWELL if given is None else given
+
+    @property
+    def dwell_cycles(self) -> int:
+        """Cycles that a placement stays at least: max(N_min W, `min_dwell_cycles`)."""
+        return max(self.min_dwell * self.window_cycles, self.controller.min_dwell_cycles)
+
+    @property
     def min_dwell_decisions(self) -> int:
-        """Decisions that a placement stays at least: of N_min windows, or `min_dwell_cycles`."""
-        settings = self.controller
-        cycles = max(settings.min_dwell * self.window_cycles, settings.min_dwell_cycles)
-        return -(-cycles // self.decide_cycles)
+        """Decisions that a placement stays at least."""
+        return -(-self.dwell_cycles // self.decide_cycles)
 
     @property
     def censor_ms(self) -> float:

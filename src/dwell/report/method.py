@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 
 from dwell.display import decimals_for
 from dwell.estimators.registry import REGISTRY as ESTIMATORS
+from dwell.estimators.registry import resolved
 from dwell.model import LinkDisturbance, Node, NodeDisturbance, Problem, Process, Trace
 from dwell.model.bounds import counted
 from dwell.model.disturbed import on_node
@@ -45,6 +46,7 @@ def method_blocks(
 
 def cell_definitions(problem: Problem) -> dict[str, str]:
     """Return what a cell is, and what its controller does, by headings."""
+    problem = resolved(problem, problem.controller.estimator)
     pipeline, controller = problem.pipeline, problem.controller
     span_s = problem.window_ms / 1e3
     nodes = problem.fabric.nodes.values()
@@ -64,7 +66,8 @@ def cell_definitions(problem: Problem) -> dict[str, str]:
         "caps": _caps(problem),
         "controller": f"on {problem.controller_node}, begins with {problem.initial}",
         "decisions": f"every {counted(problem.decide_cycles, 'cycle')}",
-        "N_min": counted(controller.min_dwell, "window"),
+        "N_min": counted(problem.min_dwell, "window"),
+        **({"dwell": f"{least} cycles at least"} if (least := controller.min_dwell_cycles) else {}),
         "Δ_min": f"{controller.min_improvement:g}",
         "estimator": controller.estimator,
     }

@@ -93,7 +93,7 @@ def _meta_of(
     **settings: Any,
 ) -> dict[str, Any]:
     """Return what the record of a cell says; of a copy, also which streams its draws are of."""
-    meta = meta_of(played.problem, played.controller, scenario=cell.entry.scenario, **settings)
+    meta = meta_of(played.controller, scenario=cell.entry.scenario, **settings)
     drawn = {"streams": cell.streams, "shared": list(shared)} if cell.streams else {}
     return {**meta, **drawn}
 
