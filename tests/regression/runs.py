@@ -15,11 +15,14 @@ import polars as pl
 import dwell
 from dwell.estimators.registry import REGISTRY as ESTIMATORS
 from dwell.model import Problem
+from dwell.model.evolve import evolve
 from dwell.policies.registry import REGISTRY as POLICIES
 
 ROOT = Path(__file__).parents[2]
 DATA = Path(__file__).parent / "data"
 EXAMPLES = ("canonical", "fan-in", "cloud", "live/cell", "visual_servoing/testbed")
+#: N_min and share of shadows where they are not 3 and 0.05.
+SETTINGS = {"visual_servoing/testbed": (2, 0.1)}
 TABLES = ("cycles", "windows", "decisions")
 #: Windows beyond the warm-up.
 WINDOWS = 7
@@ -52,8 +55,15 @@ def cases(problem: Problem) -> Iterator[Case]:
 
 @cache
 def load(example: str) -> Problem:
-    """Return an example's cell."""
-    return dwell.load(ROOT / "examples" / f"{example}.yaml")
+    """Return an example's cell with one decision per window, and N_min and shadows as numbers."""
+    problem = dwell.load(ROOT / "examples" / f"{example}.yaml")
+    least, fraction = SETTINGS.get(example, (3, 0.05))
+    settings = {
+        "controller.decide_cycles": problem.window_cycles,
+        "controller.min_dwell": least,
+        "controller.shadow_fraction": fraction,
+    }
+    return evolve(problem, settings)
 
 
 def play(example: str, case: Case, columns: Mapping[str, list[str]]) -> dict[str, str]:
