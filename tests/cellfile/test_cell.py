@@ -71,7 +71,7 @@ def test_the_example_becomes_a_problem() -> None:
     assert problem.objective.caps == Caps(120, 0.98)
     assert problem.objective.tiers == {"R1": "robot", "E": "edge", "R2": "robot"}
     assert problem.controller == ControllerSettings(
-        on="E", initial="LOC", min_dwell=3, fallbacks=("LOC", "HYB")
+        on="E", initial="LOC", min_dwell=3, estimator="profile", fallbacks=("LOC", "HYB")
     )
     assert problem.servo == Servo("double-integrator", 30, MovingTarget(50, 2), damping=8)
 

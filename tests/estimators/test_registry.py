@@ -73,8 +73,8 @@ class Silent(Unsure):
 def test_the_dwell_depends_on_the_errors_that_an_estimator_states(
     estimator: Estimator | str, windows: int
 ) -> None:
-    assert PROBLEM.controller.min_dwell is None
-    assert resolved(PROBLEM, estimator).controller.min_dwell == windows
+    open_ = replace(PROBLEM, controller=replace(PROBLEM.controller, min_dwell=None))
+    assert resolved(open_, estimator).controller.min_dwell == windows
     given = replace(PROBLEM, controller=replace(PROBLEM.controller, min_dwell=7))
     assert resolved(given, estimator).controller.min_dwell == 7
 

@@ -58,8 +58,9 @@ def check(
     from dwell.estimators.prices import prices_of
     from dwell.estimators.registry import resolved
     from dwell.live.lint import lint
+    from dwell.policies.registry import estimator_of
 
-    problem = resolved(problem, problem.controller.estimator)
+    problem = resolved(problem, estimator_of(problem))
     prices = prices_of(problem, scenario)
     cycles = min(price.cycles for price in prices.values())
     warnings = (
@@ -92,12 +93,13 @@ def class_faults(problem: Problem) -> Iterator[Fault]:
     from dwell.estimators.registry import resolved
     from dwell.model.bounds import CLASS_PATH
     from dwell.policies import by_name as make_policy
+    from dwell.policies.registry import estimator_of
 
-    settings = problem.controller
+    settings, estimator = problem.controller, estimator_of(problem)
     try:
-        if CLASS_PATH.holds(settings.estimator):
-            make_estimator(settings.estimator, problem)
-        problem = resolved(problem, settings.estimator)
+        if CLASS_PATH.holds(estimator):
+            make_estimator(estimator, problem)
+        problem = resolved(problem, estimator)
     except ProblemError as error:
         yield Fault("controller.estimator", str(error))
     try:
@@ -113,6 +115,8 @@ def _fault(fault: Fault) -> dict[str, Any]:
 
 def _contents(problem: Problem) -> dict[str, Any]:
     """Return the contents of the cell as plain values."""
+    from dwell.policies.registry import estimator_of
+
     pipeline = problem.pipeline
     return {
         "name": problem.name,
@@ -125,7 +129,7 @@ def _contents(problem: Problem) -> dict[str, Any]:
         "scenarios": list(problem.scenarios),
         "controller": {
             "policy": problem.controller.policy,
-            "estimator": problem.controller.estimator,
+            "estimator": estimator_of(problem),
             "decide_cycles": problem.decide_cycles,
             "min_dwell": problem.min_dwell,
             "min_dwell_cycles": problem.controller.min_dwell_cycles,
@@ -153,6 +157,8 @@ def _priced(problem: Problem, prices: Mapping[str, Price]) -> dict[str, Any]:
 
 
 def _summary(problem: Problem, prices: Mapping[str, Price], scenario: str) -> str:
+    from dwell.policies.registry import estimator_of
+
     pipeline, nodes = problem.pipeline, problem.fabric.nodes
     resources = problem.fabric.resources
     movable = [
@@ -181,7 +187,7 @@ def _summary(problem: Problem, prices: Mapping[str, Price], scenario: str) -> st
             f"{counted(len(problem.fabric.links), 'link')}; "
             f"P {pipeline.period_ms:.4g} ms, D {pipeline.deadline_ms:.4g} ms, "
             f"W {counted(problem.window_cycles, 'cycle')}",
-            f"decisions: {controller.policy} with {controller.estimator}, every "
+            f"decisions: {controller.policy} with {estimator_of(problem)}, every "
             f"{counted(problem.decide_cycles, 'cycle')}; N_min {least}",
             f"can move: {', '.join(movable) or 'nothing'}",
             f"scenarios: {', '.join(problem.scenarios)}",

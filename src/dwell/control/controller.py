@@ -32,6 +32,7 @@ from dwell.model.user_classes import UserCall
 from dwell.policies import MinimalPolicy, parameters_of
 from dwell.policies import by_name as policy_by_name
 from dwell.policies.pricing import Pricing
+from dwell.policies.registry import estimator_of
 from dwell.policies.user_policy import as_proposer
 
 Ints: TypeAlias = NDArray[np.int64]
@@ -170,7 +171,7 @@ class Controller:
         if isinstance(policy, str):
             policy, estimator = _without_estimator(policy, estimator, problem)
         policy = policy or problem.controller.policy
-        estimator = estimator or problem.controller.estimator
+        estimator = estimator or estimator_of(problem, policy)
         problem = resolved(problem, estimator)
         #: The cell, with the N_min that it has with this estimator.
         self.problem, self.coordination = problem, coordination

@@ -144,9 +144,7 @@ def resolved(problem: Problem, estimator: Estimator | str) -> Problem:
     settings = problem.controller
     if settings.min_dwell is not None:
         return problem
-    kind: object = type(estimator)
-    if isinstance(estimator, str):
-        kind = _class_of(estimator, problem)
+    kind = _class_of(estimator, problem) if isinstance(estimator, str) else type(estimator)
     # A user's class needs no base class.
     least = 0 if getattr(kind, "states_errors", False) is True else USUAL_DWELL
     return replace(problem, controller=replace(settings, min_dwell=least))

@@ -34,7 +34,7 @@ class ControllerSettings:
         "Cycles between two decisions, at most W.",
         DECIDE_CYCLES,
         default=None,
-        usual="W: one decision per window",
+        usual="W/4, rounded down, and at least 1",
     )
     min_dwell: int | None = key(
         "Windows that a placement stays at least (N_min).",
@@ -55,9 +55,11 @@ class ControllerSettings:
     escape: bool = key(
         "Whether an incumbent over a cap may leave before the hysteresis is met.", default=False
     )
-    estimator: str = key(
+    estimator: str | None = key(
         "How the QoS of candidates is estimated; also `package.module:Class` of your own.",
-        default="profile",
+        default=None,
+        usual="`corrected`; `profile` for a placement that never moves, `latency-first` and "
+        "`atp-thresholds`",
     )
     shadow_fraction: float | None = key(
         "Share of cycles that are also sent through each alternative, where the estimator uses "

@@ -107,7 +107,7 @@ class Problem(Displayed):
                 f"windows of {counted(self.window_cycles, 'cycle')}, "
                 f"{self.warmup_windows} of warm-up",
                 f"controller on {self.controller_node}: {controller.policy}, "
-                f"{controller.estimator}, begins with {self.initial}>",
+                f"{controller.estimator or 'its usual estimator'}, begins with {self.initial}>",
             )
         )
 
@@ -203,7 +203,7 @@ class Problem(Displayed):
     def decide_cycles(self) -> int:
         """Cycles between two decisions."""
         given = self.controller.decide_cycles
-        return self.window_cycles if given is None else given
+        return max(self.window_cycles // 4, 1) if given is None else given
 
     @property
     def decisions_per_window(self) -> float:

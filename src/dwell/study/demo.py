@@ -24,13 +24,15 @@ from dwell.study.study import Contender, load_study
 if TYPE_CHECKING:
     import polars as pl
 
-#: Policies beside every candidate as a static placement.
+#: Settings of which a contender has the defaults, whatever the cell says.
+USUAL = ("controller.decide_cycles", "controller.min_dwell", "controller.shadow_fraction")
+#: Policies with every candidate as a static placement. The cells have the paper's settings.
 POLICIES = (
     "atp",
-    "dtp",
+    Contender("DTP as printed", "dtp"),
     Contender("dtp, no caps", "dtp", settings={"objective.caps": {}}),
     "latency-first",
-    Contender("dtp+corrected", "dtp", "corrected"),
+    Contender("DTP", "dtp", "corrected", dict.fromkeys(USUAL)),
     Contender("cusum+corrected", "cusum", "corrected"),
 )
 SEEDS = 20

@@ -36,6 +36,7 @@ from dwell.estimators import Profile
 from dwell.estimators.registry import resolved
 from dwell.model import FrozenDict, Problem
 from dwell.model.window_close import window_close_ns
+from dwell.policies.registry import estimator_of
 from dwell.study.clairvoyant import Sequence, clairvoyant, priced
 from dwell.study.oracle import expected_costs
 from dwell.study.script import Script, is_up
@@ -156,7 +157,7 @@ def references(problem: Problem, realisation: Realisation) -> References:
     costs = {name: mean_cost(run) for name, run in statics.items()}
     alone = np.stack([window_costs(run, problem, realisation) for run in statics.values()], axis=1)
     decide_cycles = problem.decide_cycles
-    least = resolved(problem, problem.controller.estimator).dwell_cycles
+    least = resolved(problem, estimator_of(problem)).dwell_cycles
     expected = expected_costs(problem, realisation, decide_cycles)
     sequences, runs, promised = {}, {}, {}
     for title, known, cycles, dwell in (
@@ -344,6 +345,6 @@ def _in_time(problem: Problem) -> Problem:
         order_delay_ms=0.0,
         order_lead_cycles=0,
         migration="warm",
-        decide_cycles=None,
+        decide_cycles=problem.window_cycles,
     )
     return replace(problem, controller=settings)
