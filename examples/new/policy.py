@@ -14,7 +14,7 @@ class Patient:
     # `--policy policy:Patient+corrected`.
     def __init__(self, initial: str = "LOC", patience: int = 3) -> None:
         self.incumbent = initial
-        self.patience = patience  # windows that another candidate must be the best
+        self.patience = patience  # decisions at which another candidate must be the best
         self.better: list[str] = []
 
     @classmethod
