@@ -51,8 +51,8 @@ def test_the_canonical_demo() -> None:
     )
     paper = {"baseline", "robot-cpu-stress", "edge-cpu-stress", "network-impairment"}
     assert paper < set(found.scenarios)
-    plain = ("LOC", "SO", "HYB", "atp", "dtp", "dtp, no caps", "latency-first")
-    assert found.policies == (*plain, "dtp+corrected", "cusum+corrected")
+    plain = ("LOC", "SO", "HYB", "atp", "DTP as printed", "dtp, no caps", "latency-first")
+    assert found.policies == (*plain, "DTP", "cusum+corrected")
     assert seen[-1] == (found.runs.height, found.runs.height)
 
 
