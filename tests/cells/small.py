@@ -159,6 +159,7 @@ def make_comparison(
                             "estimated": (estimated or {}).get(name),
                             "measured": float(columns["cost"][i]) if active else None,
                             "windows": 1,
+                            "shadow_fraction": 0.0,
                         }
                     )
     problem = make_problem()

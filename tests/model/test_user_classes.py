@@ -269,7 +269,8 @@ def test_a_study_and_a_live_cell_name_a_subclass_of_ours(cell: Path) -> None:
     live = Controller(load_without_traces(cell))
     assert live.described()["estimator"] == "guess:MyCorrected"
     assert (live.learns, live.supports) == (True, True)
-    assert live.shadow_fraction == Controller(dwell.load(cell), None, "corrected").shadow_fraction
+    corrected = Controller(dwell.load(cell), None, "corrected")
+    assert live.shadow_fractions == corrected.shadow_fractions
 
 
 def test_two_folders_have_modules_of_one_name(cell: Path, tmp_path: Path) -> None:

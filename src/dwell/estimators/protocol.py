@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple, Protocol, runtime_checka
 from dwell.estimators.evidence import Evidence
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS
+from dwell.model.shadow_plan import ShadowFraction
 
 if TYPE_CHECKING:
     from dwell.estimators.presents import Present
@@ -71,9 +72,10 @@ class Learner(Protocol):
     """An estimator that learns from what happened to jobs and messages.
 
     It may have an attribute ``shadow_fraction``, the share of the cycles that it wants sent through
-    each alternative as well, and a method ``support()`` that gives a `Support` for each candidate.
-    It is started before a run. Policies compare its prediction of the incumbent with those of the
-    others, so that an error that all of them share decides nothing.
+    each alternative as well (one number, or one for each active candidate), and a method
+    ``support()`` that gives a `Support` for each candidate. It is started before a run. Policies
+    compare its prediction of the incumbent with those of the others, so that an error that all of
+    them share decides nothing.
     """
 
     def start(self, problem: Problem) -> None:
@@ -100,8 +102,8 @@ class CellEstimator(ABC):
         Whether it is shown what happened to jobs, and says what stands behind its estimates.
     states_errors : bool
         Whether its estimates have standard errors (`QoS.error`).
-    shadow_fraction : float
-        Share of the cycles that it wants sent through each alternative.
+    shadow_fraction : float, or mapping of str to float
+        Share of the cycles that it wants sent through each alternative, by the active candidate.
     revision : int
         Counts what is new of `present`.
     """
@@ -109,7 +111,7 @@ class CellEstimator(ABC):
     learns: bool = False
     supports: bool = False
     states_errors: ClassVar[bool] = False
-    shadow_fraction: float = 0.0
+    shadow_fraction: ShadowFraction = 0.0
     revision: int = 0
 
     def __init_subclass__(cls) -> None:

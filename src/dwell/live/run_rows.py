@@ -117,7 +117,7 @@ class LiveWindow:
 
 def sends_shadows(controller: Controller) -> bool:
     """Whether cycles may be sent through alternatives: to measure them, or to prove them."""
-    return bool(controller.shadow_fraction or controller.problem.controller.fallbacks)
+    return controller.sends_shadows or bool(controller.problem.controller.fallbacks)
 
 
 def columns_of(controller: Controller, *, jobs: bool = False) -> Columns:

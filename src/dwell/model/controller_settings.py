@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 from dwell.model.bounds import MAX_COUNT, MIN_DWELL, MIN_IMPROVEMENT, TIME_MS, Bound
@@ -10,6 +11,7 @@ from dwell.model.declaration import declared, key
 GUARD_CYCLES = Bound(2, MAX_COUNT, whole=True)
 PROBE_CYCLES = Bound(1, MAX_COUNT, whole=True)
 HALF_LIFE_WINDOWS = Bound(0, MAX_COUNT, above=True)
+AUTO = "auto"
 SHADOW_FRACTION = Bound(0, 1)
 DECIDE_CYCLES = Bound(1, MAX_COUNT, whole=True)
 MIN_DWELL_CYCLES = Bound(0, MAX_COUNT, whole=True)
@@ -61,12 +63,12 @@ class ControllerSettings:
         usual="`corrected`; `profile` for a placement that never moves, `latency-first` and "
         "`atp-thresholds`",
     )
-    shadow_fraction: float | None = key(
+    shadow_fraction: float | Literal["auto"] = key(
         "Share of cycles that are also sent through each alternative, where the estimator uses "
-        "shadow jobs.",
-        SHADOW_FRACTION,
-        default=None,
-        usual="0.05, or 1/(alternatives) where that is less",
+        "shadow jobs; `auto`: by placement, the largest of at most 0.05 that costs the cell's own "
+        "cycles next to nothing.",
+        replace(SHADOW_FRACTION, word=AUTO),
+        default=AUTO,
     )
     half_life_windows: float = key(
         "Windows after which a measurement counts half.", HALF_LIFE_WINDOWS, default=2.0

@@ -238,12 +238,12 @@ class Problem(Displayed):
 
     @property
     def shadow_fraction(self) -> float:
-        """Share of the cycles also sent through each alternative, of an estimator with shadows.
+        """Largest share of the cycles also sent through each alternative, if the estimator does so.
 
-        Where none is given 0.05, or all cycles over the number of alternatives where that is less.
+        With `auto` 0.05, or 1/(alternatives) if that is less; see `dwell.estimators.shadow_price`.
         """
         given = self.controller.shadow_fraction
-        if given is not None:
+        if not isinstance(given, str):
             return given
         return min(SHADOWED, 1 / max(len(self.candidates) - 1, 1))
 

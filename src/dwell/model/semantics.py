@@ -150,7 +150,7 @@ def find_unregistered(
         # The usual estimator sends shadow jobs.
         sends = estimator is None or estimator in shadowing
         given = settings.shadow_fraction if sends else None
-        if given is not None and (message := too_many_shadows(given, len(names))):
+        if isinstance(given, float | int) and (message := too_many_shadows(given, len(names))):
             yield Fault("controller.shadow_fraction", message)
     yield from _columns(parts)
 

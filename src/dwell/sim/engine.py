@@ -258,10 +258,9 @@ def play_cells(
 
 def _shadow_plan(cell: PlayedCell, probes: bool) -> ShadowPlan | None:
     """Return which cycles of a cell have a shadow; None where it needs none."""
-    fraction = cell.controller.shadow_fraction
-    if not (probes or fraction > 0):
+    if not (probes or cell.controller.sends_shadows):
         return None
-    return ShadowPlan(0, cell.realisation.cycles, len(cell.problem.candidates), fraction)
+    return ShadowPlan(0, cell.realisation.cycles, [*cell.controller.shadow_fractions.values()])
 
 
 def _check_fit(problem: Problem, realisation: Realisation) -> None:

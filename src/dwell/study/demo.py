@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from dwell.errors import ProblemError, TraceError
 from dwell.model import Problem
+from dwell.model.controller_settings import AUTO
 from dwell.model.progress import Progress
 from dwell.study.comparison import Comparison, compare
 from dwell.study.runner import StudyResult, run_study
@@ -24,15 +25,19 @@ from dwell.study.study import Contender, load_study
 if TYPE_CHECKING:
     import polars as pl
 
-#: Settings of which a contender has the defaults, whatever the cell says.
-USUAL = ("controller.decide_cycles", "controller.min_dwell", "controller.shadow_fraction")
+#: The defaults of the settings for which the cells have the paper's.
+USUAL = {
+    "controller.decide_cycles": None,
+    "controller.min_dwell": None,
+    "controller.shadow_fraction": AUTO,
+}
 #: Policies with every candidate as a static placement. The cells have the paper's settings.
 POLICIES = (
     "atp",
     Contender("DTP as printed", "dtp"),
     Contender("dtp, no caps", "dtp", settings={"objective.caps": {}}),
     "latency-first",
-    Contender("DTP", "dtp", "corrected", dict.fromkeys(USUAL)),
+    Contender("DTP", "dtp", "corrected", USUAL),
     Contender("cusum+corrected", "cusum", "corrected"),
 )
 SEEDS = 20
