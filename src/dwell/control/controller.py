@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from operator import add
 from typing import NamedTuple, TypeAlias
 
@@ -14,8 +15,13 @@ from numpy.typing import NDArray
 
 from dwell.control.coordination import Asked, Coordination, Verdict, Wish
 from dwell.control.course import Course
-from dwell.control.windows import missed_cycles, seen_l95_ms, utilisation
-from dwell.cost import excess
+from dwell.control.windows import (
+    missed_cycles,
+    seen_costs,
+    seen_l95_ms,
+    utilisation,
+)
+from dwell.cost import excess, hamming
 from dwell.errors import Fault, MetricError, PolicyError, ProblemError
 from dwell.estimators import Estimator, Evidence
 from dwell.estimators import by_name as estimator_by_name
@@ -77,6 +83,8 @@ class ClosedWindow:
         Its number, and its cycles as the record counts them.
     evidence : callable, optional
         Makes the window's `Evidence`, for estimators that learn from it.
+    recent : ClosedWindow, optional
+        Its cycles since the last decision, which estimators get; the window itself if None.
     """
 
     latency_ns: Ints
@@ -86,6 +94,7 @@ class ClosedWindow:
     core_ns: Floats
     looked: LookedAt
     evidence: Callable[[], Evidence] | None = None
+    recent: ClosedWindow | None = None
 
     def __repr__(self) -> str:
         return f"<ClosedWindow of {len(self.latency_ns)} cycles>"
@@ -301,13 +310,34 @@ class Controller:
             If the policy returns neither a decision nor a candidate's name.
         """
         self.looked = window.looked
+        metrics, shares = self._metrics(window), self.utilisation(window)
+        evidence = (window.recent or window).evidence
+        if evidence is not None:
+            self.learn(evidence)
+        recent = None if window.recent is None else self.utilisation(window.recent)
+        return self.propose_on(*metrics, shares, recent)
+
+    def _metrics(self, window: ClosedWindow) -> tuple[float, float, float]:
+        """Return L95 as it could be known (ms), V_D, and L95 as caps are compared with it."""
         age_ns = window.close_ns - window.release_ns
         missed = int(missed_cycles(window.latency_ns, age_ns, self._deadline_ns))
         l95_ms, uncut_ms = seen_l95_ms(window.latency_ns, age_ns, self._censor_ms)
-        shares = self.utilisation(window)
-        if window.evidence is not None:
-            self.learn(window.evidence)
-        return self.propose_on(float(l95_ms), missed / len(age_ns), float(uncut_ms), shares)
+        return float(l95_ms), missed / len(age_ns), float(uncut_ms)
+
+    def seen(self, window: ClosedWindow, names: Iterable[str]) -> tuple[float, float, float]:
+        """Return L95 (ms), V_D and J of a window without a decision.
+
+        Parameters
+        ----------
+        names : iterable of str
+            Candidate of the cycle before it, then the candidates of its cycles.
+        """
+        placed = self.problem.candidates
+        moved = sum(hamming(placed[b], placed[a]) for a, b in pairwise(names) if a != b)
+        l95_ms, violation_rate, _ = self._metrics(window)
+        busy = dict(zip(self.resources, self.utilisation(window)[0, :, None], strict=True))
+        of = np.array([l95_ms]), np.array([violation_rate]), busy, np.array([moved])
+        return l95_ms, violation_rate, float(seen_costs(self.problem, *of)[0])
 
     def propose_on(
         self,

@@ -232,6 +232,11 @@ class Problem(Displayed):
         return -(-self.dwell_cycles // self.decide_cycles)
 
     @property
+    def stay_cycles(self) -> int:
+        """Least number of cycles from one move of a policy that dwells to its next."""
+        return (self.min_dwell_decisions + 1) * self.decide_cycles
+
+    @property
     def censor_ms(self) -> float:
         """Latency that stands for any longer one in J: max(4 D, 2 P), and no less than L_max.
 

@@ -164,9 +164,10 @@ class Judge:
     def migrations(self) -> list[str]:
         """Return the controller's migrations since the last call that came too early.
 
-        Each comes after the dwell and one decision more; the guard's moves do not count.
+        They are `Problem.stay_cycles` apart, so that K windows hold at most K·W over that; the
+        guard's moves do not count.
         """
-        apart = self.problem.dwell_cycles + self.problem.decide_cycles
+        apart = self.problem.stay_cycles
         violations = []
         before: Term | None = None
         previous: Term | None = None
