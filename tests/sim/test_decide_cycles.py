@@ -22,7 +22,7 @@ from dwell.control import Controller
 from dwell.control.windows import missed_cycles, seen_l95_ms
 from dwell.cost import cost, hamming
 from dwell.errors import ProblemError
-from dwell.estimators import Estimator, Evidence
+from dwell.estimators import Estimator, Evidence, warnings_of
 from dwell.model import FrozenDict, Problem, QoS
 from dwell.model.fleet import Fleet, FleetEntry
 from dwell.model.window_close import window_close_ns
@@ -278,7 +278,7 @@ def test_cells_at_random_are_decided_on_in_time(seed: int) -> None:
         assert (np.diff(last)[stays] % every == 0).all()
 
 
-def test_one_decision_per_window_is_the_rule_of_windows() -> None:
+def test_without_an_interval_there_are_four_decisions_per_window() -> None:
     for policy in ("dtp", "cusum", "work-function", "atp", "latency-first"):
         for estimator in ("profile", "corrected"):
             runs = [
@@ -290,7 +290,7 @@ def test_one_decision_per_window_is_the_rule_of_windows() -> None:
                     seed=4,
                     windows=12,
                 )
-                for every in (None, CANONICAL.window_cycles)
+                for every in (None, CANONICAL.window_cycles // 4)
             ]
             for table in ("cycles", "windows", "decisions"):
                 one, other = (getattr(run, table) for run in runs)
@@ -338,6 +338,20 @@ def test_a_policy_of_a_users_own_gets_the_dwell_as_a_number() -> None:
         assert isinstance(made, Asks)
         assert made.min_dwell == windows
     assert not [*class_faults(problem)]
+
+
+@pytest.mark.parametrize(("width", "every"), [(1, 1), (3, 1), (4, 1), (7, 1), (8, 2), (100, 25)])
+def test_the_interval_is_a_quarter_of_a_window(width: int, every: int) -> None:
+    assert replace(often(CANONICAL, None), window_cycles=width).decide_cycles == every
+
+
+def test_an_improvement_of_nothing_is_enough_if_none_is_asked_for() -> None:
+    problem = often(CANONICAL, 25, min_dwell=None, min_improvement=0)
+    for estimator in ("profile", "corrected"):
+        run = dwell.simulate(problem, policy="dtp", estimator=estimator, seed=3, windows=8)
+        gains = run.decisions.filter("migrated")["delta_j"]
+        assert (gains > 0).all()
+    assert not any("min_improvement" in fault.path for fault in warnings_of(problem))
 
 
 def test_it_is_at_most_a_window() -> None:
