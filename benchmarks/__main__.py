@@ -43,6 +43,7 @@ BENCHMARKS = {
     "page-cost": ("page_cost", "measure"),
     "live-fleet": ("fleet_live", "measure"),
     "restart": ("restart", "measure"),
+    "leaving": ("leaving", "measure"),
 }
 
 

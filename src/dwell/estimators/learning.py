@@ -50,6 +50,7 @@ class Learning(Online):
     #: was not measured any more is as declared again.
     MEMORY: ClassVar[float]
     UNSEEN: ClassVar[float]
+    states_errors = True
 
     def __init__(
         self,
