@@ -174,7 +174,8 @@ class Learning(Online):
                 late = (delays[part] > 0) | (reference.ordered[0] == 0)
                 extra.append(np.where(late, delays[part] - reference.usual, np.nan))
             every: Floats = np.concatenate(extra)
-            return every[every != math.inf]  # messages that were lost
+            arrived: Floats = every[every != math.inf]
+            return arrived
 
         known = np.concatenate([one.values - one.usual for one in references.values()])
         deviation_ms = float(np.abs(known[np.isfinite(known)]).mean())
