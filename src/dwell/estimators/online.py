@@ -35,7 +35,7 @@ from dwell.model.qos import QoS
 Floats: TypeAlias = NDArray[np.float64]
 
 #: Steps that are played when the present changes, the first of which settles queues.
-FIRST_STEPS = 4
+FIRST_STEPS = 6
 #: How often a close goes on with candidates that it is not sure of, and how many steps each time.
 ROUNDS, STEPS = 2, 2
 #: How many standard errors a difference of two prices must be from what would decide otherwise.
@@ -309,10 +309,6 @@ class Online(CellEstimator):
             self._playing.go_on(present, names, FIRST_STEPS)
         elif self._has_grown:
             self._playing.go_on(present, names, has_grown=True)
-        else:
-            few = [name for name in names if not self._playing.is_full(name)]
-            if few:
-                self._playing.go_on(present, few)
         self._has_changed = self._has_grown = False
 
     def _count_presents(self) -> None:

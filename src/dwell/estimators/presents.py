@@ -255,7 +255,7 @@ class Playing:
         return twin.price
 
     def tail_error_ms(self, name: str, off: float) -> float:
-        """Return the error of a candidate's L95 if a share of the cycles more, or fewer, is lost."""
+        """Return the error of a candidate's L95 by the error of the share of lost cycles."""
         latency_ns = np.concatenate([step.latency_ns for step in self._twins[name].steps])
         return quantile_error(np.sort(np.minimum(latency_ns / 1e6, self.problem.censor_ms)), off)
 
@@ -483,12 +483,10 @@ def _mean_and_error(values: Sequence[float], usual: float = 0.0) -> tuple[float,
     if count < 2:
         return mean, abs(mean)
     squares = sum((value - mean) * (value - mean) for value in values)
-    factor = _correlation_factor(values, mean, squares)
-    # Of few values that are independent the deviation is itself hardly known: about Student's t
-    # over 2.
-    independent = max(count / factor, 2.0)
-    few = (independent + 1) / (independent - 1)
+    # Of few values the deviation is itself hardly known: about Student's t over 2.
+    few = (count + 1) / (count - 1)
     variance = max(squares / (count - 1), (squares + usual * usual) / count)
+    factor = _correlation_factor(values, mean, squares)
     return mean, few * math.sqrt(variance / count * factor)
 
 
