@@ -356,7 +356,7 @@ class LiveWindows:
         self._drop(start)
         self._left = None
         cycles = self._line[: self._size]
-        close_ns = self._close_ns(0)
+        close_ns, span_ns = self._close_ns(0), self._line[self._size].at_ns - cycles[0].at_ns
         for cycle, following in pairwise(self._line[: self._size + 1]):
             self._ledger.settle(cycle)
             cycle.window, cycle.close_ns = self._next_window, close_ns
@@ -378,6 +378,7 @@ class LiveWindows:
         self.last = LiveWindow(
             number=self._next_window,
             cycles=cycles,
+            span_ns=span_ns,
             close_ns=close_ns,
             lead=self._lead,
             heard=sum(cycle.heard for cycle in cycles),
@@ -402,6 +403,7 @@ class LiveWindows:
         """Leave cycles at the line's beginning to no window."""
         for cycle in self._line[:count]:
             self._ledger.settle(cycle)
+        self._symptoms.led(self._line[:count])
         self._lead += count
         self._take_off(count)
 
@@ -415,7 +417,7 @@ class LiveWindows:
 
     def symptoms(self, now_ns: int) -> dict[str, object]:
         """Return what the cycles say of the cell's health, as plain values (see `Symptoms`)."""
-        return self._symptoms.status(reversed(self._by_key.values()), now_ns)
+        return self._symptoms.status(list(reversed(self._by_key.values())), now_ns)
 
     def status(self) -> dict[str, object]:
         """Return how the windows are, as plain values."""

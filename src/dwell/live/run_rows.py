@@ -54,6 +54,8 @@ class LiveWindow:
 
     Parameters
     ----------
+    span_ns : int
+        Time from its first release to the first release beyond it.
     close_ns : int
         Since the origin.
     lead : int
@@ -75,6 +77,7 @@ class LiveWindow:
 
     number: int
     cycles: list[LiveCycle]
+    span_ns: int
     close_ns: int
     lead: int
     heard: int
