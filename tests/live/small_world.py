@@ -47,12 +47,10 @@ def _canonical() -> Problem:
 def canonical(window_cycles: int | None = None, **settings: Any) -> Problem:
     """Return the canonical cell with other windows, and settings of its controller."""
     cell = _canonical()
-    # Tests that decide more often say so.
-    settings = {"decide_cycles": window_cycles or cell.window_cycles, **settings}
-    controller = replace(cell.controller, **settings)
-    if window_cycles is None:
-        return replace(cell, controller=controller)
-    return replace(cell, controller=controller, window_cycles=window_cycles, warmup_windows=0)
+    if window_cycles is not None:
+        controller = replace(cell.controller, decide_cycles=window_cycles)
+        cell = replace(cell, window_cycles=window_cycles, warmup_windows=0, controller=controller)
+    return replace(cell, controller=replace(cell.controller, **settings))
 
 
 def on(problem: Problem, candidate: str) -> Problem:

@@ -26,17 +26,20 @@ from dwell.errors import Fault, MetricError, PolicyError, ProblemError
 from dwell.estimators import Estimator, Evidence
 from dwell.estimators import by_name as estimator_by_name
 from dwell.estimators.protocol import CellEstimator
+from dwell.estimators.registry import resolved
 from dwell.estimators.user_estimator import as_started
 from dwell.model import Caps, Decision, FrozenDict, Objective, Problem, QoS
 from dwell.model.bounds import CLASS_PATH
 from dwell.model.controller_settings import SHADOW_FRACTION
 from dwell.model.qos import NO_ERROR
 from dwell.model.semantics import too_many_shadows
+from dwell.model.shadow_plan import by_candidate
 from dwell.model.table_columns import DECISIONS, Feature, columns_of, those_with
 from dwell.model.user_classes import UserCall
 from dwell.policies import MinimalPolicy, parameters_of
 from dwell.policies import by_name as policy_by_name
 from dwell.policies.pricing import Pricing
+from dwell.policies.registry import estimator_of
 from dwell.policies.user_policy import as_proposer
 
 Ints: TypeAlias = NDArray[np.int64]
@@ -175,11 +178,13 @@ class Controller:
         estimator: Estimator | str | None = None,
         coordination: Coordination | None = None,
     ) -> None:
-        self.problem, self.coordination = problem, coordination
         if isinstance(policy, str):
             policy, estimator = _without_estimator(policy, estimator, problem)
         policy = policy or problem.controller.policy
-        estimator = estimator or problem.controller.estimator
+        estimator = estimator or estimator_of(problem, policy)
+        problem = resolved(problem, estimator)
+        #: The cell, with the N_min that it has with this estimator.
+        self.problem, self.coordination = problem, coordination
         #: Names of the policy and the estimator where these are classes of a user's own, else None.
         self._own = tuple(one if CLASS_PATH.holds(one) else None for one in (policy, estimator))
         decider = policy_by_name(policy, problem) if isinstance(policy, str) else policy
@@ -191,8 +196,9 @@ class Controller:
             self._estimator = as_started(made, problem, copied=made is estimator)
         if coordination is not None:
             coordination.meet(self._estimator)
-        #: Share of the cycles that the estimator wants sent through each alternative.
-        self.shadow_fraction = _shadow_fraction(self._estimator, problem)
+        #: Share of the cycles that the estimator wants sent through each alternative, by the
+        #: candidate that is active.
+        self.shadow_fractions = _shadow_fractions(self._estimator, problem)
         initial = self._policy.initial
         known = isinstance(initial, str) and initial in problem.candidates
         #: Where the cell is, as far as is known here.
@@ -273,7 +279,13 @@ class Controller:
             "policy": own_policy or (repr(policy) if known else type(policy).__name__),
             "parameters": parameters_of(policy),
             "estimator": own_estimator or type(self.estimator).__name__,
+            "shadow_fractions": dict(self.shadow_fractions),
         }
+
+    @property
+    def sends_shadows(self) -> bool:
+        """Whether the estimator wants shadows under any candidate."""
+        return any(self.shadow_fractions.values())
 
     @property
     def learns(self) -> bool:
@@ -702,18 +714,19 @@ def _without_estimator(
     return policy, named or estimator
 
 
-def _shadow_fraction(estimator: CellEstimator, problem: Problem) -> float:
-    """Share of the cycles that an estimator wants sent through each alternative.
+def _shadow_fractions(estimator: CellEstimator, problem: Problem) -> FrozenDict[str, float]:
+    """Share of the cycles that an estimator wants sent through each alternative, by candidate.
 
     Raises
     ------
     ProblemError
         If it is no share, or all alternatives together would get more than all cycles.
     """
-    fraction = estimator.shadow_fraction
     who = f"shadow_fraction of {type(estimator.given).__name__}"
-    SHADOW_FRACTION.check(who, fraction)
-    message = too_many_shadows(fraction, len(problem.candidates))
-    if message:
-        raise ProblemError([Fault(who, message)])
-    return float(fraction)
+    fractions = by_candidate(estimator.shadow_fraction, problem.candidates)
+    for fraction in fractions.values():
+        SHADOW_FRACTION.check(who, fraction)
+        message = too_many_shadows(fraction, len(problem.candidates))
+        if message:
+            raise ProblemError([Fault(who, message)])
+    return FrozenDict({name: float(fraction) for name, fraction in fractions.items()})

@@ -440,7 +440,7 @@ class ControlledCell:
         """Return an order; whatever it is for, it says what is forked, and what is to be proven."""
         course, move = self.course, self._move
         where = course.run, course.term
-        fraction = self.controller.shadow_fraction
+        fraction = self.controller.shadow_fractions[placement or course.placement]
         forks = () if move is None else move.forks
         want = self._desired(now_ns) if move is None else move.name
         return Order(self._next_number(), self.name, *where, placement, fraction, forks, want)

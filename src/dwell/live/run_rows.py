@@ -55,6 +55,8 @@ class LiveWindow:
 
     Parameters
     ----------
+    span_ns : int
+        Time from its first release to the first release beyond it.
     close_ns : int
         Since the origin.
     lead : int
@@ -76,6 +78,7 @@ class LiveWindow:
 
     number: int
     cycles: list[LiveCycle]
+    span_ns: int
     close_ns: int
     lead: int
     heard: int
@@ -120,7 +123,7 @@ class LiveWindow:
 
 def sends_shadows(controller: Controller) -> bool:
     """Whether cycles may be sent through alternatives: to measure them, or to prove them."""
-    return bool(controller.shadow_fraction or controller.problem.controller.fallbacks)
+    return controller.sends_shadows or bool(controller.problem.controller.fallbacks)
 
 
 def columns_of(controller: Controller, *, jobs: bool = False) -> Columns:
