@@ -159,7 +159,7 @@ def test_what_cannot_be_decoded_is_wrong(wire: Wire) -> None:
 @pytest.mark.parametrize(
     ("settings", "apart"),
     [
-        ({}, (MIN_DWELL + 1) * WINDOW_CYCLES),
+        ({"decide_cycles": WINDOW_CYCLES}, (MIN_DWELL + 1) * WINDOW_CYCLES),
         # By the interval of decisions: max(N_min W, min_dwell_cycles) + d cycles.
         ({"decide_cycles": 1}, MIN_DWELL * WINDOW_CYCLES + 1),
         ({"decide_cycles": 2, "min_dwell": 0}, 2),
