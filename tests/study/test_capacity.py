@@ -14,7 +14,7 @@ from dwell.errors import ProblemError
 from dwell.model import evolve
 from dwell.model.fleet import Fleet, FleetEntry
 from dwell.study import capacity
-from dwell.study.capacity import Capacity, Played, Sizes, capacity_of
+from dwell.study.capacity import Capacity, PlayedSize, Sizes, capacity_of
 from dwell.study.twins import with_twins
 from dwell.study.what_ifs import changes_of, served_by
 from tests.cells.fleets import fleet_of, one_job, within
@@ -81,7 +81,7 @@ def test_static_fleets_are_what_a_fleet_s_run_shows(quiet: Fleet, phases: Any) -
                 quiet.with_count(point.robots), seed=seed, windows=8, policy="SO", phases=phases
             )
             missed = [one.arrays("cycles")["missed"][5 * 100 :] for one in run.cells.values()]
-            worst.append(Played.of(missed, {}).rate)
+            worst.append(PlayedSize.of(missed, {}).rate)
         assert point.violation_rate.value == pytest.approx(sum(worst) / len(seeds), abs=1e-15)
 
 
@@ -132,10 +132,10 @@ class Rates:
     def __init__(self, *rates: float) -> None:
         self.rates = rates
 
-    def __call__(self, unit: Sizes) -> list[Played]:
+    def __call__(self, unit: Sizes) -> list[PlayedSize]:
         sizes = range(unit.first, unit.last + 1)
         rates = [self.rates[min(size, len(self.rates)) - 1] for size in sizes]
-        return [Played(rate, 0.0, {}) for rate in rates]
+        return [PlayedSize(rate, 0.0, {}) for rate in rates]
 
     def limiting(self, robots: int, seeds: object) -> None:
         return None

@@ -48,7 +48,7 @@ TOGETHER = 8
 WAITING_SEEDS = 3
 
 
-class Played(NamedTuple):
+class PlayedSize(NamedTuple):
     """One size under one seed.
 
     Parameters
@@ -67,7 +67,7 @@ class Played(NamedTuple):
     used: Mapping[str, float]
 
     @classmethod
-    def of(cls, missed: Iterable[NDArray[np.bool_]], used: Mapping[str, float]) -> Played:
+    def of(cls, missed: Iterable[NDArray[np.bool_]], used: Mapping[str, float]) -> PlayedSize:
         """Sum up whether each counted cycle of each cell missed."""
         halves = np.array([[part.mean() for part in np.array_split(one, 2)] for one in missed])
         first, last = halves.argmax(axis=0)
@@ -247,15 +247,15 @@ class FleetPlayer:
         fleet = self.fleet
         return all(fleet.candidate_of(entry) is not None for entry in fleet.entries)
 
-    def __call__(self, unit: Sizes) -> list[Played]:
+    def __call__(self, unit: Sizes) -> list[PlayedSize]:
         """Play every size."""
         fleets = [self.of(size) for size in range(unit.first, unit.last + 1)]
         if self.is_static:
             static = StaticFleet(seed=unit.seed, duration_ns=self.duration_ns)
-            return [Played.of(*static.play(fleet)) for fleet in fleets]
+            return [PlayedSize.of(*static.play(fleet)) for fleet in fleets]
         return [self._moving(fleet, unit.seed) for fleet in fleets]
 
-    def _moving(self, fleet: Fleet, seed: int) -> Played:
+    def _moving(self, fleet: Fleet, seed: int) -> PlayedSize:
         runs = simulate_fleet(fleet, seed=seed, seconds=self.duration_ns / 1e9).cells.values()
         missed: list[NDArray[np.bool_]] = []
         used: dict[str, float] = {}
@@ -271,7 +271,7 @@ class FleetPlayer:
                     for one in resources
                     if one.node in fleet.shared
                 }
-        return Played.of(missed, used)
+        return PlayedSize.of(missed, used)
 
     def limiting(self, robots: int, seeds: Sequence[int]) -> Limiting | None:
         """Return what the cycles that missed have waited for most; None where for nothing."""
@@ -373,10 +373,10 @@ class _Sizes:
 
     def __init__(self, limit: float, kinds: int, *, on_excess: bool) -> None:
         self.limit, self.kinds, self.asked = limit, kinds, on_excess
-        self.played: dict[int, dict[int, Played]] = {}
+        self.played: dict[int, dict[int, PlayedSize]] = {}
         self._points: dict[tuple[int, int], CapacityPoint] = {}
 
-    def take(self, unit: Sizes, played: Sequence[Played]) -> None:
+    def take(self, unit: Sizes, played: Sequence[PlayedSize]) -> None:
         """Keep what a unit has come to."""
         for size, one in enumerate(played, unit.first):
             self.played.setdefault(size, {})[unit.seed] = one
@@ -511,7 +511,7 @@ class _Search:
         """Play sizes from the smallest on until one is over the limit for certain."""
         sizes, done = self.sizes, 0
 
-        def take(unit: Sizes, played: Sequence[Played]) -> bool:
+        def take(unit: Sizes, played: Sequence[PlayedSize]) -> bool:
             nonlocal done
             sizes.take(unit, played)
             while sizes.seeds(done + 1) == len(seeds):
@@ -565,7 +565,7 @@ class _Search:
     def _play(self, size: int, seeds: Sequence[int]) -> None:
         units = [Sizes(size, size, seed) for seed in seeds]
 
-        def take(unit: Sizes, played: Sequence[Played]) -> None:
+        def take(unit: Sizes, played: Sequence[PlayedSize]) -> None:
             self.sizes.take(unit, played)
 
         if units:

@@ -31,7 +31,7 @@ Scalable: TypeAlias = Constant | Uniform | Normal | LogNormal | Gamma | Exponent
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class SiteChange:
     """A change that a site can make.
 
     Parameters
@@ -77,14 +77,14 @@ class WhatIf:
         return {"change": self.change, **{name: known[name] for name in names}}
 
 
-def changes_of(fleet: Fleet) -> Iterator[Change]:
+def changes_of(fleet: Fleet) -> Iterator[SiteChange]:
     """Yield what a site can change, the cheapest first."""
     if fleet.phases != "even":
-        yield Change("phases evenly spread", lambda _: fleet.changed(phases="even"))
+        yield SiteChange("phases evenly spread", lambda _: fleet.changed(phases="even"))
     cells = [entry.cell for entry in fleet.entries]
     pipelines = [cell.pipeline for cell in cells]
     if all(one.deadline_ms + LATER_MS <= one.period_ms for one in pipelines):
-        yield Change(f"deadlines {LATER_MS:g} ms later", lambda _: _changed(fleet, _later))
+        yield SiteChange(f"deadlines {LATER_MS:g} ms later", lambda _: _changed(fleet, _later))
     for name, resource in cells[0].fabric.resources.items():
         if resource.node not in fleet.shared:
             continue
@@ -98,17 +98,17 @@ def changes_of(fleet: Fleet) -> Iterator[Change]:
         def more(count: int, path: str = path, has: int = has) -> Fleet:
             return _changed(fleet, lambda cell: evolve(cell, {path: has + count}))
 
-        yield Change(text, more, repeats=True)
+        yield SiteChange(text, more, repeats=True)
     for name in cells[0].fabric.resources:
         if cells[0].fabric.resources[name].node in fleet.shared and _uses(cells, name):
-            yield Change(f"{name} {FASTER:g} times as fast", partial(_with_fast, fleet, name))
+            yield SiteChange(f"{name} {FASTER:g} times as fast", partial(_with_fast, fleet, name))
     for node in fleet.shared:
-        yield Change(f"a second server like {node}", lambda _: fleet, True, node)
+        yield SiteChange(f"a second server like {node}", lambda _: fleet, True, node)
     first, policy = fleet.entries[0], fleet.policy_of(fleet.entries[0])
     for name, placement in first.cell.candidates.items():
         is_everywhere = all(name in cell.candidates for cell in cells)
         if is_everywhere and name != policy and {*placement.values()} & {*fleet.shared}:
-            yield Change(f"{name} instead of {policy}", partial(_under, fleet, name))
+            yield SiteChange(f"{name} instead of {policy}", partial(_under, fleet, name))
 
 
 def served_by(fleet: Fleet, robots: int, **settings: Any) -> tuple[str, int] | None:
