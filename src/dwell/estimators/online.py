@@ -31,6 +31,7 @@ from dwell.estimators.spans import patience_ns
 from dwell.model.frozen import FrozenDict
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS
+from dwell.model.shadow_plan import by_candidate
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -51,8 +52,8 @@ class Online(CellEstimator):
 
     Attributes
     ----------
-    shadow_fraction : float
-        Share of the cycles sent through each alternative.
+    shadow_fraction : float, or mapping of str to float
+        Share of the cycles sent through each alternative, by the candidate that is active.
     seed : int
         Seed of what is played.
     """
@@ -324,6 +325,7 @@ class Online(CellEstimator):
         """Share of each resource that shadow jobs take while the cell is on a candidate."""
         problem, here = self.problem, self.problem.candidates[name]
         pipeline, resources = problem.pipeline, problem.fabric.resources
+        fraction = by_candidate(self.shadow_fraction, problem.candidates)[name]
         share = dict.fromkeys(resources, 0.0)
         for there in problem.candidates.values():
             for task in pipeline.diverging(here, there):
@@ -334,5 +336,5 @@ class Online(CellEstimator):
                 threads = execution.threads if execution.accelerator is None else 1
                 busy_ms = mean_ms(pipeline, pipeline.tasks[task], execution) * threads
                 capacity = resources[resource].capacity
-                share[resource] += self.shadow_fraction * busy_ms / pipeline.period_ms / capacity
+                share[resource] += fraction * busy_ms / pipeline.period_ms / capacity
         return FrozenDict(share)
