@@ -535,7 +535,9 @@ def _stretched(problem: Problem, site: Site) -> float:
 def _with_short_windows(problem: Problem) -> Problem:
     if problem.window_cycles <= LONGEST_WINDOW:
         return problem
-    return replace(problem, window_cycles=LONGEST_WINDOW)
+    every = min(problem.decide_cycles, LONGEST_WINDOW)
+    controller = replace(problem.controller, decide_cycles=every)
+    return replace(problem, window_cycles=LONGEST_WINDOW, controller=controller)
 
 
 def realised(problem: Problem, real: Realisation, present: Present) -> Realisation:

@@ -223,7 +223,9 @@ def take_over(known: Mapping[Question, Mapping[str, Price]]) -> None:
 def _answer(question: Question) -> Mapping[str, Price]:
     problem = question.problem
     if problem.window_cycles > LONGEST_WINDOW:
-        problem = replace(problem, window_cycles=LONGEST_WINDOW)
+        every = min(problem.decide_cycles, LONGEST_WINDOW)
+        controller = replace(problem.controller, decide_cycles=every)
+        problem = replace(problem, window_cycles=LONGEST_WINDOW, controller=controller)
     most = most_windows(problem, question.cycles)
     slow = slow_processes(problem, question.name)
     loop = slow.whole_loops(problem.window_cycles, most - SETTLING)
