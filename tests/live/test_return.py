@@ -36,6 +36,7 @@ def slow_cell(
         cell.controller,
         fallbacks=fallbacks or ("LOC",),
         initial="SO",
+        decide_cycles=window_cycles,
         min_dwell=1,
         estimator="profile",
     )
