@@ -82,6 +82,8 @@ class StandIn:
             "moves": {**dict.fromkeys(MOVED_BY, 0), "migrate": 2, "guard": 1},
             "bound_ms": 0.25,
             "unproven": False,
+            "silences": 3,
+            "release_ratio": 0.75,
             "window": {
                 "number": 11,
                 "last_cycle": 1_199,

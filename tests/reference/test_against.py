@@ -214,7 +214,8 @@ def make_case(
         # Of the largest share, none to all under each candidate.
         parts = [rng.choice([0.0, 0.2, 1.0, 1.0]) for _ in problem.candidates]
         parts[rng.randrange(len(parts))] = 1.0
-        fractions = dict(zip(problem.candidates, (share * part for part in parts), strict=True))
+        named = zip(problem.candidates, parts, strict=True)
+        fractions = {name: share * part for name, part in named}
     case = Case(problem, real, names, fractions)
     return deciding_often(case, Random(f"{seed} decides")) if orders else case
 

@@ -18,7 +18,7 @@ MOST_CYCLES = 40_000
 #: Parts of a controller's status that the page shows as they are.
 SHOWN = (
     *("health", "headline", "mode", "fallback", "moving_to", "proving", "pinned", "drained"),
-    *("migrations", "guard_moves", "unproven", "bound_ms"),
+    *("migrations", "guard_moves", "unproven", "bound_ms", "silences", "release_ratio"),
 )
 
 

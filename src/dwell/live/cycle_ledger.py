@@ -180,6 +180,11 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
         reports = self.reports.values()
         return bool(reports) and all(done.outcome == ACTUATED for done in reports)
 
+    @property
+    def silences(self) -> int:
+        """How often an actuator was at rest before it applied a command of this cycle."""
+        return sum(done.rested and done.outcome == ACTUATED for done in self.reports.values())
+
     def came_to(self, *outcomes: str) -> bool:
         """Whether a sink has said that a command of it came to one of these."""
         return any(done.outcome in outcomes for done in self.reports.values())

@@ -458,7 +458,7 @@ class LiveWindows:
         closed, cycles = self._closed(start, end), self._line[start:end]
         for cycle in cycles:
             cycle.window, cycle.close_ns = self._next_window, closed.close_ns
-        self.last = last = self._seen(cycles, closed, unix_ns)
+        self.last = last = self._seen(cycles, closed, self._line[end].at_ns, unix_ns)
         if self.often and 2 * last.heard >= self._size:
             # The cycle before it shows whether a move takes effect with its first cycle.
             names = [cycle.placement for cycle in self._line[max(start - 1, 0) : end]]
@@ -479,7 +479,7 @@ class LiveWindows:
             first -= 1
         closed = self._closed(first, end)
         closed.recent = self._closed(begin, end)
-        return self._seen(line[first:end], closed), closed
+        return self._seen(line[first:end], closed, line[end].at_ns), closed
 
     def _closed(self, begin: int, end: int) -> ClosedWindow:
         """Return the cycles between two places in the line as policies and estimators get them."""
@@ -503,13 +503,18 @@ class LiveWindows:
         )
 
     def _seen(
-        self, cycles: list[LiveCycle], closed: ClosedWindow, unix_ns: int | None = None
+        self,
+        cycles: list[LiveCycle],
+        closed: ClosedWindow,
+        beyond_ns: int,
+        unix_ns: int | None = None,
     ) -> LiveWindow:
         """Return cycles as the record and the status show them."""
         bound_ns = max(cycle.bound_ns for cycle in cycles)
         return LiveWindow(
             number=closed.looked.window,
             cycles=cycles,
+            span_ns=beyond_ns - cycles[0].at_ns,
             close_ns=closed.close_ns,
             lead=self._lead,
             heard=sum(cycle.heard for cycle in cycles),
@@ -534,6 +539,7 @@ class LiveWindows:
         """Record the cycles before a place in the line as lead."""
         for cycle in self._line[self._window.at : end]:
             self._ledger.settle(cycle)
+        self._symptoms.led(self._line[self._window.at : end])
         self._lead += max(end - self._window.at, 0)
         self._take_off(end)
 
@@ -556,7 +562,7 @@ class LiveWindows:
 
     def symptoms(self, now_ns: int) -> dict[str, object]:
         """Return what the cycles say of the cell's health, as plain values (see `Symptoms`)."""
-        return self._symptoms.status(reversed(self._by_key.values()), now_ns)
+        return self._symptoms.status(list(reversed(self._by_key.values())), now_ns)
 
     def status(self) -> dict[str, object]:
         """Return how the windows are, as plain values."""

@@ -55,6 +55,8 @@ class LiveWindow:
 
     Parameters
     ----------
+    span_ns : int
+        Time from its first release to the first release beyond it.
     close_ns : int
         Since the origin.
     lead : int
@@ -76,6 +78,7 @@ class LiveWindow:
 
     number: int
     cycles: list[LiveCycle]
+    span_ns: int
     close_ns: int
     lead: int
     heard: int
