@@ -62,7 +62,6 @@ def cell() -> Problem:
         order_lead_cycles=2,
         decide_cycles=40,
         min_dwell=1,
-        decide_cycles=40,
         min_improvement=0.0,
         fallbacks=(),
     )

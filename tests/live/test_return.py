@@ -38,7 +38,6 @@ def slow_cell(
         initial="SO",
         decide_cycles=window_cycles,
         min_dwell=1,
-        decide_cycles=window_cycles,
         estimator="profile",
     )
     pipeline = replace(cell.pipeline, period_ms=PERIOD_MS, deadline_ms=PERIOD_MS)
