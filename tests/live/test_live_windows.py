@@ -60,8 +60,8 @@ def cell() -> Problem:
         estimator="shadow",
         shadow_fraction=0.1,
         order_lead_cycles=2,
-        min_dwell=1,
         decide_cycles=40,
+        min_dwell=1,
         min_improvement=0.0,
         fallbacks=(),
     )

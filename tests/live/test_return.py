@@ -36,8 +36,8 @@ def slow_cell(
         cell.controller,
         fallbacks=fallbacks or ("LOC",),
         initial="SO",
-        min_dwell=1,
         decide_cycles=window_cycles,
+        min_dwell=1,
         estimator="profile",
     )
     pipeline = replace(cell.pipeline, period_ms=PERIOD_MS, deadline_ms=PERIOD_MS)
