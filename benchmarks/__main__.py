@@ -22,6 +22,7 @@ BENCHMARKS = {
     "deciding": ("deciding", "measure"),
     "pricing": ("pricing", "measure"),
     "regimes": ("regimes", "measure"),
+    "sooner": ("sooner", "measure"),
     "clairvoyant": ("clairvoyant", "measure"),
     "fleet": ("fleet", "measure"),
     "ledger": ("fleet_ledger", "measure"),

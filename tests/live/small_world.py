@@ -439,10 +439,18 @@ def columns(world: World, table: str, *names: str) -> list[tuple[Any, ...]]:
 class Recorded(World):
     """A cell in memory whose controller keeps its runs in a folder."""
 
-    def __init__(self, problem: Problem, out: Path, **recording: Any) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        out: Path,
+        *,
+        policy: str = "LOC",
+        exec_ms: Mapping[str, float] = EXEC_MS,
+        **recording: Any,
+    ) -> None:
         self.out, self.recording = out, recording
         self.log: list[str] = []
-        super().__init__(problem, policy="LOC")
+        super().__init__(problem, policy=policy, exec_ms=exec_ms)
 
     def recorder_of(self, controller: Controller) -> Recorder:
         kept = self.out, self.problem, controller, self.log.append

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import pairwise
@@ -10,12 +11,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from polars.testing import assert_frame_equal
 
 import dwell
+from dwell.cellfile.overrides import load_with
 from dwell.control.windows import missed_cycles, seen_l95_ms
 from dwell.cost import cost, hamming
 from dwell.errors import ProblemError
 from dwell.model import FrozenDict, Problem, QoS
+from dwell.model.fleet import Fleet, FleetEntry
 from dwell.model.window_close import window_close_ns
 from dwell.record import Run
 from dwell.sim.engine import simulate_realisation
@@ -24,6 +28,8 @@ from dwell.study.judged_cost import judged_costs
 from dwell.study.reference import play_alone, references
 from tests.cells.examples import EXAMPLES
 from tests.cells.generated import random_problem
+from tests.reference.algorithm_1 import price
+from tests.reference.algorithm_1 import switching as moved_share
 
 CANONICAL = dwell.load(EXAMPLES / "canonical.yaml")
 
@@ -103,6 +109,38 @@ def test_cycles_before_an_orders_first_stamp_belong_to_windows() -> None:
     following = run.decisions.row(1, named=True)
     assert (following["last_cycle"], following["cycles"]) == (46, 20)
     assert run.windows["violation_rate"][0] == run.cycles["missed"][:100].mean()
+
+
+@pytest.mark.parametrize(("lead", "delay_ms"), [(0, 0.0), (7, 0.0), (0, 90.0)])
+@pytest.mark.parametrize("scenario", ["robot-cpu-stress", "network-impairment"])
+def test_j_counted_again_over_fixed_stretches(scenario: str, lead: int, delay_ms: float) -> None:
+    problem = often(
+        CANONICAL, 25, min_dwell=0, order_lead_cycles=lead, order_delay_ms=delay_ms, on="R2"
+    )
+    run = dwell.simulate(problem, scenario=scenario, policy="cusum", seed=5, windows=20)
+    width, objective = problem.window_cycles, problem.objective
+    cycles = list(run.cycles.iter_rows(named=True))
+    moves = 0
+    for i, row in enumerate(run.windows.iter_rows(named=True)):
+        stretch = cycles[i * width : (i + 1) * width]
+        close_ns = stretch[-1]["release_ns"] + problem.pipeline.period_ns
+        ages = [(one["latency_ns"] or math.inf, close_ns - one["release_ns"]) for one in stretch]
+        seen = sorted(min(latency, age) for latency, age in ages)
+        l95_ms = min(seen[math.ceil(0.95 * width) - 1] / 1e6, problem.censor_ms)
+        deadline_ns = problem.pipeline.deadline_ms * 1e6
+        missed = sum(latency > min(age, deadline_ns) for latency, age in ages) / width
+        used = FrozenDict({name: row[f"u_{name}"] for name in problem.fabric.resources})
+        placed = [one["placement"] for one in cycles[max(i * width - 1, 0) : (i + 1) * width]]
+        switched = [
+            moved_share(problem.candidates[b], problem.candidates[a]) for a, b in pairwise(placed)
+        ]
+        moves += sum(share > 0 for share in switched)
+        here = problem.candidates[placed[-1]]
+        J = price(QoS(l95_ms, missed, used), here, here, objective)
+        J += objective.weights.switching * sum(switched)
+        assert row["cost"] == pytest.approx(J, rel=1e-9)
+    assert moves == run.decisions["migrated"].sum() > 1
+    assert len(cycles) == 20 * width
 
 
 @pytest.mark.parametrize("every", [25, 30, 99])
@@ -212,6 +250,24 @@ def test_it_is_at_most_a_window() -> None:
         often(CANONICAL, 0)
 
 
+@pytest.mark.parametrize("given", ["0", "-1", "2.5", "101", "true", "often", "[5]", ".nan"])
+def test_a_cell_file_with_another_interval_is_refused(given: str) -> None:
+    with pytest.raises(ProblemError) as caught:
+        load_with(EXAMPLES / "canonical.yaml", [f"controller.decide_cycles={given}"])
+    (fault,) = caught.value.faults
+    assert "decide_cycles" in fault.path
+
+
+@pytest.mark.parametrize("every", [1, 25])
+def test_without_a_least_improvement_a_gain_of_nothing_moves_no_cell(every: int) -> None:
+    problem = often(CANONICAL, every, min_dwell=0, min_improvement=0.0)
+    run = dwell.simulate(problem, policy="dtp", estimator="profile", seed=1, windows=5)
+    for row in run.decisions.filter("migrated").iter_rows(named=True):
+        assert row["delta_j"] > 0
+    moves = run.decisions["migrated"].sum()
+    assert moves <= len(run.decisions) < 5 * 100 / every + 1
+
+
 @pytest.mark.parametrize("every", [25, 100])
 def test_a_judge_of_a_run_counts_the_moves_of_each_window(every: int) -> None:
     problem = often(CANONICAL, every)
@@ -240,3 +296,67 @@ def test_the_oracle_decides_as_often_as_the_cell_does() -> None:
     assert found.runs["oracle"].decisions.height > 3 * 10
     assert found.runs["clairvoyant"].decisions.height == 10
     assert found.costs["oracle"] < found.costs["LOC"]
+
+
+# ------------------------------------------------------------------------------------- fleets
+
+TABLES = ("cycles", "windows", "decisions")
+
+
+def hall(problems: list[Problem], coordination: str, scenario: str = "robot-cpu-stress") -> Fleet:
+    entries = tuple(FleetEntry(problem, 1, scenario) for problem in problems)
+    return Fleet("hall", entries, ("E",), phases="random", coordination=coordination)  # type: ignore[arg-type]
+
+
+def named(name: str, every: int | None, **settings: Any) -> Problem:
+    return replace(often(CANONICAL, every, **settings), name=name)
+
+
+@pytest.mark.parametrize("guard", [False, True])
+@pytest.mark.parametrize("every", [17, 25])
+def test_a_fleet_of_one_decides_as_its_cell_alone(every: int, guard: bool) -> None:
+    problem = often(CANONICAL, every, on="E", min_dwell=0)
+    settings: dict[str, Any] = {"policy": "dtp+corrected", "seed": 3, "windows": 8, "guard": guard}
+    alone = dwell.simulate(problem, scenario="edge-cpu-stress", **settings)
+    fleet = replace(hall([problem], "none", "edge-cpu-stress"), phases="sync")
+    (run,) = dwell.simulate_fleet(fleet, **settings).cells.values()
+    for table in TABLES:
+        assert_frame_equal(getattr(run, table), getattr(alone, table))
+
+
+def test_cells_of_a_fleet_that_share_nothing_decide_as_alone() -> None:
+    problems = [named(f"cell-{every}", every) for every in (10, 25, 60, 99)]
+    fleet = replace(hall(problems, "none"), shared=(), phases="sync")
+    together = dwell.simulate_fleet(fleet, policy="cusum+corrected", seed=2, windows=6)
+    for problem, run in zip(problems, together.cells.values(), strict=True):
+        alone = dwell.simulate(
+            problem, scenario="robot-cpu-stress", policy="cusum+corrected", seed=2, windows=6
+        )
+        for table in TABLES:
+            assert_frame_equal(getattr(run, table), getattr(alone, table))
+
+
+@pytest.mark.parametrize("coordination", ["none", "random", "ledger"])
+def test_each_cell_of_a_fleet_decides_at_its_own_interval(coordination: str) -> None:
+    intervals = (10, 25, 60, 100)
+    problems = [named(f"cell-{every}", every, min_dwell=0) for every in intervals]
+    fleet = hall(problems, coordination)
+    played = dwell.simulate_fleet(fleet, policy="dtp+corrected", seed=1, windows=8)
+    rounds = []
+    for every, run in zip(intervals, played.cells.values(), strict=True):
+        if every < 100:
+            assert run.windows["first_cycle"].to_list() == [100 * i for i in range(8)]
+        release_ns = run.cycles["release_ns"]
+        for row in run.decisions.iter_rows(named=True):
+            begin = begins(run, row)
+            assert (row["last_cycle"] + 1 - begin) % every == 0
+            assert row["cycles"] == min(100, row["last_cycle"] + 1 - begin)
+            if coordination == "ledger":
+                at_ns = release_ns[row["last_cycle"]] + run.problem.pipeline.period_ns
+                rounds.append((at_ns, row["round"], row["phi_before"] is not None))
+    assert played.decisions["migrated"].sum() > 0
+    # A round takes the cells that decide, in the order of their instants.
+    rounds.sort()
+    assert [number for _, number, _ in rounds] == sorted(number for _, number, _ in rounds)
+    asked = [number for _, number, was_asked in rounds if was_asked]
+    assert asked == sorted(set(asked))

@@ -101,7 +101,7 @@ class Proposal:
     decision : Decision
         The policy's.
     priced : tuple
-        What was known of the candidates, for the row of ``decisions``.
+        Metrics of the cycles and of the candidates, for the row of ``decisions``.
     after : object
         What the policy is once this counts (`dwell.policies.protocol.Proposer.commit`).
     verdict : Verdict, optional
@@ -232,8 +232,12 @@ class Controller:
     @property
     def features(self) -> tuple[Feature, ...]:
         """What ``decisions`` has that not every run's has."""
-        supports: tuple[Feature, ...] = ("support",) if self.supports else ()
-        return supports if self.coordination is None else (*supports, "fleet")
+        has: dict[Feature, bool] = {
+            "support": self.supports,
+            "fleet": self.coordination is not None,
+            "between": self.problem.decide_cycles < self.problem.window_cycles,
+        }
+        return tuple(feature for feature, there in has.items() if there)
 
     @cached_property
     def decision_columns(self) -> tuple[str, ...]:
@@ -370,7 +374,7 @@ class Controller:
             )
         decision = self._checked(decision)
         seen = observed.l95_ms, observed.violation_rate, measured
-        priced = self._priced(decision, estimates)
+        priced = (*self._looked_at(observed), *self._priced(decision, estimates))
         proposal = Proposal(seen, self.looked, decision, priced, after)
         if self.coordination is not None:
             self._consider(proposal, estimates, self.coordination)
@@ -579,6 +583,13 @@ class Controller:
         dwell = dwell_cycles // self.problem.window_cycles
         fixed = (window, incumbent, name, migrated, decision.reason, dwell, decision.delta_j)
         self.decisions.append((*fixed, *cycles, dwell_cycles, *proposal.priced, *asked, why))
+
+    def _looked_at(self, observed: QoS) -> tuple[float | None, ...]:
+        """Return the metrics that a decision looked at, where no window has them."""
+        if "between" not in self.features:
+            return ()
+        used = map(observed.utilisation.get, self.resources)
+        return observed.l95_ms, observed.violation_rate, *used
 
     def _priced(self, decision: Decision, estimates: Mapping[str, QoS]) -> tuple[object, ...]:
         """Return what a row of ``decisions`` says of every candidate."""

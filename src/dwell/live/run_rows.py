@@ -128,11 +128,9 @@ def columns_of(controller: Controller, *, jobs: bool = False) -> Columns:
     jobs : bool
         Whether it keeps those that are kept on request.
     """
-    features: list[Feature] = ["live"]
+    features: list[Feature] = ["live", *controller.features]
     if sends_shadows(controller):
         features.append("shadows")
-    if controller.supports:
-        features.append("support")
     tables = ["cycles", "windows", "decisions", *(("jobs", "processes") if jobs else ())]
     return {name: column_types(name, controller.problem, features) for name in tables}
 

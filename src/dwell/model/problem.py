@@ -200,6 +200,11 @@ class Problem(Displayed):
         return self.window_cycles * self.pipeline.period_ms
 
     @property
+    def window_ns(self) -> int:
+        """Length of a window, nanoseconds."""
+        return self.window_cycles * self.pipeline.period_ns
+
+    @property
     def decide_cycles(self) -> int:
         """Cycles between two decisions."""
         given = self.controller.decide_cycles

@@ -343,12 +343,17 @@ def _scenarios(parts: CellParts) -> Iterator[Fault]:
                 yield from _unknown(f"{path}.node", "node", item.node, parts.nodes)
             elif parts.links_complete:
                 yield from _unknown(f"{path}.link", "link", item.link, links)
-        yield from _episodes(items)
+        yield from episode_faults(items)
         yield from _layers(parts, items)
 
 
-def _episodes(items: Sequence[tuple[str, Disturbance]]) -> Iterator[Fault]:
-    """Disturbances whose episodes have one name must be able to come and go together."""
+def episode_faults(items: Sequence[tuple[str, Disturbance]]) -> Iterator[Fault]:
+    """Yield where disturbances whose episodes share a name cannot begin and end together.
+
+    Parameters
+    ----------
+    items : sequence of (path, Disturbance)
+    """
     first: dict[str, tuple[str, Disturbance]] = {}
     for path, item in items:
         if item.episodes is None:

@@ -413,11 +413,15 @@ class _Stamper:
             self._go_on(boundary)
             return
         earliest = self._takes_effect(boundary, close_ns)
+        cold = self.cold
+        if cold is not None and not cold.moves(left, self.course.placement):
+            cold = None
         # Where no window can follow, the run is over, and it does not matter when tasks are ready.
-        over = not self.looks and earliest + self.window_cycles > self.cycles
-        if over or not self._begin(left, boundary, close_ns):
+        if cold is not None and earliest + self.window_cycles <= self.cycles:
+            self._begin(cold, left, boundary, close_ns)
+        else:
             self._stamp(self.stamped, earliest, left)
-            self._move(earliest, begins_window=not self.looks)
+            self._move(earliest, begins_window=cold is not None or not self.looks)
 
     def _window_of(self, cycle: int) -> int:
         """Return the number of windows that have ended by a cycle: that of its own, if any."""
@@ -477,20 +481,16 @@ class _Stamper:
             cell["look_pending"] = 0
         self.stamped = self._reach(following + self.every)
 
-    def _begin(self, left: str, boundary: int, close_ns: int) -> bool:
-        """Begin a cold migration, which ends with `step`; False if no task has to be waited for."""
+    def _begin(self, cold: ColdMigration, left: str, boundary: int, close_ns: int) -> None:
+        """Begin a cold migration, which ends with `step`."""
         arrival_ns = close_ns + self.delay_ns
-        if self.cold is None or not self.cold.begin(
-            self.arrays, left, self.course.placement, boundary, arrival_ns
-        ):
-            return False
+        cold.begin(self.arrays, left, self.course.placement, boundary, arrival_ns)
         cell = self.cell
         # No window closes, and nothing is decided, before the migration is over.
         cell["window_first"] = cell["close_cycle"] = cell["look_cycle"] = self.cycles + 1
         cell["close_pending"] = cell["look_pending"] = 0
         cell["migrating"] = 1
         self._stamp(self.stamped, self.cycles, left)
-        return True
 
     def step(self) -> None:
         """Take the step that is due: of a cold migration, or of the guard."""

@@ -14,7 +14,7 @@ from dwell.errors import PolicyError, SimulationError
 from dwell.model import FrozenDict, Problem
 from dwell.model.bounds import counted
 from dwell.model.semantics import nearest
-from dwell.study.family import same_run
+from dwell.study.family import played_alike
 from dwell.study.intervals import Floats, Interval
 from dwell.study.over_seeds import (
     difference_of,
@@ -162,7 +162,7 @@ class StudyRuns(Displayed):
         """
         first, second = (self.values(scenario, policy, column) for policy in policies)
         one, other = ({"scenario": scenario, "policy": policy} for policy in policies)
-        if same_run(self.runs, (one, other)) and np.array_equal(first, second):
+        if played_alike(self.runs, (one, other)) and np.array_equal(first, second):
             return Interval(0.0, math.nan, math.nan)
         windows = self.windows_behind(scenario, *policies)
         return difference_of(column, windows)(first, second)

@@ -54,6 +54,8 @@ PARTS = ("compute", "queue", "network")
 
 #: Column of what tells runs apart that differ in anything but their names.
 PLAYED = "played"
+#: Column of the latencies alone, which shadow jobs may leave as they are.
+LATENCIES = "latencies"
 
 #: K, the lengths of stretches of cycles, with m, the misses that are 5 % of one.
 STRETCHES = {20: 1, 100: 5}
@@ -205,6 +207,7 @@ def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Su
         **_misses(missed),
         **_actuator(cycles, counted, problem),
         **{f"{part}_ms": mean_of(cycles[f"{part}_ns"][counted]) / 1e6 for part in PARTS},
+        LATENCIES: hashlib.blake2b(final_ns.data, digest_size=8).hexdigest(),
         PLAYED: _played(final_ns, cycles.names("placement")[counted], used, problem),
     }
     incumbent, cost = decisions.names("incumbent"), windows["cost"][counts]
