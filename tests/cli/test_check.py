@@ -35,6 +35,24 @@ def test_check_as_json(cell: Path) -> None:
     assert found["candidates"]["OFF"]["own_work"] == pytest.approx({"R": 0.05, "E": 0.025})
 
 
+@pytest.mark.parametrize(("estimator", "windows"), [("profile", 3), ("corrected", 0)])
+def test_check_says_how_often_it_decides_and_how_long_it_stays(
+    cell: Path, estimator: str, windows: int
+) -> None:
+    controller = f"controller: {{estimator: {estimator}, decide_cycles: 5, min_dwell_cycles: 8}}"
+    cell.write_text(f"{SMALL}\n{controller}\n", encoding="utf-8")
+    found = read_json(call("check", cell, "--json"))
+    assert found["controller"] == {
+        "policy": "dtp",
+        "estimator": estimator,
+        "decide_cycles": 5,
+        "min_dwell": windows,
+        "min_dwell_cycles": 8,
+    }
+    line = f"decisions: dtp with {estimator}, every 5 cycles; N_min {windows} windows"
+    assert line in call("check", cell).stdout.splitlines()
+
+
 def test_l95_of_a_cell_that_loses_cycles_is_a_number(cell: Path) -> None:
     # Three of four messages are lost.
     lossy = SMALL.replace(

@@ -220,7 +220,7 @@ def test_bad_classes(cell: Path, name: str, told: str) -> None:
     [
         ("Rewrites", "decide at window 0 failed: TypeError: FrozenDict cannot be changed; "),
         ("Forgets", "decide at window 0 failed: TypeError: FrozenDict cannot be changed; "),
-        ("Late", "decide at window 2 failed: OddError: lost (choice.py:"),
+        ("Late", "decide at window 0 failed: OddError: lost (choice.py:"),
     ],
 )
 def test_a_policy_that_fails_in_a_run_is_named(cell: Path, kind: str, told: str) -> None:
@@ -233,7 +233,7 @@ def test_a_policy_that_fails_in_a_worker_process_is_named(cell: Path) -> None:
     text = "dwell-study: 1\ncell: small.yaml\nwindows: 5\npolicies: {late: 'own.choice:Late'}\n"
     study.write_text(text, encoding="utf-8")
     found = call("study", study, "--processes", "2")
-    assert_refused(found, "error: Late: decide at window 2 failed: OddError: lost (choice.py:")
+    assert_refused(found, "error: Late: decide at window 0 failed: OddError: lost (choice.py:")
 
 
 @pytest.mark.parametrize("name", ["own.choice:", ":Last", "own choice:Last", "own:choice:Last"])

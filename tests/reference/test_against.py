@@ -209,16 +209,15 @@ def make_case(
     names = tuple(random_stamps(rng, problem, windows))
     real = dwell.draw(problem, scenario="disturbed", seed=seed, windows=windows)
     share = rng.choice([0.0, 0.1, 0.3, 1.0]) / len(problem.candidates) if orders else 0.0
-    fractions = _random_fractions(rng, problem, share) if share else {}
+    fractions: dict[str, float] = {}
+    if share:
+        # Of the largest share, none to all under each candidate.
+        parts = [rng.choice([0.0, 0.2, 1.0, 1.0]) for _ in problem.candidates]
+        parts[rng.randrange(len(parts))] = 1.0
+        named = zip(problem.candidates, parts, strict=True)
+        fractions = {name: share * part for name, part in named}
     case = Case(problem, real, names, fractions)
     return deciding_often(case, Random(f"{seed} decides")) if orders else case
-
-
-def _random_fractions(rng: Random, problem: Problem, share: float) -> Mapping[str, float]:
-    """Return a share for each active candidate, none to all of the largest."""
-    parts = [rng.choice([0.0, 0.2, 1.0, 1.0]) for _ in problem.candidates]
-    parts[rng.randrange(len(parts))] = 1.0
-    return {name: share * part for name, part in zip(problem.candidates, parts, strict=True)}
 
 
 def deciding_often(case: Case, rng: Random) -> Case:

@@ -59,9 +59,14 @@ def check(
     from dwell.estimators import warnings_of
     from dwell.estimators.cell_warnings import unpriced
     from dwell.estimators.prices import prices_of
+    from dwell.estimators.registry import resolved
     from dwell.estimators.shadow_price import affordable
     from dwell.live.lint import lint
+    from dwell.model.evolve import evolve
+    from dwell.policies.registry import estimator_of
 
+    estimator = estimator_of(problem)
+    problem = resolved(evolve(problem, {"controller.estimator": estimator}), estimator)
     prices, tried = prices_of(problem, scenario), _shadow_prices(problem)
     fractions = {name: affordable(problem, shadows) for name, shadows in tried.items()}
     cycles = min(price.cycles for price in prices.values())
@@ -97,20 +102,23 @@ def _refuse(faults: Iterable[Fault], text: str, *, as_json: bool) -> NoReturn:
 def class_faults(problem: Problem) -> Iterator[Fault]:
     """Yield the faults of the policy and the estimator where these are a user's classes."""
     from dwell.estimators import by_name as make_estimator
+    from dwell.estimators.registry import resolved
     from dwell.model.bounds import CLASS_PATH
     from dwell.policies import by_name as make_policy
+    from dwell.policies.registry import estimator_of
 
-    settings = problem.controller
+    settings, estimator = problem.controller, estimator_of(problem)
+    try:
+        if CLASS_PATH.holds(estimator):
+            make_estimator(estimator, problem)
+        problem = resolved(problem, estimator)
+    except ProblemError as error:
+        yield Fault("controller.estimator", str(error))
     try:
         if CLASS_PATH.holds(settings.policy) and settings.policy not in problem.candidates:
             make_policy(settings.policy, problem)
     except PolicyError as error:
         yield Fault("controller.policy", str(error))
-    try:
-        if CLASS_PATH.holds(settings.estimator):
-            make_estimator(settings.estimator, problem)
-    except ProblemError as error:
-        yield Fault("controller.estimator", str(error))
 
 
 def _fault(fault: Fault) -> dict[str, Any]:
@@ -129,6 +137,13 @@ def _contents(problem: Problem) -> dict[str, Any]:
         "nodes": {name: node.tier for name, node in problem.fabric.nodes.items()},
         "links": list(problem.fabric.links),
         "scenarios": list(problem.scenarios),
+        "controller": {
+            "policy": problem.controller.policy,
+            "estimator": problem.controller.estimator,
+            "decide_cycles": problem.decide_cycles,
+            "min_dwell": problem.min_dwell,
+            "min_dwell_cycles": problem.controller.min_dwell_cycles,
+        },
     }
 
 
@@ -170,6 +185,7 @@ def _summary(problem: Problem, prices: Mapping[str, Price], scenario: str) -> st
         ]
         for name, price in prices.items()
     ]
+    controller, least = problem.controller, counted(problem.min_dwell, "window")
     span_s = min(price.cycles for price in prices.values()) * pipeline.period_ms / 1e3
     disturbed = f" for {span_s:.4g} s" if problem.scenario(scenario) else ""
     return "\n".join(
@@ -179,6 +195,8 @@ def _summary(problem: Problem, prices: Mapping[str, Price], scenario: str) -> st
             f"{counted(len(problem.fabric.links), 'link')}; "
             f"P {pipeline.period_ms:.4g} ms, D {pipeline.deadline_ms:.4g} ms, "
             f"W {counted(problem.window_cycles, 'cycle')}",
+            f"decisions: {controller.policy} with {controller.estimator}, every "
+            f"{counted(problem.decide_cycles, 'cycle')}; N_min {least}",
             f"can move: {', '.join(movable) or 'nothing'}",
             f"scenarios: {', '.join(problem.scenarios)}",
             "",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping
-from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 from dwell.estimators.evidence import Evidence
 from dwell.model.problem import Problem
@@ -32,7 +32,11 @@ class Support(NamedTuple):
 
 @runtime_checkable
 class Estimator(Protocol):
-    """Predicts the QoS of every candidate from what a window showed under the incumbent."""
+    """Predicts the QoS of every candidate from what a window showed under the incumbent.
+
+    Its class may have an attribute ``states_errors``, true if its estimates have standard errors
+    (`QoS.error`). N_min is then 0 where a cell gives none, else 3.
+    """
 
     def estimate(
         self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
@@ -96,6 +100,8 @@ class CellEstimator(ABC):
     ----------
     learns, supports : bool
         Whether it is shown what happened to jobs, and says what stands behind its estimates.
+    states_errors : bool
+        Whether its estimates have standard errors (`QoS.error`).
     shadow_fraction : float, or mapping of str to float
         Share of the cycles that it wants sent through each alternative, by the active candidate.
     revision : int
@@ -104,6 +110,7 @@ class CellEstimator(ABC):
 
     learns: bool = False
     supports: bool = False
+    states_errors: ClassVar[bool] = False
     shadow_fraction: ShadowFraction = 0.0
     revision: int = 0
 

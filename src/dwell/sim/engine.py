@@ -110,7 +110,6 @@ def simulate_realisation(
     played = cast("PlayedRealisation", _play(*asked) or _play(*asked, shadow=True))
     meta = partial(
         meta_of,
-        problem,
         played.controller,
         scenario=realisation.scenario,
         seed=realisation.seed,
@@ -145,7 +144,7 @@ def describe(
     """
     problem.scenario(scenario)
     controller = Controller(problem, policy, estimator)
-    meta = meta_of(problem, controller, scenario=scenario, seed=seed, windows=windows, guard=guard)
+    meta = meta_of(controller, scenario=scenario, seed=seed, windows=windows, guard=guard)
     return Run(meta, {}).meta
 
 
@@ -568,7 +567,6 @@ def _evidence(
 
 
 def meta_of(
-    problem: Problem,
     controller: Controller,
     *,
     scenario: str,
@@ -579,12 +577,12 @@ def meta_of(
     """Return what the record of a simulated run says of it."""
     return {
         "kind": "simulated",
-        "cell": problem.name,
+        "cell": controller.problem.name,
         "scenario": scenario,
         **controller.described(),
         "guard": guard and controller.guarded,
         "seed": seed,
         "windows": windows,
-        "problem": to_document(problem),
+        "problem": to_document(controller.problem),
         "versions": versions(),
     }
