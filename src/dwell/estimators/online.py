@@ -321,8 +321,10 @@ class Online(CellEstimator):
         pipeline, resources = problem.pipeline, problem.fabric.resources
         share = dict.fromkeys(resources, 0.0)
         for there in problem.candidates.values():
-            for task in pipeline.diverging(here, there):
-                if there is here or not pipeline.outputs(task):
+            apart = pipeline.diverging(here, there)
+            # In the order of tasks: that of a set, and so the rounding of the sum, may differ.
+            for task in pipeline.tasks:
+                if there is here or task not in apart or not pipeline.outputs(task):
                     continue
                 execution = pipeline.tasks[task].on[there[task]]
                 resource = execution.resource(there[task])
