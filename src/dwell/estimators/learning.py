@@ -96,8 +96,7 @@ class Learning(Online):
         tests = len(self._pools) * max(self.problem.window_cycles / cycles, 1.0)
         for part, values in demands.items():
             pool = self._pools[part]
-            # To whole nanoseconds, as everything is measured: equal values must be ties.
-            if pool.learn(np.round(values, 6), self._window, self.memory, cycles, tests):
+            if pool.learn(values, self._window, self.memory, cycles, tests):
                 changed.append(part)
             self._has_grown |= not pool.is_declared
         for pool in self._pools.values():

@@ -611,7 +611,7 @@ def _references(problem: Problem, seed: int, windows: int) -> dict[Part, Referen
         if missing:
             demands = meter.demands(_evidence_of(problem, real, _played(first, index), index))
             for part in missing:
-                values = np.round(demands.get(part, np.empty(0)), 6)
+                values = demands.get(part, np.empty(0)).copy()
                 block = min(problem.window_cycles, STEP)
                 kept = windows * problem.window_cycles
                 references[part] = Reference(values, block, kept, patience_ms)

@@ -2,6 +2,7 @@
 // node, or a flow on a link.
 
 #include <algorithm>
+#include <cmath>
 #include <limits>
 
 #include "elementary.h"
@@ -80,6 +81,14 @@ void take_off_waits(const Found& found) {
   }
 }
 
+// Rounds to whole nanoseconds, as everything is measured: equal values must be ties.
+void round_all(const Found& found) {
+  for (i64 i = 0; i < found.n_parts; ++i) {
+    f64* ms = found.ms + found.order[i] * found.most;
+    for (i64 k = 0; k < found.count[found.order[i]]; ++k) ms[k] = std::rint(ms[k] * 1e6) / 1e6;
+  }
+}
+
 // The next candidate that cycles under `active` were also sent through; -1 if there is none.
 i64 next_other(const Window& window, i64 shadow, i64 active, i64 after) {
   i64 next = -1;
@@ -101,7 +110,7 @@ using namespace dwell;
 DWELL_EXPORT void dwell_meter(const Layout* layout, const Window* window, i64 active, i64 limit_ns,
                               Found* found) noexcept {
   const i64 n_tasks = layout->n_tasks, n_flows = layout->n_flows, n_parts = n_tasks + n_flows;
-  const i64 shadow = 1 + 3 * n_tasks + n_flows;  // where its columns begin
+  const i64 shadow = 1 + 4 * n_tasks + n_flows;  // where its columns begin
   found->n_crossings = 0;
   i64 other = -1;
   do {
@@ -139,7 +148,9 @@ DWELL_EXPORT void dwell_meter(const Layout* layout, const Window* window, i64 ac
     }
     other = window->width > shadow ? next_other(*window, shadow, active, other) : -1;
   } while (other >= 0);
+  if (found->cost == nullptr) return;
   take_off_waits(*found);
+  round_all(*found);
 }
 
 // Adds up where `n` values lie among `n_known` ascending ones, each at a place p between 0 and 1:

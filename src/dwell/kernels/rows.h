@@ -240,11 +240,18 @@ struct Crossing;  // of meter.cpp
   field(i64, n_tasks) field(i64, n_flows) field(Times, sources) field(Times, parts)              \
   field(const i8*, shared)
 
-// A row a cycle of a window: the candidate that it went through, when its jobs became ready, when
-// they completed, when its messages arrived, and the core time of its jobs, -1 for what had not
-// come or is not known; then, where there are shadows, the same of its shadow, the candidate being
-// -1 where it has none.
-#define DWELL_WINDOW(field) field(Times, rows) field(i64, n) field(i64, width)
+// A row per cycle of a window: the candidate that it went through, when its jobs became ready, when
+// they completed, when its messages arrived, the core time of its jobs, and when they started, -1
+// for what had not come or is not known; then, if there are shadows, the same of its shadow, the
+// candidate being -1 where it has none.
+#define DWELL_WINDOW(field) field(i64*, rows) field(i64, n) field(i64, width)
+
+// The jobs of a node (jobs.cpp): `cores` of each candidate and task, 0 for a task that is not there;
+// cores of the node, and those that its background leaves; foreign threads next to jobs, and the
+// share of the time in which there are bursts.
+#define DWELL_NODE_JOBS(field)                                                                   \
+  field(i64, n_tasks) field(i64, n_flows) field(const f64*, cores) field(i64, is_fair)           \
+  field(f64, n_cores) field(f64, spare) field(f64, foreign) field(f64, bursts)
 
 // The times found: up to `most` of each part, and the parts in the order in which they were found.
 // Where demands are asked for, and not times, there is a `cost` of each part: of a job its time
@@ -266,7 +273,7 @@ struct Crossing;  // of meter.cpp
   row(Rule, DWELL_RULE) row(Option, DWELL_OPTION) row(Decided, DWELL_DECIDED)                    \
   row(OnOffIntervals, DWELL_ON_OFF) row(NodeEffect, DWELL_EFFECT) row(LinkFault, DWELL_FAULT)    \
   row(DrawnPath, DWELL_PATH) row(Layout, DWELL_LAYOUT) row(Window, DWELL_WINDOW)                 \
-  row(Found, DWELL_FOUND)
+  row(Found, DWELL_FOUND) row(NodeJobs, DWELL_NODE_JOBS)
 
 // clang-format on
 
