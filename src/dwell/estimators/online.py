@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from dwell.cost import cost, cost_error, hamming
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.foreign_threads import ForeignThreads, Level, Stretches
+from dwell.estimators.link_rates import Rate
 from dwell.estimators.measured import Message, Meter, Part, groups, parts_of
 from dwell.estimators.presents import PlayedPrice, Playing, Present
 from dwell.estimators.prices import SEED, Price
@@ -74,6 +75,8 @@ class Online(CellEstimator):
             name: ForeignThreads(node, every) for name, node in problem.fabric.nodes.items()
         }
         self._down: frozenset[str] = frozenset()
+        #: Rates of links that are not as declared.
+        self._rates: dict[str, Rate] = {}
         self._shared: frozenset[str] = frozenset()
         #: Counts presents: changes, and every time that what is known of one has doubled.
         self.revision = 0
@@ -141,7 +144,8 @@ class Online(CellEstimator):
         """What is not as the cell declares it."""
         self._take_in_pending()
         threads = {name: one.beyond for name, one in self._foreign.items() if one.beyond}
-        return Present(FrozenDict(self._otherwise()), FrozenDict(threads), self._down)
+        rates_mbps = FrozenDict({link: rate.mbps for link, rate in self._rates.items()})
+        return Present(FrozenDict(self._otherwise()), FrozenDict(threads), self._down, rates_mbps)
 
     @property
     def _threads(self) -> dict[str, float]:
@@ -282,9 +286,10 @@ class Online(CellEstimator):
         """Candidates that have anything that is not as declared."""
         otherwise = self._otherwise()
         nodes = {name for name, foreign in self._foreign.items() if foreign.beyond} | self._down
-        if not otherwise and not nodes:
-            return []
         links = {part.link for part in otherwise if isinstance(part, Message)}
+        links |= self._rates.keys()
+        if not otherwise and not nodes and not links:
+            return []
         return [
             name
             for name, parts in self._parts.items()

@@ -69,14 +69,18 @@ class Present:
         mean, and so many less, all the time.
     down : frozenset of str
         Nodes that are down.
+    rates_mbps : mapping of str to float
+        Rates of links.
     """
 
     demands: Mapping[Part, Floats] = field(default_factory=FrozenDict)
     threads: Mapping[str, float] = field(default_factory=FrozenDict)
     down: frozenset[str] = frozenset()
+    rates_mbps: Mapping[str, float] = field(default_factory=FrozenDict)
 
     def __repr__(self) -> str:
         what = [*map(str, self.demands), *self.threads, *(f"{name} down" for name in self.down)]
+        what += [f"{name} at {mbps:.3g} Mbit/s" for name, mbps in self.rates_mbps.items()]
         return f"<Present: {', '.join(what) or 'as declared'}>"
 
 
@@ -351,15 +355,20 @@ class Playing:
             if part in self._hops:
                 layers = tables.layers[self._hops[part] :: len(self._hops)]  # shadows' come after
                 layers[layers != 0] = self._nothing_ns.ctypes.data
+        for link, mbps in present.rates_mbps.items():
+            tables.rates["rate_mbps"][self._segments_of(link)] = mbps
         for link, share in _lost(present).items():
-            row = tables.links[list(links).index(link)]
-            mine = slice(row["segment"], row["segment_end"])
+            mine = self._segments_of(link)
             if links[link].retransmit_ms is None:
                 tables.rates["loss"][mine] = share
             else:
                 # Attempts that were lost are in the delays, and what never came was held back.
                 tables.rates["loss"][mine] = 0.0
                 tables.segments["is_down"][mine] = share >= 0.5
+
+    def _segments_of(self, link: str) -> slice:
+        row = self._first.tables.links[list(self.problem.fabric.links).index(link)]
+        return slice(row["segment"], row["segment_end"])
 
     def _changes(self, present: Present) -> Rows:
         """Return the changes of nodes with the present's foreign threads."""
@@ -519,7 +528,7 @@ def _with_short_windows(problem: Problem) -> Problem:
 
 def realised(problem: Problem, real: Realisation, present: Present) -> Realisation:
     """Return draws of the undisturbed cell with what a present has in the place of some of them."""
-    if not (present.demands or present.threads or present.down):
+    if present == Present():
         return real
     exec_ns, delay_ns, extra_ns = real.exec_ns.copy(), real.delay_ns.copy(), real.extra_ns.copy()
     places = np.arange(real.cycles)
@@ -536,6 +545,8 @@ def realised(problem: Problem, real: Realisation, present: Present) -> Realisati
         demands = _drawn(values, stretched, places)
         if part in known and demands is not None:
             times[known.index(part)] = demands
+    for name, mbps in present.rates_mbps.items():
+        rates[state[:, 1] == segments.links.index(name), 0] = mbps
     for name, share in _lost(present).items():
         mine = state[:, 1] == segments.links.index(name)
         if problem.fabric.links[name].retransmit_ms is None:
