@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from dwell.kernels.meter import CyclesLayout, PartTimes, WindowRows, places
+from dwell.kernels.meter import CyclesLayout, PartTimes, WindowRows
+from dwell.kernels.pools import places
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]

@@ -13,10 +13,11 @@ from dwell.estimators.evidence import Evidence
 from dwell.estimators.link_rates import Rate, better_rate
 from dwell.estimators.measured import Message, Part, sending_ns
 from dwell.estimators.online import Online
-from dwell.estimators.pool import Pool
+from dwell.estimators.pool import Pool, least_deviations
 from dwell.estimators.prices import SEED
 from dwell.estimators.protocol import Support
 from dwell.estimators.slow_processes import unseen_error
+from dwell.kernels.pools import ADDED, PoolRows
 from dwell.model.controller_settings import HALF_LIFE_WINDOWS
 from dwell.model.problem import Problem
 
@@ -92,6 +93,7 @@ class Learning(Online):
             part: Pool(reference, isinstance(part, Message))
             for part, reference in self._playing.declared.references.items()
         }
+        self._rows = PoolRows([self._pools[part].rows for part in self._meter.parts])
 
     def _take_in(self, demands: Mapping[Part, Floats], evidence: Evidence) -> None:
         self._window += 1
@@ -120,9 +122,20 @@ class Learning(Online):
         changed = []
         # How often any part is compared with its reference in a window of the cell.
         tests = len(self._pools) * max(self.problem.window_cycles / cycles, 1.0)
-        for part, values in demands.items():
+        least = least_deviations(tests)
+        # Most pools are as declared, and nothing has to be decided about them.
+        when = self._window, self.memory, cycles
+        parts = self._meter.numbers(demands)
+        looks = self._rows.learn(self._meter.found, parts, *when, least)
+        for (part, values), why in zip(demands.items(), looks, strict=False):
+            if not why:
+                continue
             pool = self._pools[part]
-            if pool.learn(values, self._window, self.memory, cycles, tests):
+            if why == ADDED:
+                has_changed = pool.has_left(self._window, cycles, least)
+            else:
+                has_changed = pool.learn(values, *when, tests)
+            if has_changed:
                 changed.append(part)
             self._has_grown |= not pool.is_declared
         return changed

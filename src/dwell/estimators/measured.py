@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple, TypeAlias
@@ -80,17 +80,18 @@ class Meter:
         self._sources = np.array([names.index(f.source) for f in problem.pipeline.flows], np.int64)
         self._placements = tuple(problem.candidates.values())
         every = (parts_of(problem.pipeline, placed) for placed in self._placements)
-        self._parts = tuple(dict.fromkeys(part for parts in every for part in parts))
-        self._times = PartTimes(len(self._parts))
-        costs = [_cost(problem, part) for part in self._parts]
+        self.parts = tuple(dict.fromkeys(part for parts in every for part in parts))
+        self._number = {part: number for number, part in enumerate(self.parts)}
+        self._times = PartTimes(len(self.parts))
+        costs = [_cost(problem, part) for part in self.parts]
         self._cost, self._usual_cost = np.array(costs), np.array(costs)
         self._link, repeats = self._links()
-        self._demands = PartTimes(len(self._parts), self._cost, self._link, repeats)
+        self._demands = PartTimes(len(self.parts), self._cost, self._link, repeats)
         nodes = problem.fabric.nodes
         #: Parts whose jobs need more of the core beside foreign threads, with their nodes.
         self._interfered = [
             (number, nodes[part.node])
-            for number, part in enumerate(self._parts)
+            for number, part in enumerate(self.parts)
             if isinstance(part, Site) and nodes[part.node].interference > 1.0
         ]
         self._layouts: dict[int, CyclesLayout] = {}
@@ -168,10 +169,19 @@ class Meter:
         work_ns = self.work_ns(shadows, evidence.shadow_placement, foreign)
         return replace(told, shadows=replace(shadows, work_ns=work_ns))
 
+    @property
+    def found(self) -> PartTimes:
+        """What `demands` has found in the last window."""
+        return self._demands
+
+    def numbers(self, parts: Iterable[Part]) -> Ints:
+        """Return the places of some parts in `parts`."""
+        return np.array([self._number[part] for part in parts], np.int64)
+
     def set_rate(self, link: str, rate_mbps: float) -> None:
         """Let the messages of a link be sent at a rate, and wait for each other there."""
         number = list(self._problem.fabric.links).index(link)
-        for i, part in enumerate(self._parts):
+        for i, part in enumerate(self.parts):
             if isinstance(part, Message) and part.link == link:
                 self._usual_cost[i] = sending_ns(self._problem, part, rate_mbps)
                 self._link[i] = number
@@ -191,7 +201,7 @@ class Meter:
         found.begin(rows, evidence.close_ns - self._patience_ns)
         for active, _ in groups(evidence.placement):
             found.add(active, self._layout(active))
-        return {self._parts[part]: values for part, values in found.by_part().items()}
+        return {self.parts[part]: values for part, values in found.by_part().items()}
 
     def work_ns(
         self, instants: Instants, placement: NDArray[np.integer], foreign: Mapping[str, float]
@@ -247,7 +257,7 @@ class Meter:
             for place, one in enumerate(links)
             if one.rate_mbps < np.inf or one.name in repeating
         }
-        names = [part.link if isinstance(part, Message) else "" for part in self._parts]
+        names = [part.link if isinstance(part, Message) else "" for part in self.parts]
         waits = np.array([number.get(name, -1) for name in names], np.int64)
         return waits, np.array([name in repeating for name in names], np.int64)
 
@@ -274,7 +284,7 @@ class Meter:
             message_of(flow.source, flow.target, placement) if flow.target in tasks else None
             for flow in self._pipeline.flows
         ]
-        return [-1 if part is None else self._parts.index(part) for part in parts]
+        return [-1 if part is None else self._number[part] for part in parts]
 
 
 def _shares_evenly(node: Node, shared: Collection[str]) -> bool:

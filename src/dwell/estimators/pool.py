@@ -10,7 +10,6 @@ how much alike is measured in the undisturbed cell, and the test knows of it.
 from __future__ import annotations
 
 import math
-from collections import deque
 from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple, TypeAlias
@@ -19,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.kernels.elementary import cube_root, logarithms
-from dwell.kernels.meter import places
+from dwell.kernels.pools import HeldValues, places
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -96,7 +95,11 @@ class Reference:
 
     def places(self, values: Floats) -> PlaceSums:
         """Compare values with those of the undisturbed cell."""
-        return PlaceSums.among(self._in_time(values), self.ordered)
+        return PlaceSums(len(values), *places(self.ordered, values, self._patience_ms))
+
+    def holds_nothing(self) -> HeldValues:
+        """Return room for values that are compared with these."""
+        return HeldValues(self.ordered, self._patience_ms, self.likeness, self._block)
 
     def has_any(self, ordered: Floats) -> bool:
         """Whether any of some ascending values is between its smallest and its largest."""
@@ -185,31 +188,39 @@ class Pool:
         is as declared.
     """
 
-    __slots__ = (
-        "_chunks",
-        "_cycles",
-        "_doubt",
-        "_lasting",
-        "_shift",
-        "additive",
-        "held",
-        "is_declared",
-        "last",
-        "measured",
-        "reference",
-        "touched",
-    )
+    __slots__ = ("_doubt", "additive", "reference", "rows")
 
     _doubt: _Doubt | None
 
     def __init__(self, reference: Reference, additive: bool) -> None:
         self.reference, self.additive = reference, additive
-        self.last = 0
+        #: What is held; the kernel adds to it.
+        self.rows = reference.holds_nothing()
         self.reset()
 
     def __repr__(self) -> str:
         what = "as declared" if self.is_declared else f"{self.measured} values, {self.usual:g} ms"
         return f"<Pool: {what}>"
+
+    @property
+    def held(self) -> Floats:
+        return self.rows.values
+
+    @property
+    def is_declared(self) -> bool:
+        return bool(self.rows.row.is_declared)
+
+    @property
+    def measured(self) -> int:
+        return int(self.rows.row.measured)
+
+    @property
+    def last(self) -> int:
+        return int(self.rows.row.last)
+
+    @property
+    def touched(self) -> int:
+        return int(self.rows.row.touched)
 
     @property
     def usual(self) -> float:
@@ -233,13 +244,12 @@ class Pool:
 
     def reset(self) -> None:
         """Return to what is declared."""
-        self.is_declared = True
+        self.rows.row.is_declared = True
         self._begin(np.empty(0), 0)
-        self.touched = 0
 
     def replace(self, values: Floats, window: int) -> None:
         """Begin another regime with values that nobody measured."""
-        self.is_declared = False
+        self.rows.row.is_declared = False
         self._begin(values, window)
 
     def learn(
@@ -263,7 +273,7 @@ class Pool:
         tests : float
             How often any part is compared so in a window of the cell.
         """
-        self.last = window
+        self.rows.row.last = window
         cycles = len(values) if cycles is None else cycles
         # A copy: they are overwritten by the next window's.
         values = values[:: -(-len(values) // LARGEST)].copy()
@@ -271,7 +281,7 @@ class Pool:
         declared = reference.places(values)
         if not len(reference.values):
             # Never came to an end where it is as declared, so that nothing can be told from it.
-            is_first, self.is_declared = self.is_declared, False
+            is_first, self.rows.row.is_declared = self.is_declared, False
             self._add(values, declared, window, memory, cycles)
             return is_first
         if self.is_declared:
@@ -313,21 +323,26 @@ class Pool:
         """Whether a window, or all that is held with it, is of another regime."""
         reference = self.reference
         # The chance of a deviation beyond x falls with exp(-x²/2).
-        least = _least(tests)
+        least = least_deviations(tests)
         if declared.is_large and reference.deviations(declared, cycles) >= least:
             largest, _ = reference.extremes(declared.size, cycles, least)
             if declared.largest > MARGIN * largest:
                 self._begin_anew(values, window, cycles)
                 return True
         self._add(values, declared, window, memory, cycles)
+        return self.has_left(window, cycles, least)
+
+    def has_left(self, window: int, cycles: int, least: float) -> bool:
+        """Whether all that is held is of another regime, once a window has been added to it."""
+        row = self.rows.row
         if self._off_declared() < least:
-            self._lasting = 0
+            row.lasting = 0
             return False
-        self._lasting += cycles
-        largest, longest = reference.extremes(self._shift.size, self._span, least)
-        if self._shift.largest <= MARGIN * largest and self._lasting <= MARGIN * longest:
+        row.lasting += cycles
+        largest, longest = self.reference.extremes(self._shift.size, self._span, least)
+        if self._shift.largest <= MARGIN * largest and row.lasting <= MARGIN * longest:
             return False
-        self.is_declared, self.touched = False, window
+        row.is_declared, row.touched = False, window
         return True
 
     def follow(self, witness: Pool, window: int) -> None:
@@ -365,7 +380,12 @@ class Pool:
     @property
     def _span(self) -> int:
         """Cycles of the windows that what is held is from."""
-        return max(self._cycles, 1)
+        return max(self.rows.row.cycles, 1)
+
+    @property
+    def _shift(self) -> PlaceSums:
+        row = self.rows.row
+        return PlaceSums(row.size, row.larger, row.smaller, row.places)
 
     def _begin_anew(self, values: Floats, window: int, cycles: int) -> None:
         """Begin another regime; where its values are few, with the declared shape."""
@@ -378,31 +398,14 @@ class Pool:
         self._add(values, shift, window, math.inf, cycles)
 
     def _begin(self, values: Floats, window: int) -> None:
-        self.held = values
-        self._shift = self.reference.places(values)
-        self._chunks = deque([_Chunk(window, self._shift, 0)])
-        self.measured, self.touched = 0, window
-        self._cycles, self._lasting, self._doubt = 0, 0, None
+        self.rows.begin(values, self.reference.places(values).sums, window)
+        self._doubt = None
 
     def _add(
         self, values: Floats, shift: PlaceSums, window: int, memory: float, cycles: int
     ) -> None:
         """Add values, and drop the oldest: what is forgotten, and what is beyond `LARGEST`."""
-        chunks = self._chunks
-        chunks.append(_Chunk(window, shift, cycles))
-        self._cycles += cycles
-        total = self._shift + shift
-        while (
-            chunks[0].window <= window - memory and total.size - chunks[0].shift.size >= ENOUGH
-        ) or total.size > LARGEST:
-            oldest = chunks.popleft()
-            total = total - oldest.shift
-            self._cycles -= oldest.cycles
-        self._shift = total
-        self.held = np.concatenate((self.held, values))[-total.size :]
-        self.measured = min(self.measured + len(values), total.size)
-        if not self.is_declared:
-            self.touched = window
+        self.rows.add(values, shift.sums, window, memory, cycles)
 
 
 @dataclass(frozen=True, slots=True)
@@ -428,18 +431,17 @@ class PlaceSums:
         return cls(len(values), *places(known, values))
 
     def __add__(self, other: PlaceSums) -> PlaceSums:
-        return self._with(other, 1)
-
-    def __sub__(self, other: PlaceSums) -> PlaceSums:
-        return self._with(other, -1)
-
-    def _with(self, other: PlaceSums, sign: int) -> PlaceSums:
         return PlaceSums(
-            self.size + sign * other.size,
-            self.larger + sign * other.larger,
-            self.smaller + sign * other.smaller,
-            self.places + sign * other.places,
+            self.size + other.size,
+            self.larger + other.larger,
+            self.smaller + other.smaller,
+            self.places + other.places,
         )
+
+    @property
+    def sums(self) -> tuple[float, float, float]:
+        """The sums alone."""
+        return self.larger, self.smaller, self.places
 
     @property
     def largest(self) -> float:
@@ -498,14 +500,6 @@ class _Doubt(NamedTuple):
     cycles: int
 
 
-class _Chunk(NamedTuple):
-    """What a window has brought."""
-
-    window: int
-    shift: PlaceSums
-    cycles: int
-
-
 def newest(values: Floats) -> int:
     """Return the first of a window's values since its last change, if there was one; else 0.
 
@@ -553,6 +547,6 @@ def middle(values: Floats) -> float:
 
 
 @cache
-def _least(tests: float) -> float:
+def least_deviations(tests: float) -> float:
     """Deviations that are another regime, where parts are compared so many times in a window."""
     return math.sqrt(SHIFTED * SHIFTED + 2.0 * float(logarithms(np.array([tests]))[0]))

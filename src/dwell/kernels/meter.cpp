@@ -5,7 +5,6 @@
 #include <cmath>
 #include <limits>
 
-#include "elementary.h"
 #include "export.h"
 #include "rows.h"
 
@@ -151,31 +150,4 @@ DWELL_EXPORT void dwell_meter(const Layout* layout, const Window* window, i64 ac
   if (found->cost == nullptr) return;
   take_off_waits(*found);
   round_all(*found);
-}
-
-// Adds up where `n` values lie among `n_known` ascending ones, each at a place p between 0 and 1:
-// the sums of -log(1 - p), of -log(p), and of p into `out`.
-DWELL_EXPORT void dwell_places(const f64* known, i64 n_known, const f64* values, i64 n,
-                               f64* out) noexcept {
-  // Of so many places the product is far from the least number, and has one logarithm.
-  constexpr i64 kTogether = 16;
-  out[0] = out[1] = out[2] = 0.0;
-  f64 beyond = 1.0, below = 1.0;
-  for (i64 i = 0; i < n; ++i) {
-    const f64* first = std::lower_bound(known, known + n_known, values[i]);
-    const f64* last = first;
-    if (first != known + n_known && *first == values[i]) {
-      last = std::upper_bound(first, known + n_known, values[i]);
-    }
-    const f64 p =
-        static_cast<f64>((first - known) + (last - known) + 1) / static_cast<f64>(2 * n_known + 2);
-    beyond *= 1.0 - p;
-    below *= p;
-    out[2] += p;
-    if (i % kTogether == kTogether - 1 || i == n - 1) {
-      out[0] -= dwell::log(beyond);
-      out[1] -= dwell::log(below);
-      beyond = below = 1.0;
-    }
-  }
 }

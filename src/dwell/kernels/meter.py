@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from ctypes import byref, c_double, c_int64, c_void_p
+from ctypes import byref, c_int64, c_void_p
 from typing import Any
 
 import numpy as np
@@ -135,11 +135,12 @@ class PartTimes:
         self._meter = _meter()
         self._cost, self._link, self._repeats = cost, link, repeats
         self._count, self._order = np.zeros((2, parts), np.int64)
-        self._found = structs()["Found"]()
-        self._found.count, self._found.order = self._count.ctypes.data, self._order.ctypes.data
+        #: The kernel's row of what has been found.
+        self.found = structs()["Found"]()
+        self.found.count, self.found.order = self._count.ctypes.data, self._order.ctypes.data
         if cost is not None and link is not None and repeats is not None:
-            self._found.cost, self._found.link = cost.ctypes.data, link.ctypes.data
-            self._found.repeats = repeats.ctypes.data
+            self.found.cost, self.found.link = cost.ctypes.data, link.ctypes.data
+            self.found.repeats = repeats.ctypes.data
         self._ms, self._crossings = np.empty((parts, 0)), np.empty(0, np.int64)
 
     def __reduce__(
@@ -160,47 +161,27 @@ class PartTimes:
         count, flows = len(window.table), window.flows
         if self._ms.shape[1] < 2 * count:
             self._ms = np.empty((len(self._count), 2 * count))
-            self._found.ms, self._found.most = self._ms.ctypes.data, self._ms.shape[1]
+            self.found.ms, self.found.most = self._ms.ctypes.data, self._ms.shape[1]
         if self._cost is not None:
             # Of every cycle and its shadow the messages, seven numbers each (`Crossing`).
             room = 2 * count * flows * 7
             if len(self._crossings) < room:
                 self._crossings = np.empty(room, np.int64)
-                self._found.crossings = self._crossings.ctypes.data
+                self.found.crossings = self._crossings.ctypes.data
         self._count[:] = 0
-        self._found.n_parts = 0
+        self.found.n_parts = 0
 
     def add(self, active: int, layout: CyclesLayout) -> None:
         """Add what the cycles under one candidate show, and then their shadows."""
         row = byref(self._window.row)
-        self._meter(byref(layout.row), row, active, self._limit_ns, byref(self._found))
+        self._meter(byref(layout.row), row, active, self._limit_ns, byref(self.found))
 
     def by_part(self) -> dict[int, Floats]:
         """Return the times by number of part, in the order in which they were found."""
         counts = self._count.tolist()
-        order = self._order[: self._found.n_parts].tolist()
+        order = self._order[: self.found.n_parts].tolist()
         return {part: self._ms[part, : counts[part]] for part in order}
 
 
-def places(known: Floats, values: Floats) -> tuple[float, float, float]:
-    """Add up where values lie among known ones, each at a place p between 0 and 1.
-
-    Parameters
-    ----------
-    known : float64 array, shape (m,)
-        Ascending.
-    values : float64 array, shape (n,)
-
-    Returns
-    -------
-    tuple of float
-        Sums of -log(1 - p), of -log(p), and of p.
-    """
-    out = (c_double * 3)()
-    _places()(known.ctypes.data, len(known), values.ctypes.data, len(values), out)
-    return out[0], out[1], out[2]
-
-
-_places = foreign("dwell_places", None, c_void_p, c_int64, c_void_p, c_int64, c_void_p)
 _unknown = foreign("dwell_unknown", c_int64, c_int64, c_int64, c_void_p, c_int64)
 _meter = foreign("dwell_meter", None, c_void_p, c_void_p, c_int64, c_int64, c_void_p)

@@ -262,6 +262,24 @@ struct Crossing;  // of meter.cpp
   field(const f64*, cost) field(const i64*, link) field(const i64*, repeats)                     \
   field(Crossing*, crossings) field(i64, n_crossings)
 
+// What a window has brought of a part: how many values, and the sums of their places.
+#define DWELL_CHUNK(field)                                                                       \
+  field(i64, window) field(i64, cycles) field(i64, size)                                         \
+  field(f64, larger) field(f64, smaller) field(f64, places)
+
+// What is held of a part (pools.cpp): its `n_known` values as declared, ascending, of which stretches
+// of `block` cycles are alike by `likeness`; `size` values since `first`, with the sums of their
+// places; the windows that they are from, and all cycles of those; for how many cycles they have not
+// been as declared; how many were measured; and the windows of the last of them, and in which it
+// last ceased to be as declared, or got another value since.
+#define DWELL_POOL(field)                                                                        \
+  field(const f64*, known) field(i64, n_known) field(f64, patience_ms) field(f64, likeness)      \
+  field(i64, block) field(f64*, held) field(i64, first) field(i64, size)                         \
+  field(f64, larger) field(f64, smaller) field(f64, places)                                      \
+  field(Chunk*, chunks) field(i64, first_chunk) field(i64, n_chunks)                             \
+  field(i64, cycles) field(i64, lasting) field(i64, measured) field(i64, last)                   \
+  field(i64, touched) field(i64, is_declared)
+
 #define DWELL_ROWS(row)                                                                          \
   row(Clock, DWELL_CLOCK) row(Cell, DWELL_CELL) row(Task, DWELL_TASK) row(Flow, DWELL_FLOW)      \
   row(Site, DWELL_SITE) row(Server, DWELL_SERVER) row(Quota, DWELL_QUOTA)                        \
@@ -273,7 +291,8 @@ struct Crossing;  // of meter.cpp
   row(Rule, DWELL_RULE) row(Option, DWELL_OPTION) row(Decided, DWELL_DECIDED)                    \
   row(OnOffIntervals, DWELL_ON_OFF) row(NodeEffect, DWELL_EFFECT) row(LinkFault, DWELL_FAULT)    \
   row(DrawnPath, DWELL_PATH) row(Layout, DWELL_LAYOUT) row(Window, DWELL_WINDOW)                 \
-  row(Found, DWELL_FOUND) row(NodeJobs, DWELL_NODE_JOBS)
+  row(Found, DWELL_FOUND) row(NodeJobs, DWELL_NODE_JOBS) row(Chunk, DWELL_CHUNK)   \
+  row(Pool, DWELL_POOL)
 
 // clang-format on
 
