@@ -93,13 +93,17 @@ class Learning(Online):
             part: Pool(reference, isinstance(part, Message))
             for part, reference in self._playing.declared.references.items()
         }
-        self._rows = PoolRows([self._pools[part].rows for part in self._meter.parts])
+        groups = list(map(self._meter.numbers, self._parts.values()))
+        padded = np.full((len(groups), max(map(len, groups))), -1)
+        for row, numbers in zip(padded, groups, strict=True):
+            row[: len(numbers)] = numbers
+        self._rows = PoolRows([self._pools[part].rows for part in self._meter.parts], padded)
 
     def _take_in(self, demands: Mapping[Part, Floats], evidence: Evidence) -> None:
         self._window += 1
         cycles = len(evidence.release_ns)
         changed = self._learn(demands, cycles)
-        for pool in self._pools.values():
+        for pool in map(self._pools.__getitem__, self._otherwise_parts()):
             if pool.touched and self._window - pool.touched >= max(self.unseen, 1.0):
                 pool.reset()
                 self._has_changed = True
@@ -198,18 +202,18 @@ class Learning(Online):
     def _correct(self, changed: Sequence[Part], measured: frozenset[Part]) -> None:
         """Correct what nobody measured by what has changed."""
 
+    def _otherwise_parts(self) -> list[Part]:
+        return [self._meter.parts[number] for number in self._rows.others()]
+
     def _otherwise(self) -> dict[Part, Floats]:
-        return {part: pool.held for part, pool in self._pools.items() if not pool.is_declared}
+        return {part: self._pools[part].held for part in self._otherwise_parts()}
 
     def support(self) -> dict[str, Support]:
         """Support of each candidate's estimate: that of its weakest part."""
         self._take_in_pending()
         return {
-            name: Support(
-                min(self._pools[part].measured for part in parts),
-                self._windows_since(min(self._pools[part].last for part in parts)),
-            )
-            for name, parts in self._parts.items()
+            name: Support(samples, self._windows_since(last))
+            for name, (samples, last) in zip(self._parts, self._rows.weakest(), strict=True)
         }
 
     def deviation(self) -> dict[str, float]:

@@ -380,7 +380,7 @@ class Pool:
     @property
     def _span(self) -> int:
         """Cycles of the windows that what is held is from."""
-        return max(self.rows.row.cycles, 1)
+        return max(int(self.rows.row.cycles), 1)
 
     @property
     def _shift(self) -> PlaceSums:

@@ -165,3 +165,27 @@ DWELL_EXPORT void dwell_pool_add(Pool* pool, const f64* values, i64 n, f64 large
                                  f64 places, i64 window, f64 memory, i64 cycles) noexcept {
   add(*pool, values, {n, larger, smaller, places}, window, memory, cycles);
 }
+
+// Writes the numbers of the pools that are not as declared, and returns how many they are.
+DWELL_EXPORT i64 dwell_others(const Pool* const* pools, i64 n_pools, i64* out) noexcept {
+  i64 n = 0;
+  for (i64 i = 0; i < n_pools; ++i) {
+    if (pools[i]->is_declared == 0) out[n++] = i;
+  }
+  return n;
+}
+
+// Writes of each row of parts, -1 for none, the fewest measured values of one, and the window that
+// the oldest of their newest values is from.
+DWELL_EXPORT void dwell_weakest(const Pool* const* pools, const i64* parts, i64 n_rows, i64 width,
+                                i64* out) noexcept {
+  for (i64 row = 0; row < n_rows; ++row, out += 2) {
+    out[0] = out[1] = std::numeric_limits<i64>::max();
+    for (i64 i = 0; i < width; ++i) {
+      const i64 part = parts[row * width + i];
+      if (part < 0) continue;
+      out[0] = std::min(out[0], pools[part]->measured);
+      out[1] = std::min(out[1], pools[part]->last);
+    }
+  }
+}

@@ -93,16 +93,35 @@ class HeldValues:
 
 
 class PoolRows:
-    """The rows of pools, by the number of their part."""
+    """The rows of pools, by the number of their part.
 
-    def __init__(self, pools: Sequence[HeldValues]) -> None:
-        self._pools, self._why = tuple(pools), np.empty(len(pools), np.int64)
+    Parameters
+    ----------
+    groups : int64 array, shape (groups, parts)
+        Numbers of some parts; -1 for none.
+    """
+
+    def __init__(self, pools: Sequence[HeldValues], groups: Ints) -> None:
+        self._pools, self._groups = tuple(pools), groups
         self._rows = np.array([addressof(pool.row) for pool in pools], np.uint64)
-        self._addresses = self._rows.ctypes.data, self._why.ctypes.data
+        self._out, self._support = np.empty(len(pools), np.int64), np.empty((len(groups), 2), int)
+        self._addresses = self._rows.ctypes.data, self._out.ctypes.data
+        self._of_groups = groups.ctypes.data, *groups.shape, self._support.ctypes.data
 
-    def __reduce__(self) -> tuple[type[PoolRows], tuple[Sequence[HeldValues]]]:
+    def __reduce__(self) -> tuple[type[PoolRows], tuple[Sequence[HeldValues], Ints]]:
         # A copy is of the copies of pools.
-        return PoolRows, (self._pools,)
+        return PoolRows, (self._pools, self._groups)
+
+    def others(self) -> list[int]:
+        """Return the numbers of the parts that are not as declared."""
+        pools, out = self._addresses
+        n = _others()(pools, len(self._pools), out)
+        return self._out[:n].tolist() if n else []
+
+    def weakest(self) -> list[list[int]]:
+        """Return of each group the fewest measured values of a part, and the oldest window."""
+        _weakest()(self._addresses[0], *self._of_groups)
+        return self._support.tolist()
 
     def learn(
         self, found: PartTimes, parts: Ints, window: int, memory: float, cycles: int, least: float
@@ -124,7 +143,7 @@ class PoolRows:
         pools, why = self._addresses
         asked = parts.ctypes.data, len(parts), window, memory, cycles, least
         n = _learn()(pools, byref(found.found), *asked, why)
-        return self._why[: len(parts)].tolist() if n else []
+        return self._out[: len(parts)].tolist() if n else []
 
 
 def places(
@@ -162,3 +181,5 @@ _learn = foreign(
     c_int64,
     *(c_void_p, c_void_p, c_void_p, c_int64, c_int64, c_double, c_int64, c_double, c_void_p),
 )
+_others = foreign("dwell_others", c_int64, c_void_p, c_int64, c_void_p)
+_weakest = foreign("dwell_weakest", None, c_void_p, c_void_p, c_int64, c_int64, c_void_p)
