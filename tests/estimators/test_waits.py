@@ -67,7 +67,7 @@ class Witness(Corrected):
     def _take_in(self, demands: object, evidence: Evidence) -> None:
         super()._take_in(demands, evidence)  # type: ignore[arg-type]
         waited_ns = self.meter.waited_ns(evidence, self._threads)
-        np.testing.assert_array_equal(waited_ns, evidence.rows.work_ns)
+        np.testing.assert_array_equal(waited_ns, evidence.cycles.work_ns)
         self.windows += 1
 
 

@@ -97,6 +97,20 @@ class Evidence:
     shadows_share: bool = True
     _rows: WindowRows | None = field(default=None, init=False, repr=False, compare=False)
 
+    @classmethod
+    def of(cls, rows: WindowRows, close_ns: int, release_ns: Ints) -> Evidence:
+        """Make the evidence of instants that are in one table."""
+        placement, ready, end, arrived, work, start = rows.columns(shadow=False)
+        cycles, shadows = Instants(ready, end, arrived, start, work), None
+        if rows.has_shadows:
+            sent, ready, end, arrived, work, start = rows.columns(shadow=True)
+            shadows = Instants(ready, end, arrived, start, work)
+        else:
+            sent = np.full_like(placement, -1)
+        made = cls(close_ns, release_ns, placement, cycles, sent, shadows)
+        object.__setattr__(made, "_rows", rows)
+        return made
+
     @property
     def rows(self) -> WindowRows:
         """All instants as one table, which is made once."""

@@ -157,7 +157,7 @@ class Meter:
 
     def waited_ns(self, evidence: Evidence, foreign: Mapping[str, float]) -> Ints:
         """Core time of own jobs with their waits, shape (n, tasks); see `demands`."""
-        return self._with_waits(evidence.rows, foreign).work_ns
+        return self._with_waits(evidence.rows, foreign).columns(shadow=False)[4]
 
     def _with_work(self, evidence: Evidence, foreign: Mapping[str, float]) -> Evidence:
         """Add the core time of jobs where it is not known."""

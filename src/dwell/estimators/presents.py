@@ -19,14 +19,14 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.estimators.evidence import Evidence, Instants
+from dwell.estimators.evidence import Evidence
 from dwell.estimators.measured import Message, Meter, Part, Site, cores_of, parts_of
 from dwell.estimators.pool import Reference
 from dwell.estimators.prices import SEED, Question, most_windows, prices_of
 from dwell.estimators.sent_shadows import SentShadows, hindered, stamps_of
 from dwell.estimators.slow_processes import slow_processes, unseen_error
 from dwell.estimators.spans import patience_ns
-from dwell.kernels.advance import logged_instants, play
+from dwell.kernels.advance import logged_window, play
 from dwell.kernels.arrays import Arrays, CellArrays, flow_rows, lay_out
 from dwell.kernels.codes import LAST_NS
 from dwell.kernels.random_draws import Drawing
@@ -620,7 +620,7 @@ def _references(problem: Problem, seed: int, windows: int) -> dict[Part, Referen
     for index, placement in enumerate(problem.candidates.values()):
         missing = [part for part in parts_of(problem.pipeline, placement) if part not in references]
         if missing:
-            demands = meter.demands(_evidence_of(problem, real, _played(first, index), index))
+            demands = meter.demands(_evidence_of(problem, real, _played(first, index)))
             for part in missing:
                 values = demands.get(part, np.empty(0)).copy()
                 block = min(problem.window_cycles, STEP)
@@ -666,15 +666,8 @@ def _shown(problem: Problem, arrays: Arrays) -> tuple[Floats, Floats]:
     return seen["l95_ms"].copy(), seen["missed"] / problem.window_cycles
 
 
-def _evidence_of(problem: Problem, real: Realisation, arrays: Arrays, index: int) -> Evidence:
+def _evidence_of(problem: Problem, real: Realisation, arrays: Arrays) -> Evidence:
     """What all cycles show that have run under a candidate."""
     flows = flow_rows(problem.pipeline)
-    (instants,) = logged_instants(CellArrays(arrays), 0, real.cycles, flows)
-    return Evidence(
-        close_ns=int(real.release_ns[-1]),
-        release_ns=real.release_ns[:-1],
-        placement=np.full(real.cycles, index),
-        cycles=Instants(*instants),
-        shadow_placement=np.full(real.cycles, -1),
-        shadows=None,
-    )
+    rows = logged_window(CellArrays(arrays), 0, real.cycles, flows)
+    return Evidence.of(rows, int(real.release_ns[-1]), real.release_ns[:-1])

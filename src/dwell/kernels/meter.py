@@ -77,6 +77,26 @@ class WindowRows:
         table = np.concatenate(columns, axis=1, dtype=np.int64)
         return cls(table, cycles[1].shape[1], cycles[3].shape[1])
 
+    def columns(self, *, shadow: bool) -> tuple[Ints, Ints, Ints, Ints, Ints, Ints]:
+        """Return the columns of the cycles, or of their shadows (see `of`)."""
+        tasks, flows, table = self.tasks, self.flows, self.table
+        ready = 1 + (1 + 4 * tasks + flows) * shadow
+        end, arrived = ready + tasks, ready + 2 * tasks
+        work, start = arrived + flows, arrived + flows + tasks
+        return (
+            table[:, ready - 1],
+            table[:, ready:end],
+            table[:, end:arrived],
+            table[:, arrived:work],
+            table[:, work:start],
+            table[:, start : start + tasks],
+        )
+
+    @property
+    def has_shadows(self) -> bool:
+        """Whether there are columns of shadows."""
+        return bool(self.table.shape[1] > 1 + 4 * self.tasks + self.flows)
+
     def __reduce__(self) -> tuple[type[WindowRows], tuple[Ints, int, int]]:
         # A copy has an address of its own.
         return WindowRows, (self.table, self.tasks, self.flows)
@@ -84,12 +104,6 @@ class WindowRows:
     def copy(self) -> WindowRows:
         """Return a copy, for what changes it."""
         return WindowRows(self.table.copy(), self.tasks, self.flows)
-
-    @property
-    def work_ns(self) -> Ints:
-        """Core time of own jobs, shape (n, tasks)."""
-        first = 1 + 2 * self.tasks + self.flows
-        return self.table[:, first : first + self.tasks]
 
     def unknown(self, limit_ns: int) -> tuple[bool, bool, bool]:
         """Return what has to be looked at.
