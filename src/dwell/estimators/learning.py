@@ -13,7 +13,7 @@ from dwell.estimators.evidence import Evidence
 from dwell.estimators.link_rates import Rate, better_rate
 from dwell.estimators.measured import Message, Part, sending_ns
 from dwell.estimators.online import Online
-from dwell.estimators.pool import Pool, least_deviations
+from dwell.estimators.pool import Pool, least_deviations, share_error
 from dwell.estimators.prices import SEED
 from dwell.estimators.protocol import Support
 from dwell.estimators.slow_processes import unseen_error
@@ -244,6 +244,9 @@ class Learning(Online):
         if not measured:
             return math.hypot(*sent_ms), 0.0
         l95_ms = math.hypot(*(pool.error_ms for pool in measured), *sent_ms)
+        lost = [share_error(pool.lost, max(pool.measured, 1)) for pool in measured if pool.lost]
+        if lost:
+            l95_ms = math.hypot(l95_ms, self._playing.tail_error_ms(name, math.hypot(*lost)))
         widened = max(map(self._widening, measured)) * self._playing.played(name).l95_ms
         count = max(min(pool.measured for pool in measured), 1)
         return math.hypot(l95_ms, widened), unseen_error(rate, count)

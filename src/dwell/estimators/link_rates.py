@@ -19,9 +19,9 @@ from dwell.kernels.elementary import logarithms
 Floats: TypeAlias = NDArray[np.float64]
 
 #: Rates that are tried first: the largest, a share of it, and so on.
-FASTEST_MBPS, SHARE, TRIED = 1000.0, 0.75, 32
+FASTEST_MBPS, SHARE, TRIED = 1000.0, 0.6, 18
 #: Then rates up to so much away from the best one, in so many steps each way.
-NEARER, STEPS = (0.25, 0.03, 0.003), 16
+NEARER, STEPS = (0.4, 0.05, 0.006), 8
 #: A rate above this share of the declared one is the declared one.
 LOWER = 0.9
 #: Gain of log-likelihood by which a rate explains messages better than a delay.
@@ -62,6 +62,8 @@ def better_rate(
         return None
     fastest = min(declared_mbps, FASTEST_MBPS)
     best = min(_slower(fastest), key=spread_ms)
+    if count * _log(before_ms, max(spread_ms(best), least_ms)) < GAIN / 2:
+        return None
     for width in NEARER:
         # From the fastest, which is the first of equal ones.
         best = min(

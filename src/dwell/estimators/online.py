@@ -336,6 +336,10 @@ class Online(CellEstimator):
             self._playing.go_on(present, names, FIRST_STEPS)
         elif self._has_grown:
             self._playing.go_on(present, names, has_grown=True)
+        else:
+            few = [name for name in names if not self._playing.is_full(name)]
+            if few:
+                self._playing.go_on(present, few)
         self._has_changed = self._has_grown = False
 
     def _count_presents(self) -> None:

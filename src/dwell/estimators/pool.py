@@ -236,11 +236,15 @@ class Pool:
 
     @property
     def error_ms(self) -> float:
-        """Standard error of what the values take in the mean."""
-        known = self.held[np.isfinite(self.held)]
+        """Standard error of the values' 95th percentile, and no less than of their mean."""
+        known = np.sort(self.held[np.isfinite(self.held)])
         if len(known) < 2:
             return 0.0
-        return float(known.std()) / math.sqrt(max(self.measured, 1))
+        count = max(self.measured, 2)
+        # Of few values the deviation is itself hardly known (see `Playing`).
+        few = (count + 1) / (count - 1)
+        of_mean = few * float(known.std()) / math.sqrt(count)
+        return max(of_mean, quantile_error(known, share_error(0.05, count)))
 
     def reset(self) -> None:
         """Return to what is declared."""
@@ -498,6 +502,25 @@ class _Doubt(NamedTuple):
     before: Floats
     apart: PlaceSums
     cycles: int
+
+
+def share_error(share: float, count: int) -> float:
+    """Return the standard error of a share among independent values."""
+    return math.sqrt(share * (1.0 - share) / count)
+
+
+def quantile_error(ordered: Floats, off: float) -> float:
+    """Return the error of the 95th percentile of ascending values whose place has an error.
+
+    The values at the places two errors off are the limits (Woodruff, DOI 10.2307/2280781); half
+    the distance to the farther one is the error.
+    """
+    last = len(ordered) - 1
+    low, usual, high = (
+        float(ordered[min(max(round(place * last), 0), last)])
+        for place in (0.95 - 2 * off, 0.95, 0.95 + 2 * off)
+    )
+    return max(high - usual, usual - low) / 2
 
 
 def newest(values: Floats) -> int:

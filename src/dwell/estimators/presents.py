@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.measured import Message, Meter, Part, Site, cores_of, parts_of
-from dwell.estimators.pool import Reference
+from dwell.estimators.pool import Reference, quantile_error
 from dwell.estimators.prices import SEED, Question, most_windows, prices_of
 from dwell.estimators.sent_shadows import SentShadows, hindered, stamps_of
 from dwell.estimators.slow_processes import slow_processes, unseen_error
@@ -104,6 +104,7 @@ class _Step(NamedTuple):
     violation_rate: float
     declared_rate: float
     own: Floats
+    latency_ns: Ints
 
 
 class _Twin:
@@ -240,6 +241,7 @@ class Playing:
                     float(seen["missed"].mean()) / self._window,
                     float(self.declared.violation_rate[name][stretch].mean()),
                     tables.shares[0, stretch, 1].mean(axis=0),
+                    tables.latency_ns[0, first * self._window : twin.cursor].copy(),
                 )
             )
         twin.price = None
@@ -252,8 +254,13 @@ class Playing:
             twin.price = self._price(name, twin.steps)
         return twin.price
 
+    def tail_error_ms(self, name: str, off: float) -> float:
+        """Return the error of a candidate's L95 if a share of the cycles more, or fewer, is lost."""
+        latency_ns = np.concatenate([step.latency_ns for step in self._twins[name].steps])
+        return quantile_error(np.sort(np.minimum(latency_ns / 1e6, self.problem.censor_ms)), off)
+
     def _price(self, name: str, steps: Collection[_Step]) -> PlayedPrice:
-        l95, declared_l95, uncut, rates, declared_rates, own = zip(*steps, strict=True)
+        l95, declared_l95, uncut, rates, declared_rates, own, _ = zip(*steps, strict=True)
         known = self.prices[name]
         l95_ms, l95_error_ms = _estimated(
             l95,
@@ -457,18 +464,18 @@ def _estimated(
     differences = list(map(sub, steps, declared))
     if not any(differences):
         return known, known_error
-    mean, error = _mean_and_error(steps)
+    mean, error = _mean_and_error(steps, usual)
     more, more_error = _mean_and_error(differences)
     if cycles is not None:
         error = max(error, unseen_error(mean, cycles))
         differing = sum(map(abs, differences)) / len(steps)
         more_error = max(more_error, unseen_error(differing, cycles))
     more_error = math.hypot(more_error, known_error)
-    is_better = more_error < max(error, usual / math.sqrt(len(steps)))
-    return (max(known + more, 0.0), more_error) if is_better else (mean, error)
+    return (max(known + more, 0.0), more_error) if more_error < error else (mean, error)
 
 
-def _mean_and_error(values: Sequence[float]) -> tuple[float, float]:
+def _mean_and_error(values: Sequence[float], usual: float = 0.0) -> tuple[float, float]:
+    """Return the mean, and its error had one value more deviated as is usual."""
     # Of few numbers; an array would take longer.
     count = len(values)
     # Of equal values exactly that, and no error.
@@ -476,10 +483,13 @@ def _mean_and_error(values: Sequence[float]) -> tuple[float, float]:
     if count < 2:
         return mean, abs(mean)
     squares = sum((value - mean) * (value - mean) for value in values)
-    # Of few values the deviation is itself hardly known: about Student's t over 2.
-    few = (count + 1) / (count - 1)
-    error = few * math.sqrt(squares / (count * (count - 1)))
-    return mean, error * math.sqrt(_correlation_factor(values, mean, squares))
+    factor = _correlation_factor(values, mean, squares)
+    # Of few values that are independent the deviation is itself hardly known: about Student's t
+    # over 2.
+    independent = max(count / factor, 2.0)
+    few = (independent + 1) / (independent - 1)
+    variance = max(squares / (count - 1), (squares + usual * usual) / count)
+    return mean, few * math.sqrt(variance / count * factor)
 
 
 def _correlation_factor(values: Sequence[float], mean: float, squares: float) -> float:
