@@ -104,3 +104,18 @@ def test_runs_say_the_same_in_both(scenario: str) -> None:
     compared = Compared(problem)
     dwell.simulate(problem, scenario=scenario, policy="dtp", estimator=compared, seed=2, windows=10)
     assert compared.levels
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_what_is_not_known_of_a_window(seed: int) -> None:
+    rng, cell = np.random.default_rng(seed), Random(seed)
+    evidence = random_evidence(rng, random_problem(cell, schedulers=EVERY))
+    cycles, shadows, limit_ns = evidence.cycles, evidence.shadows, int(rng.integers(1, 10**9))
+    lost = (cycles.end_ns < 0) & (cycles.ready_ns >= 0) & (cycles.ready_ns < limit_ns)
+    assert cycles.work_ns is not None
+    unknown = (cycles.end_ns >= 0) & (cycles.work_ns < 0)
+    behind = np.zeros(0)
+    if shadows is not None and shadows.work_ns is not None:
+        behind = (shadows.end_ns >= 0) & (shadows.work_ns < 0)
+    found = evidence.rows.unknown(limit_ns)
+    assert found == (lost.any(), unknown.any(), behind.any())

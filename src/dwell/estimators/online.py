@@ -23,7 +23,7 @@ from dwell.estimators.evidence import Evidence
 from dwell.estimators.foreign_threads import ForeignThreads, Level, Stretches
 from dwell.estimators.link_rates import Rate
 from dwell.estimators.measured import Message, Meter, Part, groups, parts_of
-from dwell.estimators.presents import PlayedPrice, Playing, Present
+from dwell.estimators.presents import Playing, Present
 from dwell.estimators.prices import SEED
 from dwell.estimators.profile import Foreign, Profile, mean_ms
 from dwell.estimators.protocol import CellEstimator

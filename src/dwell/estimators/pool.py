@@ -172,20 +172,6 @@ class Pool:
         What it is as declared.
     additive : bool
         Whether what disturbs the part adds to its values (a message) or multiplies them (a job).
-
-    Attributes
-    ----------
-    held : float64 array
-        Values that were measured, in the order in which they came; those of the present regime.
-    is_declared : bool
-        Whether it is as declared, whatever is held.
-    measured : int
-        How many of `held` were measured; others have the declared shape.
-    last : int
-        The window that the newest measured one is from; 0 before there is any.
-    touched : int
-        The window in which it last ceased to be as declared, or got another value since; 0 while it
-        is as declared.
     """
 
     __slots__ = ("_doubt", "additive", "reference", "rows")
@@ -204,22 +190,27 @@ class Pool:
 
     @property
     def held(self) -> Floats:
+        """Values of the present regime, in the order in which they came."""
         return self.rows.values
 
     @property
     def is_declared(self) -> bool:
+        """Whether it is as declared, whatever is held."""
         return bool(self.rows.row.is_declared)
 
     @property
     def measured(self) -> int:
+        """How many of `held` were measured; others have the declared shape."""
         return int(self.rows.row.measured)
 
     @property
     def last(self) -> int:
+        """The window that the newest measured one is from; 0 before there is any."""
         return int(self.rows.row.last)
 
     @property
     def touched(self) -> int:
+        """The window in which it last ceased to be as declared, or got a value since; else 0."""
         return int(self.rows.row.touched)
 
     @property

@@ -12,7 +12,6 @@ import math
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from operator import sub
 from typing import NamedTuple, TypeAlias
 
@@ -29,6 +28,7 @@ from dwell.estimators.spans import patience_ns
 from dwell.kernels.advance import logged_window, play
 from dwell.kernels.arrays import Arrays, CellArrays, flow_rows, lay_out
 from dwell.kernels.codes import LAST_NS
+from dwell.kernels.elementary import moments
 from dwell.kernels.random_draws import Drawing
 from dwell.kernels.realisation import LinkSegments, NodeChange, NodeChanges, Realisation
 from dwell.kernels.rows import Rows, row_types
@@ -170,6 +170,14 @@ class Playing:
         self._window = min(problem.window_cycles, LONGEST_WINDOW)
         self._names = tuple(problem.candidates)
         self._step = max(STEP // self._window, 1)
+        #: Standard deviations of what steps show as declared: L95 (ms) and V_D.
+        self._usual = {
+            name: [
+                float(windows[name][1:].std()) / math.sqrt(self._step)
+                for windows in (self.declared.l95_ms, self.declared.violation_rate)
+            ]
+            for name in self._names
+        }
         self.cycles = 0
         self._twins: dict[str, _Twin] = {}
 
@@ -235,11 +243,11 @@ class Playing:
             seen = tables.seen[0, stretch]
             twin.steps.append(
                 _Step(
-                    float(seen["l95_ms"].mean()),
-                    float(self.declared.l95_ms[name][stretch].mean()),
-                    float(seen["uncut_ms"].mean()),
-                    float(seen["missed"].mean()) / self._window,
-                    float(self.declared.violation_rate[name][stretch].mean()),
+                    _mean(seen["l95_ms"]),
+                    _mean(self.declared.l95_ms[name][stretch]),
+                    _mean(seen["uncut_ms"]),
+                    _mean(seen["missed"]) / self._window,
+                    _mean(self.declared.violation_rate[name][stretch]),
                     tables.shares[0, stretch, 1].mean(axis=0),
                     tables.latency_ns[0, first * self._window : twin.cursor].copy(),
                 )
@@ -255,7 +263,7 @@ class Playing:
         return twin.price
 
     def tail_error_ms(self, name: str, off: float) -> float:
-        """Return the error of a candidate's L95 if a share of the cycles more, or fewer, is lost."""
+        """Return the error of a candidate's L95 by the error of the share of lost cycles."""
         latency_ns = np.concatenate([step.latency_ns for step in self._twins[name].steps])
         return quantile_error(np.sort(np.minimum(latency_ns / 1e6, self.problem.censor_ms)), off)
 
@@ -267,7 +275,7 @@ class Playing:
             declared_l95,
             known.l95_ms,
             known.l95_error_ms,
-            usual=self._deviation(self.declared.l95_ms[name]),
+            usual=self._usual[name][0],
         )
         count = len(steps)
         violation_rate, violation_error = _estimated(
@@ -275,7 +283,7 @@ class Playing:
             declared_rates,
             known.violation_rate,
             known.violation_error,
-            usual=self._deviation(self.declared.violation_rate[name]),
+            usual=self._usual[name][1],
             cycles=count * self._step * self._window,
         )
         l95_ms, shares = min(l95_ms, self.problem.censor_ms), sum(own) / count
@@ -287,10 +295,6 @@ class Playing:
             violation_error,
             FrozenDict(zip(self.problem.fabric.resources, shares.tolist(), strict=True)),
         )
-
-    def _deviation(self, windows: Floats) -> float:
-        """Standard deviation of what steps show as declared."""
-        return float(windows[1:].std()) / math.sqrt(self._step)
 
     def is_full(self, name: str) -> bool:
         """Whether the price of a candidate is of as many windows as it ever is."""
@@ -474,16 +478,17 @@ def _estimated(
     return (max(known + more, 0.0), more_error) if more_error < error else (mean, error)
 
 
+def _mean(windows: Floats | Ints) -> float:
+    # Windows of a usual length are played one by one.
+    return float(windows.item() if len(windows) == 1 else windows.mean())
+
+
 def _mean_and_error(values: Sequence[float], usual: float = 0.0) -> tuple[float, float]:
     """Return the mean, and its error had one value more deviated as is usual."""
-    # Of few numbers; an array would take longer.
-    count = len(values)
-    # Of equal values exactly that, and no error.
-    mean = values[0] + sum(value - values[0] for value in values) / count
+    count, (mean, squares, products) = len(values), moments(values)
     if count < 2:
         return mean, abs(mean)
-    squares = sum((value - mean) * (value - mean) for value in values)
-    factor = _correlation_factor(values, mean, squares)
+    factor = _correlation_factor(count, squares, products)
     # Of few values that are independent the deviation is itself hardly known: about Student's t
     # over 2.
     independent = max(count / factor, 2.0)
@@ -492,7 +497,7 @@ def _mean_and_error(values: Sequence[float], usual: float = 0.0) -> tuple[float,
     return mean, few * math.sqrt(variance / count * factor)
 
 
-def _correlation_factor(values: Sequence[float], mean: float, squares: float) -> float:
+def _correlation_factor(count: int, squares: float, products: float) -> float:
     """Return by how much the variance of a mean is larger, since steps of a queue are alike.
 
     It is (1 + r) / (1 - r) of an AR(1) process, r being the correlation of successive steps, of
@@ -500,8 +505,7 @@ def _correlation_factor(values: Sequence[float], mean: float, squares: float) ->
     """
     if not squares:
         return 1.0
-    products = sum((value - mean) * (after - mean) for value, after in pairwise(values))
-    r = min(max(products / squares + 1.0 / len(values), 0.0), MOST_ALIKE)
+    r = min(max(products / squares + 1.0 / count, 0.0), MOST_ALIKE)
     return (1.0 + r) / (1.0 - r)
 
 
