@@ -86,7 +86,8 @@ void make_room(Row* rows, i64& first, i64 n, i64 more) {
 }
 
 // Adds values, and drops the oldest: what is forgotten, and what is beyond `kLargest`.
-void add(Pool& pool, const f64* values, const PlaceSums& shift, i64 window, f64 memory, i64 cycles) {
+void add(Pool& pool, const f64* values, const PlaceSums& shift, i64 window, f64 memory,
+         i64 cycles) {
   make_room(pool.chunks, pool.first_chunk, pool.n_chunks, 1);
   Chunk* oldest = pool.chunks + pool.first_chunk;
   oldest[pool.n_chunks++] = {window, cycles, shift.size, shift.larger, shift.smaller, shift.places};
