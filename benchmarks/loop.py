@@ -106,8 +106,9 @@ def _run_alone(name: str, decisions: int = 1, cycles: int = 0) -> None:
     cell, policy, most, _ = WORK.get(name, WORK["DTP, corrected"])
     scenario, problem = name if name in SCENARIOS else "baseline", dwell.load(ROOT / cell)
     if decisions > 1:
-        often = {"decide_cycles": problem.window_cycles // decisions, "min_dwell": 0}
-        problem = replace(problem, controller=replace(problem.controller, **often))
+        every = problem.window_cycles // decisions
+        controller = replace(problem.controller, decide_cycles=every, min_dwell=0)
+        problem = replace(problem, controller=controller)
 
     def play(seed: int, windows: int) -> Took:
         laps = simulate_in_parts(problem, scenario, policy=policy, seed=seed, windows=windows)

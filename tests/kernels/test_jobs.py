@@ -114,8 +114,8 @@ def test_what_is_not_known_of_a_window(seed: int) -> None:
     lost = (cycles.end_ns < 0) & (cycles.ready_ns >= 0) & (cycles.ready_ns < limit_ns)
     assert cycles.work_ns is not None
     unknown = (cycles.end_ns >= 0) & (cycles.work_ns < 0)
-    behind = np.zeros(0)
+    behind = np.zeros(0, np.bool_)
     if shadows is not None and shadows.work_ns is not None:
         behind = (shadows.end_ns >= 0) & (shadows.work_ns < 0)
     found = evidence.rows.unknown(limit_ns)
-    assert found == (lost.any(), unknown.any(), behind.any())
+    assert found == (bool(lost.any()), bool(unknown.any()), bool(behind.any()))

@@ -16,6 +16,7 @@ from dwell.estimators.online import Online
 from dwell.estimators.pool import Pool, least_deviations, share_error
 from dwell.estimators.prices import SEED
 from dwell.estimators.protocol import Support
+from dwell.estimators.shadow_price import fraction_of
 from dwell.estimators.slow_processes import unseen_error
 from dwell.kernels.pools import ADDED, PoolRows
 from dwell.model.controller_settings import HALF_LIFE_WINDOWS
@@ -36,7 +37,8 @@ class Learning(Online):
     Parameters
     ----------
     shadow_fraction : float, optional
-        Share of the cycles sent through each alternative; the cell file's where None.
+        Share of the cycles sent through each alternative; where None the cell file's, and where
+        that is `auto` by the active candidate (`dwell.estimators.shadow_price`).
     half_life_windows : float, optional
         The cell file's where None.
     seed : int
@@ -52,6 +54,7 @@ class Learning(Online):
     #: was not measured any more is as declared again.
     MEMORY: ClassVar[float]
     UNSEEN: ClassVar[float]
+    states_errors = True
 
     def __init__(
         self,
@@ -60,9 +63,7 @@ class Learning(Online):
         half_life_windows: float | None = None,
         seed: int = SEED,
     ) -> None:
-        settings = problem.controller
-        given = problem.shadow_fraction if shadow_fraction is None else shadow_fraction
-        self.shadow_fraction = given
+        settings, self._given_fraction = problem.controller, shadow_fraction
         half_life = settings.half_life_windows if half_life_windows is None else half_life_windows
         HALF_LIFE_WINDOWS.check("half_life_windows", half_life)
         #: In decisions.
@@ -78,12 +79,13 @@ class Learning(Online):
 
     def __repr__(self) -> str:
         return (
-            f"{type(self).__name__}(shadow_fraction={self.shadow_fraction:g}, "
-            f"regimes={self.regimes})"
+            f"{type(self).__name__}(shadow_fraction={self.shadow_fraction}, regimes={self.regimes})"
         )
 
     def start(self, problem: Problem) -> None:
         """Forget everything but the profile."""
+        given = self._given_fraction
+        self.shadow_fraction = fraction_of(problem) if given is None else given
         super().start(problem)
         #: Decisions that have been learnt from.
         self._window = 0

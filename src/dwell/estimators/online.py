@@ -31,11 +31,12 @@ from dwell.estimators.spans import patience_ns
 from dwell.model.frozen import FrozenDict
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS, unchecked_qos
+from dwell.model.shadow_plan import by_candidate
 
 Floats: TypeAlias = NDArray[np.float64]
 
 #: Steps that are played when the present changes, the first of which settles queues.
-FIRST_STEPS = 4
+FIRST_STEPS = 6
 #: How often a close goes on with candidates that it is not sure of, and how many steps each time.
 ROUNDS, STEPS = 2, 2
 #: How many standard errors a difference of two prices must be from what would decide otherwise.
@@ -59,8 +60,8 @@ class Online(CellEstimator):
 
     Attributes
     ----------
-    shadow_fraction : float
-        Share of the cycles sent through each alternative.
+    shadow_fraction : float, or mapping of str to float
+        Share of the cycles sent through each alternative, by the candidate that is active.
     seed : int
         Seed of what is played.
     """
@@ -336,10 +337,6 @@ class Online(CellEstimator):
             self._playing.go_on(present, names, FIRST_STEPS)
         elif self._has_grown:
             self._playing.go_on(present, names, has_grown=True)
-        else:
-            few = [name for name in names if not self._playing.is_full(name)]
-            if few:
-                self._playing.go_on(present, few)
         self._has_changed = self._has_grown = False
 
     def _count_presents(self) -> None:
@@ -355,6 +352,7 @@ class Online(CellEstimator):
         """Share of each resource that shadow jobs take while the cell is on a candidate."""
         problem, here = self.problem, self.problem.candidates[name]
         pipeline, resources = problem.pipeline, problem.fabric.resources
+        fraction = by_candidate(self.shadow_fraction, problem.candidates)[name]
         share = dict.fromkeys(resources, 0.0)
         for there in problem.candidates.values():
             apart = pipeline.diverging(here, there)
@@ -367,5 +365,5 @@ class Online(CellEstimator):
                 threads = execution.threads if execution.accelerator is None else 1
                 busy_ms = mean_ms(pipeline, pipeline.tasks[task], execution) * threads
                 capacity = resources[resource].capacity
-                share[resource] += self.shadow_fraction * busy_ms / pipeline.period_ms / capacity
+                share[resource] += fraction * busy_ms / pipeline.period_ms / capacity
         return FrozenDict(share)

@@ -31,6 +31,8 @@ SHIFTED, ALIKE = 4.0, 2.0
 MOVED = 0.75
 #: How much more than any stretch of the undisturbed cell another regime must deviate.
 MARGIN = 1.2
+#: How much longer than all others a first job takes that is cold: it loads what others find.
+COLD = 1.5
 #: Deviations that are a change within a window, of at least so many values.
 CHANGED, LEAST = 5.0, 36
 
@@ -62,10 +64,10 @@ class Reference:
     """
 
     __slots__ = (
-        "_block",
         "_extremes",
         "_in_order",
         "_patience_ms",
+        "block",
         "likeness",
         "lost",
         "ordered",
@@ -80,7 +82,7 @@ class Reference:
         kept: int | None = None,
         patience_ms: float = math.inf,
     ) -> None:
-        self.values, self._block = values[:kept], block
+        self.values, self.block = values[:kept], block
         self.usual = middle(values)
         self.lost = float(np.isinf(values).mean()) if len(values) else 0.0
         is_late = ((values > patience_ms) & np.isfinite(values)).any()
@@ -99,7 +101,7 @@ class Reference:
 
     def holds_nothing(self) -> HeldValues:
         """Return room for values that are compared with these."""
-        return HeldValues(self.ordered, self._patience_ms, self.likeness, self._block)
+        return HeldValues(self.ordered, self._patience_ms, self.likeness, self.block)
 
     def has_any(self, ordered: Floats) -> bool:
         """Whether any of some ascending values is between its smallest and its largest."""
@@ -155,7 +157,7 @@ class Reference:
 
     def _together(self, size: int, cycles: int) -> float:
         """How many values of a longer stretch may be alike."""
-        return size * min(self._block / cycles, 1.0)
+        return size * min(self.block / cycles, 1.0)
 
     def _in_time(self, values: Floats) -> Floats:
         if self._patience_ms == math.inf:
@@ -174,14 +176,19 @@ class Pool:
         Whether what disturbs the part adds to its values (a message) or multiplies them (a job).
     """
 
-    __slots__ = ("_doubt", "additive", "reference", "rows")
+    __slots__ = ("_alone", "_before", "_doubt", "additive", "reference", "rows")
 
+    #: The first job of all, if no other was measured in its window; else 0.
+    _alone: float
     _doubt: _Doubt | None
+    #: The values, ascending, before the run of decisions (see `_run`); the declared ones if None.
+    _before: Floats | None
 
     def __init__(self, reference: Reference, additive: bool) -> None:
         self.reference, self.additive = reference, additive
         #: What is held; the kernel adds to it.
         self.rows = reference.holds_nothing()
+        self._alone, self.rows.row.asks = 0.0, not additive
         self.reset()
 
     def __repr__(self) -> str:
@@ -268,29 +275,74 @@ class Pool:
         tests : float
             How often any part is compared so in a window of the cell.
         """
-        self.rows.row.last = window
+        is_first, self.rows.row.last = not self.last, window
         cycles = len(values) if cycles is None else cycles
         # A copy: they are overwritten by the next window's.
         values = values[:: -(-len(values) // LARGEST)].copy()
         reference = self.reference
+        if not self.additive and len(reference.ordered):
+            values = self._without_cold(values, is_first)
         declared = reference.places(values)
         if not len(reference.values):
             # Never came to an end where it is as declared, so that nothing can be told from it.
-            is_first, self.rows.row.is_declared = self.is_declared, False
+            was_declared, self.rows.row.is_declared = self.is_declared, False
             self._add(values, declared, window, memory, cycles)
-            return is_first
+            return was_declared
         if self.is_declared:
             return self._leave_declared(values, declared, window, memory, cycles, tests)
-        apart = PlaceSums.among(values, np.sort(self.held))
         if self._is_over(values, declared, cycles):
             self.reset()
             return True
-        is_another = apart.is_large and apart.deviations(reference.likeness) >= SHIFTED
-        if is_another and len(self.held) >= ENOUGH:
-            self._begin_anew(values, window, cycles)
+        run = self._run_before(cycles) or _Doubt(np.sort(self.held), PlaceSums(0, 0.0, 0.0, 0.0), 0)
+        run = self._run_on(run, PlaceSums.among(values, run.before), cycles)
+        is_another = run.apart.is_large and run.apart.deviations(reference.likeness) >= SHIFTED
+        if is_another and len(run.before) >= ENOUGH:
+            self._begin_anew(self._since(run, values), window, run.cycles)
             return True
         self._add(values, declared, window, memory, cycles)
         return False
+
+    def _without_cold(self, values: Floats, is_first: bool) -> Floats:
+        """Drop the first job of all if it took far longer than all others."""
+        usual = COLD * float(self.reference.ordered[-1])
+        self.rows.row.asks = False
+        if is_first and len(values) > 1:
+            return values[int(values[0] > max(COLD * values[1:].max(), usual)) :]
+        if self._alone > max(COLD * values.max(), usual):
+            self.reset()
+        self._alone = float(values[0]) if is_first else 0.0
+        self.rows.row.asks = is_first
+        return values
+
+    @property
+    def _run(self) -> _Doubt | None:
+        """Successive decisions whose values are larger, or smaller, than most known before."""
+        row, before = self.rows.row, self._before
+        if not row.run_cycles:
+            return None
+        apart = PlaceSums(row.run_size, row.run_larger, row.run_smaller, row.run_places)
+        return _Doubt(self.reference.ordered if before is None else before, apart, row.run_cycles)
+
+    def _run_before(self, cycles: int) -> _Doubt | None:
+        """Return the run of the decisions before; None if a stretch ends before this decision."""
+        run = self._run
+        return run if run is not None and run.cycles + cycles <= self.reference.block else None
+
+    def _run_on(self, run: _Doubt, apart: PlaceSums, cycles: int) -> _Doubt:
+        """Add values to a run, which goes on as long as most are larger, or smaller."""
+        run = _Doubt(run.before, run.apart + apart, run.cycles + cycles)
+        row, self._before = self.rows.row, run.before
+        row.run_size, (row.run_larger, row.run_smaller, row.run_places) = (
+            *(run.apart.size, run.apart.sums),
+        )
+        row.run_cycles = run.cycles if run.apart.is_large else 0
+        return run
+
+    def _since(self, run: _Doubt, values: Floats) -> Floats:
+        """Return the values of a run, of which the newest have not been added."""
+        added = run.apart.size - len(values)
+        since = np.concatenate((self.held[max(len(self.held) - added, 0) :], values))
+        return since[-LARGEST:]
 
     def _is_over(self, values: Floats, declared: PlaceSums, cycles: int) -> bool:
         """Whether the regime is over: by all windows since its last value, where few came."""
@@ -319,10 +371,12 @@ class Pool:
         reference = self.reference
         # The chance of a deviation beyond x falls with exp(-x²/2).
         least = least_deviations(tests)
-        if declared.is_large and reference.deviations(declared, cycles) >= least:
-            largest, _ = reference.extremes(declared.size, cycles, least)
-            if declared.largest > MARGIN * largest:
-                self._begin_anew(values, window, cycles)
+        none = _Doubt(reference.ordered, PlaceSums(0, 0.0, 0.0, 0.0), 0)
+        run = self._run_on(self._run_before(cycles) or none, declared, cycles)
+        if run.apart.is_large and reference.deviations(run.apart, run.cycles) >= least:
+            largest, _ = reference.extremes(run.apart.size, run.cycles, least)
+            if run.apart.largest > MARGIN * largest:
+                self._begin_anew(self._since(run, values), window, run.cycles)
                 return True
         self._add(values, declared, window, memory, cycles)
         return self.has_left(window, cycles, least)
@@ -394,7 +448,7 @@ class Pool:
 
     def _begin(self, values: Floats, window: int) -> None:
         self.rows.begin(values, self.reference.places(values).sums, window)
-        self._doubt = None
+        self._doubt, self._before = None, None
 
     def _add(
         self, values: Floats, shift: PlaceSums, window: int, memory: float, cycles: int
@@ -480,14 +534,16 @@ def _mean_log(size: int, deviations: float) -> float:
 
 
 class _Doubt(NamedTuple):
-    """Successive windows under a regime whose values are as declared.
+    """Successive decisions whose values are compared with known ones together.
 
     Parameters
     ----------
     before : float64 array
-        What was held before them, ascending.
+        What was known before them, ascending.
     apart : PlaceSums
         Their values among those.
+    cycles : int
+        Cycles that they are from.
     """
 
     before: Floats

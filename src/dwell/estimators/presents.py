@@ -22,7 +22,7 @@ from dwell.estimators.evidence import Evidence
 from dwell.estimators.measured import Message, Meter, Part, Site, cores_of, parts_of
 from dwell.estimators.pool import Reference, quantile_error
 from dwell.estimators.prices import SEED, Question, most_windows, prices_of
-from dwell.estimators.sent_shadows import SentShadows, hindered, stamps_of
+from dwell.estimators.sent_shadows import SentShadows, stamps_of
 from dwell.estimators.slow_processes import slow_processes, unseen_error
 from dwell.estimators.spans import patience_ns
 from dwell.kernels.advance import logged_window, play
@@ -35,6 +35,7 @@ from dwell.kernels.rows import Rows, row_types
 from dwell.model.fabric import Node
 from dwell.model.frozen import FrozenDict
 from dwell.model.problem import Problem
+from dwell.model.shadow_plan import ShadowFraction
 
 Floats: TypeAlias = NDArray[np.float64]
 Ints: TypeAlias = NDArray[np.int64]
@@ -152,8 +153,9 @@ class Playing:
     ----------
     seed : int
         Seed of what is as declared.
-    shadow_fraction : float
-        Share of the cycles that are also sent through each alternative.
+    shadow_fraction : float, or mapping of str to float
+        Share of the cycles that are also sent through each alternative, by the candidate that is
+        played.
 
     Attributes
     ----------
@@ -163,7 +165,9 @@ class Playing:
         Cycles that have been played of all candidates since the start.
     """
 
-    def __init__(self, problem: Problem, seed: int = SEED, shadow_fraction: float = 0.0) -> None:
+    def __init__(
+        self, problem: Problem, seed: int = SEED, shadow_fraction: ShadowFraction = 0.0
+    ) -> None:
         self.problem, self._seed, self._shadow_fraction = problem, seed, shadow_fraction
         self.declared = declared_of(problem, seed, shadow_fraction)
         self.prices = prices_of(problem, shadow_fraction=shadow_fraction)
@@ -181,7 +185,7 @@ class Playing:
         self.cycles = 0
         self._twins: dict[str, _Twin] = {}
 
-    def __reduce__(self) -> tuple[type[Playing], tuple[Problem, int, float]]:
+    def __reduce__(self) -> tuple[type[Playing], tuple[Problem, int, ShadowFraction]]:
         # The kernel's tables have addresses; a copy begins anew.
         return Playing, (self.problem, self._seed, self._shadow_fraction)
 
@@ -488,12 +492,10 @@ def _mean_and_error(values: Sequence[float], usual: float = 0.0) -> tuple[float,
     count, (mean, squares, products) = len(values), moments(values)
     if count < 2:
         return mean, abs(mean)
-    factor = _correlation_factor(count, squares, products)
-    # Of few values that are independent the deviation is itself hardly known: about Student's t
-    # over 2.
-    independent = max(count / factor, 2.0)
-    few = (independent + 1) / (independent - 1)
+    # Of few values the deviation is itself hardly known: about Student's t over 2.
+    few = (count + 1) / (count - 1)
     variance = max(squares / (count - 1), (squares + usual * usual) / count)
+    factor = _correlation_factor(count, squares, products)
     return mean, few * math.sqrt(variance / count * factor)
 
 
@@ -582,14 +584,16 @@ def realised(problem: Problem, real: Realisation, present: Present) -> Realisati
     )
 
 
-def declared_of(problem: Problem, seed: int = SEED, shadow_fraction: float = 0.0) -> Declared:
+def declared_of(
+    problem: Problem, seed: int = SEED, shadow_fraction: ShadowFraction = 0.0
+) -> Declared:
     """Return the undisturbed cell; what was asked before is not played again."""
     question = Question.of(problem, "baseline", seed, DRAWN, shadow_fraction)
     known = _known.pop(question, None)
     if known is None:
         short = _with_short_windows(question.problem)
-        if question.shadow_fraction:
-            known = _with_shadows(short, declared_of(question.problem, seed), shadow_fraction)
+        if question.shadow_fractions:
+            known = _with_shadows(short, declared_of(question.problem, seed), question)
         else:
             known = _played_as_declared(short, seed)
     _known[question] = known
@@ -655,13 +659,13 @@ def _played(first: Arrays, index: int) -> Arrays:
     return arrays
 
 
-def _with_shadows(problem: Problem, plain: Declared, shadow_fraction: float) -> Declared:
+def _with_shadows(problem: Problem, plain: Declared, question: Question) -> Declared:
     """Play again with shadow jobs the candidates that are hindered by them."""
-    shadows = SentShadows(problem, plain.realisation, shadow_fraction)
+    shadows = SentShadows(problem, plain.realisation, question.shadow_fractions)
     first = lay_out([(problem, plain.realisation)], shadows=[shadows.realisation])
     l95_ms, violation_rate = dict(plain.l95_ms), dict(plain.violation_rate)
     for index, name in enumerate(problem.candidates):
-        if name in hindered(problem):
+        if question.shadow_fractions[name]:
             arrays = first.copy()
             arrays.replace(stamps=stamps_of(first, index, shadows))
             play(arrays)

@@ -120,10 +120,23 @@ void add(Pool& pool, const f64* values, const PlaceSums& shift, i64 window, f64 
 // Adds what a window brought to a pool that is as declared, if that is nothing to look at; returns
 // 0 then, else why another look is needed.
 i64 learn(Pool& pool, const f64* values, i64 n, i64 window, f64 memory, i64 cycles, f64 least) {
-  if (pool.is_declared == 0 || pool.n_known == 0 || n > kLargest) return kNotAdded;
+  if (pool.is_declared == 0 || pool.n_known == 0 || pool.asks != 0 || n > kLargest)
+    return kNotAdded;
   PlaceSums declared;
   add_places(pool.known, pool.n_known, values, n, pool.patience_ms, declared);
-  if (is_large(declared) && deviations(pool, declared, cycles) >= least) return kNotAdded;
+  // Windows that are larger, or smaller, are a run, up to a stretch.
+  PlaceSums run = declared;
+  i64 run_cycles = cycles;
+  if (pool.run_cycles > 0 && pool.run_cycles + cycles <= pool.block) {
+    run = plus({pool.run_size, pool.run_larger, pool.run_smaller, pool.run_places}, declared, 1);
+    run_cycles += pool.run_cycles;
+  }
+  if (is_large(run) && deviations(pool, run, run_cycles) >= least) return kNotAdded;
+  pool.run_cycles = is_large(run) ? run_cycles : 0;
+  pool.run_size = run.size;
+  pool.run_larger = run.larger;
+  pool.run_smaller = run.smaller;
+  pool.run_places = run.places;
   pool.last = window;
   add(pool, values, declared, window, memory, cycles);
   const PlaceSums held = {pool.size, pool.larger, pool.smaller, pool.places};

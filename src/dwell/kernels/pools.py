@@ -70,7 +70,7 @@ class HeldValues:
         row.first, row.size, (row.larger, row.smaller, row.places) = 0, len(values), sums
         self._chunks[0] = structs()["Chunk"](window, 0, len(values), *sums)
         row.first_chunk, row.n_chunks, row.touched = 0, 1, window
-        row.measured = row.cycles = row.lasting = 0
+        row.measured = row.cycles = row.lasting = row.run_cycles = 0
 
     def add(
         self,

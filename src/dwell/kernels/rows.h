@@ -53,7 +53,8 @@ struct Crossing;  // of meter.cpp
   field(i64, pauses) /* whether a call ends when the cell is to be decided on */                 \
   field(i64, closed_cell)                                                                        \
   field(i64, step_key) field(i64, step_ns)                                                       \
-  field(i64, end_ns) /* of the last close that any cell can have */
+  field(i64, end_ns) /* of the last close that any cell can have */                              \
+  field(i64, plays_on) /* up to there, also where no window is left to close */
 
 // A window closes no earlier than `due_ns` after the release of its last cycle, and `grace_ns` after
 // that of the one beyond it. `wakes_ns` is when the guard is woken if no cycle from `waited` on has
@@ -271,14 +272,17 @@ struct Crossing;  // of meter.cpp
 // of `block` cycles are alike by `likeness`; `size` values since `first`, with the sums of their
 // places; the windows that they are from, and all cycles of those; for how many cycles they have not
 // been as declared; how many were measured; and the windows of the last of them, and in which it
-// last ceased to be as declared, or got another value since.
+// last ceased to be as declared, or got another value since; whether Python asks for the next window;
+// and the cycles and sums of a run of windows that are larger, or smaller, 0 for none.
 #define DWELL_POOL(field)                                                                        \
   field(const f64*, known) field(i64, n_known) field(f64, patience_ms) field(f64, likeness)      \
   field(i64, block) field(f64*, held) field(i64, first) field(i64, size)                         \
   field(f64, larger) field(f64, smaller) field(f64, places)                                      \
   field(Chunk*, chunks) field(i64, first_chunk) field(i64, n_chunks)                             \
   field(i64, cycles) field(i64, lasting) field(i64, measured) field(i64, last)                   \
-  field(i64, touched) field(i64, is_declared)
+  field(i64, touched) field(i64, is_declared) field(i64, asks)                                   \
+  field(i64, run_cycles) field(i64, run_size)                                                    \
+  field(f64, run_larger) field(f64, run_smaller) field(f64, run_places)
 
 #define DWELL_ROWS(row)                                                                          \
   row(Clock, DWELL_CLOCK) row(Cell, DWELL_CELL) row(Task, DWELL_TASK) row(Flow, DWELL_FLOW)      \
