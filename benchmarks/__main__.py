@@ -16,6 +16,7 @@ from benchmarks.machine import available_cores, describe, pin
 BENCHMARKS = {
     "peers": ("chain", "measure"),
     "loop": ("loop", "measure"),
+    "learning": ("loop", "learning"),
     "canonical": ("canonical", "measure"),
     "length": ("canonical", "length"),
     "closing": ("closing", "measure"),

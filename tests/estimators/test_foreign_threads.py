@@ -10,7 +10,6 @@ import pytest
 import dwell
 from dwell.estimators import Evidence
 from dwell.estimators.foreign_threads import (
-    JOBS,
     WINDOWS,
     ForeignThreads,
     Level,
@@ -33,6 +32,7 @@ from dwell.model.fabric import Scheduler
 from tests.cells.generated import make_problem
 from tests.estimators.windows import Row, window
 from tests.reference.test_against import Probe
+from tests.reference.window_jobs import JOBS
 
 SCHEDULERS: tuple[Scheduler, ...] = ("fair", "fifo", "priority")
 FOUR = Node("E", "edge", 4)

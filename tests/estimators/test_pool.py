@@ -455,10 +455,8 @@ def test_shifts_add_up(first: list[float], second: list[float]) -> None:
     known = np.sort(about(5.0, 100))
     one, other = (PlaceSums.among(np.array(values), known) for values in (first, second))
     both = PlaceSums.among(np.array(first + second), known)
-    for found, expected in ((one + other, both), (both - other, one)):
-        assert found.size == expected.size
-        for name in ("larger", "smaller", "places"):
-            assert getattr(found, name) == pytest.approx(getattr(expected, name))
+    assert (one + other).size == both.size
+    assert (one + other).sums == pytest.approx(both.sums)
 
 
 @pytest.mark.parametrize("size", [2, 5, 100])

@@ -10,48 +10,47 @@ import pytest
 import dwell
 from dwell.estimators import Corrected, Evidence
 from dwell.estimators.measured import Meter, Site
-from dwell.estimators.waits import alone_with_waits, beside
 from dwell.model import Node, Problem
 from tests.cells.random_dags import random_dag
+from tests.reference.window_jobs import Jobs, alone_with_waits, used_beside
 
 MS = 1e6
 CORE = Node("R", "robot", cores=1)
-Jobs = tuple[np.ndarray, np.ndarray, np.ndarray, float]
 
 
-def jobs(start_ms: list[float], taken_ms: list[float], alone_ms: list[float]) -> Jobs:
-    start = np.array(start_ms) * MS
-    return start, start + np.array(taken_ms) * MS, np.array(alone_ms) * MS, 1.0
+def jobs(task: int, start_ms: list[float], taken_ms: list[float], alone_ms: list[float]) -> Jobs:
+    start, one = np.array(start_ms) * MS, np.ones(len(start_ms))
+    return Jobs(start, start + np.array(taken_ms) * MS, np.array(alone_ms) * MS, one, task * one)
 
 
 def test_the_mean_of_what_others_used_while_a_job_ran() -> None:
-    others = np.array([0.0, 5.0]), np.array([10.0, 15.0]), np.array([1.0, 2.0])
-    found = beside(np.array([0.0, 5.0, 8.0]), np.array([10.0, 15.0, 20.0]), others)
+    mine = jobs(0, [0.0, 5.0, 8.0], [10.0, 10.0, 12.0], [1.0, 1.0, 1.0])
+    others = jobs(0, [0.0, 5.0], [10.0, 10.0], [1.0, 1.0])._replace(cores=np.array([1.0, 2.0]))
     # 10 of one and 5 of two; 5 of one and 10 of two; 2 of one and 7 of two, of 12.
-    np.testing.assert_allclose(found, [2.0, 2.5, 16 / 12])
+    np.testing.assert_allclose(used_beside(mine, others), [2.0, 2.5, 16 / 12])
 
 
 def test_a_job_that_takes_longer_than_its_core_time_has_waited() -> None:
-    waits = jobs([0.0, 100.0, 200.0], [30.0, 25.0, 1.0], [5.0, 5.0, 1.0])
-    found = alone_with_waits(CORE, 0.0, {3: waits})
-    np.testing.assert_allclose(found[3], [30.0 * MS, 25.0 * MS, 1.0 * MS])
+    waits = jobs(3, [0.0, 100.0, 200.0], [30.0, 25.0, 1.0], [5.0, 5.0, 1.0])
+    np.testing.assert_allclose(alone_with_waits(CORE, 0.0, waits), [30.0 * MS, 25.0 * MS, 1.0 * MS])
 
 
 def test_what_few_jobs_do_is_no_wait() -> None:
-    once = jobs([0.0, 100.0, 200.0], [30.0, 5.0, 5.0], [5.0, 5.0, 5.0])
-    assert alone_with_waits(CORE, 0.0, {0: once}) == {}
+    once = jobs(0, [0.0, 100.0, 200.0], [30.0, 5.0, 5.0], [5.0, 5.0, 5.0])
+    assert alone_with_waits(CORE, 0.0, once).tolist() == once.alone_ns.tolist()
 
 
 def test_jobs_that_share_a_core_have_not_waited() -> None:
     """Two of 30 ms from the same instant on take 60 ms each."""
-    both = {task: jobs([0.0, 70.0], [60.0, 60.0], [30.0, 30.0]) for task in (0, 1)}
-    assert alone_with_waits(CORE, 0.0, both) == {}
+    one, other = (jobs(task, [0.0, 70.0], [60.0, 60.0], [30.0, 30.0]) for task in (0, 1))
+    both = Jobs(*map(np.concatenate, zip(one, other, strict=True)))
+    assert alone_with_waits(CORE, 0.0, both).tolist() == both.alone_ns.tolist()
 
 
 def test_jobs_beside_foreign_threads_have_not_waited() -> None:
-    slowed = {0: jobs([0.0, 70.0, 140.0], [30.0, 30.0, 30.0], [10.0, 10.0, 10.0])}
-    assert alone_with_waits(CORE, 2.0, slowed) == {}
-    assert 0 in alone_with_waits(CORE, 1.0, slowed)
+    slowed = jobs(0, [0.0, 70.0, 140.0], [30.0, 30.0, 30.0], [10.0, 10.0, 10.0])
+    assert alone_with_waits(CORE, 2.0, slowed).tolist() == slowed.alone_ns.tolist()
+    assert alone_with_waits(CORE, 1.0, slowed).tolist() > slowed.alone_ns.tolist()
 
 
 class Witness(Corrected):
@@ -67,10 +66,8 @@ class Witness(Corrected):
 
     def _take_in(self, demands: object, evidence: Evidence) -> None:
         super()._take_in(demands, evidence)  # type: ignore[arg-type]
-        cycles, foreign = evidence.cycles, self._threads
-        work_ns = self.meter.work_ns(cycles, evidence.placement, foreign)
-        told = self.meter._with_waits(cycles, evidence.placement, work_ns, foreign)
-        assert told is work_ns
+        waited_ns = self.meter.waited_ns(evidence, self._threads)
+        np.testing.assert_array_equal(waited_ns, evidence.cycles.work_ns)
         self.windows += 1
 
 
@@ -115,5 +112,5 @@ def test_a_device_that_a_job_waits_for_is_part_of_its_demand() -> None:
 
 
 def test_where_there_are_no_others_they_used_nothing() -> None:
-    nothing = np.empty(0), np.empty(0), np.empty(0)
-    assert beside(np.array([0.0, 5.0]), np.array([10.0, 15.0]), nothing).tolist() == [0.0, 0.0]
+    mine = jobs(0, [0.0, 5.0], [10.0, 15.0], [1.0, 1.0])
+    assert used_beside(mine, jobs(0, [], [], [])).tolist() == [0.0, 0.0]

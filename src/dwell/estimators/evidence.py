@@ -7,11 +7,13 @@ simulator and the live runtime hand over the same instants.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+
+from dwell.kernels.meter import WindowRows
 
 Ints: TypeAlias = NDArray[np.int64]
 Rows: TypeAlias = slice | NDArray[np.bool_] | NDArray[np.int64]
@@ -59,6 +61,13 @@ class Instants:
             work_ns=None if self.work_ns is None else self.work_ns[rows],
         )
 
+    def columns(self, placement: NDArray[np.integer]) -> tuple[NDArray[np.integer], ...]:
+        """Return what `WindowRows.of` takes of cycles, or shadows, under candidates."""
+        nothing = np.full_like(self.ready_ns, UNKNOWN)
+        work_ns = nothing if self.work_ns is None else self.work_ns
+        start_ns = nothing if self.start_ns is None else self.start_ns
+        return placement, self.ready_ns, self.end_ns, self.arrived_ns, work_ns, start_ns
+
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
@@ -86,6 +95,33 @@ class Evidence:
     shadow_placement: NDArray[np.integer]
     shadows: Instants | None
     shadows_share: bool = True
+    _rows: WindowRows | None = field(default=None, init=False, repr=False, compare=False)
+
+    @classmethod
+    def of(cls, rows: WindowRows, close_ns: int, release_ns: Ints) -> Evidence:
+        """Make the evidence of instants that are in one table."""
+        placement, ready, end, arrived, work, start = rows.columns(shadow=False)
+        cycles, shadows = Instants(ready, end, arrived, start, work), None
+        if rows.has_shadows:
+            sent, ready, end, arrived, work, start = rows.columns(shadow=True)
+            shadows = Instants(ready, end, arrived, start, work)
+        else:
+            sent = np.full_like(placement, -1)
+        made = cls(close_ns, release_ns, placement, cycles, sent, shadows)
+        object.__setattr__(made, "_rows", rows)
+        return made
+
+    @property
+    def rows(self) -> WindowRows:
+        """All instants as one table, which is made once."""
+        if self._rows is None:
+            sent = None
+            if self.shadows is not None:
+                sent = self.shadows.columns(self.shadow_placement)
+            rows = WindowRows.of(self.cycles.columns(self.placement), sent)
+            object.__setattr__(self, "_rows", rows)
+            return rows
+        return self._rows
 
     def __repr__(self) -> str:
         shadows = int((self.shadow_placement >= 0).sum())

@@ -13,11 +13,12 @@ from dwell.estimators.evidence import Evidence
 from dwell.estimators.link_rates import Rate, better_rate
 from dwell.estimators.measured import Message, Part, sending_ns
 from dwell.estimators.online import Online
-from dwell.estimators.pool import Pool, share_error
+from dwell.estimators.pool import Pool, least_deviations, share_error
 from dwell.estimators.prices import SEED
 from dwell.estimators.protocol import Support
 from dwell.estimators.shadow_price import fraction_of
 from dwell.estimators.slow_processes import unseen_error
+from dwell.kernels.pools import ADDED, PoolRows
 from dwell.model.controller_settings import HALF_LIFE_WINDOWS
 from dwell.model.problem import Problem
 
@@ -94,12 +95,17 @@ class Learning(Online):
             part: Pool(reference, isinstance(part, Message))
             for part, reference in self._playing.declared.references.items()
         }
+        groups = list(map(self._meter.numbers, self._parts.values()))
+        padded = np.full((len(groups), max(map(len, groups))), -1)
+        for row, numbers in zip(padded, groups, strict=True):
+            row[: len(numbers)] = numbers
+        self._rows = PoolRows([self._pools[part].rows for part in self._meter.parts], padded)
 
     def _take_in(self, demands: Mapping[Part, Floats], evidence: Evidence) -> None:
         self._window += 1
         cycles = len(evidence.release_ns)
         changed = self._learn(demands, cycles)
-        for pool in self._pools.values():
+        for pool in map(self._pools.__getitem__, self._otherwise_parts()):
             if pool.touched and self._window - pool.touched >= max(self.unseen, 1.0):
                 pool.reset()
                 self._has_changed = True
@@ -122,10 +128,20 @@ class Learning(Online):
         changed = []
         # How often any part is compared with its reference in a window of the cell.
         tests = len(self._pools) * max(self.problem.window_cycles / cycles, 1.0)
-        for part, values in demands.items():
+        least = least_deviations(tests)
+        # Most pools are as declared, and nothing has to be decided about them.
+        when = self._window, self.memory, cycles
+        parts = self._meter.numbers(demands)
+        looks = self._rows.learn(self._meter.found, parts, *when, least)
+        for (part, values), why in zip(demands.items(), looks, strict=False):
+            if not why:
+                continue
             pool = self._pools[part]
-            # To whole nanoseconds, as everything is measured: equal values must be ties.
-            if pool.learn(np.round(values, 6), self._window, self.memory, cycles, tests):
+            if why == ADDED:
+                has_changed = pool.has_left(self._window, cycles, least)
+            else:
+                has_changed = pool.learn(values, *when, tests)
+            if has_changed:
                 changed.append(part)
             self._has_grown |= not pool.is_declared
         return changed
@@ -188,18 +204,18 @@ class Learning(Online):
     def _correct(self, changed: Sequence[Part], measured: frozenset[Part]) -> None:
         """Correct what nobody measured by what has changed."""
 
+    def _otherwise_parts(self) -> list[Part]:
+        return [self._meter.parts[number] for number in self._rows.others()]
+
     def _otherwise(self) -> dict[Part, Floats]:
-        return {part: pool.held for part, pool in self._pools.items() if not pool.is_declared}
+        return {part: self._pools[part].held for part in self._otherwise_parts()}
 
     def support(self) -> dict[str, Support]:
         """Support of each candidate's estimate: that of its weakest part."""
         self._take_in_pending()
         return {
-            name: Support(
-                min(self._pools[part].measured for part in parts),
-                self._windows_since(min(self._pools[part].last for part in parts)),
-            )
-            for name, parts in self._parts.items()
+            name: Support(samples, self._windows_since(last))
+            for name, (samples, last) in zip(self._parts, self._rows.weakest(), strict=True)
         }
 
     def deviation(self) -> dict[str, float]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -12,8 +13,8 @@ from numpy.typing import NDArray
 from dwell.estimators.evidence import UNKNOWN, Evidence, Instants
 from dwell.estimators.slowdown import slowdown
 from dwell.estimators.spans import patience_ns
-from dwell.estimators.waits import alone_with_waits
-from dwell.kernels.meter import CyclesLayout, PartTimes
+from dwell.kernels.jobs import NodeJobs, WaitingJobs
+from dwell.kernels.meter import CyclesLayout, PartTimes, WindowRows
 from dwell.model.fabric import Node
 from dwell.model.pipeline import Execution, Pipeline
 from dwell.model.placement import Placement
@@ -79,28 +80,38 @@ class Meter:
         self._sources = np.array([names.index(f.source) for f in problem.pipeline.flows], np.int64)
         self._placements = tuple(problem.candidates.values())
         every = (parts_of(problem.pipeline, placed) for placed in self._placements)
-        self._parts = tuple(dict.fromkeys(part for parts in every for part in parts))
-        self._times = PartTimes(len(self._parts))
-        costs = [_cost(problem, part) for part in self._parts]
+        self.parts = tuple(dict.fromkeys(part for parts in every for part in parts))
+        self._number = {part: number for number, part in enumerate(self.parts)}
+        self._times = PartTimes(len(self.parts))
+        costs = [_cost(problem, part) for part in self.parts]
         self._cost, self._usual_cost = np.array(costs), np.array(costs)
         self._link, repeats = self._links()
-        self._demands = PartTimes(len(self._parts), self._cost, self._link, repeats)
+        self._demands = PartTimes(len(self.parts), self._cost, self._link, repeats)
         nodes = problem.fabric.nodes
         #: Parts whose jobs need more of the core beside foreign threads, with their nodes.
         self._interfered = [
             (number, nodes[part.node])
-            for number, part in enumerate(self._parts)
+            for number, part in enumerate(self.parts)
             if isinstance(part, Site) and nodes[part.node].interference > 1.0
         ]
         self._layouts: dict[int, CyclesLayout] = {}
-        self._sharing = [self._sharing_of(placed) for placed in self._placements]
+        sharing = [node for node in nodes.values() if _shares_evenly(node, shared)]
+        #: Nodes whose jobs share the cores evenly, with the most threads of their bursts.
+        self._sharing = [(one.name, one.bursts.threads if one.bursts else 0) for one in sharing]
+        self._waiting = WaitingJobs(
+            [
+                NodeJobs(cores_on(problem, one, partial(cores_of, one)), True, one.cores, one.spare)
+                for one in sharing
+            ],
+            len(problem.pipeline.flows),
+        )
 
     def times(self, evidence: Evidence) -> dict[Part, Floats]:
         """Times of every part that the window has any of, milliseconds, infinite where lost.
 
         They are overwritten by those of the next window.
         """
-        return self._take_apart(self._times, evidence)
+        return self._take_apart(self._times, evidence, evidence.rows)
 
     def demands(
         self, evidence: Evidence, foreign: Mapping[str, float] | None = None
@@ -126,19 +137,51 @@ class Meter:
             # What bursts cost is in the declared demands, too.
             if foreign.get(node.name, 0.0) - node.burst_threads >= BESIDE:
                 self._cost[number] /= node.interference
+        rows = evidence.rows
+        if any(rows.unknown(0)[1:]):
+            rows = self._with_work(evidence, foreign).rows
+        return self._take_apart(self._demands, evidence, self._with_waits(rows, foreign))
+
+    def _with_waits(self, rows: WindowRows, foreign: Mapping[str, float]) -> WindowRows:
+        """Add what most jobs of a task waited for to their work.
+
+        A job of a real system may wait for something that no cell declares: a device, the network,
+        a lock. That wait is a part of its demand, wherever it runs. It shows if jobs took longer
+        than their core time would have, stretched by what the cell's own jobs and foreign threads
+        took meanwhile.
+        """
+        rows = rows.copy()
+        # Bursts may be on all the while that a job runs.
+        self._waiting.add(rows, [foreign.get(name, 0.0) + most for name, most in self._sharing])
+        return rows
+
+    def waited_ns(self, evidence: Evidence, foreign: Mapping[str, float]) -> Ints:
+        """Core time of own jobs with their waits, shape (n, tasks); see `demands`."""
+        return self._with_waits(evidence.rows, foreign).columns(shadow=False)[4]
+
+    def _with_work(self, evidence: Evidence, foreign: Mapping[str, float]) -> Evidence:
+        """Add the core time of jobs where it is not known."""
         cycles, shadows = evidence.cycles, evidence.shadows
         work_ns = self.work_ns(cycles, evidence.placement, foreign)
-        work_ns = self._with_waits(cycles, evidence.placement, work_ns, foreign)
         told = replace(evidence, cycles=replace(cycles, work_ns=work_ns))
-        if shadows is not None:
-            work_ns = self.work_ns(shadows, evidence.shadow_placement, foreign)
-            told = replace(told, shadows=replace(shadows, work_ns=work_ns))
-        return self._take_apart(self._demands, told)
+        if shadows is None:
+            return told
+        work_ns = self.work_ns(shadows, evidence.shadow_placement, foreign)
+        return replace(told, shadows=replace(shadows, work_ns=work_ns))
+
+    @property
+    def found(self) -> PartTimes:
+        """What `demands` has found in the last window."""
+        return self._demands
+
+    def numbers(self, parts: Iterable[Part]) -> Ints:
+        """Return the places of some parts in `parts`."""
+        return np.array([self._number[part] for part in parts], np.int64)
 
     def set_rate(self, link: str, rate_mbps: float) -> None:
         """Let the messages of a link be sent at a rate, and wait for each other there."""
         number = list(self._problem.fabric.links).index(link)
-        for i, part in enumerate(self._parts):
+        for i, part in enumerate(self.parts):
             if isinstance(part, Message) and part.link == link:
                 self._usual_cost[i] = sending_ns(self._problem, part, rate_mbps)
                 self._link[i] = number
@@ -148,20 +191,17 @@ class Meter:
         usual, joins = self._usual_cost.copy(), self._link.copy()
         self.set_rate(link, rate_mbps)
         self._cost[:] = self._usual_cost
-        found = self._take_apart(self._demands, evidence)
+        found = self._take_apart(self._demands, evidence, evidence.rows)
         self._usual_cost[:], self._link[:] = usual, joins
         return {part: values for part, values in found.items() if isinstance(part, Message)}
 
-    def _take_apart(self, found: PartTimes, evidence: Evidence) -> dict[Part, Floats]:
-        limit_ns = evidence.close_ns - self._patience_ns
-        own = _columns_of(evidence.placement, evidence.cycles)
-        sent = None
-        if evidence.shadows is not None:
-            sent = _columns_of(evidence.shadow_placement, evidence.shadows)
-        found.begin(own, sent, limit_ns)
+    def _take_apart(
+        self, found: PartTimes, evidence: Evidence, rows: WindowRows
+    ) -> dict[Part, Floats]:
+        found.begin(rows, evidence.close_ns - self._patience_ns)
         for active, _ in groups(evidence.placement):
             found.add(active, self._layout(active))
-        return {self._parts[part]: values for part, values in found.by_part().items()}
+        return {self.parts[part]: values for part, values in found.by_part().items()}
 
     def work_ns(
         self, instants: Instants, placement: NDArray[np.integer], foreign: Mapping[str, float]
@@ -194,49 +234,6 @@ class Meter:
         work_ns[~ended | (begun_ns < 0)] = UNKNOWN
         return work_ns if known_ns is None else np.where(known_ns >= 0, known_ns, work_ns)
 
-    def _with_waits(
-        self,
-        cycles: Instants,
-        placement: NDArray[np.integer],
-        work_ns: Ints,
-        foreign: Mapping[str, float],
-    ) -> Ints:
-        """Add what most jobs of a task waited for to their work (see `dwell.estimators.waits`)."""
-        if cycles.start_ns is None:
-            return work_ns
-        # Most windows are of one placement, and in most of those nobody waits.
-        known = (work_ns > 0) & (cycles.start_ns >= 0) & (cycles.end_ns >= 0)
-        found = work_ns
-        for code, rows in groups(placement):
-            for name, tasks in self._sharing[code].items():
-                node = self._problem.fabric.nodes[name]
-                jobs = {}
-                for task, cores in tasks:
-                    mine = known[rows, task]
-                    if mine.any():
-                        columns = (cycles.start_ns, cycles.end_ns, work_ns)
-                        begun, ended, work = (of[rows, task][mine].astype(float) for of in columns)
-                        jobs[task] = begun, ended, work / cores, cores
-                # Bursts may be on all the while that a job runs.
-                most = foreign.get(name, 0.0) + (node.bursts.threads if node.bursts else 0.0)
-                for task, alone_ns in alone_with_waits(node, most, jobs).items():
-                    found = found.copy() if found is work_ns else found
-                    column = found[rows, task]
-                    column[known[rows, task]] = np.rint(alone_ns * jobs[task][3])
-                    found[rows, task] = column
-        return found
-
-    def _sharing_of(self, placement: Placement) -> dict[str, list[tuple[int, float]]]:
-        """Tasks on the CPU of each node whose jobs share its cores evenly, with their cores."""
-        nodes = self._problem.fabric.nodes
-        sharing: dict[str, list[tuple[int, float]]] = {}
-        for column, (name, task) in enumerate(self._pipeline.tasks.items()):
-            node, execution = nodes[placement[name]], task.on[placement[name]]
-            is_even = node.scheduler == "fair" and node.quota is None
-            if is_even and execution.accelerator is None and node.name not in self._shared:
-                sharing.setdefault(node.name, []).append((column, cores_of(node, execution)))
-        return sharing
-
     def _cores_received(self, placement: Placement, foreign: Mapping[str, float]) -> Floats:
         """Cores that the job of each task has in the mean beside foreign threads."""
         received = []
@@ -260,7 +257,7 @@ class Meter:
             for place, one in enumerate(links)
             if one.rate_mbps < np.inf or one.name in repeating
         }
-        names = [part.link if isinstance(part, Message) else "" for part in self._parts]
+        names = [part.link if isinstance(part, Message) else "" for part in self.parts]
         waits = np.array([number.get(name, -1) for name in names], np.int64)
         return waits, np.array([name in repeating for name in names], np.int64)
 
@@ -287,14 +284,22 @@ class Meter:
             message_of(flow.source, flow.target, placement) if flow.target in tasks else None
             for flow in self._pipeline.flows
         ]
-        return [-1 if part is None else self._parts.index(part) for part in parts]
+        return [-1 if part is None else self._number[part] for part in parts]
 
 
-def _columns_of(
-    placement: NDArray[np.integer], instants: Instants
-) -> tuple[NDArray[np.integer], ...]:
-    work_ns = instants.ready_ns if instants.work_ns is None else instants.work_ns
-    return placement, instants.ready_ns, instants.end_ns, instants.arrived_ns, work_ns
+def _shares_evenly(node: Node, shared: Collection[str]) -> bool:
+    return node.scheduler == "fair" and node.quota is None and node.name not in shared
+
+
+def cores_on(problem: Problem, node: Node, cores: Callable[[Execution], float]) -> Floats:
+    """Cores of each task's job on the CPU of a node, shape (candidates, tasks); else 0."""
+    found = np.zeros((len(problem.candidates), len(problem.pipeline.tasks)))
+    for row, placed in zip(found, problem.candidates.values(), strict=True):
+        for column, (name, task) in enumerate(problem.pipeline.tasks.items()):
+            execution = task.on[placed[name]]
+            if placed[name] == node.name and execution.accelerator is None:
+                row[column] = cores(execution)
+    return found
 
 
 def cores_of(node: Node, execution: Execution) -> float:

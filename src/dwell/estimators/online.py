@@ -13,7 +13,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import partial
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +23,14 @@ from dwell.estimators.evidence import Evidence
 from dwell.estimators.foreign_threads import ForeignThreads, Level, Stretches
 from dwell.estimators.link_rates import Rate
 from dwell.estimators.measured import Message, Meter, Part, groups, parts_of
-from dwell.estimators.presents import PlayedPrice, Playing, Present
-from dwell.estimators.prices import SEED, Price
+from dwell.estimators.presents import Playing, Present
+from dwell.estimators.prices import SEED
 from dwell.estimators.profile import Foreign, Profile, mean_ms
 from dwell.estimators.protocol import CellEstimator
 from dwell.estimators.spans import patience_ns
 from dwell.model.frozen import FrozenDict
 from dwell.model.problem import Problem
-from dwell.model.qos import QoS
+from dwell.model.qos import QoS, unchecked_qos
 from dwell.model.shadow_plan import by_candidate
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -45,6 +45,14 @@ BAND = 2.0
 
 def _says_nothing() -> None:
     """Stand for jobs that say nothing of foreign threads."""
+
+
+class _Declared(NamedTuple):
+    """Work, and metrics, of a candidate as declared, as `unchecked_qos` takes them."""
+
+    work: list[tuple[str, float]]
+    latency: tuple[float, float]
+    others: tuple[float | None, tuple[float, float] | None]
 
 
 class Online(CellEstimator):
@@ -85,6 +93,8 @@ class Online(CellEstimator):
         self._plays = False
         self._patience_ns = patience_ns(problem)
         self._sent = {name: self._sent_under(name) for name in problem.candidates}
+        #: What is the same at every close, made at the first.
+        self._declared: dict[str, _Declared] = {}
         #: The window that has been learnt from and not been priced, and not been taken in.
         self._evidence: Evidence | None = None
         self._pending: Evidence | None = None
@@ -98,7 +108,7 @@ class Online(CellEstimator):
         not in the evidence. What others take of the node still does. Cells take turns in sending
         shadows there.
         """
-        self._shared = frozenset(nodes)
+        self._shared, self._declared = frozenset(nodes), {}
         self._meter = Meter(self.problem, self._shared)
         for name, sent in self._sent.items():
             of = {
@@ -122,6 +132,10 @@ class Online(CellEstimator):
     def _known_error(self, name: str, rate: float) -> tuple[float, float]:
         """Standard errors of a candidate's L95 and V_D by the samples behind its present."""
         return 0.0, 0.0
+
+    def look(self, evidence: Evidence) -> None:
+        """Learn."""
+        self.learn(evidence)
 
     def learn(self, evidence: Evidence) -> None:
         """Take in a window: what it showed of each part, once it is known of its nodes."""
@@ -169,7 +183,7 @@ class Online(CellEstimator):
         if names and (evidence is not None or self._has_changed):
             self._play(names)
         estimates = self._priced(names, foreign)
-        if evidence is not None:
+        if evidence is not None and names:
             for _ in range(ROUNDS):
                 unsure = self._unsure(names, estimates, incumbent)
                 if not unsure:
@@ -181,18 +195,20 @@ class Online(CellEstimator):
     def _priced(self, names: list[str], foreign: Foreign) -> dict[str, QoS]:
         """Every candidate's metrics; of those that are played by what they have come to."""
         played = {name: self._playing.played(name) for name in names}
-        prices, work = self._playing.prices, []
-        for name in prices:
-            does = played[name].own if name in played else prices[name].own
-            sent = self._sent[name]
-            work.append((name, [(one, share + sent[one]) for one, share in does.items()]))
+        if not self._declared:
+            self._declared = {name: self._as_declared(name) for name in self.problem.candidates}
+        work = [
+            (name, self._with_sent(name, played[name].own) if name in played else one.work)
+            for name, one in self._declared.items()
+        ]
         shares = self.profile.with_work(foreign, work)
         estimates = {}
-        for name in self.problem.candidates:
-            price: PlayedPrice | Price = played.get(name, prices[name])
-            known = (0.0, 0.0)
-            if name in played:
-                known = self._known_error(name, price.violation_rate)
+        for name, one in self._declared.items():
+            if name not in played:
+                estimates[name] = unchecked_qos(*one.latency, shares[name], *one.others)
+                continue
+            price = played[name]
+            known = self._known_error(name, price.violation_rate)
             error = (
                 math.hypot(price.l95_error_ms, known[0]),
                 math.hypot(price.violation_error, known[1]),
@@ -200,6 +216,17 @@ class Online(CellEstimator):
             l95_ms, rate, uncut_ms = price.l95_ms, price.violation_rate, price.uncut_l95_ms
             estimates[name] = QoS(l95_ms, rate, shares[name], uncut_ms, error)
         return estimates
+
+    def _as_declared(self, name: str) -> _Declared:
+        """Return what does not change of the estimate of a candidate that is as declared."""
+        qos, work = self._playing.prices[name].qos, self._playing.prices[name].own
+        latency, others = (qos.l95_ms, qos.violation_rate), (qos.cut_from_ms, qos.error)
+        return _Declared(self._with_sent(name, work), latency, others)
+
+    def _with_sent(self, name: str, work: Mapping[str, float]) -> list[tuple[str, float]]:
+        """Add the share of each resource that shadow jobs take to the cell's own work."""
+        sent = self._sent[name]
+        return [(one, share + sent[one]) for one, share in work.items()]
 
     def _unsure(self, names: list[str], estimates: Mapping[str, QoS], incumbent: str) -> list[str]:
         """Of candidates that are played, those that more has to be played of.
@@ -258,10 +285,10 @@ class Online(CellEstimator):
     def _down_nodes(self, evidence: Evidence, own: Mapping[str, float]) -> Iterator[str]:
         """Nodes on which nothing has completed since jobs were lost there."""
         limit_ns = evidence.close_ns - self._patience_ns
+        if not evidence.rows.unknown(limit_ns)[0]:
+            return
         cycles, placements = evidence.cycles, tuple(self.problem.candidates.values())
         lost = (cycles.end_ns < 0) & (cycles.ready_ns >= 0) & (cycles.ready_ns < limit_ns)
-        if not lost.any():
-            return
         names = list(self.problem.pipeline.tasks)
         ended_ns: dict[str, int] = {}
         ready_ns: dict[str, list[int]] = {}
@@ -328,8 +355,10 @@ class Online(CellEstimator):
         fraction = by_candidate(self.shadow_fraction, problem.candidates)[name]
         share = dict.fromkeys(resources, 0.0)
         for there in problem.candidates.values():
-            for task in pipeline.diverging(here, there):
-                if there is here or not pipeline.outputs(task):
+            apart = pipeline.diverging(here, there)
+            # In the order of tasks: that of a set, and so the rounding of the sum, may differ.
+            for task in pipeline.tasks:
+                if there is here or task not in apart or not pipeline.outputs(task):
                     continue
                 execution = pipeline.tasks[task].on[there[task]]
                 resource = execution.resource(there[task])

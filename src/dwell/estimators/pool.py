@@ -10,7 +10,6 @@ how much alike is measured in the undisturbed cell, and the test knows of it.
 from __future__ import annotations
 
 import math
-from collections import deque
 from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple, TypeAlias
@@ -19,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.kernels.elementary import cube_root, logarithms
-from dwell.kernels.meter import places
+from dwell.kernels.pools import HeldValues, places
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -98,7 +97,11 @@ class Reference:
 
     def places(self, values: Floats) -> PlaceSums:
         """Compare values with those of the undisturbed cell."""
-        return PlaceSums.among(self._in_time(values), self.ordered)
+        return PlaceSums(len(values), *places(self.ordered, values, self._patience_ms))
+
+    def holds_nothing(self) -> HeldValues:
+        """Return room for values that are compared with these."""
+        return HeldValues(self.ordered, self._patience_ms, self.likeness, self.block)
 
     def has_any(self, ordered: Floats) -> bool:
         """Whether any of some ascending values is between its smallest and its largest."""
@@ -171,53 +174,51 @@ class Pool:
         What it is as declared.
     additive : bool
         Whether what disturbs the part adds to its values (a message) or multiplies them (a job).
-
-    Attributes
-    ----------
-    held : float64 array
-        Values that were measured, in the order in which they came; those of the present regime.
-    is_declared : bool
-        Whether it is as declared, whatever is held.
-    measured : int
-        How many of `held` were measured; others have the declared shape.
-    last : int
-        The window that the newest measured one is from; 0 before there is any.
-    touched : int
-        The window in which it last ceased to be as declared, or got another value since; 0 while it
-        is as declared.
     """
 
-    __slots__ = (
-        "_alone",
-        "_chunks",
-        "_cycles",
-        "_doubt",
-        "_lasting",
-        "_run",
-        "_shift",
-        "additive",
-        "held",
-        "is_declared",
-        "last",
-        "measured",
-        "reference",
-        "touched",
-    )
+    __slots__ = ("_alone", "_before", "_doubt", "additive", "reference", "rows")
 
     #: The first job of all, if no other was measured in its window; else 0.
     _alone: float
     _doubt: _Doubt | None
-    #: Successive decisions whose values are larger, or smaller, than most that were known before.
-    _run: _Doubt | None
+    #: The values, ascending, before the run of decisions (see `_run`); the declared ones if None.
+    _before: Floats | None
 
     def __init__(self, reference: Reference, additive: bool) -> None:
         self.reference, self.additive = reference, additive
-        self.last, self._alone = 0, 0.0
+        #: What is held; the kernel adds to it.
+        self.rows = reference.holds_nothing()
+        self._alone, self.rows.row.asks = 0.0, not additive
         self.reset()
 
     def __repr__(self) -> str:
         what = "as declared" if self.is_declared else f"{self.measured} values, {self.usual:g} ms"
         return f"<Pool: {what}>"
+
+    @property
+    def held(self) -> Floats:
+        """Values of the present regime, in the order in which they came."""
+        return self.rows.values
+
+    @property
+    def is_declared(self) -> bool:
+        """Whether it is as declared, whatever is held."""
+        return bool(self.rows.row.is_declared)
+
+    @property
+    def measured(self) -> int:
+        """How many of `held` were measured; others have the declared shape."""
+        return int(self.rows.row.measured)
+
+    @property
+    def last(self) -> int:
+        """The window that the newest measured one is from; 0 before there is any."""
+        return int(self.rows.row.last)
+
+    @property
+    def touched(self) -> int:
+        """The window in which it last ceased to be as declared, or got a value since; else 0."""
+        return int(self.rows.row.touched)
 
     @property
     def usual(self) -> float:
@@ -245,13 +246,12 @@ class Pool:
 
     def reset(self) -> None:
         """Return to what is declared."""
-        self.is_declared = True
+        self.rows.row.is_declared = True
         self._begin(np.empty(0), 0)
-        self.touched = 0
 
     def replace(self, values: Floats, window: int) -> None:
         """Begin another regime with values that nobody measured."""
-        self.is_declared = False
+        self.rows.row.is_declared = False
         self._begin(values, window)
 
     def learn(
@@ -275,7 +275,7 @@ class Pool:
         tests : float
             How often any part is compared so in a window of the cell.
         """
-        is_first, self.last = not self.last, window
+        is_first, self.rows.row.last = not self.last, window
         cycles = len(values) if cycles is None else cycles
         # A copy: they are overwritten by the next window's.
         values = values[:: -(-len(values) // LARGEST)].copy()
@@ -285,7 +285,7 @@ class Pool:
         declared = reference.places(values)
         if not len(reference.values):
             # Never came to an end where it is as declared, so that nothing can be told from it.
-            was_declared, self.is_declared = self.is_declared, False
+            was_declared, self.rows.row.is_declared = self.is_declared, False
             self._add(values, declared, window, memory, cycles)
             return was_declared
         if self.is_declared:
@@ -305,12 +305,23 @@ class Pool:
     def _without_cold(self, values: Floats, is_first: bool) -> Floats:
         """Drop the first job of all if it took far longer than all others."""
         usual = COLD * float(self.reference.ordered[-1])
+        self.rows.row.asks = False
         if is_first and len(values) > 1:
             return values[int(values[0] > max(COLD * values[1:].max(), usual)) :]
         if self._alone > max(COLD * values.max(), usual):
             self.reset()
         self._alone = float(values[0]) if is_first else 0.0
+        self.rows.row.asks = is_first
         return values
+
+    @property
+    def _run(self) -> _Doubt | None:
+        """Successive decisions whose values are larger, or smaller, than most known before."""
+        row, before = self.rows.row, self._before
+        if not row.run_cycles:
+            return None
+        apart = PlaceSums(row.run_size, row.run_larger, row.run_smaller, row.run_places)
+        return _Doubt(self.reference.ordered if before is None else before, apart, row.run_cycles)
 
     def _run_before(self, cycles: int) -> _Doubt | None:
         """Return the run of the decisions before; None if a stretch ends before this decision."""
@@ -320,7 +331,11 @@ class Pool:
     def _run_on(self, run: _Doubt, apart: PlaceSums, cycles: int) -> _Doubt:
         """Add values to a run, which goes on as long as most are larger, or smaller."""
         run = _Doubt(run.before, run.apart + apart, run.cycles + cycles)
-        self._run = run if run.apart.is_large else None
+        row, self._before = self.rows.row, run.before
+        row.run_size, (row.run_larger, row.run_smaller, row.run_places) = (
+            *(run.apart.size, run.apart.sums),
+        )
+        row.run_cycles = run.cycles if run.apart.is_large else 0
         return run
 
     def _since(self, run: _Doubt, values: Floats) -> Floats:
@@ -355,7 +370,7 @@ class Pool:
         """Whether a window, or all that is held with it, is of another regime."""
         reference = self.reference
         # The chance of a deviation beyond x falls with exp(-x²/2).
-        least = _least(tests)
+        least = least_deviations(tests)
         none = _Doubt(reference.ordered, PlaceSums(0, 0.0, 0.0, 0.0), 0)
         run = self._run_on(self._run_before(cycles) or none, declared, cycles)
         if run.apart.is_large and reference.deviations(run.apart, run.cycles) >= least:
@@ -364,14 +379,19 @@ class Pool:
                 self._begin_anew(self._since(run, values), window, run.cycles)
                 return True
         self._add(values, declared, window, memory, cycles)
+        return self.has_left(window, cycles, least)
+
+    def has_left(self, window: int, cycles: int, least: float) -> bool:
+        """Whether all that is held is of another regime, once a window has been added to it."""
+        row = self.rows.row
         if self._off_declared() < least:
-            self._lasting = 0
+            row.lasting = 0
             return False
-        self._lasting += cycles
-        largest, longest = reference.extremes(self._shift.size, self._span, least)
-        if self._shift.largest <= MARGIN * largest and self._lasting <= MARGIN * longest:
+        row.lasting += cycles
+        largest, longest = self.reference.extremes(self._shift.size, self._span, least)
+        if self._shift.largest <= MARGIN * largest and row.lasting <= MARGIN * longest:
             return False
-        self.is_declared, self.touched = False, window
+        row.is_declared, row.touched = False, window
         return True
 
     def follow(self, witness: Pool, window: int) -> None:
@@ -409,7 +429,12 @@ class Pool:
     @property
     def _span(self) -> int:
         """Cycles of the windows that what is held is from."""
-        return max(self._cycles, 1)
+        return max(int(self.rows.row.cycles), 1)
+
+    @property
+    def _shift(self) -> PlaceSums:
+        row = self.rows.row
+        return PlaceSums(row.size, row.larger, row.smaller, row.places)
 
     def _begin_anew(self, values: Floats, window: int, cycles: int) -> None:
         """Begin another regime; where its values are few, with the declared shape."""
@@ -422,31 +447,14 @@ class Pool:
         self._add(values, shift, window, math.inf, cycles)
 
     def _begin(self, values: Floats, window: int) -> None:
-        self.held = values
-        self._shift = self.reference.places(values)
-        self._chunks = deque([_Chunk(window, self._shift, 0)])
-        self.measured, self.touched = 0, window
-        self._cycles, self._lasting, self._doubt, self._run = 0, 0, None, None
+        self.rows.begin(values, self.reference.places(values).sums, window)
+        self._doubt, self._before = None, None
 
     def _add(
         self, values: Floats, shift: PlaceSums, window: int, memory: float, cycles: int
     ) -> None:
         """Add values, and drop the oldest: what is forgotten, and what is beyond `LARGEST`."""
-        chunks = self._chunks
-        chunks.append(_Chunk(window, shift, cycles))
-        self._cycles += cycles
-        total = self._shift + shift
-        while (
-            chunks[0].window <= window - memory and total.size - chunks[0].shift.size >= ENOUGH
-        ) or total.size > LARGEST:
-            oldest = chunks.popleft()
-            total = total - oldest.shift
-            self._cycles -= oldest.cycles
-        self._shift = total
-        self.held = np.concatenate((self.held, values))[-total.size :]
-        self.measured = min(self.measured + len(values), total.size)
-        if not self.is_declared:
-            self.touched = window
+        self.rows.add(values, shift.sums, window, memory, cycles)
 
 
 @dataclass(frozen=True, slots=True)
@@ -472,18 +480,17 @@ class PlaceSums:
         return cls(len(values), *places(known, values))
 
     def __add__(self, other: PlaceSums) -> PlaceSums:
-        return self._with(other, 1)
-
-    def __sub__(self, other: PlaceSums) -> PlaceSums:
-        return self._with(other, -1)
-
-    def _with(self, other: PlaceSums, sign: int) -> PlaceSums:
         return PlaceSums(
-            self.size + sign * other.size,
-            self.larger + sign * other.larger,
-            self.smaller + sign * other.smaller,
-            self.places + sign * other.places,
+            self.size + other.size,
+            self.larger + other.larger,
+            self.smaller + other.smaller,
+            self.places + other.places,
         )
+
+    @property
+    def sums(self) -> tuple[float, float, float]:
+        """The sums alone."""
+        return self.larger, self.smaller, self.places
 
     @property
     def largest(self) -> float:
@@ -541,14 +548,6 @@ class _Doubt(NamedTuple):
 
     before: Floats
     apart: PlaceSums
-    cycles: int
-
-
-class _Chunk(NamedTuple):
-    """What a window has brought."""
-
-    window: int
-    shift: PlaceSums
     cycles: int
 
 
@@ -618,6 +617,6 @@ def middle(values: Floats) -> float:
 
 
 @cache
-def _least(tests: float) -> float:
+def least_deviations(tests: float) -> float:
     """Deviations that are another regime, where parts are compared so many times in a window."""
     return math.sqrt(SHIFTED * SHIFTED + 2.0 * float(logarithms(np.array([tests]))[0]))

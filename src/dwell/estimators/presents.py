@@ -12,23 +12,23 @@ import math
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from operator import sub
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.estimators.evidence import Evidence, Instants
+from dwell.estimators.evidence import Evidence
 from dwell.estimators.measured import Message, Meter, Part, Site, cores_of, parts_of
 from dwell.estimators.pool import Reference, quantile_error
 from dwell.estimators.prices import SEED, Question, most_windows, prices_of
 from dwell.estimators.sent_shadows import SentShadows, stamps_of
 from dwell.estimators.slow_processes import slow_processes, unseen_error
 from dwell.estimators.spans import patience_ns
-from dwell.kernels.advance import logged_instants, play
+from dwell.kernels.advance import logged_window, play
 from dwell.kernels.arrays import Arrays, CellArrays, flow_rows, lay_out
 from dwell.kernels.codes import LAST_NS
+from dwell.kernels.elementary import moments
 from dwell.kernels.random_draws import Drawing
 from dwell.kernels.realisation import LinkSegments, NodeChange, NodeChanges, Realisation
 from dwell.kernels.rows import Rows, row_types
@@ -174,6 +174,14 @@ class Playing:
         self._window = min(problem.window_cycles, LONGEST_WINDOW)
         self._names = tuple(problem.candidates)
         self._step = max(STEP // self._window, 1)
+        #: Standard deviations of what steps show as declared: L95 (ms) and V_D.
+        self._usual = {
+            name: [
+                float(windows[name][1:].std()) / math.sqrt(self._step)
+                for windows in (self.declared.l95_ms, self.declared.violation_rate)
+            ]
+            for name in self._names
+        }
         self.cycles = 0
         self._twins: dict[str, _Twin] = {}
 
@@ -239,11 +247,11 @@ class Playing:
             seen = tables.seen[0, stretch]
             twin.steps.append(
                 _Step(
-                    float(seen["l95_ms"].mean()),
-                    float(self.declared.l95_ms[name][stretch].mean()),
-                    float(seen["uncut_ms"].mean()),
-                    float(seen["missed"].mean()) / self._window,
-                    float(self.declared.violation_rate[name][stretch].mean()),
+                    _mean(seen["l95_ms"]),
+                    _mean(self.declared.l95_ms[name][stretch]),
+                    _mean(seen["uncut_ms"]),
+                    _mean(seen["missed"]) / self._window,
+                    _mean(self.declared.violation_rate[name][stretch]),
                     tables.shares[0, stretch, 1].mean(axis=0),
                     tables.latency_ns[0, first * self._window : twin.cursor].copy(),
                 )
@@ -271,7 +279,7 @@ class Playing:
             declared_l95,
             known.l95_ms,
             known.l95_error_ms,
-            usual=self._deviation(self.declared.l95_ms[name]),
+            usual=self._usual[name][0],
         )
         count = len(steps)
         violation_rate, violation_error = _estimated(
@@ -279,7 +287,7 @@ class Playing:
             declared_rates,
             known.violation_rate,
             known.violation_error,
-            usual=self._deviation(self.declared.violation_rate[name]),
+            usual=self._usual[name][1],
             cycles=count * self._step * self._window,
         )
         l95_ms, shares = min(l95_ms, self.problem.censor_ms), sum(own) / count
@@ -291,10 +299,6 @@ class Playing:
             violation_error,
             FrozenDict(zip(self.problem.fabric.resources, shares.tolist(), strict=True)),
         )
-
-    def _deviation(self, windows: Floats) -> float:
-        """Standard deviation of what steps show as declared."""
-        return float(windows[1:].std()) / math.sqrt(self._step)
 
     def is_full(self, name: str) -> bool:
         """Whether the price of a candidate is of as many windows as it ever is."""
@@ -478,23 +482,24 @@ def _estimated(
     return (max(known + more, 0.0), more_error) if more_error < error else (mean, error)
 
 
+def _mean(windows: Floats | Ints) -> float:
+    # Windows of a usual length are played one by one.
+    return float(windows.item() if len(windows) == 1 else windows.mean())
+
+
 def _mean_and_error(values: Sequence[float], usual: float = 0.0) -> tuple[float, float]:
     """Return the mean, and its error had one value more deviated as is usual."""
-    # Of few numbers; an array would take longer.
-    count = len(values)
-    # Of equal values exactly that, and no error.
-    mean = values[0] + sum(value - values[0] for value in values) / count
+    count, (mean, squares, products) = len(values), moments(values)
     if count < 2:
         return mean, abs(mean)
-    squares = sum((value - mean) * (value - mean) for value in values)
     # Of few values the deviation is itself hardly known: about Student's t over 2.
     few = (count + 1) / (count - 1)
     variance = max(squares / (count - 1), (squares + usual * usual) / count)
-    factor = _correlation_factor(values, mean, squares)
+    factor = _correlation_factor(count, squares, products)
     return mean, few * math.sqrt(variance / count * factor)
 
 
-def _correlation_factor(values: Sequence[float], mean: float, squares: float) -> float:
+def _correlation_factor(count: int, squares: float, products: float) -> float:
     """Return by how much the variance of a mean is larger, since steps of a queue are alike.
 
     It is (1 + r) / (1 - r) of an AR(1) process, r being the correlation of successive steps, of
@@ -502,8 +507,7 @@ def _correlation_factor(values: Sequence[float], mean: float, squares: float) ->
     """
     if not squares:
         return 1.0
-    products = sum((value - mean) * (after - mean) for value, after in pairwise(values))
-    r = min(max(products / squares + 1.0 / len(values), 0.0), MOST_ALIKE)
+    r = min(max(products / squares + 1.0 / count, 0.0), MOST_ALIKE)
     return (1.0 + r) / (1.0 - r)
 
 
@@ -636,9 +640,9 @@ def _references(problem: Problem, seed: int, windows: int) -> dict[Part, Referen
     for index, placement in enumerate(problem.candidates.values()):
         missing = [part for part in parts_of(problem.pipeline, placement) if part not in references]
         if missing:
-            demands = meter.demands(_evidence_of(problem, real, _played(first, index), index))
+            demands = meter.demands(_evidence_of(problem, real, _played(first, index)))
             for part in missing:
-                values = np.round(demands.get(part, np.empty(0)), 6)
+                values = demands.get(part, np.empty(0)).copy()
                 block = min(problem.window_cycles, STEP)
                 kept = windows * problem.window_cycles
                 references[part] = Reference(values, block, kept, patience_ms)
@@ -682,15 +686,8 @@ def _shown(problem: Problem, arrays: Arrays) -> tuple[Floats, Floats]:
     return seen["l95_ms"].copy(), seen["missed"] / problem.window_cycles
 
 
-def _evidence_of(problem: Problem, real: Realisation, arrays: Arrays, index: int) -> Evidence:
+def _evidence_of(problem: Problem, real: Realisation, arrays: Arrays) -> Evidence:
     """What all cycles show that have run under a candidate."""
     flows = flow_rows(problem.pipeline)
-    (instants,) = logged_instants(CellArrays(arrays), 0, real.cycles, flows)
-    return Evidence(
-        close_ns=int(real.release_ns[-1]),
-        release_ns=real.release_ns[:-1],
-        placement=np.full(real.cycles, index),
-        cycles=Instants(*instants),
-        shadow_placement=np.full(real.cycles, -1),
-        shadows=None,
-    )
+    rows = logged_window(CellArrays(arrays), 0, real.cycles, flows)
+    return Evidence.of(rows, int(real.release_ns[-1]), real.release_ns[:-1])

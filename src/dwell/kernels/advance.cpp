@@ -36,27 +36,27 @@ DWELL_EXPORT void dwell_post_event(const Tables* tables, i64 at_ns, i64 key) noe
   queue.save(tables->clock[0]);
 }
 
-// Copies what the logs have of `n` cycles, cell after cell, and in it one table after another: when
-// jobs became ready, when they completed, when they started and the core time that they took, (n,
-// tasks), and when the messages of `n_flows` flows arrived, (n, n_flows); -1 for never.
-DWELL_EXPORT void dwell_logged_instants(const Tables* tables, i64 cell_0, i64 n_cells, i64 first,
-                                        i64 n, const i64* flows, i64 n_flows, i64* out) noexcept {
+// Writes what the logs still have of cycles, and of those of their shadows, as rows of a `Window`.
+DWELL_EXPORT void dwell_logged_window(const Tables* tables, i64 cell_0, i64 n_cells, i64 first,
+                                      i64 n, i64 n_tasks, const i64* flows, i64 n_flows,
+                                      i64* out) noexcept {
   const Simulation<false, false> s(*tables);
-  for (i64 cell = cell_0; cell < cell_0 + n_cells; ++cell) {
-    const i64 jobs = n * s.n_tasks;
-    i64 *ready_ns = out, *end_ns = ready_ns + jobs, *start_ns = end_ns + jobs;
-    i64 *work_ns = start_ns + jobs, *arrived_ns = work_ns + jobs;
-    for (i64 cycle = first; cycle < first + n; ++cycle) {
+  for (i64 cycle = first; cycle < first + n; ++cycle) {
+    for (i64 cell = cell_0; cell < cell_0 + n_cells; ++cell) {
       const i64 row = s.log_row(cell, cycle);
-      for (i64 at = row * s.n_tasks; at < (row + 1) * s.n_tasks; ++at) {
-        *ready_ns++ = s.log[at].ready_ns;
-        *end_ns++ = s.log_outcome[at] == kDone ? s.log[at].end_ns : -1;
-        *start_ns++ = s.log[at].start_ns;
-        *work_ns++ = s.log[at].work_ns;
+      *out++ = s.stamp(cell, cycle);
+      i64 *ready_ns = out, *end_ns = ready_ns + n_tasks, *arrived_ns = end_ns + n_tasks;
+      i64 *work_ns = arrived_ns + n_flows, *start_ns = work_ns + n_tasks;
+      for (i64 task = 0; task < n_tasks; ++task) {
+        const i64 at = row * s.n_tasks + task;
+        ready_ns[task] = s.log[at].ready_ns;
+        end_ns[task] = s.log_outcome[at] == kDone ? s.log[at].end_ns : -1;
+        work_ns[task] = s.log[at].work_ns;
+        start_ns[task] = s.log[at].start_ns;
       }
-      for (i64 i = 0; i < n_flows; ++i) *arrived_ns++ = s.log_arrived[row * s.n_flows + flows[i]];
+      for (i64 i = 0; i < n_flows; ++i) arrived_ns[i] = s.log_arrived[row * s.n_flows + flows[i]];
+      out = start_ns + n_tasks;
     }
-    out = arrived_ns;
   }
 }
 

@@ -9,6 +9,7 @@ import numpy as np
 from dwell.kernels.arrays import Arrays, CellArrays
 from dwell.kernels.codes import EventKind, Status, make_key
 from dwell.kernels.library import foreign
+from dwell.kernels.meter import WindowRows
 from dwell.kernels.rows import Ints
 
 STATUSES = tuple(Status)
@@ -18,7 +19,7 @@ _post = foreign("dwell_post_event", None, c_void_p, c_int64, c_int64)
 _send = foreign("dwell_send_state", None, c_void_p, *(c_int64,) * 5, POINTER(c_int64))
 _end_repeats = foreign("dwell_end_repeats", None, c_void_p, *(c_int64,) * 2)
 _logged = foreign(
-    "dwell_logged_instants", None, c_void_p, *(c_int64,) * 4, c_void_p, c_int64, c_void_p
+    "dwell_logged_window", None, c_void_p, *(c_int64,) * 5, c_void_p, c_int64, c_void_p
 )
 
 
@@ -48,10 +49,8 @@ def post_event(of: CellArrays, at_ns: int, kind: EventKind, cycle: int = 0, item
     _post()(of.whole.address, at_ns, make_key(kind, of.part.row, cycle, item))
 
 
-def logged_instants(
-    of: CellArrays, first: int, last: int, flows: Ints
-) -> list[tuple[Ints, Ints, Ints, Ints, Ints]]:
-    """Return what the logs still have of a cell's cycles, nanoseconds; -1 for never.
+def logged_window(of: CellArrays, first: int, last: int, flows: Ints) -> WindowRows:
+    """Return what the logs still have of a cell's cycles, and of its shadow, if it has one.
 
     Parameters
     ----------
@@ -59,27 +58,15 @@ def logged_instants(
         Cycles, the last excluded.
     flows : int64 array, shape (flows,)
         Which flows, in the order of the kernel's.
-
-    Returns
-    -------
-    list of (ready_ns, end_ns, arrived_ns, start_ns, work_ns)
-        Of the cell, then of its shadow: when all inputs of a job were there, and when it had
-        completed, int64 arrays of shape (cycles, tasks), when messages arrived, (cycles, flows),
-        when a job started, and the core time that it has received, if it has completed,
-        (cycles, tasks).
     """
-    part, tables, count = of.part, of.whole.tables, last - first
-    jobs = count * (tables.jobs.size // tables.slots.size)
-    found = np.empty((part.rows, 4 * jobs + count * len(flows)), np.int64)
+    part, tasks, count = of.part, of.part.tasks, len(flows)
+    table = np.empty((last - first, part.rows * (1 + 4 * tasks + count)), np.int64)
+    rows = WindowRows(table, tasks, count)
     _logged()(
-        *(of.whole.address, part.row, part.rows, first, count),
-        *(flows.ctypes.data, len(flows), found.ctypes.data),
+        *(of.whole.address, part.row, part.rows, first, last - first, tasks),
+        *(flows.ctypes.data, count, rows.row.rows),
     )
-    by_row = []
-    for row in found:
-        ready, end, start, work = row[: 4 * jobs].reshape(4, count, -1)[..., : part.tasks]
-        by_row.append((ready, end, row[4 * jobs :].reshape(count, len(flows)), start, work))
-    return by_row
+    return rows
 
 
 def send_state(

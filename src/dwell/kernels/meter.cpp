@@ -2,9 +2,9 @@
 // node, or a flow on a link.
 
 #include <algorithm>
+#include <cmath>
 #include <limits>
 
-#include "elementary.h"
 #include "export.h"
 #include "rows.h"
 
@@ -80,6 +80,14 @@ void take_off_waits(const Found& found) {
   }
 }
 
+// Rounds to whole nanoseconds, as everything is measured: equal values must be ties.
+void round_all(const Found& found) {
+  for (i64 i = 0; i < found.n_parts; ++i) {
+    f64* ms = found.ms + found.order[i] * found.most;
+    for (i64 k = 0; k < found.count[found.order[i]]; ++k) ms[k] = std::rint(ms[k] * 1e6) / 1e6;
+  }
+}
+
 // The next candidate that cycles under `active` were also sent through; -1 if there is none.
 i64 next_other(const Window& window, i64 shadow, i64 active, i64 after) {
   i64 next = -1;
@@ -101,7 +109,7 @@ using namespace dwell;
 DWELL_EXPORT void dwell_meter(const Layout* layout, const Window* window, i64 active, i64 limit_ns,
                               Found* found) noexcept {
   const i64 n_tasks = layout->n_tasks, n_flows = layout->n_flows, n_parts = n_tasks + n_flows;
-  const i64 shadow = 1 + 3 * n_tasks + n_flows;  // where its columns begin
+  const i64 shadow = 1 + 4 * n_tasks + n_flows;  // where its columns begin
   found->n_crossings = 0;
   i64 other = -1;
   do {
@@ -139,32 +147,7 @@ DWELL_EXPORT void dwell_meter(const Layout* layout, const Window* window, i64 ac
     }
     other = window->width > shadow ? next_other(*window, shadow, active, other) : -1;
   } while (other >= 0);
+  if (found->cost == nullptr) return;
   take_off_waits(*found);
-}
-
-// Adds up where `n` values lie among `n_known` ascending ones, each at a place p between 0 and 1:
-// the sums of -log(1 - p), of -log(p), and of p into `out`.
-DWELL_EXPORT void dwell_places(const f64* known, i64 n_known, const f64* values, i64 n,
-                               f64* out) noexcept {
-  // Of so many places the product is far from the least number, and has one logarithm.
-  constexpr i64 kTogether = 16;
-  out[0] = out[1] = out[2] = 0.0;
-  f64 beyond = 1.0, below = 1.0;
-  for (i64 i = 0; i < n; ++i) {
-    const f64* first = std::lower_bound(known, known + n_known, values[i]);
-    const f64* last = first;
-    if (first != known + n_known && *first == values[i]) {
-      last = std::upper_bound(first, known + n_known, values[i]);
-    }
-    const f64 p =
-        static_cast<f64>((first - known) + (last - known) + 1) / static_cast<f64>(2 * n_known + 2);
-    beyond *= 1.0 - p;
-    below *= p;
-    out[2] += p;
-    if (i % kTogether == kTogether - 1 || i == n - 1) {
-      out[0] -= dwell::log(beyond);
-      out[1] -= dwell::log(below);
-      beyond = below = 1.0;
-    }
-  }
+  round_all(*found);
 }

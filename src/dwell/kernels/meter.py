@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from ctypes import byref, c_double, c_int64, c_void_p
+from ctypes import byref, c_int64, c_void_p
 from typing import Any
 
 import numpy as np
@@ -39,6 +39,85 @@ class CyclesLayout:
         return CyclesLayout, self._behind
 
 
+class WindowRows:
+    """The instants of a window's cycles, as functions of the kernel take them.
+
+    Parameters
+    ----------
+    table : int64 array, shape (n, columns)
+        See `of`.
+    tasks, flows : int
+        Number of tasks and flows.
+    """
+
+    def __init__(self, table: Ints, tasks: int, flows: int) -> None:
+        self.table, self.tasks, self.flows = table, tasks, flows
+        self.row = structs()["Window"](table.ctypes.data, *table.shape)
+
+    @classmethod
+    def of(
+        cls,
+        cycles: Sequence[NDArray[np.integer]],
+        shadows: Sequence[NDArray[np.integer]] | None = None,
+    ) -> WindowRows:
+        """Put the instants of cycles, and of their shadows, into one table.
+
+        Parameters
+        ----------
+        cycles, shadows : sequence of six int64 arrays
+            The candidate that each went through, shape (n,), -1 for none; when its jobs became
+            ready and when they had completed, (n, tasks); when its messages arrived, (n, flows);
+            the core time of its jobs, and when they started, (n, tasks). -1 for an instant that had
+            not come, and for what is not known.
+        """
+        columns = [cycles[0][:, None], *cycles[1:]]
+        if shadows is not None:
+            columns += [shadows[0][:, None], *shadows[1:]]
+        # One table has one address, which takes as long to find as to copy it.
+        table = np.concatenate(columns, axis=1, dtype=np.int64)
+        return cls(table, cycles[1].shape[1], cycles[3].shape[1])
+
+    def columns(self, *, shadow: bool) -> tuple[Ints, Ints, Ints, Ints, Ints, Ints]:
+        """Return the columns of the cycles, or of their shadows (see `of`)."""
+        tasks, flows, table = self.tasks, self.flows, self.table
+        ready = 1 + (1 + 4 * tasks + flows) * shadow
+        end, arrived = ready + tasks, ready + 2 * tasks
+        work, start = arrived + flows, arrived + flows + tasks
+        return (
+            table[:, ready - 1],
+            table[:, ready:end],
+            table[:, end:arrived],
+            table[:, arrived:work],
+            table[:, work:start],
+            table[:, start : start + tasks],
+        )
+
+    @property
+    def has_shadows(self) -> bool:
+        """Whether there are columns of shadows."""
+        return bool(self.table.shape[1] > 1 + 4 * self.tasks + self.flows)
+
+    def __reduce__(self) -> tuple[type[WindowRows], tuple[Ints, int, int]]:
+        # A copy has an address of its own.
+        return WindowRows, (self.table, self.tasks, self.flows)
+
+    def copy(self) -> WindowRows:
+        """Return a copy, for what changes it."""
+        return WindowRows(self.table.copy(), self.tasks, self.flows)
+
+    def unknown(self, limit_ns: int) -> tuple[bool, bool, bool]:
+        """Return what has to be looked at.
+
+        Returns
+        -------
+        tuple of bool
+            Whether an own job that began before `limit_ns` has not ended; whether the work of an
+            own job that has ended is not known; whether the work of a shadow's is not known.
+        """
+        found = _unknown()(self.tasks, self.flows, byref(self.row), limit_ns)
+        return bool(found & 1), bool(found & 2), bool(found & 4)
+
+
 class PartTimes:
     """Times, or demands, of the parts of a window's cycles, milliseconds, infinite where lost.
 
@@ -70,11 +149,12 @@ class PartTimes:
         self._meter = _meter()
         self._cost, self._link, self._repeats = cost, link, repeats
         self._count, self._order = np.zeros((2, parts), np.int64)
-        self._window, self._found = structs()["Window"](), structs()["Found"]()
-        self._found.count, self._found.order = self._count.ctypes.data, self._order.ctypes.data
+        #: The kernel's row of what has been found.
+        self.found = structs()["Found"]()
+        self.found.count, self.found.order = self._count.ctypes.data, self._order.ctypes.data
         if cost is not None and link is not None and repeats is not None:
-            self._found.cost, self._found.link = cost.ctypes.data, link.ctypes.data
-            self._found.repeats = repeats.ctypes.data
+            self.found.cost, self.found.link = cost.ctypes.data, link.ctypes.data
+            self.found.repeats = repeats.ctypes.data
         self._ms, self._crossings = np.empty((parts, 0)), np.empty(0, np.int64)
 
     def __reduce__(
@@ -83,75 +163,39 @@ class PartTimes:
         # As in a copy of `CyclesLayout`; what has been found stays here.
         return PartTimes, (len(self._count), self._cost, self._link, self._repeats)
 
-    def begin(
-        self,
-        cycles: Sequence[NDArray[np.integer]],
-        shadows: Sequence[NDArray[np.integer]] | None,
-        limit_ns: int,
-    ) -> None:
+    def begin(self, window: WindowRows, limit_ns: int) -> None:
         """Begin a window; the times of the one before are overwritten.
 
         Parameters
         ----------
-        cycles, shadows : sequence of five int64 arrays
-            Of the cycles, and of their shadows: the candidate that each went through, shape (n,),
-            -1 for none; when its jobs became ready and when they had completed, (n, tasks); when
-            its messages arrived, (n, flows); and the core time of its jobs, (n, tasks). -1 for an
-            instant that had not come, and for what is not known.
         limit_ns : int
             A job or message that began before this, and has not ended, counts as lost.
         """
-        columns = [cycles[0][:, None], *cycles[1:]]
-        if shadows is not None:
-            columns += [shadows[0][:, None], *shadows[1:]]
-        # One table has one address, which takes as long to find as to copy it.
-        self._rows = np.concatenate(columns, axis=1, dtype=np.int64)
-        (count, width), self._limit_ns = self._rows.shape, limit_ns
-        self._window.rows, self._window.n = self._rows.ctypes.data, count
-        self._window.width = width
+        self._window, self._limit_ns = window, limit_ns
+        count, flows = len(window.table), window.flows
         if self._ms.shape[1] < 2 * count:
             self._ms = np.empty((len(self._count), 2 * count))
-            self._found.ms, self._found.most = self._ms.ctypes.data, self._ms.shape[1]
+            self.found.ms, self.found.most = self._ms.ctypes.data, self._ms.shape[1]
         if self._cost is not None:
             # Of every cycle and its shadow the messages, seven numbers each (`Crossing`).
-            room = 2 * count * cycles[3].shape[1] * 7
+            room = 2 * count * flows * 7
             if len(self._crossings) < room:
                 self._crossings = np.empty(room, np.int64)
-                self._found.crossings = self._crossings.ctypes.data
+                self.found.crossings = self._crossings.ctypes.data
         self._count[:] = 0
-        self._found.n_parts = 0
+        self.found.n_parts = 0
 
     def add(self, active: int, layout: CyclesLayout) -> None:
         """Add what the cycles under one candidate show, and then their shadows."""
-        self._meter(
-            byref(layout.row), byref(self._window), active, self._limit_ns, byref(self._found)
-        )
+        row = byref(self._window.row)
+        self._meter(byref(layout.row), row, active, self._limit_ns, byref(self.found))
 
     def by_part(self) -> dict[int, Floats]:
         """Return the times by number of part, in the order in which they were found."""
         counts = self._count.tolist()
-        order = self._order[: self._found.n_parts].tolist()
+        order = self._order[: self.found.n_parts].tolist()
         return {part: self._ms[part, : counts[part]] for part in order}
 
 
-def places(known: Floats, values: Floats) -> tuple[float, float, float]:
-    """Add up where values lie among known ones, each at a place p between 0 and 1.
-
-    Parameters
-    ----------
-    known : float64 array, shape (m,)
-        Ascending.
-    values : float64 array, shape (n,)
-
-    Returns
-    -------
-    tuple of float
-        Sums of -log(1 - p), of -log(p), and of p.
-    """
-    out = (c_double * 3)()
-    _places()(known.ctypes.data, len(known), values.ctypes.data, len(values), out)
-    return out[0], out[1], out[2]
-
-
-_places = foreign("dwell_places", None, c_void_p, c_int64, c_void_p, c_int64, c_void_p)
+_unknown = foreign("dwell_unknown", c_int64, c_int64, c_int64, c_void_p, c_int64)
 _meter = foreign("dwell_meter", None, c_void_p, c_void_p, c_int64, c_int64, c_void_p)

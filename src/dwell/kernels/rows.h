@@ -241,11 +241,18 @@ struct Crossing;  // of meter.cpp
   field(i64, n_tasks) field(i64, n_flows) field(Times, sources) field(Times, parts)              \
   field(const i8*, shared)
 
-// A row a cycle of a window: the candidate that it went through, when its jobs became ready, when
-// they completed, when its messages arrived, and the core time of its jobs, -1 for what had not
-// come or is not known; then, where there are shadows, the same of its shadow, the candidate being
-// -1 where it has none.
-#define DWELL_WINDOW(field) field(Times, rows) field(i64, n) field(i64, width)
+// A row per cycle of a window: the candidate that it went through, when its jobs became ready, when
+// they completed, when its messages arrived, the core time of its jobs, and when they started, -1
+// for what had not come or is not known; then, if there are shadows, the same of its shadow, the
+// candidate being -1 where it has none.
+#define DWELL_WINDOW(field) field(i64*, rows) field(i64, n) field(i64, width)
+
+// The jobs of a node (jobs.cpp): `cores` of each candidate and task, 0 for a task that is not there;
+// cores of the node, and those that its background leaves; foreign threads next to jobs, and the
+// share of the time in which there are bursts.
+#define DWELL_NODE_JOBS(field)                                                                   \
+  field(i64, n_tasks) field(i64, n_flows) field(const f64*, cores) field(i64, is_fair)           \
+  field(f64, n_cores) field(f64, spare) field(f64, foreign) field(f64, bursts)
 
 // The times found: up to `most` of each part, and the parts in the order in which they were found.
 // Where demands are asked for, and not times, there is a `cost` of each part: of a job its time
@@ -255,6 +262,27 @@ struct Crossing;  // of meter.cpp
   field(f64*, ms) field(i64*, count) field(i64*, order) field(i64, most) field(i64, n_parts)     \
   field(const f64*, cost) field(const i64*, link) field(const i64*, repeats)                     \
   field(Crossing*, crossings) field(i64, n_crossings)
+
+// What a window has brought of a part: how many values, and the sums of their places.
+#define DWELL_CHUNK(field)                                                                       \
+  field(i64, window) field(i64, cycles) field(i64, size)                                         \
+  field(f64, larger) field(f64, smaller) field(f64, places)
+
+// What is held of a part (pools.cpp): its `n_known` values as declared, ascending, of which stretches
+// of `block` cycles are alike by `likeness`; `size` values since `first`, with the sums of their
+// places; the windows that they are from, and all cycles of those; for how many cycles they have not
+// been as declared; how many were measured; and the windows of the last of them, and in which it
+// last ceased to be as declared, or got another value since; whether Python asks for the next window;
+// and the cycles and sums of a run of windows that are larger, or smaller, 0 for none.
+#define DWELL_POOL(field)                                                                        \
+  field(const f64*, known) field(i64, n_known) field(f64, patience_ms) field(f64, likeness)      \
+  field(i64, block) field(f64*, held) field(i64, first) field(i64, size)                         \
+  field(f64, larger) field(f64, smaller) field(f64, places)                                      \
+  field(Chunk*, chunks) field(i64, first_chunk) field(i64, n_chunks)                             \
+  field(i64, cycles) field(i64, lasting) field(i64, measured) field(i64, last)                   \
+  field(i64, touched) field(i64, is_declared) field(i64, asks)                                   \
+  field(i64, run_cycles) field(i64, run_size)                                                    \
+  field(f64, run_larger) field(f64, run_smaller) field(f64, run_places)
 
 #define DWELL_ROWS(row)                                                                          \
   row(Clock, DWELL_CLOCK) row(Cell, DWELL_CELL) row(Task, DWELL_TASK) row(Flow, DWELL_FLOW)      \
@@ -267,7 +295,8 @@ struct Crossing;  // of meter.cpp
   row(Rule, DWELL_RULE) row(Option, DWELL_OPTION) row(Decided, DWELL_DECIDED)                    \
   row(OnOffIntervals, DWELL_ON_OFF) row(NodeEffect, DWELL_EFFECT) row(LinkFault, DWELL_FAULT)    \
   row(DrawnPath, DWELL_PATH) row(Layout, DWELL_LAYOUT) row(Window, DWELL_WINDOW)                 \
-  row(Found, DWELL_FOUND)
+  row(Found, DWELL_FOUND) row(NodeJobs, DWELL_NODE_JOBS) row(Chunk, DWELL_CHUNK)   \
+  row(Pool, DWELL_POOL)
 
 // clang-format on
 

@@ -14,14 +14,13 @@ from dwell.control import (
     Controller,
     Estimator,
     Evidence,
-    Instants,
     LookedAt,
     MinimalPolicy,
     ShadowPlan,
     plain_rule,
 )
 from dwell.errors import SimulationError
-from dwell.kernels.advance import logged_instants, play
+from dwell.kernels.advance import logged_window, play
 from dwell.kernels.arrays import CellArrays, flow_rows, lay_out
 from dwell.kernels.codes import BuiltInPolicy, EventKind, Status, Tier, cell_of, kind_of
 from dwell.kernels.random_draws import draw, draw_shadows
@@ -548,20 +547,10 @@ def _evidence(
 ) -> Callable[[int, int, int], Evidence]:
     """Return the function that cuts a window's evidence out of the logs."""
     flows = flow_rows(problem.pipeline)
-    shadowed, stamps = len(arrays.tables.cells) > 1, arrays.tables.stamps
 
     def cut(first: int, last: int, close_ns: int) -> Evidence:
-        instants = [Instants(*of) for of in logged_instants(arrays, first, last, flows)]
-        return Evidence(
-            close_ns=close_ns,
-            release_ns=realisation.release_ns[first:last].copy(),
-            placement=stamps[0, first:last].copy(),
-            cycles=instants[0],
-            shadow_placement=(
-                stamps[1, first:last].copy() if shadowed else np.full(last - first, -1)
-            ),
-            shadows=instants[1] if shadowed else None,
-        )
+        rows = logged_window(arrays, first, last, flows)
+        return Evidence.of(rows, close_ns, realisation.release_ns[first:last].copy())
 
     return cut
 

@@ -1,0 +1,205 @@
+// Pools: what is held of each part of a cycle, next to what it is as declared (pool.py).
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+#include "elementary.h"
+#include "export.h"
+#include "rows.h"
+
+namespace dwell {
+
+// How values lie among known ones: sums of -log(1 - p), of -log(p), and of p, their places.
+struct PlaceSums {
+  i64 size;
+  f64 larger, smaller, places;
+};
+
+namespace {
+
+// As in pool.py.
+constexpr i64 kLargest = 200, kEnough = 12;
+constexpr f64 kMoved = 0.75;
+// Room for values and for chunks, of which the newest are held (pools.py).
+constexpr i64 kRoom = 408;
+// Why a pool needs another look: what a window brought has not been added, or it has been.
+constexpr i64 kNotAdded = 1, kAdded = 2;
+
+void add_places(const f64* known, i64 n_known, const f64* values, i64 n, f64 patience_ms,
+                PlaceSums& out) {
+  // Of so many places the product is far from the least number, and has one logarithm.
+  constexpr i64 kTogether = 16;
+  out = {n, 0.0, 0.0, 0.0};
+  f64 beyond = 1.0, below = 1.0;
+  for (i64 i = 0; i < n; ++i) {
+    const f64 value = values[i] > patience_ms ? std::numeric_limits<f64>::infinity() : values[i];
+    const f64* first = std::lower_bound(known, known + n_known, value);
+    const f64* last = first;
+    if (first != known + n_known && *first == value) {
+      last = std::upper_bound(first, known + n_known, value);
+    }
+    const f64 p =
+        static_cast<f64>((first - known) + (last - known) + 1) / static_cast<f64>(2 * n_known + 2);
+    beyond *= 1.0 - p;
+    below *= p;
+    out.places += p;
+    if (i % kTogether == kTogether - 1 || i == n - 1) {
+      out.larger -= dwell::log(beyond);
+      out.smaller -= dwell::log(below);
+      beyond = below = 1.0;
+    }
+  }
+}
+
+PlaceSums plus(const PlaceSums& one, const PlaceSums& other, i64 sign) {
+  const f64 by = static_cast<f64>(sign);
+  return {one.size + sign * other.size, one.larger + by * other.larger,
+          one.smaller + by * other.smaller, one.places + by * other.places};
+}
+
+// Deviations from chance by which values of a stretch of so many cycles are larger, or smaller,
+// than declared.
+f64 deviations(const Pool& pool, const PlaceSums& sums, i64 cycles) {
+  if (sums.size == 0) return 0.0;
+  const f64 size = static_cast<f64>(sums.size);
+  const f64 share = static_cast<f64>(pool.block) / static_cast<f64>(cycles);
+  const f64 together = size * std::min(share, 1.0);
+  // Of a sum of exponential values, by the cube root of its mean (Wilson and Hilferty).
+  const f64 part = 1.0 / (9.0 * size);
+  const f64 largest = std::max({sums.larger, sums.smaller, 0.0}) / size;
+  const f64 off = (dwell::cube_root(largest) - (1.0 - part)) / std::sqrt(part);
+  return off / std::sqrt(1.0 + std::max(together - 1.0, 0.0) * pool.likeness);
+}
+
+bool is_large(const PlaceSums& sums) {
+  const f64 mean = sums.places / static_cast<f64>(sums.size);
+  return !(1 - kMoved <= mean && mean <= kMoved);
+}
+
+// Keeps what is held at the begin of its room, where no more fits behind it.
+template <class Row>
+void make_room(Row* rows, i64& first, i64 n, i64 more) {
+  if (first + n + more <= kRoom) return;
+  std::copy(rows + first, rows + first + n, rows);
+  first = 0;
+}
+
+// Adds values, and drops the oldest: what is forgotten, and what is beyond `kLargest`.
+void add(Pool& pool, const f64* values, const PlaceSums& shift, i64 window, f64 memory,
+         i64 cycles) {
+  make_room(pool.chunks, pool.first_chunk, pool.n_chunks, 1);
+  Chunk* oldest = pool.chunks + pool.first_chunk;
+  oldest[pool.n_chunks++] = {window, cycles, shift.size, shift.larger, shift.smaller, shift.places};
+  pool.cycles += cycles;
+  PlaceSums total = plus({pool.size, pool.larger, pool.smaller, pool.places}, shift, 1);
+  const auto is_forgotten = [&](const Chunk& chunk) {
+    return static_cast<f64>(chunk.window) <= static_cast<f64>(window) - memory &&
+           total.size - chunk.size >= kEnough;
+  };
+  while (is_forgotten(*oldest) || total.size > kLargest) {
+    total = plus(total, {oldest->size, oldest->larger, oldest->smaller, oldest->places}, -1);
+    pool.cycles -= oldest->cycles;
+    ++oldest;
+    ++pool.first_chunk;
+    --pool.n_chunks;
+  }
+  // What is left of what was held, then the new values.
+  const i64 kept = total.size - shift.size;
+  pool.first += pool.size - kept;
+  make_room(pool.held, pool.first, kept, shift.size);
+  std::copy(values, values + shift.size, pool.held + pool.first + kept);
+  pool.measured = std::min(pool.measured + shift.size, total.size);
+  pool.size = total.size;
+  pool.larger = total.larger;
+  pool.smaller = total.smaller;
+  pool.places = total.places;
+  if (pool.is_declared == 0) pool.touched = window;
+}
+
+// Adds what a window brought to a pool that is as declared, if that is nothing to look at; returns
+// 0 then, else why another look is needed.
+i64 learn(Pool& pool, const f64* values, i64 n, i64 window, f64 memory, i64 cycles, f64 least) {
+  if (pool.is_declared == 0 || pool.n_known == 0 || pool.asks != 0 || n > kLargest)
+    return kNotAdded;
+  PlaceSums declared;
+  add_places(pool.known, pool.n_known, values, n, pool.patience_ms, declared);
+  // Windows that are larger, or smaller, are a run, up to a stretch.
+  PlaceSums run = declared;
+  i64 run_cycles = cycles;
+  if (pool.run_cycles > 0 && pool.run_cycles + cycles <= pool.block) {
+    run = plus({pool.run_size, pool.run_larger, pool.run_smaller, pool.run_places}, declared, 1);
+    run_cycles += pool.run_cycles;
+  }
+  if (is_large(run) && deviations(pool, run, run_cycles) >= least) return kNotAdded;
+  pool.run_cycles = is_large(run) ? run_cycles : 0;
+  pool.run_size = run.size;
+  pool.run_larger = run.larger;
+  pool.run_smaller = run.smaller;
+  pool.run_places = run.places;
+  pool.last = window;
+  add(pool, values, declared, window, memory, cycles);
+  const PlaceSums held = {pool.size, pool.larger, pool.smaller, pool.places};
+  if (deviations(pool, held, std::max(pool.cycles, i64{1})) >= least) return kAdded;
+  pool.lasting = 0;
+  return 0;
+}
+
+}  // namespace
+}  // namespace dwell
+
+using namespace dwell;
+
+// Adds up where values lie among `n_known` ascending ones into `out`; a value beyond the patience
+// counts as lost.
+DWELL_EXPORT void dwell_places(const f64* known, i64 n_known, const f64* values, i64 n,
+                               f64 patience_ms, f64* out) noexcept {
+  PlaceSums sums;
+  add_places(known, n_known, values, n, patience_ms, sums);
+  out[0] = sums.larger;
+  out[1] = sums.smaller;
+  out[2] = sums.places;
+}
+
+// Adds what a window brought of some parts to their pools; writes of each part why another look is
+// needed, 0 where none is, and returns how many need one.
+DWELL_EXPORT i64 dwell_learn(Pool* const* pools, const Found* found, const i64* parts, i64 n_parts,
+                             i64 window, f64 memory, i64 cycles, f64 least, i64* out) noexcept {
+  i64 n = 0;
+  for (i64 i = 0; i < n_parts; ++i) {
+    const i64 part = parts[i];
+    const f64* values = found->ms + part * found->most;
+    out[i] = learn(*pools[part], values, found->count[part], window, memory, cycles, least);
+    n += out[i] != 0 ? 1 : 0;
+  }
+  return n;
+}
+
+DWELL_EXPORT void dwell_pool_add(Pool* pool, const f64* values, i64 n, f64 larger, f64 smaller,
+                                 f64 places, i64 window, f64 memory, i64 cycles) noexcept {
+  add(*pool, values, {n, larger, smaller, places}, window, memory, cycles);
+}
+
+// Writes the numbers of the pools that are not as declared, and returns how many they are.
+DWELL_EXPORT i64 dwell_others(const Pool* const* pools, i64 n_pools, i64* out) noexcept {
+  i64 n = 0;
+  for (i64 i = 0; i < n_pools; ++i) {
+    if (pools[i]->is_declared == 0) out[n++] = i;
+  }
+  return n;
+}
+
+// Writes of each row of parts, -1 for none, the fewest measured values of one, and the window that
+// the oldest of their newest values is from.
+DWELL_EXPORT void dwell_weakest(const Pool* const* pools, const i64* parts, i64 n_rows, i64 width,
+                                i64* out) noexcept {
+  for (i64 row = 0; row < n_rows; ++row, out += 2) {
+    out[0] = out[1] = std::numeric_limits<i64>::max();
+    for (i64 i = 0; i < width; ++i) {
+      const i64 part = parts[row * width + i];
+      if (part < 0) continue;
+      out[0] = std::min(out[0], pools[part]->measured);
+      out[1] = std::min(out[1], pools[part]->last);
+    }
+  }
+}

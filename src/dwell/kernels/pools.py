@@ -1,0 +1,185 @@
+"""What is held of the parts of a cycle (see ``pools.cpp``)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from ctypes import addressof, byref, c_double, c_int64, c_void_p
+from typing import Any
+
+import numpy as np
+
+from dwell.kernels.library import foreign
+from dwell.kernels.meter import PartTimes
+from dwell.kernels.rows import Floats, Ints, structs
+
+#: Room for values, and for windows.
+ROOM = 408
+#: Why a pool needs another look: what a window brought has not been added, or it has been.
+NOT_ADDED, ADDED = 1, 2
+
+
+class HeldValues:
+    """The newest values of a part.
+
+    Parameters
+    ----------
+    known : float64 array, shape (n,)
+        The values as declared, ascending.
+    patience_ms, likeness, block
+        See `dwell.estimators.pool.Reference`.
+
+    Attributes
+    ----------
+    row : ctypes.Structure
+        The kernel's row; its fields are declared in ``rows.h``.
+    """
+
+    def __init__(self, known: Floats, patience_ms: float, likeness: float, block: int) -> None:
+        self.row = structs()["Pool"](0, len(known), patience_ms, likeness, block)
+        self._known, self._held = known, np.empty(ROOM)
+        self._chunks = (structs()["Chunk"] * ROOM)()
+        self._set_addresses()
+
+    def __getstate__(self) -> tuple[Any, ...]:
+        return bytes(self.row), self._known, self._held, bytes(self._chunks)
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        # A copy has addresses of its own.
+        row, self._known, self._held, chunks = state
+        self.row = structs()["Pool"].from_buffer_copy(row)
+        self._chunks = (structs()["Chunk"] * ROOM).from_buffer_copy(chunks)
+        self._set_addresses()
+
+    def _set_addresses(self) -> None:
+        self.row.known, self.row.held = self._known.ctypes.data, self._held.ctypes.data
+        self.row.chunks = addressof(self._chunks)
+
+    @property
+    def values(self) -> Floats:
+        """A copy of the values, in the order in which they came."""
+        return self._held[self.row.first : self.row.first + self.row.size].copy()
+
+    def begin(self, values: Floats, sums: tuple[float, float, float], window: int) -> None:
+        """Hold some values, none of which was measured, in the place of all others."""
+        row = self.row
+        if len(values) > len(self._held):
+            self._held = np.empty(len(values))
+            self._set_addresses()
+        self._held[: len(values)] = values
+        row.first, row.size, (row.larger, row.smaller, row.places) = 0, len(values), sums
+        self._chunks[0] = structs()["Chunk"](window, 0, len(values), *sums)
+        row.first_chunk, row.n_chunks, row.touched = 0, 1, window
+        row.measured = row.cycles = row.lasting = row.run_cycles = 0
+
+    def add(
+        self,
+        values: Floats,
+        sums: tuple[float, float, float],
+        window: int,
+        memory: float,
+        cycles: int,
+    ) -> None:
+        """Add values, and drop the oldest: what is forgotten, and what is beyond the most held.
+
+        Parameters
+        ----------
+        sums : tuple of float
+            Of their places (see `places`).
+        """
+        values = np.ascontiguousarray(values)
+        where = values.ctypes.data, len(values)
+        _pool_add()(byref(self.row), *where, *sums, window, memory, cycles)
+
+
+class PoolRows:
+    """The rows of pools, by the number of their part.
+
+    Parameters
+    ----------
+    groups : int64 array, shape (groups, parts)
+        Numbers of some parts; -1 for none.
+    """
+
+    def __init__(self, pools: Sequence[HeldValues], groups: Ints) -> None:
+        self._pools, self._groups = tuple(pools), groups
+        self._rows = np.array([addressof(pool.row) for pool in pools], np.uint64)
+        self._out, self._support = np.empty(len(pools), np.int64), np.empty((len(groups), 2), int)
+        self._addresses = self._rows.ctypes.data, self._out.ctypes.data
+        self._of_groups = groups.ctypes.data, *groups.shape, self._support.ctypes.data
+
+    def __reduce__(self) -> tuple[type[PoolRows], tuple[Sequence[HeldValues], Ints]]:
+        # A copy is of the copies of pools.
+        return PoolRows, (self._pools, self._groups)
+
+    def others(self) -> list[int]:
+        """Return the numbers of the parts that are not as declared."""
+        pools, out = self._addresses
+        n = _others()(pools, len(self._pools), out)
+        return self._out[:n].tolist() if n else []
+
+    def weakest(self) -> list[list[int]]:
+        """Return of each group the fewest measured values of a part, and the oldest window."""
+        _weakest()(self._addresses[0], *self._of_groups)
+        return self._support.tolist()
+
+    def learn(
+        self, found: PartTimes, parts: Ints, window: int, memory: float, cycles: int, least: float
+    ) -> list[int]:
+        """Add what a window brought to the pools that are as declared.
+
+        Parameters
+        ----------
+        parts : int64 array, shape (n,)
+            Numbers of the parts.
+        least : float
+            Deviations that are another regime.
+
+        Returns
+        -------
+        list of int
+            Of each part, why another look is needed (`NOT_ADDED`, `ADDED`), else 0.
+        """
+        pools, why = self._addresses
+        asked = parts.ctypes.data, len(parts), window, memory, cycles, least
+        n = _learn()(pools, byref(found.found), *asked, why)
+        return self._out[: len(parts)].tolist() if n else []
+
+
+def places(
+    known: Floats, values: Floats, patience_ms: float = math.inf
+) -> tuple[float, float, float]:
+    """Add up where values lie among known ones, each at a place p between 0 and 1.
+
+    Parameters
+    ----------
+    known : float64 array, shape (m,)
+        Ascending.
+    values : float64 array, shape (n,)
+    patience_ms : float
+        A value beyond counts as infinite.
+
+    Returns
+    -------
+    tuple of float
+        Sums of -log(1 - p), of -log(p), and of p.
+    """
+    values, out = np.ascontiguousarray(values), (c_double * 3)()
+    where = known.ctypes.data, len(known), values.ctypes.data, len(values)
+    _places()(*where, patience_ms, out)
+    return out[0], out[1], out[2]
+
+
+_places = foreign("dwell_places", None, c_void_p, c_int64, c_void_p, c_int64, c_double, c_void_p)
+_pool_add = foreign(
+    "dwell_pool_add",
+    None,
+    *(c_void_p, c_void_p, c_int64, c_double, c_double, c_double, c_int64, c_double, c_int64),
+)
+_learn = foreign(
+    "dwell_learn",
+    c_int64,
+    *(c_void_p, c_void_p, c_void_p, c_int64, c_int64, c_double, c_int64, c_double, c_void_p),
+)
+_others = foreign("dwell_others", c_int64, c_void_p, c_int64, c_void_p)
+_weakest = foreign("dwell_weakest", None, c_void_p, c_void_p, c_int64, c_int64, c_void_p)

@@ -1,0 +1,137 @@
+"""What the kernel holds of parts is what a plain list of windows holds."""
+
+from __future__ import annotations
+
+import copy
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from dwell.estimators.pool import ENOUGH, LARGEST, PlaceSums, Pool, Reference, least_deviations
+from dwell.kernels.elementary import moments
+from dwell.kernels.meter import CyclesLayout, PartTimes, WindowRows
+from dwell.kernels.pools import ADDED, HeldValues, PoolRows
+
+Floats = NDArray[np.float64]
+PARTS, BLOCK = 5, 10
+#: How often a part is compared in a window.
+TESTS = 5.0
+
+
+class Plain:
+    """Values of the newest windows, and the sums of their places."""
+
+    def __init__(self) -> None:
+        self.windows: deque[tuple[int, Floats, PlaceSums, int]] = deque()
+
+    def add(self, values: Floats, sums: PlaceSums, window: int, memory: float, cycles: int) -> None:
+        """Add values, and drop the oldest: what is forgotten, and what is beyond `LARGEST`."""
+        self.windows.append((window, values.copy(), sums, cycles))
+        while len(self.values) > LARGEST or (
+            self.windows[0][0] <= window - memory
+            and len(self.values) - len(self.windows[0][1]) >= ENOUGH
+        ):
+            self.windows.popleft()
+
+    @property
+    def values(self) -> Floats:
+        return np.concatenate([values for _, values, _, _ in self.windows])
+
+    @property
+    def cycles(self) -> int:
+        return sum(cycles for *_, cycles in self.windows)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_newest_values_are_held(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    known = np.sort(rng.lognormal(size=50))
+    held, plain = HeldValues(known, np.inf, 0.1, BLOCK), Plain()
+    held.begin(np.empty(0), (0.0, 0.0, 0.0), 0)
+    for window in range(1, 80):
+        values = rng.lognormal(size=int(rng.integers(1, rng.choice([3, LARGEST + 1]))))
+        sums, memory = PlaceSums.among(values, known), float(rng.choice([0.5, 3.0, np.inf]))
+        held.add(values, sums.sums, window, memory, len(values) + 3)
+        plain.add(values, sums, window, memory, len(values) + 3)
+        if seed % 2:
+            held = copy.deepcopy(held)
+        np.testing.assert_array_equal(held.values, plain.values)
+        assert held.row.cycles == plain.cycles
+        assert held.row.places == pytest.approx(sum(one.places for _, _, one, _ in plain.windows))
+
+
+def of_parts(values: Sequence[Floats]) -> tuple[PartTimes, NDArray[np.int64]]:
+    """Return a window that shows some values of each part, as the times of a task's jobs."""
+    found = PartTimes(len(values))
+    count = max(map(len, values))
+    end = np.full((count, len(values)), -1)
+    for column, one in enumerate(values):
+        end[: len(one), column] = np.rint(one * 1e6)
+    begin = np.where(end >= 0, 0, -1)
+    none = begin[:, :0]
+    nothing = np.zeros((2, 0), np.bool_)
+    layout = CyclesLayout(np.zeros(0, np.int64), np.array([range(len(values))] * 2), nothing)
+    found.begin(WindowRows.of((begin[:, 0] * 0, begin, end, none, begin, begin)), 0)
+    found.add(0, layout)
+    return found, np.array(list(found.by_part()))
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_a_window_of_all_parts_leaves_pools_as_each_by_itself_does(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scale = rng.choice([1.0, 1.0, 4.0], PARTS)
+
+    def shown() -> list[Floats]:
+        sizes = rng.integers(0, 60, PARTS)
+        return [
+            np.round(rng.gamma(9.0, size=n) * by, 6) for n, by in zip(sizes, scale, strict=True)
+        ]
+
+    references = [
+        Reference(np.round(rng.gamma(9.0, size=400), 6), BLOCK, patience_ms=patience)
+        for patience in (np.inf, 15.0, np.inf, 12.0, np.inf)
+    ]
+    alone, together = ([Pool(one, additive=False) for one in references] for _ in range(2))
+    least = least_deviations(TESTS)
+    rows = PoolRows([pool.rows for pool in together], np.array([[0, 1, -1], [2, 3, 4]]))
+    for window in range(1, 25):
+        if window % 8 == 0:
+            scale = rng.choice([1.0, 1.0, 4.0], PARTS)
+            alone, together, rows = copy.deepcopy((alone, together, rows))
+        found, parts = of_parts(shown())
+        times = found.by_part()
+        looks = rows.learn(found, parts, window, 6.0, 60, least) or [0] * len(parts)
+        for part, why in zip(parts.tolist(), looks, strict=True):
+            has_changed = alone[part].learn(times[part], window, 6.0, 60, TESTS)
+            if why == ADDED:
+                assert together[part].has_left(window, 60, least) == has_changed
+            elif why:
+                assert together[part].learn(times[part], window, 6.0, 60, TESTS) == has_changed
+            else:
+                assert not has_changed
+        for one, other in zip(alone, together, strict=True):
+            np.testing.assert_array_equal(one.held, other.held)
+            assert (one.is_declared, one.last, one.measured, one.touched) == (
+                *(other.is_declared, other.last, other.measured, other.touched),
+            )
+        assert rows.others() == [i for i, one in enumerate(alone) if not one.is_declared]
+        assert rows.weakest() == [
+            [min(alone[i].measured for i in of), min(alone[i].last for i in of)]
+            for of in ((0, 1), (2, 3, 4))
+        ]
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 24])
+def test_moments_are_sums_one_after_another(count: int) -> None:
+    values = np.random.default_rng(count).gamma(3.0, size=count).tolist()
+    total = squares = products = 0.0
+    for value in values:
+        total += value - values[0]
+    mean = values[0] + total / count
+    for i, value in enumerate(values):
+        squares += (value - mean) * (value - mean)
+        products += (values[i - 1] - mean) * (value - mean) if i else 0.0
+    assert moments(values) == (mean, squares, products)
