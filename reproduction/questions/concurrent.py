@@ -107,21 +107,23 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
     columns = ("violation_rate", "l95_ms", "u_robot", "u_edge", "cost", "migrations")
     every = by_policy(everybody, columns)
     verdicts = pl.concat(claims(everybody, METRICS, main.scenarios, asked, main, margin=MARGIN))
-    answering = {"first": RULE, "second": TUNED, "metric": "violation_rate"}
+    rivals = pl.col("second").is_in([TUNED, BEST_HERE])
+    answering = verdicts.filter(rivals, metric="violation_rate")
     return Answer(
         verdicts,
         {
             "Every policy under every stress": every,
             "ATP's settings on the held-out seeds: stage, L95 over D, U_r, U_e, N_min": settings,
         },
-        map_of(verdicts.filter(**answering), _label, 100.0),
+        map_of(answering, _label, 100.0),
     )
 
 
 def _label(row: dict[str, str]) -> tuple[str, str, str]:
     stress, _, place = row["scenario"].partition(" + ")
     robot, _, load = stress.partition(" ")
-    return f"V_D, points: {robot} stressed, threads", load, place or "no fault"
+    tuned = "all cells" if row["second"] == TUNED else "its cell"
+    return f"{robot} stressed: less ATP tuned for {tuned}", load, place or "no fault"
 
 
 def stress_scenarios(cell: Problem) -> dict[str, Scenario]:
