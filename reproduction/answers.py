@@ -62,11 +62,12 @@ def table(name: str, cells: pl.DataFrame) -> str:
     for (scenario,), mine in cells.group_by(["row"], maintain_order=True):
         *shares, span = mine.to_dicts()
         known = [one for one in shares if one["effect"] is not None]
-        most = (
-            max(known, key=lambda one: one["effect"]) if known else {"column": "–", "effect": None}
-        )
-        told = [number(one["effect"]) if one["effect"] is not None else "–" for one in (most, span)]
-        lines.append(f"| {scenario} | {most['column']} | {told[0]} | {told[1]} |")
+        told = "none | –"
+        if known:
+            most = max(known, key=lambda one: float(one["effect"]))
+            ends = ", ".join(number(most[end]) for end in ("low", "high"))
+            told = f"{most['column']} | {number(most['effect'])} [{ends}]"
+        lines.append(f"| {scenario} | {told} | {number(span['effect'])} |")
     return "\n".join(lines)
 
 
