@@ -115,7 +115,9 @@ def _panel(cells: pl.DataFrame, words: list[str]) -> dict[str, object]:
     fill = {
         "field": "word",
         "scale": {"domain": words, "range": colours},
-        "legend": {"title": None, "orient": "bottom", "columnPadding": 24} if any(words) else None,
+        "legend": {"title": None, "orient": "bottom", "columns": 2, "columnPadding": 24}
+        if any(words)
+        else None,
     }
     ink = {"condition": {"test": is_coloured, "value": "white"}, "value": INK}
     return {
