@@ -2,7 +2,6 @@ from .capacity import Capacity as Capacity
 from .capacity import CapacityPoint as CapacityPoint
 from .capacity import Limiting as Limiting
 from .capacity import capacity_of as capacity_of
-from .capacity import what_ifs as what_ifs
 from .comparison import Comparison as Comparison
 from .comparison import compare as compare
 from .demo import canonical_demo as canonical_demo
@@ -45,3 +44,4 @@ from .study_folder import Shard as Shard
 from .study_folder import open_study as open_study
 from .validation import Validation as Validation
 from .validation import validate as validate
+from .what_ifs import changes_of as changes_of
