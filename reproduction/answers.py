@@ -62,12 +62,12 @@ def table(name: str, cells: pl.DataFrame) -> str:
     for (scenario,), mine in cells.group_by(["row"], maintain_order=True):
         *shares, span = mine.to_dicts()
         known = [one for one in shares if one["effect"] is not None]
-        most = (
-            max(known, key=lambda one: one["effect"]) if known else {"column": "–", "effect": None}
-        )
-        effects = [one["effect"] for one in (most, span)]
-        told = ["–" if effect is None else number(float(effect)) for effect in effects]
-        lines.append(f"| {scenario} | {most['column']} | {told[0]} | {told[1]} |")
+        told = "none | –"
+        if known:
+            most = max(known, key=lambda one: float(one["effect"]))
+            ends = ", ".join(number(most[end]) for end in ("low", "high"))
+            told = f"{most['column']} | {number(most['effect'])} [{ends}]"
+        lines.append(f"| {scenario} | {told} | {number(span['effect'])} |")
     return "\n".join(lines)
 
 

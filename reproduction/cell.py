@@ -23,7 +23,7 @@ STEADY = (
     "network-impairment-mild",
 )
 #: The best placement changes while the run goes on, by a timetable of 300 windows.
-TIMETABLE = ("step", "drift")
+TIMETABLE, TIMETABLE_WINDOWS = ("step", "drift"), 300
 #: It changes at random, from the begin of a run to its end, however long that is.
 RANDOM = ("bursts", "flapping", "mixture")
 DYNAMIC = (*TIMETABLE, *RANDOM)

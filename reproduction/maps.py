@@ -65,7 +65,8 @@ def number(value: float) -> str:
 
 def svg(cells: pl.DataFrame) -> str:
     """Draw a map: a panel below the other, in each cell its effect, coloured by its word."""
-    panels = [_panel(mine) for _, mine in cells.group_by("panel", maintain_order=True)]
+    words = list(dict.fromkeys(brief(cells)["word"]))
+    panels = [_panel(mine, words) for _, mine in cells.group_by("panel", maintain_order=True)]
     style = {
         "font": "system-ui, sans-serif",
         "view": {"stroke": None},
@@ -89,14 +90,13 @@ def svg(cells: pl.DataFrame) -> str:
     return re.sub(r' (?:role|aria-[\w-]+)="[^"]*"', "", vl_convert.vegalite_to_svg(drawing))
 
 
-def _panel(cells: pl.DataFrame) -> dict[str, object]:
+def _panel(cells: pl.DataFrame, words: list[str]) -> dict[str, object]:
     shown = brief(cells).select(*LABELS, "effect", "word")
     texts = [
         "=" if word.startswith("same") else number(effect) if effect is not None else ""
         for effect, word in shown.select("effect", "word").iter_rows()
     ]
     data = shown.with_columns(text=pl.Series(texts, dtype=pl.String))
-    words = list(dict.fromkeys(data["word"]))
     colours = [COLOURS.get(word, FAINT) for word in words]
     is_coloured = f"indexof({list(COLOURS)}, datum.word) >= 0"
     places = {
@@ -115,7 +115,9 @@ def _panel(cells: pl.DataFrame) -> dict[str, object]:
     fill = {
         "field": "word",
         "scale": {"domain": words, "range": colours},
-        "legend": {"title": None, "orient": "bottom", "columnPadding": 24} if any(words) else None,
+        "legend": {"title": None, "orient": "bottom", "columns": 2, "columnPadding": 24}
+        if any(words)
+        else None,
     }
     ink = {"condition": {"test": is_coloured, "value": "white"}, "value": INK}
     return {

@@ -65,7 +65,7 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
 def _label(row: dict[str, str]) -> tuple[str, str, str]:
     estimator, dwell, rule = row["first"].split(", ")
     panel = f"Migrations: {estimator}, {dwell}"
-    return panel, f"α_S = {rule.removeprefix(PENALTY)}", row["scenario"]
+    return panel, f"α_S = {rule.split()[-1]}", row["scenario"]
 
 
 def judging(cell: Problem) -> Problem:

@@ -8,7 +8,7 @@ import polars as pl
 
 from dwell.model import Problem
 from dwell.study import Point
-from reproduction.cell import DYNAMIC, STEADY, by_length
+from reproduction.cell import RANDOM, STEADY
 from reproduction.maps import map_of
 from reproduction.questions import Run, study_file
 from reproduction.scale import Scale
@@ -31,15 +31,11 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
     """Compare every interval with a decision a window."""
     point = Point({}, cell)
     plan = replace(study_file("deciding"), points=(point,), seeds=scale.fresh_seeds)
-    scenarios = (*STEADY, *DYNAMIC)
-    studies = [
-        replace(plan, name=f"{plan.name}{suffix}", scenarios=mine, windows=windows)
-        for suffix, mine, windows in by_length(scenarios, scale.windows, scale.dynamic_windows)
-    ]
-    runs = pl.concat([run(study).runs for study in studies])
+    study = replace(plan, scenarios=(*STEADY, *RANDOM), windows=scale.windows)
+    runs = run(study).runs
     *sooner, once = plan.policies
     asked = {"Deciding more often changes a metric": [(one, once) for one in sooner]}
-    verdicts = pl.concat(claims(runs, METRICS, scenarios, asked, *studies, margin=MARGIN))
+    verdicts = pl.concat(claims(runs, METRICS, study.scenarios, asked, study, margin=MARGIN))
     maps = [
         map_of(
             verdicts.filter(metric=metric),

@@ -14,7 +14,15 @@ from SALib.sample import sobol as sampling
 
 from dwell.model import Problem
 from dwell.study import Contender, Interval, StudyResult
-from reproduction.cell import DYNAMIC, STEADY, by_length, dtp, of_cell
+from reproduction.cell import (
+    DYNAMIC,
+    STEADY,
+    TIMETABLE,
+    TIMETABLE_WINDOWS,
+    by_length,
+    dtp,
+    of_cell,
+)
 from reproduction.maps import LABELS
 from reproduction.questions import Run
 from reproduction.scale import Scale
@@ -47,22 +55,30 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
         of_cell(f"weights{suffix}", cell, mine, weighing(rows), seeds, windows)
         for seeds in (scale.fresh_seeds[: scale.sobol_seeds],)
         for suffix, mine, windows in by_length(
-            (*STEADY, *DYNAMIC), scale.sobol_windows, scale.dynamic_windows
+            whole(scale, *STEADY, *DYNAMIC), scale.sobol_windows, scale.dynamic_windows
         )
     ]
+    steps = whole(scale, *ONE_AT_A_TIME)
     alone = [
         of_cell(f"weights-one{suffix}", cell, mine, stepping(cell), scale.fresh_seeds, windows)
-        for suffix, mine, windows in by_length(ONE_AT_A_TIME, scale.windows, scale.dynamic_windows)
+        for suffix, mine, windows in by_length(steps, scale.windows, scale.dynamic_windows)
     ]
     swept = pl.concat([indices(run(study), scale.sobol_n) for study in together])
     runs = pl.concat([run(study).runs for study in alone])
     pairs = [(one.name, AS_IT_IS) for one in alone[0].contenders if one.name != AS_IT_IS]
     asked = {"One weight changed changes a metric": pairs}
     return Answer(
-        pl.concat(claims(runs, OUTPUTS, ONE_AT_A_TIME, asked, *alone, margin=MARGIN)),
+        pl.concat(claims(runs, OUTPUTS, steps, asked, *alone, margin=MARGIN)),
         {"Outputs over the weights, the part of it that is luck, and Sobol indices": swept},
         cells_of(swept, f"{scale.sobol_seeds} seeds of {scale.sobol_n * 7} settings"),
     )
+
+
+def whole(scale: Scale, *scenarios: str) -> tuple[str, ...]:
+    """Return the scenarios whose timetable a run is long enough for."""
+    if scale.dynamic_windows >= TIMETABLE_WINDOWS:
+        return scenarios
+    return tuple(name for name in scenarios if name not in TIMETABLE)
 
 
 def cells_of(swept: pl.DataFrame, design: str) -> pl.DataFrame:

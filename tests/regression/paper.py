@@ -53,7 +53,9 @@ def read(file: Path) -> pl.DataFrame:
 
 
 def write(folder: Path, file: Path) -> int:
-    """Write down the means of the studies in a folder; returns how many rows."""
+    """Replace the means of the studies in a folder; return how many rows there are."""
     found = means(path.parent for path in folder.glob("*/runs.parquet"))
-    found.write_csv(file)
-    return found.height
+    kept = read(file).filter(~pl.col("study").is_in(found["study"])).fill_null("")
+    together = pl.concat([kept, found.select(kept.columns)], how="vertical_relaxed").sort(KEYS)
+    together.write_csv(file)
+    return together.height

@@ -87,10 +87,9 @@ def windows_behind(*groups: pl.DataFrame) -> int | None:
         One row a run each; their column ``windows`` counts those after the warm-up. None if a
         table has no such column, or if the `UNIT` of a run is `RUN` (see `unit_of`).
     """
-    if any("windows" not in runs.columns for runs in groups):
-        return None
-    if any(UNIT in runs.columns and RUN in runs[UNIT] for runs in groups):
-        return None
+    for runs in groups:
+        if "windows" not in runs.columns or RUN in runs.get_column(UNIT, default=()):
+            return None
     return min(int(runs["windows"].sum()) for runs in groups)
 
 

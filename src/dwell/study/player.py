@@ -7,7 +7,7 @@ another. What a window showed is the same for both.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import TYPE_CHECKING
@@ -250,36 +250,32 @@ class Player:
         from dwell.study.fleet_summary import summarise_fleet
 
         for point in item.points:
-            fleet = self.study.points[point].fleet
+            fleet, windows = self.study.points[point].fleet, self.study.windows
             if fleet is None:
                 continue
             for contender in contenders:
                 played = contender.fleet(fleet, item.scenario)
-                run = simulate_fleet(played, seed=item.seed, windows=self.study.windows)
+                run = simulate_fleet(played, seed=item.seed, windows=windows)
                 labels = _labels(item, contender.name)
                 summary = summarise_fleet(run, fleet, labels)
                 worst = run.cells[str(summary.row["worst_cell"])]
-                cells = [(one.cell, one.scenario) for one in played.entries]
-                yield contender.name, point, None, self._completed(summary, worst, cells, labels)
+                unit = unit_of(((one.cell, one.scenario) for one in played.entries), windows)
+                yield contender.name, point, None, self._completed(summary, worst, unit, labels)
 
     def _summary(self, run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Summary:
         """Sum up a run of a cell."""
-        cells = ((problem, str(labels["scenario"])),)
-        summary = self._completed(summarise(run, problem, labels), run, cells, labels)
+        unit = unit_of([(problem, str(labels["scenario"]))], self.study.windows)
+        summary = self._completed(summarise(run, problem, labels), run, unit, labels)
         if self.study.references:
             kept = few_misses(run, problem).tobytes()
             summary = replace(summary, compared={"kept": kept})
         return summary
 
     def _completed(
-        self,
-        summary: Summary,
-        run: Run,
-        cells: Iterable[tuple[Problem, str]],
-        labels: Mapping[str, str | int],
+        self, summary: Summary, run: Run, unit: str, labels: Mapping[str, str | int]
     ) -> Summary:
-        """Add the independent unit of the cells' runs, and the metrics of the study's own."""
-        summary = replace(summary, row={**summary.row, UNIT: unit_of(cells, self.study.windows)})
+        """Add the independent unit of a run, and the metrics of the study's own."""
+        summary = replace(summary, row={**summary.row, UNIT: unit})
         taken = [name for name in self.study.metrics if name in summary.row or name in COMPARED]
         if taken:
             raise SimulationError(f"metrics.{taken[0]}: {TAKEN}")
