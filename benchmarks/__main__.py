@@ -22,6 +22,8 @@ BENCHMARKS = {
     "deciding": ("deciding", "measure"),
     "pricing": ("pricing", "measure"),
     "regimes": ("regimes", "measure"),
+    "sooner": ("sooner", "measure"),
+    "errors": ("stated_errors", "measure"),
     "clairvoyant": ("clairvoyant", "measure"),
     "fleet": ("fleet", "measure"),
     "ledger": ("fleet_ledger", "measure"),
@@ -42,6 +44,7 @@ BENCHMARKS = {
     "page-cost": ("page_cost", "measure"),
     "live-fleet": ("fleet_live", "measure"),
     "restart": ("restart", "measure"),
+    "leaving": ("leaving", "measure"),
 }
 
 

@@ -12,13 +12,13 @@ from pathlib import Path
 import dwell
 from dwell.report import study_html
 from dwell.study import Study, StudyResult, open_study, run_study
-from reproduction.answers import found, page_of, write
+from reproduction.answers import RESEARCH, page_of, write
 from reproduction.cell import paper_cell
 from reproduction.page import Question, page
 from reproduction.questions import QUESTIONS, Run
 from reproduction.scale import Scale, scale_of
 
-SCALES = ("full", "quick", "tiny")
+SCALES = ("full", "medium", "quick", "tiny")
 REAL = "real"
 
 
@@ -48,8 +48,11 @@ def main(words: list[str]) -> int:
     names = asked.only or [name for name in QUESTIONS if name != REAL or asked.real]
     try:
         done = [_ask(name, scale, run, asked.real, out) for name in names]
-        answers = found({one.name: one.answer.verdicts for one in done})
-        write(answers, out / "answers")
+        mapped = {one.name: one.answer.cells for one in done if one.answer.cells is not None}
+        answers = {
+            name: mapped[one.question] for name, one in RESEARCH.items() if one.question in mapped
+        }
+        write(answers, out)
         text = page(
             done,
             answers=page_of(answers),

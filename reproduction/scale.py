@@ -16,6 +16,9 @@ SCALES = Path(__file__).parent / "scales.yaml"
 
 #: Seeds that parameters are tuned on begin after this one; no comparison uses them.
 HELD_OUT = 1000
+#: Seeds of the comparisons behind maps begin after this one. None was played before the margins of
+#: the questions were written down.
+FRESH = 2000
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +62,11 @@ class Scale:
     def all_seeds(self) -> tuple[int, ...]:
         """Seeds of a comparison."""
         return tuple(range(1, self.seeds + 1))
+
+    @property
+    def fresh_seeds(self) -> tuple[int, ...]:
+        """Seeds of a comparison with a margin."""
+        return tuple(FRESH + seed for seed in self.all_seeds)
 
     @property
     def some_seeds(self) -> tuple[int, ...]:

@@ -26,16 +26,23 @@ from dwell.study import (
     windows_behind,
 )
 
+#: Word of a difference that is not shown and whose interval lies within a margin named beforehand:
+#: two one-sided tests at 2.5 %.
+WITHIN = "within the margin"
 NUMBERS = ("effect", "low", "high", "p", "p_least")
 COLUMNS = ("claim", "design", "scenario", "first", "second", "metric", *NUMBERS, "word")
 SCHEMA = {name: pl.Float64 if name in NUMBERS else pl.String for name in COLUMNS}
 
 
 class Answer(NamedTuple):
-    """What came of a question: a row a verdict, and what else the runs show, by a title."""
+    """What came of a question: a row a verdict, and what else the runs show, by a title.
+
+    A research question also has the map that answers it (`reproduction.maps`).
+    """
 
     verdicts: pl.DataFrame
     tables: Mapping[str, pl.DataFrame]
+    cells: pl.DataFrame | None = None
 
 
 def design_of(*studies: Study) -> str:
@@ -62,8 +69,15 @@ def claims(
     scenarios: Iterable[str],
     pairs: Mapping[str, Iterable[tuple[str, str]]],
     *studies: Study,
+    margin: float = 0.0,
 ) -> list[pl.DataFrame]:
     """Compare pairs of policies in every scenario, by claim; each metric is a family of its own.
+
+    Parameters
+    ----------
+    margin : float
+        Differences of V_D within it have the word `WITHIN`, if it was written down before any of
+        the seeds was played; 0 claims none.
 
     Returns
     -------
@@ -87,7 +101,13 @@ def claims(
         family = Family.of_runs(runs, claim, metric, contrasts).table().drop("p").rename(renamed)
         labels = pl.DataFrame(rows, schema=schema, orient="row")
         labels = labels.with_columns(claim=pl.lit(claim), design=pl.lit(design_of(*studies)))
-        frames.append(labels.hstack(family).select(COLUMNS))
+        frame = labels.hstack(family).select(COLUMNS)
+        if margin and metric.endswith("violation_rate"):
+            inside = (pl.col("low") >= -margin) & (pl.col("high") <= margin)
+            is_equal = inside & (pl.col("word") == "no difference shown")
+            word = pl.when(is_equal).then(pl.lit(WITHIN)).otherwise("word")
+            frame = frame.with_columns(word=word)
+        frames.append(frame)
     return frames
 
 

@@ -18,6 +18,7 @@ QUESTIONS = (
     "reversion",
     "chatter",
     "weights",
+    "deciding",
     "hysteresis",
     "jitter",
     "dominance",

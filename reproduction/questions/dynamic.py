@@ -17,7 +17,6 @@ from dwell.model import Problem
 from dwell.policies import Cusum
 from dwell.study import (
     AIM,
-    SAME_RUN,
     Contender,
     Hindsight,
     Interval,
@@ -25,7 +24,7 @@ from dwell.study import (
     StudyResult,
     keeps,
     mean_interval,
-    same_run,
+    played_alike,
     share_interval,
     under,
     windows_behind,
@@ -203,8 +202,9 @@ def aims(
                 moves = (values(here, "migrations", policy=who) for who in (name, other))
                 more = mean_interval(np.subtract(*moves))
                 word = within(more, 0.0)
-                if same_run(here, ({"policy": name}, {"policy": other})):
-                    more, word = Interval(0.0, np.nan, np.nan), SAME_RUN
+                alike = played_alike(here, ({"policy": name}, {"policy": other}))
+                if alike and not more.value:
+                    more, word = Interval(0.0, np.nan, np.nan), alike
                 claim = (f"No more migrations than {other}", scenario, name, "migrations")
                 found.append(judge(*claim, more, word, *studies))
     return found

@@ -33,9 +33,7 @@ def test_a_fleet_is_played_saved_and_summed_up(fleet: Path) -> None:
     result = call("fleet", "run", fleet, "--windows", "12", "--policy", "OFF")
     assert (result.exit_code, result.stderr) == (0, "")
     first, *_ = result.stdout.splitlines()
-    assert first == (
-        "pair: 2 cells; shared: E; phases: even; coordination: none; seed 1; 12 windows"
-    )
+    assert first == ("pair: 2 cells; shared: E; phases: even; coordination: none; seed 1; 2.4 s")
     assert "saved to runs/pair-OFF-none-even-1" in result.stdout
     run = open_fleet("runs/pair-OFF-none-even-1")
     assert [one.windows.height for one in run.cells.values()] == [12, 12]
@@ -96,6 +94,13 @@ def test_a_shared_node_that_nobody_uses_is_warned_of(fleet: Path) -> None:
     assert "shared.E: no candidate of any cell uses this node" in result.stderr
 
 
+def test_a_length_in_seconds(fleet: Path) -> None:
+    found = read_json(call("fleet", "run", fleet, "--seconds", "1.25", "--json"))
+    assert found["seconds"] == 1.25
+    text = call("fleet", "run", fleet, "--seconds", "0.1")
+    assert_refused(text, "seconds: 0.1 is not allowed; it must be at least the longest window, 0.2")
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -150,7 +155,7 @@ def crowd(fleet: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         "E: {exec_ms: 2}", "E: {exec_ms: 6}"
     )
     fleet.with_name("small.yaml").write_text(text, encoding="utf-8")
-    monkeypatch.setattr("dwell.study.capacity.CYCLES", 100)
+    monkeypatch.setattr("dwell.study.capacity.CYCLES", 400)
     return fleet
 
 
@@ -172,9 +177,13 @@ def test_a_capacity_as_json(crowd: Path) -> None:
         "sync",
         "OFF",
     )
-    assert found["limits"] == {"node": "E", "share": pytest.approx(12 / 15, abs=1e-3)}
+    assert found["limits"] == {"resource": "E", "share": pytest.approx(12 / 15, abs=1e-3)}
+    assert (found["robots_at_limit"], found["searched"]) == (2, "every size")
     assert [point["robots"] for point in found["curve"]] == [1, 2, 3]
-    assert set(found["curve"][0]) == {"robots", "violation_rate", "low", "high"}
+    assert set(found["curve"][0]) == {
+        *("robots", "violation_rate", "low", "high", "phases_error", "cycles_error", "utilisation")
+    }
+    assert found["curve"][1]["utilisation"] == {"E": pytest.approx(0.6, abs=0.01)}
     assert "what_if" not in found
     assert found["report"] is None
     assert read_json(call(*command, "--out", "page.html"))["report"] == "page.html"
@@ -193,6 +202,8 @@ def test_a_capacity_on_a_terminal_with_what_would_change_it(crowd: Path) -> None
     (even,) = [line.split() for line in lines if line.startswith("phases evenly spread")]
     assert even[3:] == ["3", "[3,", "3]"]
     assert "report: capacity/pair-OFF-sync.html" in result.stdout
+    asked = call(*command, "--asked", "5", "--out", "asked.html")
+    assert "5 asked: 3 too many; served with a core more on E, 2 times" in asked.stdout
     assert {path.name for path in Path("figures").iterdir()} >= {"capacity.svg", "capacity.pdf"}
     page = Path("capacity/pair-OFF-sync.html").read_text(encoding="utf-8")
     assert "all cells begin their cycles at one instant" in page

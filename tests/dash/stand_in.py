@@ -86,6 +86,8 @@ class StandIn:
             "release_ratio": 0.75,
             "window": {
                 "number": 11,
+                "last_cycle": 1_199,
+                "cycles": 100,
                 "violation_rate": 0.1,
                 "estimates": {"LOC": 1.5, "SO": None, "HYB": 2.5},
                 "utilisation": {"R1": 0.5, "R2": 0.25, "E": None},

@@ -48,7 +48,8 @@ def canonical(window_cycles: int | None = None, **settings: Any) -> Problem:
     """Return the canonical cell with other windows, and settings of its controller."""
     cell = _canonical()
     if window_cycles is not None:
-        cell = replace(cell, window_cycles=window_cycles, warmup_windows=0)
+        controller = replace(cell.controller, decide_cycles=window_cycles)
+        cell = replace(cell, window_cycles=window_cycles, warmup_windows=0, controller=controller)
     return replace(cell, controller=replace(cell.controller, **settings))
 
 
@@ -439,10 +440,18 @@ def columns(world: World, table: str, *names: str) -> list[tuple[Any, ...]]:
 class Recorded(World):
     """A cell in memory whose controller keeps its runs in a folder."""
 
-    def __init__(self, problem: Problem, out: Path, **recording: Any) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        out: Path,
+        *,
+        policy: str = "LOC",
+        exec_ms: Mapping[str, float] = EXEC_MS,
+        **recording: Any,
+    ) -> None:
         self.out, self.recording = out, recording
         self.log: list[str] = []
-        super().__init__(problem, policy="LOC")
+        super().__init__(problem, policy=policy, exec_ms=exec_ms)
 
     def recorder_of(self, controller: Controller) -> Recorder:
         kept = self.out, self.problem, controller, self.log.append

@@ -25,7 +25,8 @@ from dwell.record import open_run
 from dwell.record.journal import JOURNAL, MARK
 from dwell.report.run_page import run_page
 from dwell.testbed.chaos.disk import limit_file_size
-from tests.live.small_world import Recorded, canonical
+from tests.live.small_world import EXEC_MS, Recorded, canonical
+from tests.reference.derivation import require_derived
 from tests.report.pages import table_of
 
 #: A cell in memory, at full speed; its controller records as that of real processes does.
@@ -99,6 +100,19 @@ def test_a_full_disk_costs_no_decision_and_once_it_has_room_no_row(
     assert run.cycles["cycle"].to_list() == list(range(run.cycles.height))
     assert run.meta["recovered"]["missing_windows"] == 0
     assert run.decisions["placement"][-1] == "SO"
+
+
+@pytest.mark.parametrize("policy", ["dtp", "cusum"])
+def test_every_decision_of_a_live_run_follows_from_its_tables(
+    problem: Problem, tmp_path: Path, policy: str
+) -> None:
+    # The placement that holds looks worse than the profiles of the others.
+    slow = {**EXEC_MS, "perception": 30.0}
+    world = Recorded(problem, tmp_path, policy=policy, exec_ms=slow)
+    world.run(20_000)
+    rows = require_derived(world.finish(), policy)
+    assert len(rows) > 20
+    assert sum(row["migrated"] for row in rows) > 1
 
 
 def test_rows_that_have_waited_for_too_long_are_dropped_and_counted(

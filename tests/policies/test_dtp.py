@@ -93,6 +93,41 @@ def test_it_is_algorithm_1(
         assert decision.delta_j == row.delta_j or math.isnan(decision.delta_j + row.delta_j)
 
 
+@given(
+    windows,
+    st.integers(1, 12).flatmap(lambda width: st.tuples(st.just(width), st.integers(1, width))),
+    st.integers(0, 3),
+    st.integers(0, 40),
+)
+def test_it_is_algorithm_1_however_often_it_decides(
+    shown: list[dict[str, QoS]], often: tuple[int, int], min_dwell: int, least_cycles: int
+) -> None:
+    width, every = often
+    cell = problem()
+    controller = replace(
+        cell.controller,
+        decide_cycles=every,
+        min_dwell=min_dwell,
+        min_dwell_cycles=least_cycles,
+        min_improvement=0.05,
+    )
+    policy = DTP.from_problem(replace(cell, window_cycles=width, controller=controller))
+    expected = algorithm_1(
+        shown,
+        CANDIDATES,
+        policy.incumbent,
+        cell.objective,
+        min_dwell,
+        0.05,
+        W=width,
+        d=every,
+        least_cycles=least_cycles,
+    )
+    for decision, row in zip(run(policy, shown), expected, strict=True):
+        assert (decision.name, decision.reason) == (row.placement, row.reason)
+        assert (decision.dwell, decision.dwell * every) == (row.dwell, row.run)
+
+
 @given(windows, st.integers(0, 4))
 def test_the_bound_on_migrations_holds_for_any_metrics(
     shown: list[dict[str, QoS]], min_dwell: int

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from dwell.cost import ERRORS
 from dwell.errors import MetricError, PolicyError
-from dwell.model import Caps, Objective, Placement, QoS, Targets, Weights
+from dwell.model import Caps, ControllerSettings, Objective, Placement, QoS, Targets, Weights
 from dwell.policies import WorkFunction
 from tests.cells.paper import CANDIDATES, OBJECTIVE, estimates, problem, qos
 from tests.reference.algorithm_1 import price, switching, worst
@@ -314,11 +314,13 @@ def erring(costs: Costs, error_ms: float) -> dict[str, QoS]:
     return {name: replace(one, error=(error_ms, 0.0)) for name, one in window.items()}
 
 
+@pytest.mark.parametrize("every", [10, 50])
 @pytest.mark.parametrize(("error_ms", "moves"), [(0.0, True), (0.70, True), (0.71, False)])
 def test_an_advantage_within_its_error_never_moves_however_long_it_lasts(
-    error_ms: float, moves: bool
+    error_ms: float, moves: bool, every: int
 ) -> None:
     policy = WorkFunction(candidates=CANDIDATES, initial="LOC", objective=bare(4.0))
+    policy.start(problem(controller=ControllerSettings(decide_cycles=every)))
     window = erring([11.0, 20.0, 10.0], error_ms)
     assert ERRORS == 1.0
     names = [policy.decide(observed=qos(), estimates=window).name for _ in range(50)]

@@ -28,7 +28,7 @@ HEAD = """\
 @pytest.fixture(scope="module")
 def problem() -> Problem:
     cell = dwell.load(ROOT / "examples" / "canonical.yaml")
-    return replace(cell, window_cycles=20)
+    return replace(cell, window_cycles=20, controller=replace(cell.controller, decide_cycles=20))
 
 
 def declared(table: str, problem: Problem, *features: Feature) -> pl.Schema:
@@ -47,6 +47,23 @@ def test_a_simulated_run_has_the_declared_columns_and_types(
     assert run.windows.schema == declared("windows", problem, *shadows)
     assert run.decisions.schema == declared("decisions", problem, *support)
     assert run.jobs.schema == declared("jobs", problem, *shadows)
+
+
+@pytest.mark.parametrize("policy", ["dtp", "dtp+scaling"])
+def test_decisions_between_closes_have_the_metrics_that_they_look_at(
+    problem: Problem, policy: str
+) -> None:
+    often = replace(problem, controller=replace(problem.controller, decide_cycles=5))
+    run = dwell.simulate(often, policy=policy, seed=1, windows=3)
+    support: list[Feature] = ["support"] if policy == "dtp+scaling" else []
+    assert run.decisions.schema == declared("decisions", often, "between", *support)
+    assert run.windows.schema == declared("windows", often)
+    # After a whole window under one placement both say the same of its cycles.
+    (row,) = run.decisions.filter(pl.col("last_cycle") == 19).iter_rows(named=True)
+    window = run.windows.row(0, named=True)
+    assert row["cycles"] == 20
+    for column in ("seen_l95_ms", "seen_violation_rate", "u_R1", "u_E", "u_R2"):
+        assert row[column] == window[column]
 
 
 @pytest.mark.parametrize("scenario", ["network-impairment", "baseline"])

@@ -16,12 +16,13 @@ Nodes = Mapping[str, str]
 
 @dataclass
 class Row:
-    """What was decided for the window after this one."""
+    """A decision; `dwell` counts decisions since the last move, `run` cycles."""
 
     placement: str
     migrated: bool
     reason: str
     dwell: int
+    run: int
     delta_j: float
     costs: dict[str, float]
 
@@ -74,19 +75,29 @@ def algorithm_1(
     objective: Objective,
     N_min: int,
     Delta_min: float,
+    *,
+    W: int = 1,
+    d: int = 1,
+    least_cycles: int = 0,
 ) -> list[Row]:
-    """Return the decision after every window; its metrics are given for every candidate."""
+    """Return every decision; its metrics are given for every candidate.
+
+    A placement may be left when max(N_min W, `least_cycles`) + d cycles have run under it, d being
+    the cycles between two decisions; where d is W this is N_min windows and one.
+    """
     pi = [initial, initial]  # placements k - 2 and k - 1
     n_d = 0
+    cycles_run = 0
     rows = []
     for shown in windows:
         before, now = pi[-2:]
         J_now = price(shown[now], candidates[now], candidates[before], objective)
         J_of = {c: price(shown[c], candidates[c], candidates[now], objective) for c in candidates}
-        if n_d < N_min:
+        cycles_run += d
+        if cycles_run < max(N_min * W, least_cycles) + d:
             n_d += 1
             pi.append(now)
-            rows.append(Row(now, False, "dwell", n_d, math.nan, J_of))
+            rows.append(Row(now, False, "dwell", n_d, cycles_run, math.nan, J_of))
             continue
         allowed = [c for c in candidates if worst(shown[c], objective) <= 0]
         infeasible = not allowed
@@ -100,7 +111,7 @@ def algorithm_1(
         least = Delta_min + doubt(shown[now], shown[star], objective)
         migrates = star != now and Delta - least > 1e-9
         if migrates:
-            n_d = 0
+            n_d = cycles_run = 0
             pi.append(star)
             left_out = any(J_of[c] < lowest for c in candidates if c not in allowed)
             reason = "infeasible" if infeasible else "capped" if left_out else "migrate"
@@ -108,5 +119,5 @@ def algorithm_1(
             n_d += 1
             pi.append(now)
             reason = "infeasible" if infeasible else "hold"
-        rows.append(Row(pi[-1], migrates, reason, n_d, Delta, J_of))
+        rows.append(Row(pi[-1], migrates, reason, n_d, cycles_run, Delta, J_of))
     return rows

@@ -25,7 +25,8 @@ from tests.reference.guard import NEVER, Guard, Proof
 
 #: Of the changes of one instant, the place of what quotas do then.
 LAST_CHANGE = 900_000
-COMPLETION, ARRIVAL, START, REPEAT, DISTURBANCE, RESTART, STEP, CLOSE, GUARD, RELEASE = range(1, 11)
+COMPLETION, ARRIVAL, START, REPEAT, DISTURBANCE, RESTART, STEP = range(1, 8)
+CLOSE, DECIDE, GUARD, RELEASE = range(8, 12)
 # Cells: the jobs of a cycle itself, and those of its shadow.
 ITSELF, SHADOW = 0, 1
 ZERO, ONE = Fraction(0), Fraction(1)
@@ -38,6 +39,8 @@ LEAST_TURN_MS = 1.4
 GIVEN_UP_AFTER = 64
 # Behind all that an event does one after another.
 LATE = 10**9
+# Behind SimPy's own priorities, 0 and 1, and before every other event.
+EVENT_END = 2
 
 
 # --------------------------------------------------------------------------- what comes out
@@ -111,10 +114,35 @@ class WindowResult:
 
 
 @dataclass(frozen=True)
+class Look:
+    """The cycles of one decision: `first` to `last`, of which those from `begin` on are new.
+
+    `opened` is the usage at the release of `first`, `begun` at the release of `begin`. `known` and
+    `arrived` hold the jobs and messages of the cycles from `first` on, as of the decision.
+    """
+
+    first: int
+    begin: int
+    last: int
+    close_ns: int
+    opened: Mapping[str, Usage]
+    begun: Mapping[str, Usage]
+    closed: Mapping[str, Usage]
+    known: Mapping[tuple[int, int, str], JobResult]
+    arrived: Mapping[tuple[int, int, str, str], int]
+
+
+@dataclass(frozen=True)
 class Decision:
-    """What is decided on a window, or a move of the guard before that window's own."""
+    """A decision of the controller, or a move of the guard.
+
+    `window` holds `last_cycle`; a move of the guard begins it. It looks at `cycles` cycles,
+    a move of the guard at none.
+    """
 
     window: int
+    last_cycle: int
+    cycles: int
     incumbent: str
     placement: str
     by_guard: bool
@@ -127,7 +155,8 @@ class Result:
     `cycles` are those released before the run ended. `jobs` and `shadow_jobs` are by cycle and
     task; `arrived` is when a message was handed to its target, by cell, cycle, source and target.
     `stamps` are the candidates that every released cycle runs under, and is also sent through.
-    `decisions` are those of the controller, and the moves of the guard.
+    `decisions` are those of the controller, and the moves of the guard. `looks` has one entry per
+    instant at which a decision is due, whether or not the controller's node is up.
     `closest_ns` is the least distance, below a microsecond, of two events that have nothing to do
     with each other (see `closest_unrelated`); None where there is no such pair.
     """
@@ -137,6 +166,7 @@ class Result:
     shadow_jobs: Mapping[tuple[int, str], JobResult]
     arrived: Mapping[tuple[int, int, str, str], int]
     windows: tuple[WindowResult, ...]
+    looks: tuple[Look, ...]
     stamps: tuple[tuple[str, str | None], ...]
     decisions: tuple[Decision, ...]
     closest_ns: int | None
@@ -749,8 +779,8 @@ class Simulation:
     """One run of one cell, and of its shadow if it has one.
 
     Cycles are stamped as `given` says, or else as a controller does that orders what the `script`
-    says, one name at each close that it sees. With a guard the cell has one, and a name that it
-    holds back is said again at the next close, unless the controller is `fickle`.
+    says, one name at each decision. With a guard the cell has one, and a name that it
+    holds back is said again at the next decision, unless the controller is `fickle`.
     """
 
     def __init__(
@@ -761,7 +791,7 @@ class Simulation:
         *,
         given: Sequence[tuple[str, str | None]] | None = None,
         script: Sequence[str] = (),
-        fraction: float = 0.0,
+        fractions: Mapping[str, float] | None = None,
         guarded: bool = False,
         fickle: bool = False,
     ) -> None:
@@ -779,7 +809,7 @@ class Simulation:
 
         self.given = given
         self.script = list(script)
-        self.fraction = fraction
+        self.fractions = fractions or {}
         self.fickle = fickle
         # Candidates that were ordered, with the first cycle that each stamps.
         self.moves = [(0, problem.initial)]
@@ -788,7 +818,13 @@ class Simulation:
         self.over = False
         self.opened: dict[int, dict[str, Usage]] = {}
         self.windows: list[WindowResult] = []
+        self.looks: list[Look] = []
+        self.every = problem.decide_cycles
+        # First cycle under the placement that decisions look at, and end of the next stretch.
+        self.since = 0
+        self.due = self.every
         self.migration = 0
+        self.moving = False
 
         self.patience = self.settings.guard_cycles * nanoseconds(self.pipeline.period_ms)
         self.guard = Guard(problem, self.patience) if guarded else None
@@ -862,15 +898,20 @@ class Simulation:
             for node in self.nodes.values():
                 node.advance(time)
             action()
-            for name, node in self.nodes.items():
-                node.give_out(self.awaiter(name))
-                node.give_back()
-                self.plan(node)
-                node.touched = False
-                node.looked_at.clear()
+            # Links begin what the event sends: what is lost then is lost before the event ends.
+            At(self.env, 0, EVENT_END, self.end_event)
 
         order = (((kind * 10 + cell) * 10**9 + cycle + 1) * 10**6 + task + 1) * 10**6 + flow
         At(self.env, time - self.now, order, happen)
+
+    def end_event(self) -> None:
+        """Give out cores, and places on accelerators."""
+        for name, node in self.nodes.items():
+            node.give_out(self.awaiter(name))
+            node.give_back()
+            self.plan(node)
+            node.touched = False
+            node.looked_at.clear()
 
     def note(self, time: int, cause: int, *, kind: int = 0, fixed: bool = False) -> int:
         entry = len(self.log)
@@ -979,9 +1020,10 @@ class Simulation:
         for k in range(self.number):
             self.at(self.release[k], RELEASE, k, -1, self.releaser(k), fixed=True)
         if self.guard is not None:
-            for time in sorted(self.looks()):
+            for time in sorted(self.guard_looks()):
                 self.at(time, GUARD, -1, -1, self.look, fixed=True)
         self.open_window(0)
+        self.look_from(0)
         while not self.over and self.env.peek() <= self.end:
             self.env.step()
         return Result(
@@ -990,6 +1032,7 @@ class Simulation:
             shadow_jobs=self.results(SHADOW),
             arrived=self.arrived,
             windows=tuple(self.windows),
+            looks=tuple(self.looks),
             stamps=tuple(self.stamps),
             decisions=tuple(self.decisions),
             closest_ns=closest_unrelated(self.log),
@@ -1033,38 +1076,107 @@ class Simulation:
 
     def close_window(self) -> None:
         boundary = self.first + self.problem.window_cycles
-        cycles = range(self.first, boundary)
+        known, arrived = self.known_of(self.first, boundary)
         self.windows.append(
             WindowResult(
                 first_cycle=self.first,
                 close_ns=self.now,
                 opened=self.opened.get(self.first, self.usage),
                 closed=self.usage,
-                known={key: job.result for key, job in self.jobs.items() if key[1] in cycles},
-                arrived={key: at for key, at in self.arrived.items() if key[1] in cycles},
+                known=known,
+                arrived=arrived,
+            )
+        )
+        if not self.between:
+            self.decide(boundary)
+        if self.first + self.problem.window_cycles == boundary:
+            self.open_window(boundary)
+
+    def known_of(
+        self, first: int, end: int
+    ) -> tuple[dict[tuple[int, int, str], JobResult], dict[tuple[int, int, str, str], int]]:
+        """Return the jobs and arrivals of some cycles up to now."""
+        known = {key: job.result for key, job in self.jobs.items() if first <= key[1] < end}
+        return known, {key: at for key, at in self.arrived.items() if first <= key[1] < end}
+
+    # --------------------------------------------------------------------------------- decisions
+
+    @property
+    def between(self) -> bool:
+        """Whether decisions are made between the closes of windows."""
+        return self.given is None and self.every < self.problem.window_cycles
+
+    def look_from(self, since: int) -> None:
+        """Count the cycles of the next decisions from the first cycle under a placement."""
+        self.since = since
+        self.await_decision(since + self.every)
+
+    def await_decision(self, boundary: int) -> None:
+        """Make the next decision when a window that ends before this cycle would close."""
+        self.due = boundary
+        if self.between and boundary <= self.number:
+            self.at(
+                self.close_of(boundary),
+                DECIDE,
+                boundary,
+                -1,
+                lambda: self.decide(boundary),
+                fixed=True,
+                # A move puts it off.
+                valid=lambda: self.due == boundary and not self.moving,
+            )
+
+    def decide(self, boundary: int) -> None:
+        """Look at the last W cycles under the placement, and order what the script says."""
+        begin, first = boundary - self.every, max(self.since, boundary - self.problem.window_cycles)
+        known, arrived = self.known_of(first, boundary)
+        self.looks.append(
+            Look(
+                first=first,
+                begin=begin,
+                last=boundary - 1,
+                close_ns=self.now,
+                opened=self.opened.get(first, self.usage),
+                begun=self.opened.get(begin, self.usage),
+                closed=self.usage,
+                known=known,
+                arrived=arrived,
             )
         )
         active = self.moves[-1][1]
         order = active
         if self.given is None and not self.nodes[self.problem.controller_node].down:
-            order = self.ordered_at_close(active, boundary)
+            order = self.next_order(active, boundary)
         if order == active:
-            self.open_window(boundary)
-        elif self.settings.migration == "cold":
+            self.await_decision(boundary + self.every)
+        elif self.settings.migration == "cold" and self.apart_of(active, order):
             self.migrate(active, order, boundary)
         else:
             delay = nanoseconds(self.settings.order_delay_ms)
-            self.move(order, boundary, self.now + delay)
+            self.move(order, boundary, self.now + delay, begins_window=not self.between)
 
-    def ordered_at_close(self, active: str, boundary: int) -> str:
+    def apart_of(self, active: str, order: str) -> set[str]:
+        """Return the tasks that a move takes to another node."""
+        old, new = self.problem.candidates[active], self.problem.candidates[order]
+        return {task for task in self.pipeline.tasks if old[task] != new[task]}
+
+    def next_order(self, active: str, boundary: int) -> str:
         """Return what the policy says, unless the guard holds it back."""
         name = self.script[0]
         held = self.held_back(name, active, boundary)
         if not held or self.fickle:
             self.script.pop(0)
         order = active if held else name
-        self.decisions.append(Decision(len(self.windows) - 1, active, order, by_guard=held))
+        last, cycles = boundary - 1, boundary - self.looks[-1].first
+        self.decisions.append(
+            Decision(self.window_of(last), last, cycles, active, order, by_guard=held)
+        )
         return order
+
+    def window_of(self, cycle: int) -> int:
+        """Return the number of windows that end before a cycle."""
+        ends = [window.first_cycle + self.problem.window_cycles for window in self.windows]
+        return sum(end <= cycle for end in ends)
 
     def held_back(self, name: str, active: str, boundary: int) -> bool:
         """Whether an order has to wait for its proof, which begins with the wish."""
@@ -1079,14 +1191,17 @@ class Simulation:
             self.wishes.append((self.first_stamped(boundary, self.now + delay), wish))
         return wish is not None
 
-    def move(self, order: str, boundary: int, ready: int) -> None:
-        """Stamp cycles with what was ordered once it is ready, and open a window with them."""
+    def move(self, order: str, boundary: int, ready: int, *, begins_window: bool) -> None:
+        """Stamp cycles with what was ordered once it is ready."""
         first = self.first_stamped(boundary, ready)
         self.moves.append((first, order))
+        self.moving = False
         if self.guard is not None and self.guard.on_fallback:
             self.proof.returns()
             self.wishes.append((first, None))
-        self.open_window(first)
+        if begins_window:
+            self.open_window(first)
+        self.look_from(first)
 
     def first_stamped(self, boundary: int, ready: int) -> int:
         """First cycle that an order stamps which takes effect at `ready`."""
@@ -1100,18 +1215,18 @@ class Simulation:
             self.over = True  # no window can follow, however fast the tasks move
             return
         old, new = self.problem.candidates[active], self.problem.candidates[order]
-        moving = {task for task in self.pipeline.tasks if old[task] != new[task]}
+        moving = self.apart_of(active, order)
+        # No window closes, and nothing is decided, before the migration is over.
+        self.first, self.moving = -1, True
         self.migration += 1
         number = self.migration
 
         def be_ready(task: str) -> None:
             moving.remove(task)
             if not moving:
-                self.move(order, boundary, self.now)
+                self.move(order, boundary, self.now, begins_window=True)
 
         def arrive() -> None:
-            if not moving:
-                self.move(order, boundary, self.now)
             for task in moving:
                 started = self.now + nanoseconds(self.pipeline.tasks[task].start_ms)
                 self.step(started, 0, task, number, lambda task=task: send_state(task))  # type: ignore[misc]
@@ -1161,7 +1276,7 @@ class Simulation:
 
     # --------------------------------------------------------------------------------- the guard
 
-    def looks(self) -> set[int]:
+    def guard_looks(self) -> set[int]:
         """Instants at which the guard may move: patience ends, or something is there again."""
         back = {change.at_ns for change in self.reals[ITSELF].node_changes}
         started = {
@@ -1222,9 +1337,12 @@ class Simulation:
         self.migration += 1
         self.moves = [*(move for move in self.moves if move[0] < first), (first, fallback)]
         self.wishes = [*(wish for wish in self.wishes if wish[0] < first), (first, None)]
+        self.moving = False
         self.open_window(first)
+        self.look_from(first)
         if not self.over:
-            self.decisions.append(Decision(len(self.windows), left, fallback, by_guard=True))
+            window = len(self.windows)
+            self.decisions.append(Decision(window, first - 1, 0, left, fallback, by_guard=True))
 
     def hear_back(self, cell: int, cycle: int) -> None:
         """Let the guard hear of a cycle or a probe if it has completed, after the way back."""
@@ -1277,7 +1395,8 @@ class Simulation:
         wishes = [name for first, name in self.wishes if first <= cycle]
         if wishes and wishes[-1] is not None:
             return active, wishes[-1]
-        return active, shadow_stamp(cycle, active, list(self.problem.candidates), self.fraction)
+        fraction = self.fractions.get(active, 0.0)
+        return active, shadow_stamp(cycle, active, list(self.problem.candidates), fraction)
 
     def releaser(self, cycle: int) -> Callable[[], None]:
         def release() -> None:
@@ -1817,22 +1936,23 @@ def control(
     script: Sequence[str],
     *,
     shadows: Realisation | None = None,
-    fraction: float = 0.0,
+    fractions: Mapping[str, float] | None = None,
     guarded: bool = False,
     fickle: bool = False,
 ) -> Result:
-    """Play a realisation under a controller that orders one name of a script at each close.
+    """Play a realisation under a controller that orders one name of a script at each decision.
 
-    `fraction` is the share of cycles that are also sent through each alternative. If it is
-    `guarded`, the cell's guard acts, and `shadows` are what its probes meet; a name that it holds
-    back is said again at the next close, unless the controller is `fickle`.
+    `fractions` are the shares of cycles that are also sent through each alternative, by the
+    candidate that is active. If it is `guarded`, the cell's guard acts, and `shadows` are what its
+    probes meet; a name that it holds back is said again at the next decision, unless the controller
+    is `fickle`.
     """
     return Simulation(
         problem,
         realisation,
         shadows,
         script=script,
-        fraction=fraction,
+        fractions=fractions,
         guarded=guarded,
         fickle=fickle,
     ).run()

@@ -146,7 +146,7 @@ def test_fleets_are_one_cell_with_the_pipelines_of_all() -> None:
             fleet, seed=seed, windows=windows, policy="ONLY", estimator="profile", jobs=True
         )
         problems = dict(zip(run.cells, phased(fleet, seed), strict=True))
-        parts = [*drawn(fleet, problems, seed, windows).values()]
+        parts = [*drawn(fleet, problems, seed, fleet.duration_ns(windows)).values()]
         whole = all_in_one(cell, phases)
         real = with_draws(dwell.draw(whole, seed=seed, windows=windows), parts)
         expected = simulate(whole, real, ["ONLY"] * real.cycles)

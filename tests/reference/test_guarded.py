@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from random import Random
 
 import pytest
@@ -136,17 +137,27 @@ class _Maker:
             period_ms=self.period_ms,
             deadline_ms=self.period_ms * rng.choice([0.5, 1.0]),
             scenario=disturbances,
-            window_cycles=rng.randint(1, 3),
+            window_cycles=rng.choice([1, 2, 3, 8]),
             controller=self.controller(),
         )
+        every = rng.randint(1, problem.window_cycles)
+        often = replace(problem.controller, decide_cycles=every)
+        problem = replace(problem, controller=often)
         windows = rng.randint(40, 160) // problem.window_cycles
         real = dwell.draw(problem, scenario="disturbed", seed=self.seed, windows=windows)
         wishes: list[str] = []
-        while len(wishes) < windows:
+        while len(wishes) < real.cycles // every:
             wishes += [rng.choice(CANDIDATES)] * rng.randint(1, 12)
-        names = (problem.initial, *wishes[: windows - 1])
+        names = (problem.initial, *wishes)
         share = rng.choice([0.0, 0.0, 0.1])
-        return Case(problem, real, names, share, guarded=True, fickle=rng.random() < 0.5)
+        return Case(
+            problem,
+            real,
+            names,
+            dict.fromkeys(problem.candidates, share) if share else {},
+            guarded=True,
+            fickle=rng.random() < 0.5,
+        )
 
 
 @pytest.fixture(params=["few", "the others"])

@@ -118,7 +118,13 @@ def test_refusals_are_counted_by_reason(
         for name, one in run.cells.items()
     }  # fmt: skip
     refusing = FleetRun(
-        run.fleet, cells, lambda: run.load, seed=1, guard=False, phases_ms=run.phases_ms
+        run.fleet,
+        cells,
+        lambda: run.load,
+        seed=1,
+        seconds=1.0,
+        guard=False,
+        phases_ms=run.phases_ms,
     )
     count = refusing.decisions.height
     assert refusals(refusing) == {(candidate, reason): count}

@@ -14,10 +14,11 @@ from reproduction.__main__ import main
 from reproduction.questions import QUESTIONS
 from reproduction.questions.jitter import turning_point
 from reproduction.questions.weights import luck
+from reproduction.verdicts import WITHIN
 
 WORDS = {"lower", "higher", "no difference shown", "under", "over", "not shown", "met", "missed"}
 WORDS |= {"not asked", "turns", "never", "always", "cannot tell", "cannot tell with 2 seeds"}
-WORDS |= {"same run"}
+WORDS |= {"same run", "same cycles", WITHIN}
 
 
 @pytest.mark.parametrize("name", [name for name in QUESTIONS if name not in ("weights", "real")])

@@ -347,9 +347,10 @@ def test_without_start_and_state_a_cold_migration_is_a_warm_one(seed: int) -> No
         problem = replace(
             case.problem,
             pipeline=replace(pipeline, tasks=tasks),
-            controller=replace(case.problem.controller, migration=migration),
+            controller=replace(case.problem.controller, migration=migration, decide_cycles=None),
         )
-        real = dwell.draw(problem, scenario="disturbed", seed=seed, windows=len(case.names))
+        windows = case.real.windows
+        real = dwell.draw(problem, scenario="disturbed", seed=seed, windows=windows)
         policy = Replay([*case.names[1:], case.names[0]])
         runs.append(dwell.simulate_realisation(problem, real, policy=policy, jobs=True))
     for table in ("cycles", "windows", "decisions", "jobs"):

@@ -32,23 +32,24 @@ def behind(problem: Problem, rate_mbps: float) -> Problem:
 def test_one_after_another_each_waits_for_those_before() -> None:
     """Three jobs of 2 ms at once with D = 3: the second waits 2 ms, the third 4."""
     fleet = fleet_of((within(one_job(), 3.0), 3))
-    waited = waiting_in_fleet(fleet.changed(policy="OFF", estimator="profile"), seed=1, windows=2)
-    assert ms(waited) == {("node", "E"): pytest.approx(40 * (2 + 4))}
+    fleet = fleet.changed(policy="OFF", estimator="profile")
+    waited = waiting_in_fleet(fleet, seed=1, duration_ns=fleet.duration_ns(2))
+    assert ms(waited) == {("resource", "E"): pytest.approx(40 * (2 + 4))}
 
 
 def test_a_static_fleet_waits_the_same() -> None:
     fleet = fleet_of((within(one_job(scheduler="fair"), 3.0), 3), phases="even")
     fleet = replace(fleet, entries=(replace(fleet.entries[0], count=4),))
-    static = StaticFleet({"one": "OFF"}, seed=1, windows=2).waiting(fleet)
-    assert static == waiting_in_fleet(
-        fleet.changed(policy="OFF", estimator="profile"), seed=1, windows=2
-    )
+    length = {"seed": 1, "duration_ns": fleet.duration_ns(2)}
+    fleet = fleet.changed(policy="OFF", estimator="profile")
+    assert StaticFleet(**length).waiting(fleet) == waiting_in_fleet(fleet, **length)
 
 
 def test_a_message_behind_others_waits_for_its_link() -> None:
     """8,000 bits at 0.75 Mbit/s take 10.7 ms of a period of 10: every message waits 0.7 ms more."""
     cell = within(behind(one_job(), 0.75), 10.0)
-    waited = ms(waiting_in_fleet(fleet_of((cell, 1)).changed(policy="OFF"), seed=1, windows=2))
+    fleet = fleet_of((cell, 1)).changed(policy="OFF")
+    waited = ms(waiting_in_fleet(fleet, seed=1, duration_ns=fleet.duration_ns(2)))
     assert set(waited) == {("link", "R->E")}
     # Of the last cycles some are on their way when the run ends.
     by_cycle = [2 / 3 * cycle for cycle in range(40)]
@@ -57,4 +58,4 @@ def test_a_message_behind_others_waits_for_its_link() -> None:
 
 def test_nothing_is_waited_for_where_nothing_is_missed() -> None:
     fleet = fleet_of((one_job(), 3)).changed(policy="OFF", estimator="profile")
-    assert waiting_in_fleet(fleet, seed=1, windows=2) == {}
+    assert waiting_in_fleet(fleet, seed=1, duration_ns=fleet.duration_ns(2)) == {}

@@ -65,7 +65,7 @@ def test_a_row_is_the_summary_of_that_run(comparison: Comparison) -> None:
         "policy": "dtp",
         "seed": 2,
     }
-    expected = summarise(run, PROBLEM, labels).row
+    expected = {**summarise(run, PROBLEM, labels).row, "unit": "window"}
     found = comparison.runs.filter(
         (pl.col("scenario") == "network-impairment")
         & (pl.col("policy") == "dtp")

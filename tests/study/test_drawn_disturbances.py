@@ -37,7 +37,7 @@ def test_cells_of_a_fleet_draw_their_own_episodes_and_the_first_those_of_shared_
     fleet = Fleet("two", (FleetEntry(problem, 2, scenario="windy"),), ("E",), coordination="none")
     runs = dwell.simulate_fleet(fleet, policy="LOC", seed=4, windows=40).cells
     problems = dict(zip(runs, phased(fleet, 4), strict=True))
-    for name, realisation in drawn(fleet, problems, 4, 40).items():
+    for name, realisation in drawn(fleet, problems, 4, fleet.duration_ns(40)).items():
         changes = {(change.node, change.at_ns) for change in realisation.node_changes}
         met = disturbances_of(runs[name])
         begins = {

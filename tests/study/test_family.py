@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dwell.errors import MetricError, SimulationError
-from dwell.study.family import Family, cannot_tell, holm, same_run, seed_values
+from dwell.study.family import Family, cannot_tell, holm, played_alike, seed_values
 from dwell.study.pairs import (
     PairedDifference,
     PairedMedian,
@@ -234,14 +234,26 @@ def test_what_is_the_same_run_is_no_comparison() -> None:
 def test_what_is_not_known_to_be_the_same_run_is_compared(played: pl.Expr) -> None:
     """Of other runs, and of runs that are the same under some seeds only."""
     equal = RUNS.with_columns(played, cost=pl.lit(1.0))
-    assert not same_run(equal, PAIR)
+    assert not played_alike(equal, PAIR)
     assert Family.of_runs(equal, "which?", "cost", {"one": PAIR}).tested.keys() == {"one"}
 
 
 def test_the_same_cycles_priced_otherwise_are_compared() -> None:
     alike = RUNS.with_columns(played=pl.lit("equal"))
-    assert same_run(alike, PAIR)
+    assert played_alike(alike, PAIR) == "same run"
     assert Family.of_runs(alike, "which?", "cost", {"one": PAIR}).tested.keys() == {"one"}
+
+
+def test_the_same_latencies_under_another_load_are_the_same_cycles() -> None:
+    """Shadow jobs may load a node and delay no cycle: V_D is equal, and U is compared."""
+    alike = RUNS.with_columns(
+        latencies=pl.format("{}", "seed"), violation_rate=pl.lit(0.1), u_edge=pl.col("cost")
+    )
+    assert played_alike(alike, PAIR) == "same cycles"
+    rate = Family.of_runs(alike, "which?", "violation_rate", {"one": PAIR})
+    assert rate.verdicts == {"one": "same cycles"}
+    assert not rate.tested
+    assert Family.of_runs(alike, "which?", "u_edge", {"one": PAIR}).tested.keys() == {"one"}
 
 
 def test_what_may_be_infinite_is_compared_by_its_median() -> None:

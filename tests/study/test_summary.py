@@ -128,7 +128,8 @@ def test_a_run_of_warm_up_alone_is_refused() -> None:
 
 def test_a_row_holds_what_the_tables_show() -> None:
     row = summarise(make_run(), make_problem(warmup_windows=1, window_cycles=W), LABELS).row
-    assert re.fullmatch(r"[0-9a-f]{16}", str(row.pop("played")))
+    for digest in ("played", "latencies"):
+        assert re.fullmatch(r"[0-9a-f]{16}", str(row.pop(digest)))
     expected = {
         **LABELS,
         "windows": 3,
@@ -213,11 +214,11 @@ def test_j_of_a_run_takes_accelerators_where_the_cell_says_so() -> None:
 def test_runs_are_told_apart_by_what_was_played_and_by_nothing_else() -> None:
     problem = make_problem(warmup_windows=1, window_cycles=W)
 
-    def played(table: str = "", **columns: pl.Expr) -> object:
+    def played(table: str = "", digest: str = "played", **columns: pl.Expr) -> object:
         tables = {name: getattr(make_run(), name) for name in ("cycles", "windows", "decisions")}
         if table:
             tables[table] = tables[table].with_columns(**columns)
-        return summarise(Run({}, tables), problem, LABELS).row["played"]
+        return summarise(Run({}, tables), problem, LABELS).row[digest]
 
     same = played()
     # Another policy believes otherwise; what is left out does not count.
@@ -228,6 +229,10 @@ def test_runs_are_told_apart_by_what_was_played_and_by_nothing_else() -> None:
     assert played("cycles", latency_ns=before(5, None, pl.col("latency_ns"))) != same
     # Shadow jobs that delay nobody load a node.
     assert played("windows", u_E=pl.lit(0.2)) != same
+    latencies = played(digest="latencies")
+    assert played("windows", "latencies", u_E=pl.lit(0.2)) == latencies
+    later = before(5, 1, pl.col("latency_ns"))
+    assert played("cycles", "latencies", latency_ns=later) != latencies
 
 
 def before(cycle: int, value: object, other: pl.Expr) -> pl.Expr:

@@ -125,7 +125,7 @@ class _Reading:
         if faults:
             return None
         entries = tuple(made for _, made in read if made is not None)
-        return Fleet(name, entries, file=str(self.path), **given)
+        return faults.attempt("", Fleet, name, entries, file=str(self.path), **given)
 
     def _entry(self, path: str, entry: Entry | None) -> tuple[Kind, FleetEntry | None]:
         """Return count and cell of an entry, and cells of one kind; None beside a fault."""

@@ -33,12 +33,16 @@ from dwell.model.bounds import counted
 if TYPE_CHECKING:
     from dwell.model.fleet import Fleet
     from dwell.record import FleetRun
-    from dwell.study.capacity import Capacity, WhatIf
+    from dwell.study.capacity import Capacity
     from dwell.study.fleet_plan import FleetPlan
     from dwell.study.intervals import Interval
+    from dwell.study.what_ifs import WhatIf
 
 #: Cells, and rounds, that the terminal shows, and columns that time has there.
 SHOWN, TIMES = 24, 40
+THE_LIMIT = "the limit".rjust(TIMES // 2 + 4)
+#: Keys of a change that serves what was asked for.
+CHANGE = ("change", "times")
 
 fleet = typer.Typer(
     no_args_is_help=True,
@@ -83,7 +87,10 @@ Phases = Annotated[
 def run(
     file: FleetArgument,
     seed: Seed = 1,
-    windows: Annotated[int, option("N", "Length in windows, the warm-up included.", min=1)] = 100,
+    windows: Annotated[
+        int, option("N", "Length in windows of the cell whose windows are longest.", min=1)
+    ] = 100,
+    seconds: Annotated[float | None, option("S", "Length in place of --windows.")] = None,
     policy: Policy = None,
     estimator: Estimator = None,
     coordination: Coordination = None,
@@ -101,21 +108,22 @@ def run(
 ) -> None:
     """Simulate the cells of a fleet together, save a run a cell, sum them up."""
     from dwell.record.fleet_run import describe_fleet, require_free_or_same
-    from dwell.sim.fleet import phases_ms
+    from dwell.sim.fleet import duration_of, phases_ms
     from dwell.study.fleet_summary import fleet_numbers
 
     changes = {"policy": policy, "estimator": estimator, "coordination": coordination}
     played = _read(file, phases, **changes)
     parts = (policy, estimator, played.coordination, played.phasing, str(seed))
     folder = out or default_folder(played.name, *filter(None, parts))
-    settings = {"seed": seed, "guard": guard, "windows": windows, "versions": None}
+    duration_s = duration_of(played, windows, seconds) / 1e9
+    settings = {"seed": seed, "guard": guard, "seconds": duration_s, "versions": None}
     offsets = phases_ms(played, seed)
     require_free_or_same(folder, describe_fleet(played, phases=offsets, **settings))
     cells = counted(len(played.cells), "cell")
     try:
-        with progress(f"simulating {cells}, {counted(windows, 'window')} of each") as shown:
+        with progress(f"simulating {cells} for {duration_s:g} s") as shown:
             result = dwell.simulate_fleet(
-                played, seed=seed, windows=windows, guard=guard, jobs=jobs, progress=shown
+                played, seed=seed, seconds=duration_s, guard=guard, jobs=jobs, progress=shown
             )
         with working(f"writing {cells}"):
             result.save(folder)
@@ -127,9 +135,9 @@ def run(
         )
     summary = fleet_numbers(result)
     if as_json:
-        print_json({**_head(result, windows), "run": folder, **summary})
+        print_json({**_head(result), "run": folder, **summary})
     else:
-        typer.echo(_text(result, windows, summary))
+        typer.echo(_text(result, summary))
         typer.echo(f"\nsaved to {folder}")
 
 
@@ -167,10 +175,14 @@ def capacity(
         bool,
         flag(
             "--what-if",
-            "Also with a core more on a shared node, with phases evenly spread, and on every "
-            "other placement that uses a shared node.",
+            "Also with each change that a site can make: phases, deadlines, cores, accelerators, "
+            "servers, placements.",
         ),
     ] = False,
+    asked: Annotated[
+        int | None,
+        option("N", "Robots that are wanted; the first change that serves them is named.", min=1),
+    ] = None,
     processes: Processes = None,
     out: Annotated[
         Path | None,
@@ -186,43 +198,67 @@ def capacity(
 ) -> None:
     """Find how many robots a fleet may have, so that no cell misses more than a limit.
 
-    The count of the first entry is varied, the others stay: 10 seeds of 2,000 cycles a cell each.
+    The count of the first entry is varied, the others stay. Where phases are drawn and no cell
+    moves, 100 draws of 200 cycles are played of each size; else 10 seeds of 2,000 cycles.
     """
     from dwell.record.fleet_run import fleet_document
     from dwell.report.capacity_page import capacity_page
-    from dwell.study.capacity import WhatIf, capacity_of, policy_of, what_ifs
+    from dwell.study.capacity import capacity_of
+    from dwell.study.what_ifs import WhatIf, changes_of, served_by
 
     if not 0 < limit < 1:
         raise typer.BadParameter(f"--limit: {limit:g} is not allowed; it must be between 0 and 1")
-    asked = _read(file, phases, policy=policy)
+    read = _read(file, phases, policy=policy)
     page = out
     if page is None and not as_json:
-        names = ", ".join(dict.fromkeys(policy_of(asked, one) for one in asked.entries))
-        page = Path("capacity", file_name(f"{asked.name}-{names}-{asked.phases}.html"))
-    mark = mark_of(fleet_document(asked), limit, most, what_if)
+        names = ", ".join(dict.fromkeys(read.policy_of(one) for one in read.entries))
+        page = Path("capacity", file_name(f"{read.name}-{names}-{read.phases}.html"))
+    mark = mark_of(fleet_document(read), limit, most, what_if)
     if page is not None:
         require_own(page, mark)
     settings: dict[str, Any] = {"limit": limit, "most": most, "processes": processes}
     with progress(f"playing up to {most} robots") as shown:
-        found = capacity_of(asked, **settings, progress=shown)
+        found = capacity_of(read, **settings, progress=shown)
     changes = []
     # Numbers of robots compare where the limit is on the same.
     settings["on_excess"] = found.limit_on == "excess"
-    for change, changed in what_ifs(asked) if what_if else ():
-        with progress(f"what if: {change}") as shown:
-            changes.append(WhatIf(change, capacity_of(changed, **settings, progress=shown)))
+    for change in changes_of(read) if what_if else ():
+        with progress(f"what if: {change.text}") as shown:
+            changes.append(WhatIf(change.text, change.capacity(**settings, progress=shown)))
+    served = None
+    if asked is not None and found.robots < asked:
+        with working(f"looking for a change that serves {asked} robots"):
+            served = served_by(read, asked, **settings)
     if page is not None or figures is not None:
-        shown_page = capacity_page(asked.name, found, changes)
+        shown_page = capacity_page(read.name, found, changes)
         with working("writing the report"):
             write_report(shown_page, page, figures=figures, static=False, mark=mark)
     if as_json:
-        more = {"what_if": [one.as_json() for one in changes]} if what_if else {}
-        print_json({"fleet": asked.name, **found.as_json(), **more, "report": page})
+        more: dict[str, Any] = {"what_if": [one.as_json() for one in changes]} if what_if else {}
+        if asked is not None:
+            more["asked"] = {
+                "robots": asked,
+                "too_many": max(asked - found.robots, 0),
+                "served_by": None if served is None else dict(zip(CHANGE, served, strict=True)),
+            }
+        print_json({"fleet": read.name, **found.as_json(), **more, "report": page})
         return
-    typer.echo(_capacity_text(asked, found, changes))
+    typer.echo(_capacity_text(read, found, changes))
+    if asked is not None:
+        typer.echo(f"\n{_asked_text(asked, found, served)}")
     typer.echo(f"\nreport: {page}")
     if figures is not None:
         typer.echo(f"figures: {figures}")
+
+
+def _asked_text(asked: int, found: Capacity, served: tuple[str, int] | None) -> str:
+    if found.robots >= asked:
+        return f"{asked} asked: served"
+    told = f"{asked} asked: {asked - found.robots} too many; "
+    if served is None:
+        return told + "no single change serves them"
+    change, count = served
+    return told + f"served with {change}" + (f", {count} times" if count > 1 else "")
 
 
 def _plan_text(of: Fleet, found: FleetPlan, seed: int) -> str:
@@ -269,12 +305,12 @@ def _read(file: Path, phases: str | None, **changes: str | None) -> Fleet:
     return fleet.changed(phases=read_phases(phases), **changes)
 
 
-def _head(result: FleetRun, windows: int) -> dict[str, Any]:
+def _head(result: FleetRun) -> dict[str, Any]:
     fleet = result.fleet
     return {
         "fleet": fleet.name,
         "seed": result.seed,
-        "windows": windows,
+        "seconds": result.seconds,
         "coordination": fleet.coordination,
         "phases": fleet.phases,
         "phases_ms": result.phases_ms,
@@ -285,13 +321,13 @@ def _head(result: FleetRun, windows: int) -> dict[str, Any]:
 # --------------------------------------------------------------------------- on a terminal
 
 
-def _text(result: FleetRun, windows: int, summary: Mapping[str, Any]) -> str:
+def _text(result: FleetRun, summary: Mapping[str, Any]) -> str:
     fleet = result.fleet
     shared = ", ".join(fleet.shared) or "nothing"
     lines = [
         f"{fleet.name}: {counted(len(result.cells), 'cell')}; shared: {shared}; phases: "
         f"{fleet.phasing}; coordination: {fleet.coordination}; seed {result.seed}; "
-        f"{counted(windows, 'window')}",
+        f"{result.seconds:g} s",
         "",
         *_cells(result, summary["cells"]),
         "",
@@ -378,19 +414,25 @@ def _round_lines(rounds: Sequence[Mapping[str, Any]]) -> Iterator[str]:
 
 
 def _capacity_text(of: Fleet, found: Capacity, changes: Sequence[WhatIf]) -> str:
-    from dwell.report.capacity_page import written
+    from dwell.report.capacity_page import answer, busy, errors, written
 
     limits = found.limits
     excess = " beyond that of one cell" if found.limit_on == "excess" else ""
-    low, high = found.interval
+    point = found.point(found.robots)
     facts = [
-        ("robots", f"{written(found)} [{low}, {high}]"),
+        ("robots", answer(found)),
         ("limit", f"V_D of the worst cell{excess}: {found.limit * 100:g} %"),
         ("played", f"{found.policy}, phases {found.phases}"),
     ]
     if limits is not None:
         share = f"{limits.share:.0%} of what cycles that missed have waited"
-        facts.append(("what limits", f"{limits.kind} {limits.name}, {share}"))
+        used = point.utilisation.get(limits.name)
+        told = "" if used is None else f", busy {used:.0%} at {point.robots}"
+        facts.append(("what limits", f"{limits.name}, {share}{told}"))
+    if found.phases == "random":
+        facts.append(("errors", errors(found)))
+    if found.searched == "bisection":
+        facts.append(("searched", "by bisection"))
     if found.reason:
         facts.append(("why none", found.reason))
     width = max(len(name) for name, _ in facts)
@@ -401,6 +443,7 @@ def _capacity_text(of: Fleet, found: Capacity, changes: Sequence[WhatIf]) -> str
             f"{point.violation_rate.value * 100:.2f}",
             _ends(point.violation_rate),
             _bar(point.violation_rate.value / scale),
+            busy(point),
         ]
         for point in found.curve
     ]
@@ -409,7 +452,7 @@ def _capacity_text(of: Fleet, found: Capacity, changes: Sequence[WhatIf]) -> str
         *(f"{name.ljust(width)}  {value}" for name, value in facts),
         "",
         aligned(
-            ["robots", "V_D (%)", "95 % interval", f"{'the limit'.rjust(TIMES // 2 + 4)}"], rows
+            [*("robots", "V_D (%)", "95 % interval"), THE_LIMIT.ljust(TIMES), "utilisation"], rows
         ),
     ]
     if changes:

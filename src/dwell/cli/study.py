@@ -144,7 +144,12 @@ def _measures(study: Study) -> list[Measure]:
 
 def _text(result: StudyResult) -> str:
     """Return a table a point and scenario."""
-    from dwell.report.formatting import few_seeds, shown_policy, shown_scenario
+    from dwell.report.formatting import (
+        few_seeds,
+        independent_runs,
+        shown_policy,
+        shown_scenario,
+    )
     from dwell.report.table import Table, Text, table_text
     from dwell.study import over_seeds
 
@@ -163,7 +168,7 @@ def _text(result: StudyResult) -> str:
     lines = [table_text(Table("", "", [Text("policy", ""), *measures], rows, Text("group", "")))]
     seeds = len(study.seeds)
     means = f"Mean over {seeds} seeds, with its 95 % interval" if seeds > 1 else "One seed"
-    lines.append(f"{means}{few_seeds(seeds) or '.'}")
+    lines.append(f"{means}{few_seeds(seeds) or '.'}{independent_runs(result.runs)}")
     if groups > SHOWN:
         lines.append(f"{SHOWN} of {groups} tables are shown; runs.parquet has all runs.")
     return "\n".join(lines)

@@ -38,11 +38,11 @@ SENTENCES: Mapping[Kind, Mapping[str, str]] = {
         "dwell_deadline_seconds": "Deadline of a cycle.",
         "dwell_guard_fallback": "Whether the cell is where its guard has put it.",
         "dwell_release_ratio": "Cycles released per period, over the time of three windows.",
-        "dwell_violation_ratio": "Share of the cycles of the last window that missed.",
-        "dwell_estimated_cost": "Cost J of a candidate as estimated at the close of the last "
-        "window.",
-        "dwell_utilisation_ratio": "Utilisation of a resource in the last window, foreign work "
-        "included.",
+        "dwell_violation_ratio": "Share of the cycles that the last decision looked at that "
+        "missed.",
+        "dwell_estimated_cost": "Cost J of a candidate as estimated for the last decision.",
+        "dwell_utilisation_ratio": "Utilisation of a resource over the cycles that the last "
+        "decision looked at, foreign work included.",
         "dwell_clock_bound_seconds": "Largest error of the latencies of the last window, by the "
         "clocks.",
         "dwell_window_unproven": "Whether clocks or losses of messages leave the last window "

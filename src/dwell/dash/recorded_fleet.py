@@ -143,8 +143,8 @@ class RecordedFleet:
         except RunError as error:
             self._faults.append(str(error))
             return self._members[0].windows.closes, {}
-        first = self._run.fleet.entries[0].cell
-        closes = table["start_ns"].to_numpy() / 1e9 + first.window_ms / 1e3
+        window_ms = min(entry.cell.window_ms for entry in self._run.fleet.entries)
+        closes = table["start_ns"].to_numpy() / 1e9 + window_ms / 1e3
         names = [name for name in table.columns if name.startswith("u_")]
         return closes, {name.removeprefix("u_"): table[name].to_numpy() for name in names}
 

@@ -26,6 +26,7 @@ from dwell.model.frozen import FrozenDict
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS
+from dwell.model.scenario import Scenario
 
 Floats: TypeAlias = NDArray[np.float64]
 #: Candidate of each cell, in their order; None for a cell that is left out.
@@ -126,10 +127,16 @@ class FleetPrices:
         Nodes that are one computer for all cells.
     cycles : int
         Cycles of all cells together.
+    disturbances : sequence of Disturbance
+        What happens to shared nodes.
     """
 
     def __init__(
-        self, cells: Sequence[PricedCell], shared: Sequence[str], cycles: int = CYCLES
+        self,
+        cells: Sequence[PricedCell],
+        shared: Sequence[str],
+        cycles: int = CYCLES,
+        disturbances: Scenario = (),
     ) -> None:
         self.cells, self.shared = tuple(cells), tuple(shared)
         self._windows = [_windows_of(cell.problem, cells, cycles) for cell in self.cells]
@@ -140,6 +147,8 @@ class FleetPrices:
                 seed=SEED,
                 windows=windows,
                 streams=cell.streams,
+                shared=self.shared,
+                disturbances=disturbances,
             )
             for cell, windows in zip(self.cells, self._windows, strict=True)
         ]

@@ -83,8 +83,9 @@ template <class S>
     announce_look(s, cell);
   }
   const i64 margin = s.clock[0].margin, end_ns = s.clock[0].end_ns;
+  const bool plays_on = s.clock[0].plays_on != 0;
   i64 budget = s.clock[0].budget;
-  while (waiting > 0 && !s.queue.is_empty()) {
+  while ((waiting > 0 || plays_on) && !s.queue.is_empty()) {
     const Status status = room(s, margin);
     if (status != kPaused) return status;
     if (--budget < 0) return kBusy;

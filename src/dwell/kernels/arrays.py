@@ -682,6 +682,7 @@ class _Layout:
             "budget": BUDGET,
             "logs_all": self.logs_all,
             "end_ns": self.end_ns,
+            "plays_on": any(real.is_cut(problem) for problem, real in self.cells),
         }
         day_bits, n_days = self._calendar()
         rows["clock"].append(clock | {"day_bits": day_bits})

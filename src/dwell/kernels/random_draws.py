@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from functools import cached_property
 
@@ -63,6 +63,8 @@ def draw(
     seed: int,
     windows: int,
     streams: str = "",
+    shared: Collection[str] = (),
+    disturbances: Scenario = (),
 ) -> Realisation:
     """Draw a realisation of a scenario.
 
@@ -76,6 +78,10 @@ def draw(
         Number of windows, at least 1; the run has ``windows * window_cycles`` cycles.
     streams : str
         What the names of its streams begin with, where several are drawn of one seed.
+    shared : collection of str
+        Nodes that the cell shares with others; their changes are drawn without `streams`.
+    disturbances : sequence of Disturbance
+        All disturbances of shared nodes; the scenario's own ones of these nodes do not count.
 
     Raises
     ------
@@ -93,7 +99,14 @@ def draw(
         raise SimulationError(f"seed is {seed!r}; it must be a whole number of at least 0")
     _require_memory(problem, windows)
     try:
-        drawing = Drawing(problem, scenario, seed=seed, windows=windows, streams=streams)
+        drawing = Drawing(
+            *(problem, scenario),
+            seed=seed,
+            windows=windows,
+            streams=streams,
+            shared=shared,
+            disturbances=disturbances,
+        )
         return drawing.take(windows)
     except MemoryError:
         raise SimulationError(
@@ -119,7 +132,14 @@ def _require_memory(problem: Problem, windows: int) -> None:
 
 
 def drawn_scenario(
-    problem: Problem, *, scenario: str, seed: int, windows: int, streams: str = ""
+    problem: Problem,
+    *,
+    scenario: str,
+    seed: int,
+    windows: int,
+    streams: str = "",
+    shared: Collection[str] = (),
+    disturbances: Scenario = (),
 ) -> Scenario:
     """Return a scenario as a realisation has it (see `draw`): its drawn episodes as disturbances.
 
@@ -130,7 +150,14 @@ def drawn_scenario(
     TraceError
         If the times of episodes are a trace that is too short or is not there.
     """
-    return Drawing(problem, scenario, seed=seed, windows=windows, streams=streams).episodes()
+    return Drawing(
+        *(problem, scenario),
+        seed=seed,
+        windows=windows,
+        streams=streams,
+        shared=shared,
+        disturbances=disturbances,
+    ).episodes()
 
 
 def draw_changes(
@@ -178,13 +205,16 @@ def draw_shadows(
             wraps=wraps,
             streams=realisation.streams,
         )
-        drawing.release_ns, drawing.sent = realisation.release_ns, sent
+        drawing.sent = sent
+        # Rows of traces follow the releases of whole windows.
+        if realisation.cycles == drawing.cycles:
+            drawing.release_ns = realisation.release_ns
         return drawing
 
     if sent is None:
-        return drawing(None).take(realisation.windows)
+        return drawing(None).take(realisation.windows).until(realisation.cycles)
     whole = drawing(None).take(realisation.windows) if others else None
-    return drawing(sent).take_sent(realisation, whole)
+    return drawing(sent).take_sent(realisation, whole).until(realisation.cycles)
 
 
 def draw_on_off(
@@ -233,6 +263,8 @@ class Drawing:
         Whether every trace begins anew where it ends.
     streams : str
         What the names of its streams begin with.
+    shared, disturbances
+        As in `draw`.
 
     Raises
     ------
@@ -250,8 +282,12 @@ class Drawing:
         shadow: bool = False,
         wraps: bool = False,
         streams: str = "",
+        shared: Collection[str] = (),
+        disturbances: Scenario = (),
     ) -> None:
-        self.problem, self.name, self.scenario = problem, scenario, problem.scenario(scenario)
+        self.problem, self.name, self.shared = problem, scenario, shared
+        own = (item for item in problem.scenario(scenario) if not self._is_shared(item))
+        self.scenario: Scenario = (*own, *disturbances)
         self.seed, self.windows, self.shadow, self.wraps = seed, windows, shadow, wraps
         self.streams = streams
         self.cycles = problem.cycles_of(windows)
@@ -483,12 +519,16 @@ class Drawing:
         items = self._on_link(name)
         return added + [(i.add_delay_ms, i.layers) for i in items if i.add_delay_ms is not None]
 
+    def _is_shared(self, item: Disturbance) -> bool:
+        return isinstance(item, NodeDisturbance) and item.node in self.shared
+
     def _on_link(self, link: str) -> list[LinkDisturbance]:
         return [i for i in self.scenario if isinstance(i, LinkDisturbance) and i.link == link]
 
     def _bursts(self, bursts: Bursts, name: str) -> OnOffIntervals:
         """Draw the bursts of the node or link of this name, up to the end of the run."""
-        horizon_ns, name = int(self.release_ns[-1]), f"{self.streams}bursts/{name}"
+        streams = "" if name in self.shared else self.streams
+        horizon_ns, name = int(self.release_ns[-1]), f"{streams}bursts/{name}"
         return draw_on_off(
             self.seed, name, bursts.every_ms, bursts.for_ms, NS_PER_MS, 0, horizon_ns
         )
@@ -504,7 +544,7 @@ class Drawing:
         episodes, horizon_ns = item.episodes, min(end_ns, int(self.release_ns[-1]))
         # The stream has the name of the episodes alone: what shares it comes and goes together.
         name, every, length = episodes.name, episodes.every_s, episodes.for_s
-        name = f"{self.streams}episodes/{name}"
+        name = f"{'' if self._is_shared(item) else self.streams}episodes/{name}"
         drawn = draw_on_off(self.seed, name, every, length, NS_PER_S, begin_ns, horizon_ns)
         return drawn.until(end_ns)
 

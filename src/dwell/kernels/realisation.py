@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.model import Problem
 from dwell.model.bounds import counted
 
 
@@ -189,7 +190,7 @@ class Realisation:
     seed : int or None
         None where it was recorded, not drawn.
     windows : int
-        Windows of W cycles the run has; N = windows * W.
+        Windows of W cycles the run has; N = windows * W, or less where the last is incomplete.
     release_ns : int64 array, shape (N + 1,)
         Release instant of every cycle, ascending; the last entry is that of the first cycle beyond
         the last window.
@@ -246,6 +247,20 @@ class Realisation:
             f"{counted(self.windows, 'window')}, {counted(self.cycles, 'cycle')}; "
             f"{counted(len(self.sites), 'site')}, {counted(len(self.hops), 'hop')}>"
         )
+
+    def until(self, cycles: int) -> Realisation:
+        """Return its first cycles; its last window is incomplete where they end in it."""
+        return replace(
+            self,
+            release_ns=self.release_ns[: cycles + 1],
+            exec_ns=self.exec_ns[:, :cycles],
+            delay_ns=self.delay_ns[:, :cycles],
+            extra_ns=self.extra_ns[:, :cycles],
+        )
+
+    def is_cut(self, problem: Problem) -> bool:
+        """Whether its last window is incomplete."""
+        return self.cycles < self.windows * problem.window_cycles
 
     @property
     def cycles(self) -> int:

@@ -53,7 +53,8 @@ struct Crossing;  // of meter.cpp
   field(i64, pauses) /* whether a call ends when the cell is to be decided on */                 \
   field(i64, closed_cell)                                                                        \
   field(i64, step_key) field(i64, step_ns)                                                       \
-  field(i64, end_ns) /* of the last close that any cell can have */
+  field(i64, end_ns) /* of the last close that any cell can have */                              \
+  field(i64, plays_on) /* up to there, also where no window is left to close */
 
 // A window closes no earlier than `due_ns` after the release of its last cycle, and `grace_ns` after
 // that of the one beyond it. `wakes_ns` is when the guard is woken if no cycle from `waited` on has

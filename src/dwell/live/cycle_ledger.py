@@ -397,7 +397,6 @@ class Ledger:
             used[:, column] = counted_ns
             if jobs_ns:
                 used[1, column] = jobs_ns[node]
-            load.forget(begin_ns)
             kinds = self._nodes[node].accelerators.items()
             if len(kinds) == 1 and told_ns >= HOOKED_SHARE * (end_ns - begin_ns):
                 ((kind, count),) = kinds
@@ -409,6 +408,11 @@ class Ledger:
                 busy_ns = hooked.get(name, own_ns + shadow_ns)
                 used[:, column] = busy_ns, own_ns, shadow_ns
         return used
+
+    def forget(self, before: LiveCycle) -> None:
+        """Drop the reports of loads that only earlier cycles need."""
+        for node, load in self.loads.items():
+            load.forget(self.span_ns(node, before, before.at_ns)[0])
 
     def spent_ns(self, cycles: Sequence[LiveCycle]) -> Counter[str]:
         """CPU time that the jobs of some cycles took, by node; of those that told it.

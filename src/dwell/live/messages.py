@@ -248,7 +248,8 @@ class Order(_Array, frozen=True):
     placement : str
         Candidate; empty to change nothing.
     shadow_fraction : float
-        Share of the cycles sent through each alternative.
+        Share of the cycles sent through each alternative, under the placement that the order leads
+        to.
     forks : tuple of (str, str)
         For `Stamp.forks` from now on.
     want : str

@@ -102,9 +102,6 @@ class RolePlace:
     def __post_init__(self) -> None:
         phase_ms = self.problem.pipeline.first_release_ms
         require(phase_ms == 0, "phase_ms", phase_ms, "0 in a live cell, which begins when it is up")
-        every, width = self.problem.decide_cycles, self.problem.window_cycles
-        bound = f"window_cycles = {width} in a live cell, which decides once per window"
-        require(every == width, "controller.decide_cycles", every, bound)
         self.keys = Keys(self.problem.name)
         self.period_ns = self.problem.pipeline.period_ns
 

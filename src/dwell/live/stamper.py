@@ -330,6 +330,8 @@ class Stamper:
         if by_guard:
             self._ahead = None
             self._forks = ()
+            # Only the controller knows the share of the fallback; its next order has it.
+            self._fraction = 0.0
         self.moves.append((self._next, placement, "guard" if by_guard else "order"))
         del self.moves[:-1_000]
         self._partial.clear()

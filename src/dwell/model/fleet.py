@@ -12,7 +12,8 @@ from dwell.model.bounds import Bound, as_read, counted
 from dwell.model.declaration import declared, declared_fields, key
 from dwell.model.fabric import Node
 from dwell.model.problem import Problem
-from dwell.model.semantics import nearest, nearest_of
+from dwell.model.scenario import Disturbance, NodeDisturbance, Scenario
+from dwell.model.semantics import episode_faults, nearest, nearest_of
 
 Phases: TypeAlias = "Literal['sync', 'even', 'random'] | tuple[float, ...]"
 Coordination: TypeAlias = Literal["none", "random", "ledger"]
@@ -112,6 +113,12 @@ class Fleet:
             object.__setattr__(self, "phases", tuple(self.phases))
         kinds = [(entry.count, entry.cell) for entry in self.entries]
         faults = [*fleet_faults(kinds, self.shared, self.phases)]
+        met = [
+            (f"cells[{i}].scenario", item)
+            for i, entry in enumerate(self.entries)
+            for item in self._of(entry)
+        ]
+        faults += episode_faults(met)
         if faults:
             raise ProblemError(faults)
 
@@ -135,6 +142,35 @@ class Fleet:
     def problems(self) -> dict[str, Problem]:
         """What every cell is, by its name."""
         return {cell.name: cell.problem for cell in self.cells}
+
+    def policy_of(self, entry: FleetEntry) -> str:
+        """Return the policy of the cells of an entry."""
+        return entry.policy or self.policy or entry.cell.controller.policy
+
+    def candidate_of(self, entry: FleetEntry) -> str | None:
+        """Return the candidate that the cells of an entry never leave; None where they may move."""
+        name, _ = entry.cell.policy_and_estimator(self.policy_of(entry))
+        return name if name in entry.cell.candidates else None
+
+    @property
+    def disturbances(self) -> Scenario:
+        """What the scenarios of its cells do to shared nodes; equal ones count once."""
+        return tuple(dict.fromkeys(item for entry in self.entries for item in self._of(entry)))
+
+    def _of(self, entry: FleetEntry) -> Iterator[Disturbance]:
+        for item in entry.cell.scenario(entry.scenario):
+            if isinstance(item, NodeDisturbance) and item.node in self.shared:
+                yield item
+
+    def duration_ns(self, windows: int) -> int:
+        """Return the length of so many of the longest windows."""
+        return windows * max(entry.cell.window_ns for entry in self.entries)
+
+    @property
+    def warmup_ns(self) -> int:
+        """Longest warm-up of a cell; all cells are counted from then on."""
+        cells = [entry.cell for entry in self.entries]
+        return max(cell.warmup_windows * cell.window_ns for cell in cells)
 
     @property
     def phasing(self) -> str:

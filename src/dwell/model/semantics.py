@@ -144,11 +144,13 @@ def find_unregistered(
         if settings.policy not in parts.candidates and not CLASS_PATH.holds(settings.policy):
             known = [*policies, *names]
             yield from _unknown("controller.policy", "policy", settings.policy, known)
-        if not CLASS_PATH.holds(settings.estimator):
-            path = "controller.estimator"
-            yield from _unknown(path, "estimator", settings.estimator, estimators)
-        given = settings.shadow_fraction if settings.estimator in shadowing else None
-        if given is not None and (message := too_many_shadows(given, len(names))):
+        estimator = settings.estimator
+        if estimator is not None and not CLASS_PATH.holds(estimator):
+            yield from _unknown("controller.estimator", "estimator", estimator, estimators)
+        # The usual estimator sends shadow jobs.
+        sends = estimator is None or estimator in shadowing
+        given = settings.shadow_fraction if sends else None
+        if isinstance(given, float | int) and (message := too_many_shadows(given, len(names))):
             yield Fault("controller.shadow_fraction", message)
     yield from _columns(parts)
 
@@ -343,12 +345,17 @@ def _scenarios(parts: CellParts) -> Iterator[Fault]:
                 yield from _unknown(f"{path}.node", "node", item.node, parts.nodes)
             elif parts.links_complete:
                 yield from _unknown(f"{path}.link", "link", item.link, links)
-        yield from _episodes(items)
+        yield from episode_faults(items)
         yield from _layers(parts, items)
 
 
-def _episodes(items: Sequence[tuple[str, Disturbance]]) -> Iterator[Fault]:
-    """Disturbances whose episodes have one name must be able to come and go together."""
+def episode_faults(items: Sequence[tuple[str, Disturbance]]) -> Iterator[Fault]:
+    """Yield where disturbances whose episodes share a name cannot begin and end together.
+
+    Parameters
+    ----------
+    items : sequence of (path, Disturbance)
+    """
     first: dict[str, tuple[str, Disturbance]] = {}
     for path, item in items:
         if item.episodes is None:

@@ -22,8 +22,8 @@ Kind: TypeAlias = Literal[
 ]
 #: What a run has that not every run has: `live` processes; cycles that may be sent through
 #: alternatives, too (`shadows`); an estimator that says what stands behind its estimates
-#: (`support`); a cell of a `fleet`.
-Feature: TypeAlias = Literal["live", "shadows", "support", "fleet"]
+#: (`support`); a cell of a `fleet`; decisions between the closes of windows (`between`).
+Feature: TypeAlias = Literal["live", "shadows", "support", "fleet", "between"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class Column:
         Unit of a number; empty for a count, a share and a bare number.
     null : str
         When it is null; empty where it never is. NaN is null there, too.
-    of : tuple of {"live", "shadows", "support", "fleet"}
+    of : tuple of {"live", "shadows", "support", "fleet", "between"}
         Runs that have it: those with one of these; all where empty.
     """
 
@@ -88,6 +88,7 @@ LIVE: tuple[Feature, ...] = ("live",)
 SHADOWS: tuple[Feature, ...] = ("shadows",)
 SUPPORT: tuple[Feature, ...] = ("support",)
 FLEET: tuple[Feature, ...] = ("fleet",)
+BETWEEN: tuple[Feature, ...] = ("between",)
 UNASKED = "the ledger was not asked"
 
 CYCLES = (
@@ -195,6 +196,15 @@ DECISIONS = (
     Column("last_cycle", "Int64", "The last cycle that it looked at."),
     Column("cycles", "Int64", "How many cycles it looked at; 0: a move of the guard's."),
     Column("dwell_cycles", "Int64", "n_d in cycles."),
+    Column("seen_l95_ms", "Float64", "L95 of the cycles that it looked at.", "ms", GUARD, BETWEEN),
+    Column("seen_violation_rate", "Float64", "V_D of these cycles.", null=GUARD, of=BETWEEN),
+    Column(
+        "u_{resource}",
+        "Float64",
+        "Utilisation of a resource from the release of the first of them.",
+        null=f"{GUARD}, or {UNMEASURED}",
+        of=BETWEEN,
+    ),
     Column(
         "j_{candidate}",
         "Float64",

@@ -27,7 +27,8 @@ Errors of estimates
     the `dwell.cost.margin` of the two estimates. Since w_{k-1}(incumbent) - w_{k-1}(s) is never
     more than d(s, incumbent), that takes a window in which s is cheaper by more than the margin,
     and errors that last add up to no move. An incumbent that is not eligible is left without it:
-    there caps decide, not J. Where estimates say no errors, all is as above.
+    there caps decide, not J. Where estimates say no errors, all is as above. A decision that serves
+    a share of a window takes the same share of the margin.
 
 What is not claimed
     The algorithm costs at most 2n - 1 times the optimum, plus a constant, if it sees a window's
@@ -139,9 +140,9 @@ class WorkFunction(PricingPolicy):
         return self._move(best, reason, costs), work
 
     def _unsure(self, best: str, served: list[float], estimates: Mapping[str, QoS]) -> bool:
-        """Whether what a move saves in the sums is no more than the margin of the estimates."""
+        """Whether a move saves no more in the sums than the margin of this decision's share."""
         now = self.incumbent
-        least = self._pricing.margin(estimates[best], estimates[now])
+        least = self._served * self._pricing.margin(estimates[best], estimates[now])
         here, there = self._index[now], self._index[best]
         saved = served[here] - served[there] - self._distances[here][there]
         # Without errors a tie is a move.

@@ -47,6 +47,8 @@ class FleetRun:
     load : mapping of str to array, or function that makes a DataFrame
         Of every shared node over time (see `dwell.sim.shared_load`).
     seed : int
+    seconds : float
+        Length of the run: every cell is released until then.
     guard : bool
         Whether guards acted.
     phases_ms : mapping of str to float
@@ -64,13 +66,15 @@ class FleetRun:
         load: Mapping[str, NDArray[np.generic]] | Callable[[], pl.DataFrame],
         *,
         seed: int,
+        seconds: float,
         guard: bool,
         phases_ms: Mapping[str, float],
         faults: Sequence[str] = (),
         finished: bool = True,
     ) -> None:
         self.fleet, self.cells, self._load = fleet, dict(cells), load
-        self.seed, self.guard, self.phases_ms = seed, guard, dict(phases_ms)
+        self.seed, self.seconds, self.guard = seed, seconds, guard
+        self.phases_ms = dict(phases_ms)
         self.faults, self.finished = tuple(faults), finished
 
     def __repr__(self) -> str:
@@ -154,7 +158,7 @@ class FleetRun:
             seed=self.seed,
             guard=self.guard,
             phases=self.phases_ms,
-            windows=meta["windows"],
+            seconds=self.seconds,
             versions=meta["versions"],
         )
 
@@ -165,7 +169,7 @@ def describe_fleet(fleet: Fleet, **settings: Any) -> dict[str, Any]:
     Parameters
     ----------
     **settings : JSON-able
-        Seed, guard, windows, versions, and the phases as drawn, ms by cell.
+        Seed, seconds, guard, versions, and the phases as drawn, ms by cell.
     """
     document = fleet_document(fleet)
     digest = hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
@@ -259,6 +263,7 @@ def open_fleet(path: str | os.PathLike[str], *, whole: bool = True) -> FleetRun:
         names = [str(name) for name in described["cells"]]
         fleet = _fleet_of(described["fleet"], str(described.get("file") or ""))
         seed, guard = int(described["seed"]), bool(described["guard"])
+        seconds = float(described["seconds"])
         phases_ms = {name: float(described["phases"][name]) for name in names}
     except (KeyError, TypeError, ValueError) as error:
         why = "; ".join(str(error).splitlines()) if isinstance(error, ProblemError) else repr(error)
@@ -278,6 +283,7 @@ def open_fleet(path: str | os.PathLike[str], *, whole: bool = True) -> FleetRun:
     return FleetRun(
         *(fleet, runs, load),
         seed=seed,
+        seconds=seconds,
         guard=guard,
         phases_ms=phases_ms,
         faults=faults,

@@ -122,13 +122,26 @@ class Run(Displayed):
         RunError
             If what the run says of them, or of its cell, cannot be read.
         """
-        told = self.meta.get("played")
+        return self._scenario("played")
+
+    @cached_property
+    def shared_disturbances(self) -> Scenario:
+        """What happened to the nodes that a cell of a fleet shares, as scenarios have it.
+
+        Raises
+        ------
+        RunError
+            As `played`.
+        """
+        return self._scenario("disturbances") or ()
+
+    def _scenario(self, key: str) -> Scenario | None:
+        told = self.meta.get(key)
         if not isinstance(told, list):
             return None
         items = [item for item in told if isinstance(item, Mapping)]
         within = [_from_the_start(item) for item in items if _end_s(item) > max(_at_s(item), 0.0)]
-        scenarios = {PLAYED: within}
-        return self._cell_with({"scenarios": scenarios}).scenarios[PLAYED]
+        return self._cell_with({"scenarios": {PLAYED: within}}).scenarios[PLAYED]
 
     @property
     def disturbances(self) -> Scenario:
@@ -141,7 +154,8 @@ class Run(Displayed):
         """
         if self.played is not None:
             return self.played
-        return self.problem.scenarios.get(str(self.meta.get("scenario")), ())
+        own = self.problem.scenarios.get(str(self.meta.get("scenario")), ())
+        return tuple(dict.fromkeys((*own, *self.shared_disturbances)))
 
     def _cell_with(self, changes: Mapping[str, object]) -> Problem:
         from dwell.cellfile import from_record

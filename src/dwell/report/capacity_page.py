@@ -13,7 +13,8 @@ from dwell.report.palette import CIRCLE, INK, SOLID, Style
 from dwell.report.table import Table, Text, interval_row
 
 if TYPE_CHECKING:
-    from dwell.study.capacity import Capacity, WhatIf
+    from dwell.study.capacity import Capacity, CapacityPoint
+    from dwell.study.what_ifs import WhatIf
 
 RATE = Measure("violation_rate", "V_D of the worst cell", "%", 100.0, decimals=2)
 
@@ -28,9 +29,13 @@ def capacity_page(name: str, found: Capacity, what_ifs: Sequence[WhatIf] = ()) -
     """
     low, high = found.interval
     facts = [Fact("robots", written(found), f"[{low}, {high}]")]
+    if found.limit_on == "excess":
+        facts.append(Fact(f"robots at ≤ {found.limit:.0%}", f"{found.robots_at_limit}"))
     if found.limits is not None:
         limits = found.limits
-        facts.append(Fact("what limits", f"{limits.kind} {limits.name}", f"{limits.share:.0%}"))
+        used = found.point(found.robots).utilisation.get(limits.name)
+        told = "" if used is None else f", busy {used:.0%}"
+        facts.append(Fact("what limits", limits.name, f"{limits.share:.0%} of the waiting{told}"))
     blocks: list[Figure | Table | Definitions] = [_figure(found), _assumed(found)]
     sections = [Section("V_D by number of robots", blocks)]
     if what_ifs:
@@ -49,17 +54,30 @@ def written(found: Capacity) -> str:
     return f"at least {found.robots}" if found.at_least else str(found.robots)
 
 
+def answer(found: Capacity) -> str:
+    """Return how many robots at which V_D: ``0 at ≤ 5 %; 9 at ≤ 10.3 % (one alone: 5.3 %)``."""
+    interval = "[{}, {}]".format(*found.interval)
+    if found.limit_on == "violation_rate":
+        return f"{written(found)} {interval}"
+    limit, bound = found.limit * 100, found.bound * 100
+    return (
+        f"{found.robots_at_limit} at ≤ {limit:g} %; {written(found)} {interval} at ≤ {bound:.1f} % "
+        f"(one alone: {found.alone * 100:.1f} %)"
+    )
+
+
 def _assumed(found: Capacity) -> Definitions:
     """Return what was assumed, and what each number is."""
     excess = " beyond that of one cell alone" if found.limit_on == "excess" else ""
     entries = {
         "robots": "the largest number such that neither it nor a smaller one is over the limit; in "
         "brackets the same by the ends of the 95 % intervals over seeds",
+        **({"errors": errors(found)} if found.phases == "random" else {}),
         "limit": f"{found.limit * 100:g} % of deadlines missed{excess}, by the cell that misses "
         "most; the mean over seeds",
         "phases": PHASES.get(str(found.phases), "as listed"),
-        "what limits": "the node or link that cycles which missed have waited for most, and its "
-        "share of all that they waited, one robot beyond the limit",
+        "what limits": "the resource or link for which cycles that missed have waited most, and "
+        "its share of their waiting, one robot beyond the limit",
     }
     return Definitions(entries | ({"none": found.reason} if found.reason else {}))
 
@@ -108,7 +126,24 @@ def _changes(found: Capacity, what_ifs: Sequence[WhatIf]) -> Table:
 
 def _numbers(found: Capacity) -> Table:
     rows = [
-        {"robots": str(point.robots), **interval_row({RATE.column: point.violation_rate})}
+        {
+            "robots": str(point.robots),
+            **interval_row({RATE.column: point.violation_rate}),
+            "used": busy(point),
+        }
         for point in found.curve
     ]
-    return Table("curve", "V_D by number of robots", [Text("robots", "robots"), RATE], rows)
+    columns: list[Text | Measure] = [Text("robots", "robots"), RATE, Text("used", "utilisation")]
+    return Table("curve", "V_D by number of robots", columns, rows)
+
+
+def errors(found: Capacity) -> str:
+    """Return how far V_D may be off by the draws of phases, and by the cycles played."""
+    point = found.point(found.robots)
+    by_phases, by_cycles = point.phases_error * 100, point.cycles_error * 100
+    return f"at {point.robots}: phases ± {by_phases:.2f}, cycles ± {by_cycles:.2f} points of V_D"
+
+
+def busy(point: CapacityPoint) -> str:
+    """Return the utilisation of the shared resources: ``E 9 %, E.gpu 98 %``."""
+    return ", ".join(f"{name} {share:.0%}" for name, share in point.utilisation.items())

@@ -10,7 +10,15 @@ from dwell.model.bounds import counted
 from dwell.model.disturbed import disturbed
 from dwell.report.charts import curves
 from dwell.report.figure import Figure
-from dwell.report.formatting import COST, RATE, Measure, few_seeds, shown_policy, shown_scenario
+from dwell.report.formatting import (
+    COST,
+    RATE,
+    Measure,
+    few_seeds,
+    independent_runs,
+    shown_policy,
+    shown_scenario,
+)
 from dwell.report.method import numbered
 from dwell.report.page import Page, Section, page_html
 from dwell.report.policy_blocks import THE_AIM, PolicyBlocks, named, scaled
@@ -120,7 +128,7 @@ def _sections(
         runs=f"{counted(comparison.windows, 'window')}, {numbered(comparison.seeds)}; every policy "
         "plays the same realisation of a scenario and seed",
         intervals="95 %, two-sided, over seeds, by the studentised bootstrap, each on its own; "
-        "of medians, by order statistics",
+        f"of medians, by order statistics.{independent_runs(comparison.runs)}",
     )
     yield Section("How it was made", method)
 
@@ -169,7 +177,7 @@ def _beliefs(comparison: Comparison, blocks: PolicyBlocks) -> Table:
     import polars as pl
 
     means = comparison.costs.group_by("scenario", "policy", "candidate", maintain_order=True).agg(
-        pl.col("estimated").mean(), pl.col("measured").mean()
+        pl.col("estimated", "measured", "shadow_fraction").mean()
     )
     alone = comparison.runs.group_by("scenario", "policy", maintain_order=True).agg(
         pl.col("cost").mean().alias("alone")
@@ -183,6 +191,7 @@ def _beliefs(comparison: Comparison, blocks: PolicyBlocks) -> Table:
         Measure("estimated", "estimated while idle", decimals=2),
         Measure("measured", "measured while active", decimals=2),
         Measure("alone", "measured alone", decimals=2),
+        Measure("shadow_fraction", "shadows per alternative", "%", 100.0, 1),
     ]
     return Table(
         f"{blocks.prefix}beliefs",

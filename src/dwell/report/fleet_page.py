@@ -70,7 +70,6 @@ class _FleetPage:
 
     def page(self) -> Page:
         fleet = self.run.fleet
-        windows = int(next(iter(self.run.cells.values())).meta["windows"])
         return Page(
             title=f"Fleet {fleet.name}",
             subtitle=" · ".join(
@@ -80,7 +79,7 @@ class _FleetPage:
                     f"coordination: {fleet.coordination}",
                     f"phases: {fleet.phasing}",
                     f"seed {self.run.seed}",
-                    f"{counted(windows, 'window')} of each",
+                    f"{write_number(self.run.seconds, 0)} s",
                 )
             ),
             facts=list(self._facts()),

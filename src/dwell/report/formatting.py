@@ -5,16 +5,25 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from dwell.display import decimals_for
 from dwell.report.palette import FAMILIES, contended
 from dwell.study import Interval
+from dwell.study.over_seeds import RUN, UNIT
+
+if TYPE_CHECKING:
+    import polars as pl
 
 #: What has to stand beside everything that shows ATP.
 OURS = "ATP is our reconstruction."
 #: Fewer make intervals that say little, and this is said beside them.
 FEW_SEEDS = 5
+#: Why windows of a run are not independent, and what follows.
+LASTING = (
+    "a trace is replayed, or what comes and goes takes longer than a run; there limits of V_D rest "
+    "on the number of runs alone"
+)
 #: A symbol with its index: V_D, N_min, α_L.
 SYMBOL = re.compile(r"(?<![\w.])([A-ZΔα-ωdp])_(D|L|V|S|r|e|z|min|max|loss)(?!\w)")
 ABBREVIATIONS = {"cpu": "CPU", "gpu": "GPU", "lan": "LAN", "wan": "WAN", "5g": "5G"}
@@ -169,6 +178,15 @@ def few_seeds(count: int) -> str:
     return f". Few seeds: give at least {FEW_SEEDS} for intervals that say something."
 
 
+def independent_runs(runs: pl.DataFrame) -> str:
+    """Return the sentence about scenarios in which only whole runs are independent, if any."""
+    names = list(dict.fromkeys(runs.filter(unit=RUN)["scenario"])) if UNIT in runs.columns else []
+    if not names:
+        return ""
+    listed = ", ".join(map(shown_scenario, names))
+    return f" Runs, not windows, are independent in {listed}: {LASTING}."
+
+
 def percent(share: float, decimals: int = 0) -> str:
     """Write a share in percent: ``5 %``."""
     return f"{write_number(100 * share, decimals)} %"
@@ -196,7 +214,8 @@ def _shown(name: str, remark: str = "") -> str:
     shown += f"-{known.variant}" if known.variant else ""
     brackets = "; ".join(filter(None, (remark, known.belief)))
     shown += f" ({brackets})" if brackets else ""
-    return f"{shown}, {known.rest}" if known.rest else shown
+    glue = " " if known.rest.startswith("as ") else ", "
+    return f"{shown}{glue}{known.rest}" if known.rest else shown
 
 
 def shown_scenario(name: str) -> str:

@@ -19,6 +19,7 @@ from dwell.report.formatting import (
     REGRET,
     Measure,
     few_seeds,
+    independent_runs,
     own_measures,
 )
 from dwell.report.method import numbered
@@ -72,7 +73,8 @@ def _sections(study: StudyRuns, blocks: PolicyBlocks) -> Iterator[Section]:
         yield Section("More numbers", [blocks.more()])
     method = blocks.method(
         runs=f"{counted(study.windows, 'window')}, {numbered(study.seeds)}",
-        intervals="95 %, two-sided, over seeds, by the studentised bootstrap, each on its own",
+        intervals="95 %, two-sided, over seeds, by the studentised bootstrap, each on its own."
+        f"{independent_runs(study.runs)}",
     )
     yield Section("How it was made", method)
 

@@ -35,10 +35,14 @@ class ColdMigration:
         # Of the tasks that are not ready yet: the hop that their state takes, -1 for none.
         self.hops: dict[int, int] = {}
 
+    def moves(self, incumbent: str, order: str) -> bool:
+        """Whether an order moves a task."""
+        return self.candidates[incumbent] != self.candidates[order]
+
     def begin(
         self, arrays: CellArrays, incumbent: str, order: str, boundary: int, arrival_ns: int
-    ) -> bool:
-        """Start a worker of every task that an order moves; False if there is none."""
+    ) -> None:
+        """Start a worker of every task that an order moves."""
         self.boundary, self.number = boundary, self.number + 1
         old, new = self.candidates[incumbent], self.candidates[order]
         for row, task in enumerate(self.tasks):
@@ -47,7 +51,6 @@ class ColdMigration:
                 self.hops[row] = self.hop_row.get((task.name, task.name, link), -1)
                 started_ns = arrival_ns + round(task.start_ms * 1e6)
                 self._announce(arrays, row, 0, self.hops[row] < 0, started_ns)
-        return bool(self.hops)
 
     def step(self, arrays: CellArrays) -> bool:
         """Take the step that is due; True if the last task is ready now."""

@@ -110,7 +110,6 @@ def simulate_realisation(
     played = cast("PlayedRealisation", _play(*asked) or _play(*asked, shadow=True))
     meta = partial(
         meta_of,
-        problem,
         played.controller,
         scenario=realisation.scenario,
         seed=realisation.seed,
@@ -145,7 +144,7 @@ def describe(
     """
     problem.scenario(scenario)
     controller = Controller(problem, policy, estimator)
-    meta = meta_of(problem, controller, scenario=scenario, seed=seed, windows=windows, guard=guard)
+    meta = meta_of(controller, scenario=scenario, seed=seed, windows=windows, guard=guard)
     return Run(meta, {}).meta
 
 
@@ -259,10 +258,9 @@ def play_cells(
 
 def _shadow_plan(cell: PlayedCell, probes: bool) -> ShadowPlan | None:
     """Return which cycles of a cell have a shadow; None where it needs none."""
-    fraction = cell.controller.shadow_fraction
-    if not (probes or fraction > 0):
+    if not (probes or cell.controller.sends_shadows):
         return None
-    return ShadowPlan(0, cell.realisation.cycles, len(cell.problem.candidates), fraction)
+    return ShadowPlan(0, cell.realisation.cycles, [*cell.controller.shadow_fractions.values()])
 
 
 def _check_fit(problem: Problem, realisation: Realisation) -> None:
@@ -414,11 +412,15 @@ class _Stamper:
             self._go_on(boundary)
             return
         earliest = self._takes_effect(boundary, close_ns)
+        cold = self.cold
+        if cold is not None and not cold.moves(left, self.course.placement):
+            cold = None
         # Where no window can follow, the run is over, and it does not matter when tasks are ready.
-        over = not self.looks and earliest + self.window_cycles > self.cycles
-        if over or not self._begin(left, boundary, close_ns):
+        if cold is not None and earliest + self.window_cycles <= self.cycles:
+            self._begin(cold, left, boundary, close_ns)
+        else:
             self._stamp(self.stamped, earliest, left)
-            self._move(earliest, begins_window=not self.looks)
+            self._move(earliest, begins_window=cold is not None or not self.looks)
 
     def _window_of(self, cycle: int) -> int:
         """Return the number of windows that have ended by a cycle: that of its own, if any."""
@@ -478,20 +480,16 @@ class _Stamper:
             cell["look_pending"] = 0
         self.stamped = self._reach(following + self.every)
 
-    def _begin(self, left: str, boundary: int, close_ns: int) -> bool:
-        """Begin a cold migration, which ends with `step`; False if no task has to be waited for."""
+    def _begin(self, cold: ColdMigration, left: str, boundary: int, close_ns: int) -> None:
+        """Begin a cold migration, which ends with `step`."""
         arrival_ns = close_ns + self.delay_ns
-        if self.cold is None or not self.cold.begin(
-            self.arrays, left, self.course.placement, boundary, arrival_ns
-        ):
-            return False
+        cold.begin(self.arrays, left, self.course.placement, boundary, arrival_ns)
         cell = self.cell
         # No window closes, and nothing is decided, before the migration is over.
         cell["window_first"] = cell["close_cycle"] = cell["look_cycle"] = self.cycles + 1
         cell["close_pending"] = cell["look_pending"] = 0
         cell["migrating"] = 1
         self._stamp(self.stamped, self.cycles, left)
-        return True
 
     def step(self) -> None:
         """Take the step that is due: of a cold migration, or of the guard."""
@@ -569,7 +567,6 @@ def _evidence(
 
 
 def meta_of(
-    problem: Problem,
     controller: Controller,
     *,
     scenario: str,
@@ -580,12 +577,12 @@ def meta_of(
     """Return what the record of a simulated run says of it."""
     return {
         "kind": "simulated",
-        "cell": problem.name,
+        "cell": controller.problem.name,
         "scenario": scenario,
         **controller.described(),
         "guard": guard and controller.guarded,
         "seed": seed,
         "windows": windows,
-        "problem": to_document(problem),
+        "problem": to_document(controller.problem),
         "versions": versions(),
     }

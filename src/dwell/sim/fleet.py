@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -12,10 +12,13 @@ import numpy as np
 from dwell.control import Controller
 from dwell.control.coordination import ByChance, Coordination
 from dwell.control.ledger import FleetLedger, PricedCell, Seat
+from dwell.errors import Fault, ProblemError
 from dwell.kernels.random_draws import draw, stream
-from dwell.kernels.realisation import NodeChanges, Realisation
-from dwell.model import NodeDisturbance, Problem, Scenario
+from dwell.kernels.realisation import Realisation
+from dwell.model import Problem
+from dwell.model.document import disturbance_document
 from dwell.model.fleet import Fleet, FleetCell, Phases
+from dwell.model.instants import HORIZON_NS
 from dwell.model.progress import Progress
 from dwell.record import Run
 from dwell.record.fleet_run import FleetRun
@@ -24,12 +27,16 @@ from dwell.sim.shared_load import shared_load
 from dwell.sim.tables import PlayedRealisation, make_tables
 from dwell.sim.waiting import Waiting, waiting_of
 
+NS_PER_MS = 1e6
+NS_PER_S = 1e9
+
 
 def simulate_fleet(
     fleet: Fleet,
     *,
     seed: int = 1,
     windows: int = 100,
+    seconds: float | None = None,
     policy: str | None = None,
     estimator: str | None = None,
     coordination: str | None = None,
@@ -45,7 +52,9 @@ def simulate_fleet(
     seed : int
         Seed of all random streams; the first cell of a file draws what it draws alone.
     windows : int
-        Windows of every cell.
+        Length of the run in windows of the cell whose windows are longest.
+    seconds : float, optional
+        Length of the run, in place of `windows`.
     policy, estimator : str, optional
         Of every cell; what the fleet's file says where None.
     coordination, phases : optional
@@ -65,44 +74,67 @@ def simulate_fleet(
     fleet = fleet.changed(
         policy=policy, estimator=estimator, coordination=coordination, phases=phases
     )
+    duration_ns = duration_of(fleet, windows, seconds)
     played = play_fleet(
-        fleet, seed=seed, windows=windows, guard=guard, jobs=jobs, progress=progress
+        fleet, seed=seed, duration_ns=duration_ns, guard=guard, jobs=jobs, progress=progress
     )
     runs = {}
     for cell in fleet.cells:
         one = played[cell.name]
-        meta = partial(
-            _meta_of,
-            cell,
-            one,
-            fleet.shared,
-            seed=seed,
-            windows=windows,
-            guard=guard,
-        )
+        meta = partial(_meta_of, fleet, cell, one, seed=seed, guard=guard)
         runs[cell.name] = Run(meta, *make_tables(one, jobs=jobs))
     load = shared_load(played, fleet.shared)
     offsets = phases_ms(fleet, seed)
-    return FleetRun(fleet, runs, load, seed=seed, guard=guard, phases_ms=offsets)
+    return FleetRun(
+        *(fleet, runs, load),
+        seed=seed,
+        seconds=duration_ns / NS_PER_S,
+        guard=guard,
+        phases_ms=offsets,
+    )
+
+
+def duration_of(fleet: Fleet, windows: int, seconds: float | None = None) -> int:
+    """Return the length of a run, nanoseconds: seconds where given, else in windows.
+
+    Raises
+    ------
+    ProblemError
+        If it is shorter than a window of some cell.
+    """
+    if seconds is None:
+        return fleet.duration_ns(windows)
+    longest_ns = fleet.duration_ns(1)
+    if not longest_ns <= seconds * NS_PER_S < HORIZON_NS:
+        bounds = f"at least the longest window, {longest_ns / NS_PER_S:g}, and below 9.2e9"
+        raise ProblemError([Fault("seconds", f"{seconds:g} is not allowed; it must be {bounds}")])
+    return round(seconds * NS_PER_S)
 
 
 def _meta_of(
-    cell: FleetCell,
-    played: PlayedRealisation,
-    shared: Sequence[str],
-    **settings: Any,
+    fleet: Fleet, cell: FleetCell, played: PlayedRealisation, *, seed: int, guard: bool
 ) -> dict[str, Any]:
-    """Return what the record of a cell says; of a copy, also which streams its draws are of."""
-    meta = meta_of(played.problem, played.controller, scenario=cell.entry.scenario, **settings)
-    drawn = {"streams": cell.streams, "shared": list(shared)} if cell.streams else {}
-    return {**meta, **drawn}
+    """Return what the record of a cell says: also by which streams `draw` repeats its draws."""
+    meta = meta_of(
+        played.controller,
+        scenario=cell.entry.scenario,
+        seed=seed,
+        windows=played.realisation.windows,
+        guard=guard,
+    )
+    if cell.streams:
+        meta["streams"] = cell.streams
+    if len(fleet.cells) > 1 and (fleet.disturbances or cell.streams):
+        meta["shared"] = list(fleet.shared)
+        meta["disturbances"] = [disturbance_document(one) for one in fleet.disturbances]
+    return meta
 
 
 def play_fleet(
     fleet: Fleet,
     *,
     seed: int,
-    windows: int,
+    duration_ns: int,
     guard: bool = False,
     jobs: bool = False,
     progress: Progress | None = None,
@@ -110,7 +142,7 @@ def play_fleet(
     """Play the cells of a fleet as it is (see `simulate_fleet`), and return them by name."""
     names = [cell.name for cell in fleet.cells]
     problems = dict(zip(names, phased(fleet, seed), strict=True))
-    realisations = drawn(fleet, problems, seed, windows)
+    realisations = drawn(fleet, problems, seed, duration_ns)
 
     asked = partial(coordinations, fleet, problems, seed, progress)
 
@@ -132,18 +164,20 @@ def play_fleet(
     return dict(zip(names, played, strict=True))
 
 
-def waiting_in_fleet(fleet: Fleet, *, seed: int, windows: int) -> Waiting:
+def waiting_in_fleet(fleet: Fleet, *, seed: int, duration_ns: int) -> Waiting:
     """Return where the cycles of a fleet that missed have waited."""
     whole = Waiting()
-    for one in play_fleet(fleet, seed=seed, windows=windows, jobs=True).values():
+    for one in play_fleet(fleet, seed=seed, duration_ns=duration_ns, jobs=True).values():
         whole += waiting_of(one.problem, one.realisation, one.arrays)
     return whole
 
 
 def phased(fleet: Fleet, seed: int) -> Iterator[Problem]:
-    """Yield the problem of every cell, with its phase."""
+    """Yield the problem of every cell, with its phase, and the warm-up of the whole fleet."""
+    warmup_ns = fleet.warmup_ns
     for cell, phase_ms in zip(fleet.cells, phases_ms(fleet, seed).values(), strict=True):
-        yield cell.problem.at_phase(phase_ms)
+        windows = -(-warmup_ns // cell.problem.window_ns)
+        yield replace(cell.problem.at_phase(phase_ms), warmup_windows=windows)
 
 
 def phases_ms(fleet: Fleet, seed: int) -> dict[str, float]:
@@ -173,63 +207,36 @@ def _phase_ms(phases: Phases, cell: FleetCell, place: int, count: int, seed: int
 
 
 def drawn(
-    fleet: Fleet, problems: Mapping[str, Problem], seed: int, windows: int
+    fleet: Fleet, problems: Mapping[str, Problem], seed: int, duration_ns: int
 ) -> dict[str, Realisation]:
-    """Draw every cell; what befalls a shared node is drawn once, with the first cell."""
-    found: dict[str, Realisation] = {}
-    first, *others = fleet.cells
-    found[first.name] = draw_cell(fleet, first, problems[first.name], seed, windows, is_first=True)
-    for cell in others:
-        real = draw_cell(fleet, cell, problems[cell.name], seed, windows)
-        found[cell.name] = _meeting(real, found[first.name], fleet.shared)
+    """Draw every cell; what happens to a shared node is the same for all."""
+    found = {}
+    for cell in fleet.cells:
+        problem = problems[cell.name]
+        whole = draw_cell(fleet, cell, problem, seed, duration_ns)
+        found[cell.name] = whole.until(cycles_within(problem, duration_ns))
     return found
 
 
 def draw_cell(
-    fleet: Fleet,
-    cell: FleetCell,
-    problem: Problem,
-    seed: int,
-    windows: int,
-    *,
-    is_first: bool = False,
+    fleet: Fleet, cell: FleetCell, problem: Problem, seed: int, duration_ns: int
 ) -> Realisation:
-    """Draw a cell; the first one of the fleet with what all scenarios do to shared nodes."""
-    scenario = cell.entry.scenario
-    if is_first:
-        problem = _with_all(problem, scenario, fleet)
-    return draw(problem, scenario=scenario, seed=seed, windows=windows, streams=cell.streams)
+    """Draw a cell for a duration: whole windows, the last of which may end beyond it."""
+    return draw(
+        problem,
+        scenario=cell.entry.scenario,
+        seed=seed,
+        windows=-(-duration_ns // problem.window_ns),
+        streams=cell.streams,
+        shared=fleet.shared,
+        disturbances=fleet.disturbances,
+    )
 
 
-def _with_all(problem: Problem, scenario: str, fleet: Fleet) -> Problem:
-    """Return the first cell with what the scenarios of all do to shared nodes; equal ones once."""
-    own: Scenario = problem.scenario(scenario)
-    others = [
-        one
-        for entry in fleet.entries
-        for one in entry.cell.scenario(entry.scenario)
-        if isinstance(one, NodeDisturbance) and one.node in fleet.shared
-    ]
-    added = tuple(one for one in dict.fromkeys(others) if one not in own)
-    if not added:
-        return problem
-    return replace(problem, scenarios={**problem.scenarios, scenario: (*own, *added)})
-
-
-def _meeting(real: Realisation, first: Realisation, shared: tuple[str, ...]) -> Realisation:
-    """Return a realisation whose shared nodes go through what those of the first cell do."""
-    own, theirs = NodeChanges.of(real.node_changes), NodeChanges.of(first.node_changes)
-    nodes = tuple(dict.fromkeys((*own.nodes, *theirs.nodes)))
-    rows = []
-    for changes, is_first in ((own, False), (theirs, True)):
-        taken = [i for i, name in enumerate(changes.nodes) if (name in shared) == is_first]
-        table = changes.table[np.isin(changes.table[:, 1], taken)]
-        places = np.array([nodes.index(name) for name in changes.nodes], np.int64)
-        table[:, 1] = places[table[:, 1]]
-        rows.append(table)
-    merged = np.concatenate(rows)
-    order = np.argsort(merged[:, 0], kind="stable")
-    return replace(real, node_changes=NodeChanges(nodes, merged[order]))
+def cycles_within(problem: Problem, duration_ns: int) -> int:
+    """Return how many cycles of a cell are released within a duration."""
+    first_ns = round(problem.pipeline.first_release_ms * NS_PER_MS)
+    return -((first_ns - duration_ns) // problem.pipeline.period_ns)
 
 
 def coordinations(

@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 def shared_load(
     played: Mapping[str, PlayedRealisation], shared: Collection[str]
 ) -> dict[str, NDArray[np.generic]]:
-    """Return the load of shared nodes, window by window of the first cell's length.
+    """Return the load of shared nodes in windows as long as the shortest of the cells'.
 
     Windows begin with the run, whatever the cells' own do, and last as long as all cells are there.
     What a resource had done is known where any cell's window begins or ends, and is interpolated
@@ -34,8 +34,7 @@ def shared_load(
         ``window``, ``start_ns``, and for every shared resource ``u_RESOURCE``, its utilisation,
         and ``own_RESOURCE_CELL``, the share of it that a cell has had, its shadow's included.
     """
-    first, *_ = played.values()
-    problem = first.problem
+    problem = min((one.problem for one in played.values()), key=lambda one: one.window_ms)
     window_ns = problem.window_ms * 1e6
     end_ns = min(one.close_ns[-1] if len(one.first) else 0 for one in played.values())
     count = int(end_ns // window_ns)

@@ -4,49 +4,81 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.errors import SimulationError
 from dwell.kernels.advance import play
 from dwell.kernels.arrays import CellArrays, lay_out
 from dwell.kernels.random_draws import Drawing
 from dwell.kernels.realisation import Realisation
 from dwell.model import Problem
 from dwell.model.fleet import Fleet
-from dwell.sim.fleet import draw_cell, phased
+from dwell.sim.fleet import cycles_within, draw_cell, phased
 from dwell.sim.waiting import Waiting, waiting_of
 
 
+class StaticRun(NamedTuple):
+    """What a fleet came to after the warm-up.
+
+    Parameters
+    ----------
+    missed : list of bool array, shape (cycles,)
+        Of every cell: whether each of its cycles missed.
+    used : mapping of str to float
+        Utilisation of the shared resources.
+    """
+
+    missed: list[NDArray[np.bool_]]
+    used: Mapping[str, float]
+
+
 class StaticFleet:
-    """Plays a fleet in several sizes under one seed; what cells have in common is drawn once.
+    """Plays a fleet in several sizes under one seed; a cell of several sizes is drawn once.
 
     It gives what `simulate_fleet` does under static policies.
 
     Parameters
     ----------
-    placements : mapping of str to str
-        Candidate of every cell, by the name of its file.
-    seed, windows : int
+    seed : int
+    duration_ns : int
+        Length of the run.
     """
 
-    def __init__(self, placements: Mapping[str, str], *, seed: int, windows: int) -> None:
-        self.placements, self.seed, self.windows = placements, seed, windows
+    def __init__(self, *, seed: int, duration_ns: int) -> None:
+        self.seed, self.duration_ns = seed, duration_ns
         self._drawn: dict[tuple[object, ...], tuple[float, Realisation]] = {}
 
     def __repr__(self) -> str:
-        return f"<StaticFleet under {dict(self.placements)}: seed {self.seed}>"
+        return f"<StaticFleet: seed {self.seed}>"
 
-    def violation_rates(self, fleet: Fleet) -> NDArray[np.float64]:
-        """Return V_D of every cell after the warm-up, as its controller would see it."""
-        cells = self._play(fleet)
-        warmup = [cell.problem.warmup_windows for cell in fleet.cells]
-        rates = [
-            float(cell.tables.seen[0, first : self.windows]["missed"].mean())
-            for cell, first in zip(cells, warmup, strict=True)
-        ]
-        sizes = [cell.problem.window_cycles for cell in fleet.cells]
-        return np.array(rates) / sizes
+    def play(self, fleet: Fleet) -> StaticRun:
+        """Play a fleet, and return what it came to.
+
+        Raises
+        ------
+        SimulationError
+            If some cell may move.
+        """
+        problems, cells = [*phased(fleet, self.seed)], self._play(fleet)
+        missed: list[NDArray[np.bool_]] = []
+        used: dict[str, float] = {}
+        for problem, cell in zip(problems, cells, strict=True):
+            width, closed = problem.window_cycles, int(cell.tables.cells[0]["window"])
+            first, last = problem.warmup_windows, closed
+            latency_ns = cell.tables.latency_ns[0, first * width : last * width]
+            missed.append(latency_ns > problem.pipeline.deadline_ns)
+            if not used:
+                shares = cell.tables.shares[0, first:last, 0].mean(axis=0).tolist()
+                resources = problem.fabric.resources.values()
+                used = {
+                    one.name: share
+                    for one, share in zip(resources, shares, strict=False)
+                    if one.node in fleet.shared
+                }
+        return StaticRun(missed, used)
 
     def waiting(self, fleet: Fleet) -> Waiting:
         """Return where the cycles that missed have waited, of all cells."""
@@ -61,29 +93,33 @@ class StaticFleet:
         problems, reals = self._realisations(fleet)
         pairs = [*zip(problems, reals, strict=True)]
         whole = lay_out(pairs, shared=fleet.shared, log_jobs=jobs)
-        for row, problem in enumerate(problems):
-            candidates = list(problem.candidates)
-            whole.tables.stamps[row] = candidates.index(self.placements[problem.name])
+        for row, (cell, problem) in enumerate(zip(fleet.cells, problems, strict=True)):
+            placed = fleet.candidate_of(cell.entry)
+            if placed is None:
+                raise SimulationError(f"{cell.name} may move")
+            whole.tables.stamps[row] = list(problem.candidates).index(placed)
         play(whole)
         return [CellArrays(whole, i) for i in range(len(problems))]
 
     def _realisations(self, fleet: Fleet) -> tuple[list[Problem], list[Realisation]]:
         problems = [*phased(fleet, self.seed)]
         reals = []
-        for i, (cell, problem) in enumerate(zip(fleet.cells, problems, strict=True)):
-            key = (problem.name, cell.copy, cell.entry.scenario, i == 0)
+        for cell, problem in zip(fleet.cells, problems, strict=True):
+            key = (problem.name, cell.copy, cell.entry.scenario)
             phase_ms = problem.pipeline.first_release_ms
             known = self._drawn.get(key)
             if known is None or (known[1].trace_starts and known[0] != phase_ms):
-                real = draw_cell(fleet, cell, problem, self.seed, self.windows, is_first=i == 0)
+                real = draw_cell(fleet, cell, problem, self.seed, self.duration_ns)
                 known = phase_ms, real
                 self._drawn[key] = known
             drawn_at_ms, real = known
-            reals.append(real if drawn_at_ms == phase_ms else _released_at(problem, real))
+            if drawn_at_ms != phase_ms:
+                real = _released_at(fleet, problem, real)
+            reals.append(real.until(cycles_within(problem, self.duration_ns)))
         return problems, reals
 
 
-def _released_at(problem: Problem, real: Realisation) -> Realisation:
+def _released_at(fleet: Fleet, problem: Problem, real: Realisation) -> Realisation:
     """Return a realisation without traces with another phase; jobs and messages take the same."""
     drawing = Drawing(
         problem,
@@ -91,6 +127,8 @@ def _released_at(problem: Problem, real: Realisation) -> Realisation:
         seed=real.seed or 0,
         windows=real.windows,
         streams=real.streams,
+        shared=fleet.shared,
+        disturbances=fleet.disturbances,
     )
     node_changes, link_segments = drawing.changes
     return replace(

@@ -132,8 +132,9 @@ class PlayedRealisation:
         """Whether each cycle missed: later than D, or unfinished when its window closed."""
         latency_ns = self.arrays.tables.latency_ns[0, : self.released]
         missed: NDArray[np.bool_] = latency_ns > self.problem.pipeline.deadline_ns
-        # The run has ended before the windows of the last cycles could close.
-        missed[self.counted :] = False
+        if not self.realisation.is_cut(self.problem):
+            # The run has ended before the windows of the last cycles could close.
+            missed[self.counted :] = False
         age_ns = self.close_ns[:, None] - self.by_window(self.realisation.release_ns)
         late = self.by_window(latency_ns) > age_ns
         if self.whole:
@@ -330,6 +331,13 @@ def _decided_by_kernel(played: PlayedRealisation) -> TableArrays:
         "dwell_cycles": decided["dwell"] * played.problem.decide_cycles,
         "delta_j": decided["delta_j"],
     }
+    if played.looks:
+        used = tables.look_shares[0, :count, 1, 0].T
+        columns |= {
+            "seen_l95_ms": looked["l95_ms"],
+            "seen_violation_rate": looked["missed"] / looked["cycles"],
+            **dict(zip((f"u_{one}" for one in controller.resources), used, strict=False)),
+        }
     # It decides by estimates without errors alone.
     errors = ("est_l95_error_ms", "est_violation_error")
     columns |= {f"{error}_{name}": np.zeros(count) for error in errors for name in names}

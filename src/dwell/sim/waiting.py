@@ -1,4 +1,4 @@
-"""Waiting: where the cycles of a cell that missed have waited, on nodes and links."""
+"""Waiting: where the cycles of a cell that missed have waited, for resources and links."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from dwell.kernels.realisation import LinkSegments, Realisation
 from dwell.model import Problem
 
 Ints: TypeAlias = NDArray[np.int64]
-#: Nanoseconds by what was waited for: ("node", "E"), or ("link", "R1->E").
+#: Nanoseconds by what was waited for: ("resource", "E.gpu"), or ("link", "R1->E").
 Waiting: TypeAlias = Counter[tuple[str, str]]
 
 
 def waiting_of(problem: Problem, real: Realisation, arrays: CellArrays) -> Waiting:
     """Sum up what the cycles after the warm-up that missed have waited.
 
-    On a node it is the time from readiness to completion beyond what the job takes alone; on a link
-    the time before the message is sent, and what sending it again takes.
+    For a resource it is the time from readiness to completion beyond what the job takes alone; for
+    a link the time before the message is sent, and the time for sending it again.
 
     Parameters
     ----------
@@ -46,7 +46,8 @@ def waiting_of(problem: Problem, real: Realisation, arrays: CellArrays) -> Waiti
             node = placement[task]
             exec_ns = real.exec_ns[real.sites.index((task, node)), these]
             spent = of["end_ns"][:, i] - of["ready_ns"][:, i] - exec_ns
-            waits["node", node] += _sum(spent, of["end_ns"][:, i] >= 0)
+            resource = pipeline.tasks[task].on[node].resource(node)
+            waits["resource", resource] += _sum(spent, of["end_ns"][:, i] >= 0)
         for j, flow in enumerate(pipeline.flows):
             here, there = placement[flow.source], placement[flow.target]
             if here == there:

@@ -2,7 +2,6 @@ from .capacity import Capacity as Capacity
 from .capacity import CapacityPoint as CapacityPoint
 from .capacity import Limiting as Limiting
 from .capacity import capacity_of as capacity_of
-from .capacity import what_ifs as what_ifs
 from .comparison import Comparison as Comparison
 from .comparison import compare as compare
 from .demo import canonical_demo as canonical_demo
@@ -10,10 +9,11 @@ from .demo import longest_run as longest_run
 from .demo import real_demo as real_demo
 from .demo import stored_deadlines as stored_deadlines
 from .demo import tenants_demo as tenants_demo
+from .family import SAME_CYCLES as SAME_CYCLES
 from .family import SAME_RUN as SAME_RUN
 from .family import UNTOLD as UNTOLD
 from .family import Family as Family
-from .family import same_run as same_run
+from .family import played_alike as played_alike
 from .family import untold as untold
 from .hindsight import Hindsight as Hindsight
 from .intervals import Interval as Interval
@@ -44,3 +44,4 @@ from .study_folder import Shard as Shard
 from .study_folder import open_study as open_study
 from .validation import Validation as Validation
 from .validation import validate as validate
+from .what_ifs import changes_of as changes_of

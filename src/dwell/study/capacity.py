@@ -1,39 +1,78 @@
 """Capacity: how many robots the shared nodes of a fleet carry under a placement or a policy.
 
-A size is how many cells of the first entry there are; the others stay. Of every size so many seeds
-are played, and of every seed the cell with the largest V_D counts. Sizes are played from the
-smallest on until the limit is passed for certain; seeds, and further sizes, side by side.
+A size is the number of cells of the first entry; the other entries stay. Each size is played under
+several seeds, and the cell with the largest V_D of each seed counts. With random phases the unit is
+the draw of phases: a run keeps its phases from begin to end. Where no cell moves, every size is
+played until the limit is passed for certain; the sizes of a policy are found by bisection.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from statistics import fmean
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from dwell.errors import Fault, ProblemError
-from dwell.model import evolve
-from dwell.model.fleet import PHASES, Fleet, FleetEntry, Phases
+from dwell.model.fleet import PHASES, Fleet, Phases
 from dwell.model.progress import Progress
 from dwell.sim.fleet import simulate_fleet, waiting_in_fleet
 from dwell.sim.static_fleet import StaticFleet
 from dwell.sim.waiting import Waiting
-from dwell.study.intervals import Interval, mean_interval
+from dwell.study.intervals import Interval, share_difference_interval, share_interval
+from dwell.study.twins import with_twins
 from dwell.study.workers import available_processes, spread
 
-#: Cycles that count, of a cell and seed, at least.
+#: Cycles that count of the slowest cell in a run, and seeds, where phases are not drawn.
 CYCLES = 2_000
 SEEDS = tuple(range(1, 11))
+#: Draws of phases, and cycles that count in each where no cell moves. Phases spread more than
+#: cycles do, so that many short runs say more than few long ones.
+DRAWS = tuple(range(1, 101))
+CYCLES_OF_A_DRAW = 200
 MOST = 128
+#: Cycles of a cell beyond which a warning says how long the run is.
+MANY_CYCLES = 2_000_000
 #: Share of cycles that one cell alone may miss where an excess over it is of any use.
 USELESS = 0.5
 ROUNDING = 1e-12
-#: Sizes that are played together where no cell moves: they have draws in common.
-TOGETHER = 4
-#: Names of what a point of the curve says, in JSON.
-CURVE = ("robots", "violation_rate", "low", "high")
+#: Standard errors on either side of a 95 % interval.
+NORMAL = 1.96
+#: Sizes that are played together where no cell moves: their cells are drawn once.
+TOGETHER = 8
 #: Seeds that say where cycles wait.
 WAITING_SEEDS = 3
+
+
+class Played(NamedTuple):
+    """One size under one seed.
+
+    Parameters
+    ----------
+    rate : float
+        V_D of the cell that misses most. Which cell that is, one half of the cycles says, and the
+        other half how much it misses: the largest of several noisy rates would be too high.
+    half : float
+        Half the difference between both halves: how far `rate` may be off by its cycles.
+    used : mapping of str to float
+        Utilisation of the shared resources.
+    """
+
+    rate: float
+    half: float
+    used: Mapping[str, float]
+
+    @classmethod
+    def of(cls, missed: Iterable[NDArray[np.bool_]], used: Mapping[str, float]) -> Played:
+        """Sum up whether each counted cycle of each cell missed."""
+        halves = np.array([[part.mean() for part in np.array_split(one, 2)] for one in missed])
+        first, last = halves.argmax(axis=0)
+        late, early = float(halves[first, 1]), float(halves[last, 0])
+        return cls((late + early) / 2, (late - early) / 2, used)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,10 +85,33 @@ class CapacityPoint:
         Cells of the first entry.
     violation_rate : Interval
         V_D of the worst cell, over seeds.
+    excess : Interval
+        The same less that of one cell alone, seed by seed.
+    phases_error, cycles_error : float
+        Half-widths of the 95 % interval by the draws of phases alone, and by the cycles alone.
+    utilisation : mapping of str to float
+        Of the shared resources.
     """
 
     robots: int
     violation_rate: Interval
+    excess: Interval
+    phases_error: float
+    cycles_error: float
+    utilisation: Mapping[str, float] = field(hash=False)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        rate = self.violation_rate
+        return {
+            "robots": self.robots,
+            "violation_rate": rate.value,
+            "low": rate.low,
+            "high": rate.high,
+            "phases_error": self.phases_error,
+            "cycles_error": self.cycles_error,
+            "utilisation": dict(self.utilisation),
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,8 +120,9 @@ class Limiting:
 
     Parameters
     ----------
-    kind : {"node", "link"}
+    kind : {"resource", "link"}
     name : str
+        ``E``, ``E.gpu``, ``R1->E``.
     share : float
         Of all that they waited.
     """
@@ -76,7 +139,9 @@ class Capacity:
     Parameters
     ----------
     robots : int
-        The largest size such that none up to it is over the limit.
+        The largest size such that no played size up to it is over the limit.
+    robots_at_limit : int
+        The same by V_D itself, whatever one cell alone misses.
     at_least : bool
         Whether larger ones were not asked for.
     interval : tuple of int
@@ -88,6 +153,8 @@ class Capacity:
         What was assumed of when cells begin.
     policy : str
         What was played, where all cells have the same.
+    searched : {"every size", "bisection"}
+        Which sizes were played.
     curve : tuple of CapacityPoint
         Of every size that was played.
     limits : Limiting, optional
@@ -97,56 +164,49 @@ class Capacity:
     """
 
     robots: int
+    robots_at_limit: int
     at_least: bool
     interval: tuple[int, int]
     limit: float
     limit_on: Literal["violation_rate", "excess"]
     phases: Phases
     policy: str
+    searched: Literal["every size", "bisection"]
     curve: tuple[CapacityPoint, ...] = field(repr=False)
     limits: Limiting | None = None
     reason: str = ""
 
     @property
+    def alone(self) -> float:
+        """V_D of one cell alone."""
+        return self.curve[0].violation_rate.value
+
+    @property
     def bound(self) -> float:
         """V_D that is not to be passed."""
-        alone = self.curve[0].violation_rate.value if self.limit_on == "excess" else 0.0
-        return self.limit + alone
+        return self.limit + (self.alone if self.limit_on == "excess" else 0.0)
+
+    def point(self, robots: int) -> CapacityPoint:
+        """Return the largest played size up to a number of robots, or the smallest."""
+        return next((one for one in reversed(self.curve) if one.robots <= robots), self.curve[0])
 
     def as_json(self) -> dict[str, Any]:
         """Return it as plain values."""
         limits = self.limits
-        names = ("robots", "at_least", "interval", "limit", "limit_on", "phases", "policy")
         return {
-            **{name: getattr(self, name) for name in names},
+            **{name: getattr(self, name) for name in PLAIN},
             "interval": list(self.interval),
             "reason": self.reason or None,
             "limits": None if limits is None else {limits.kind: limits.name, "share": limits.share},
-            "curve": [
-                dict(zip(CURVE, (point.robots, *point.violation_rate), strict=True))
-                for point in self.curve
-            ],
+            "curve": [point.as_json() for point in self.curve],
         }
 
 
-@dataclass(frozen=True, slots=True)
-class WhatIf:
-    """A change of a fleet, and how many robots there may be then.
-
-    Parameters
-    ----------
-    change : str
-        In words: ``a core more on E``.
-    """
-
-    change: str
-    capacity: Capacity
-
-    def as_json(self) -> dict[str, Any]:
-        """Return it as plain values."""
-        known = self.capacity.as_json()
-        names = ("robots", "at_least", "interval", "limit_on", "phases", "policy", "reason")
-        return {"change": self.change, **{name: known[name] for name in names}}
+#: Attributes of a capacity that are plain values.
+PLAIN = (
+    *("robots", "robots_at_limit", "at_least", "interval", "limit", "limit_on"),
+    *("phases", "policy", "searched"),
+)
 
 
 class Sizes(NamedTuple):
@@ -159,44 +219,69 @@ class Sizes(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class FleetPlayer:
-    """Plays a fleet in some sizes, wherever it is sent to.
+    """Plays a fleet in some sizes, in whichever process.
 
     Parameters
     ----------
-    windows : int
-        Of every cell.
-    placements : mapping of str to str
-        Candidate of every cell by the name of its file; empty where some may move.
+    fleet : Fleet
+    duration_ns : int
+        Length of a run.
+    servers : mapping of str to int
+        How many twins each shared node has (see `dwell.study.twins`).
     """
 
     fleet: Fleet
-    windows: int
-    placements: Mapping[str, str]
+    duration_ns: int
+    servers: Mapping[str, int] = field(default_factory=dict)
 
-    def __call__(self, unit: Sizes) -> list[float]:
-        """Return V_D of the worst cell of every size."""
-        fleets = [self.fleet.with_count(size) for size in range(unit.first, unit.last + 1)]
-        if self.placements:
-            static = StaticFleet(self.placements, seed=unit.seed, windows=self.windows)
-            return [float(static.violation_rates(fleet).max()) for fleet in fleets]
-        worst = []
-        for fleet in fleets:
-            runs = simulate_fleet(fleet, seed=unit.seed, windows=self.windows).cells.values()
-            tables = [run.arrays("windows") for run in runs]
-            rates = [float(one["violation_rate"][~one["warmup"]].mean()) for one in tables]
-            worst.append(max(rates))
-        return worst
+    def of(self, robots: int) -> Fleet:
+        """Return the fleet with so many cells of the first entry."""
+        fleet = self.fleet.with_count(robots)
+        for node, count in self.servers.items():
+            fleet = with_twins(fleet, node, count)
+        return fleet
+
+    @property
+    def is_static(self) -> bool:
+        """Whether no cell moves."""
+        fleet = self.fleet
+        return all(fleet.candidate_of(entry) is not None for entry in fleet.entries)
+
+    def __call__(self, unit: Sizes) -> list[Played]:
+        """Play every size."""
+        fleets = [self.of(size) for size in range(unit.first, unit.last + 1)]
+        if self.is_static:
+            static = StaticFleet(seed=unit.seed, duration_ns=self.duration_ns)
+            return [Played.of(*static.play(fleet)) for fleet in fleets]
+        return [self._moving(fleet, unit.seed) for fleet in fleets]
+
+    def _moving(self, fleet: Fleet, seed: int) -> Played:
+        runs = simulate_fleet(fleet, seed=seed, seconds=self.duration_ns / 1e9).cells.values()
+        missed: list[NDArray[np.bool_]] = []
+        used: dict[str, float] = {}
+        for run in runs:
+            cycles, windows = run.arrays("cycles"), run.arrays("windows")
+            counts = ~windows["warmup"]
+            first = int(windows["first_cycle"][counts][0])
+            missed.append(cycles["missed"][first:][~cycles["lead"][first:]])
+            if not used:
+                resources = run.problem.fabric.resources.values()
+                used = {
+                    one.name: float(np.nanmean(windows[f"u_{one.name}"][counts]))
+                    for one in resources
+                    if one.node in fleet.shared
+                }
+        return Played.of(missed, used)
 
     def limiting(self, robots: int, seeds: Sequence[int]) -> Limiting | None:
         """Return what the cycles that missed have waited for most; None where for nothing."""
         waited = Waiting()
-        fleet = self.fleet.with_count(robots)
+        fleet, duration_ns = self.of(robots), self.duration_ns
         for seed in seeds[:WAITING_SEEDS]:
-            if self.placements:
-                static = StaticFleet(self.placements, seed=seed, windows=self.windows)
-                waited += static.waiting(fleet)
+            if self.is_static:
+                waited += StaticFleet(seed=seed, duration_ns=duration_ns).waiting(fleet)
             else:
-                waited += waiting_in_fleet(fleet, seed=seed, windows=self.windows)
+                waited += waiting_in_fleet(fleet, seed=seed, duration_ns=duration_ns)
         if not waited:
             return None
         (kind, name), most = max(waited.items(), key=lambda item: item[1])
@@ -211,8 +296,9 @@ def capacity_of(
     phases: str | None = None,
     on_excess: bool = False,
     most: int = MOST,
-    seeds: Sequence[int] = SEEDS,
-    cycles: int = CYCLES,
+    seeds: Sequence[int] | None = None,
+    cycles: int | None = None,
+    twins: Mapping[str, int] | None = None,
     processes: int | None = None,
     progress: Progress | None = None,
 ) -> Capacity:
@@ -231,8 +317,14 @@ def capacity_of(
         Whether the limit is on the excess over one cell, also where one alone is not over it.
     most : int
         Sizes beyond are not played.
-    cycles : int
-        Cycles after the warm-up, of a cell and seed, at least.
+    seeds : sequence of int, optional
+        `SEEDS` where None. With random phases: `DRAWS` where no cell moves; for a policy the first
+        ten of these, and further ones at sizes whose interval holds the limit.
+    cycles : int, optional
+        Cycles of the slowest cell that count in a run, at least. `CYCLES` where None; with random
+        phases and no cell that moves `CYCLES_OF_A_DRAW`, after a warm-up of one window.
+    twins : mapping of str to int, optional
+        How many more servers there are like a shared node; cells take them in turn.
     processes : int, optional
         One a CPU where None.
     progress : callable, optional
@@ -246,116 +338,255 @@ def capacity_of(
     fleet = fleet.changed(policy=policy, phases=phases)
     _require_capacity(fleet)
     fleet.with_count(most)
-    counted = ((one.warmup_windows, one.window_cycles) for one in fleet.problems.values())
-    windows = max(warmup + -(-cycles // width) for warmup, width in counted)
-    player = FleetPlayer(fleet, windows, _placements(fleet))
-    together = TOGETHER if player.placements else 1
-    units = [
-        Sizes(first, min(first + together - 1, most), seed)
-        for first in range(1, most + 1, together)
-        for seed in seeds
-    ]
-    curve = _Curve(limit, len(seeds), on_excess=on_excess)
-
-    def take(unit: Sizes, rates: list[float]) -> bool:
-        enough = curve.take(unit, rates)
-        if progress is not None:
-            progress(len(curve.points), most)
-        return enough
-
+    is_static = FleetPlayer(fleet, 0).is_static
+    draws = fleet.phases == "random"
+    if cycles is None and draws and is_static:
+        fleet, cycles = _with_short_warmup(fleet), CYCLES_OF_A_DRAW
+    duration_ns = _duration_ns(fleet, CYCLES if cycles is None else cycles)
+    player = FleetPlayer(fleet, duration_ns, twins or {})
+    known = tuple(seeds or (DRAWS if draws else SEEDS))
+    # A run has one draw of phases, and windows that differ.
+    kinds = 1 if draws else max(duration_ns - fleet.warmup_ns, 1) // fleet.duration_ns(1)
+    sizes = _Sizes(limit, kinds, on_excess=on_excess)
     workers = available_processes() if processes is None else processes
-    spread(player, units, processes=workers, take=take)
-    found = curve.capacity(fleet)
-    beyond = min(found.robots + 1, len(found.curve))
-    return replace(found, limits=player.limiting(beyond, seeds))
+    search = _Search(player, sizes, most, workers, progress)
+    if is_static:
+        search.every_size(known)
+    else:
+        search.by_bisection(known[: len(SEEDS)] if draws and seeds is None else known, known)
+    found = sizes.capacity(fleet, most, "every size" if is_static else "bisection")
+    beyond = min(found.robots + 1, found.curve[-1].robots)
+    return replace(found, limits=player.limiting(beyond, known))
 
 
-class _Curve:
-    """V_D by size, in order, as seeds of sizes come in."""
+class _Sizes:
+    """What has been played of each size.
 
-    def __init__(self, limit: float, seeds: int, *, on_excess: bool) -> None:
-        self.limit, self.seeds, self.asked = limit, seeds, on_excess
-        self.points: list[CapacityPoint] = []
-        self._rates: dict[int, dict[int, float]] = {}
-        self._enough = False
+    Parameters
+    ----------
+    limit : float
+    kinds : int
+        Independent parts of a run: windows, or one where its phases are a draw.
+    on_excess : bool
+        Whether the limit is on the excess in any case.
+    """
 
-    def take(self, unit: Sizes, rates: Sequence[float]) -> bool:
-        """Take the rates of a unit; whether no larger size can change the answer."""
-        for size, rate in enumerate(rates, unit.first):
-            self._rates.setdefault(size, {})[unit.seed] = rate
-        while (
-            not self._enough and len(of := self._rates.get(len(self.points) + 1, {})) == self.seeds
-        ):
-            rates = [of[seed] for seed in sorted(of)]
-            self.points.append(CapacityPoint(len(self.points) + 1, mean_interval(rates)))
-            is_over = self._is_over(self.points[-1], lambda rate: rate.low)
-            self._enough = is_over or self._useless
-        return self._enough
+    def __init__(self, limit: float, kinds: int, *, on_excess: bool) -> None:
+        self.limit, self.kinds, self.asked = limit, kinds, on_excess
+        self.played: dict[int, dict[int, Played]] = {}
+        self._points: dict[tuple[int, int], CapacityPoint] = {}
+
+    def take(self, unit: Sizes, played: Sequence[Played]) -> None:
+        """Keep what a unit has come to."""
+        for size, one in enumerate(played, unit.first):
+            self.played.setdefault(size, {})[unit.seed] = one
+
+    def seeds(self, size: int) -> int:
+        """Return under how many seeds a size has been played."""
+        return len(self.played.get(size, {}))
+
+    def point(self, size: int) -> CapacityPoint:
+        """Return what is known of a size."""
+        key = size, self.seeds(size)
+        if key not in self._points:
+            self._points[key] = self._point(size)
+        return self._points[key]
+
+    def _point(self, size: int) -> CapacityPoint:
+        of, alone = self.played[size], self.played.get(1, {})
+        seeds = sorted(of)
+        rates = [of[seed].rate for seed in seeds]
+        both = [seed for seed in seeds if seed in alone]
+        pairs = [of[seed].rate for seed in both], [alone[seed].rate for seed in both]
+        count, windows = len(seeds), len(seeds) * self.kinds
+        whole = float(np.var(rates, ddof=1)) / count if count > 1 else math.nan
+        by_cycles = fmean(one.half**2 for one in of.values()) / count
+        excess = Interval(math.nan, math.nan, math.nan)
+        if both:
+            excess = share_difference_interval(*pairs, windows=len(both) * self.kinds)
+        return CapacityPoint(
+            robots=size,
+            violation_rate=share_interval(rates, windows=windows),
+            excess=excess,
+            phases_error=NORMAL * math.sqrt(max(whole - by_cycles, 0.0)),
+            cycles_error=NORMAL * math.sqrt(by_cycles),
+            utilisation={
+                name: fmean(one.used[name] for one in of.values()) for name in of[seeds[0]].used
+            },
+        )
 
     @property
-    def _alone(self) -> float:
-        return self.points[0].violation_rate.value
+    def alone(self) -> float:
+        """V_D of one cell alone."""
+        return self.point(1).violation_rate.value
 
     @property
-    def _useless(self) -> bool:
-        return self._alone > self.limit + ROUNDING and self._alone >= USELESS
+    def useless(self) -> bool:
+        """Whether one cell alone misses so much that no excess is of any use."""
+        return self.alone > self.limit + ROUNDING and self.alone >= USELESS
 
     @property
-    def bound(self) -> float:
-        """V_D that is not to be passed, and what sums of floats are off by."""
-        return self.limit + (self._alone if self._on_excess else 0.0) + ROUNDING
+    def on_excess(self) -> bool:
+        """Whether the limit is on the excess over one cell."""
+        return (self.asked or self.alone > self.limit + ROUNDING) and not self.useless
 
-    @property
-    def _on_excess(self) -> bool:
-        return (self.asked or self._alone > self.limit + ROUNDING) and not self._useless
+    def is_over(self, size: int, end: Callable[[Interval], float]) -> bool:
+        """Whether a size is over the limit, by the value or an end of its interval."""
+        if size == 1 and self.on_excess:
+            return False
+        point = self.point(size)
+        rate = point.excess if self.on_excess else point.violation_rate
+        # One seed gives no interval.
+        return (end(rate) if rate.known else rate.value) > self.limit + ROUNDING
 
-    def capacity(self, fleet: Fleet) -> Capacity:
+    def capacity(
+        self, fleet: Fleet, most: int, searched: Literal["every size", "bisection"]
+    ) -> Capacity:
         """Return what it comes to."""
-        robots = self._largest(lambda rate: rate.value)
-        names = dict.fromkeys(policy_of(fleet, entry) for entry in fleet.entries)
-        alone = f"one cell alone misses {self._alone:.0%} of its deadlines"
+        names = dict.fromkeys(fleet.policy_of(entry) for entry in fleet.entries)
+        robots, largest = self._largest(_value), max(self.played)
+        alone = f"one cell alone misses {self.alone:.0%} of its deadlines"
         return Capacity(
             robots=robots,
-            at_least=robots == len(self.points),
-            interval=(self._largest(lambda rate: rate.high), self._largest(lambda rate: rate.low)),
+            robots_at_limit=0 if self.alone > self.limit + ROUNDING else robots,
+            at_least=robots == largest,
+            interval=(self._largest(_high), self._below(_low)),
             limit=self.limit,
-            limit_on="excess" if self._on_excess else "violation_rate",
+            limit_on="excess" if self.on_excess else "violation_rate",
             phases=fleet.phases,
             policy=", ".join(names),
-            curve=tuple(self.points),
-            reason=alone if self._useless else "",
+            searched=searched,
+            curve=tuple(self.point(size) for size in sorted(self.played)),
+            reason=alone if self.useless else "",
         )
 
     def _largest(self, end: Callable[[Interval], float]) -> int:
-        """Return the largest size such that none up to it is over the bound."""
-        over = (i for i, point in enumerate(self.points) if self._is_over(point, end))
-        return next(over, len(self.points))
+        """Return the largest played size such that none up to it is over the limit."""
+        found = 0
+        for size in sorted(self.played):
+            if self.is_over(size, end):
+                break
+            found = size
+        return found
 
-    def _is_over(self, point: CapacityPoint, end: Callable[[Interval], float]) -> bool:
-        rate = point.violation_rate
-        # One seed gives no interval.
-        return (end(rate) if rate.known else rate.value) > self.bound
-
-
-def policy_of(fleet: Fleet, entry: FleetEntry) -> str:
-    """Return the policy of the cells of an entry."""
-    return entry.policy or fleet.policy or entry.cell.controller.policy
-
-
-def _placements(fleet: Fleet) -> dict[str, str]:
-    """Return the candidate of every cell by the name of its file; nothing where some may move."""
-    known: dict[str, str] = {}
-    for entry in fleet.entries:
-        placed = _placed(fleet, entry)
-        if placed is None or known.setdefault(entry.cell.name, placed) != placed:
-            return {}
-    return known
+    def _below(self, end: Callable[[Interval], float]) -> int:
+        """Return the size before the first played one that is over the limit."""
+        over = (size - 1 for size in sorted(self.played) if self.is_over(size, end))
+        return next(over, max(self.played))
 
 
-def _placed(fleet: Fleet, entry: FleetEntry) -> str | None:
-    """Return the candidate at which the cells of an entry stay, whatever estimator is named."""
-    name, _ = entry.cell.policy_and_estimator(policy_of(fleet, entry))
-    return name if name in entry.cell.candidates else None
+def _value(rate: Interval) -> float:
+    return rate.value
+
+
+def _low(rate: Interval) -> float:
+    return rate.low
+
+
+def _high(rate: Interval) -> float:
+    return rate.high
+
+
+class _Search:
+    """Plays the sizes that decide.
+
+    Parameters
+    ----------
+    most : int
+        Largest size.
+    """
+
+    def __init__(
+        self,
+        player: FleetPlayer,
+        sizes: _Sizes,
+        most: int,
+        processes: int,
+        progress: Progress | None,
+    ) -> None:
+        self.player, self.sizes, self.most = player, sizes, most
+        self.processes, self.progress = processes, progress
+
+    def every_size(self, seeds: Sequence[int]) -> None:
+        """Play sizes from the smallest on until one is over the limit for certain."""
+        sizes, done = self.sizes, 0
+
+        def take(unit: Sizes, played: Sequence[Played]) -> bool:
+            nonlocal done
+            sizes.take(unit, played)
+            while sizes.seeds(done + 1) == len(seeds):
+                done += 1
+                if sizes.useless or sizes.is_over(done, _low):
+                    break
+            else:
+                self._tell(done)
+                return False
+            self._tell(done)
+            return True
+
+        steps = range(1, self.most + 1, TOGETHER)
+        units = [
+            Sizes(first, min(first + TOGETHER - 1, self.most), seed)
+            for first in steps
+            for seed in seeds
+        ]
+        spread(self.player, units, processes=self.processes, take=take)
+        for size in [one for one in sizes.played if one > done]:
+            del sizes.played[size]
+
+    def by_bisection(self, few: Sequence[int], all_of: Sequence[int]) -> None:
+        """Play the sizes between which the limit is passed, each under few seeds first.
+
+        A size whose interval holds the limit is played under more, until it does not.
+        """
+        low, high, size = 0, self.most + 1, 1
+        while low + 1 < high:
+            if self._is_over(size, few, all_of):
+                high = size
+            else:
+                low = size
+            if self.sizes.useless:
+                return
+            size = min(2 * low, self.most) if high > self.most else (low + high) // 2
+
+    def _is_over(self, size: int, few: Sequence[int], all_of: Sequence[int]) -> bool:
+        sizes, seeds = self.sizes, len(few)
+        while True:
+            for one in dict.fromkeys((1, size) if size > 1 else (1,)):
+                self._play(one, all_of[sizes.seeds(one) : seeds])
+            if (
+                seeds == len(all_of)
+                or sizes.useless
+                or sizes.is_over(size, _low) == sizes.is_over(size, _high)
+            ):
+                return sizes.is_over(size, _value)
+            seeds = min(2 * seeds, len(all_of))
+
+    def _play(self, size: int, seeds: Sequence[int]) -> None:
+        units = [Sizes(size, size, seed) for seed in seeds]
+
+        def take(unit: Sizes, played: Sequence[Played]) -> None:
+            self.sizes.take(unit, played)
+
+        if units:
+            spread(self.player, units, processes=self.processes, take=take)
+        self._tell(size)
+
+    def _tell(self, done: int) -> None:
+        if self.progress is not None:
+            self.progress(done, self.most)
+
+
+def _with_short_warmup(fleet: Fleet) -> Fleet:
+    """Return a fleet with one window of warm-up: enough where no cell moves."""
+    entries = (replace(one, cell=replace(one.cell, warmup_windows=1)) for one in fleet.entries)
+    return replace(fleet, entries=tuple(entries))
+
+
+def _duration_ns(fleet: Fleet, cycles: int) -> int:
+    """Return how long a fleet is played so that each cell counts so many cycles, in windows."""
+    cells = [entry.cell for entry in fleet.entries]
+    return fleet.warmup_ns + max(-(-cycles // c.window_cycles) * c.window_ns for c in cells)
 
 
 def _require_capacity(fleet: Fleet) -> None:
@@ -364,7 +595,7 @@ def _require_capacity(fleet: Fleet) -> None:
     if not isinstance(fleet.phases, str):
         faults.append(Fault("phases", f"a list is of one size; give one of {', '.join(PHASES)}"))
     first = fleet.entries[0]
-    placed, candidates = _placed(fleet, first), first.cell.candidates
+    placed, candidates = fleet.candidate_of(first), first.cell.candidates
     used = candidates.values() if placed is None else [candidates[placed]]
     if not fleet.shared:
         faults.append(
@@ -372,30 +603,8 @@ def _require_capacity(fleet: Fleet) -> None:
         )
     elif not any(node in fleet.shared for one in used for node in one.values()):
         nodes = ", ".join(fleet.shared)
-        message = f"{policy_of(fleet, first)} never uses a shared node ({nodes})"
+        message = f"{fleet.policy_of(first)} never uses a shared node ({nodes})"
         any_number = f"so that there may be any number of {first.cell.name}"
         faults.append(Fault("policy", f"{message}, {any_number}; name another one"))
     if faults:
         raise ProblemError(faults)
-
-
-def what_ifs(fleet: Fleet) -> Iterator[tuple[str, Fleet]]:
-    """Yield changes that may take more robots, in words, and the fleet with each.
-
-    A core more on every shared node, phases that are evenly spread, and every other candidate of
-    the first entry that uses a shared node.
-    """
-    for node in fleet.shared:
-        cores = fleet.entries[0].cell.fabric.nodes[node].cores + 1
-        entries = [
-            replace(one, cell=evolve(one.cell, {f"nodes.{node}.cores": cores}))
-            for one in fleet.entries
-        ]
-        yield f"a core more on {node}", replace(fleet, entries=tuple(entries))
-    if fleet.phases != "even":
-        yield "phases evenly spread", fleet.changed(phases="even")
-    first, policy = fleet.entries[0], policy_of(fleet, fleet.entries[0])
-    for name, placement in first.cell.candidates.items():
-        is_everywhere = all(name in one.cell.candidates for one in fleet.entries)
-        if is_everywhere and name != policy and {*placement.values()} & {*fleet.shared}:
-            yield f"{name} instead of {policy}", fleet.changed(policy=name)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from dwell.errors import TraceError
-from dwell.model import Disturbance, NodeDisturbance, Problem, Scenario
+from dwell.model import Problem, Scenario
 from dwell.record import Run
 from dwell.sim import drawn_scenario
 
@@ -27,6 +27,7 @@ def disturbances_of(run: Run) -> Scenario:
         *(run.problem, str(scenario), int(str(seed)), run.windows.height),
         streams=str(run.meta.get("streams", "")),
         shared=run.meta.get("shared", ()),
+        disturbances=run.shared_disturbances,
     )
 
 
@@ -38,6 +39,7 @@ def drawn_disturbances(
     *,
     streams: str = "",
     shared: Sequence[str] = (),
+    disturbances: Scenario = (),
 ) -> Scenario:
     """Return a scenario's disturbances as they are drawn; without episodes that cannot be.
 
@@ -47,24 +49,20 @@ def drawn_disturbances(
         The run's; episodes are drawn as far as it reaches.
     streams : str
         What the names of its streams begin with: those of a cell of a fleet.
-    shared : sequence of str
-        Nodes of which the first cell of a fleet draws what happens.
+    shared, disturbances
+        Nodes that the cells of a fleet share, and what happens to them (see `dwell.draw`).
     """
-
-    def drawn(streams: str) -> Scenario:
-        return drawn_scenario(
-            problem, scenario=scenario, seed=seed, windows=windows, streams=streams
-        )
-
-    def is_shared(item: Disturbance) -> bool:
-        return isinstance(item, NodeDisturbance) and item.node in shared
-
     try:
-        own = drawn(streams)
-        if not streams:
-            return own
-        alone = [item for item in own if not is_shared(item)]
-        return (*alone, *(item for item in drawn("") if is_shared(item)))
+        return drawn_scenario(
+            problem,
+            scenario=scenario,
+            seed=seed,
+            windows=windows,
+            streams=streams,
+            shared=shared,
+            disturbances=disturbances,
+        )
     except TraceError:
         # Their times are recorded ones, which a run does not have.
-        return tuple(item for item in problem.scenario(scenario) if item.episodes is None)
+        items = (*problem.scenario(scenario), *disturbances)
+        return tuple(dict.fromkeys(item for item in items if item.episodes is None))

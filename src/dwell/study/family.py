@@ -27,22 +27,24 @@ from dwell.study.pairs import (
     paired_difference,
     paired_median,
 )
-from dwell.study.summary import PLAYED
+from dwell.study.summary import LATENCIES, PLAYED
 
 if TYPE_CHECKING:
     import polars as pl
 
 #: Begin of a verdict that is none, and what stands for it in the rows of a page.
 CANNOT_TELL, UNTOLD = "cannot tell", "–"
-#: Verdict of a pair that is the same run.
-SAME_RUN = "same run"
+#: Verdicts of a pair that is the same run, and of one with the same latencies only.
+SAME_RUN, SAME_CYCLES = "same run", "same cycles"
+#: The columns of runs that are equal then.
+EQUAL = {SAME_RUN: PLAYED, SAME_CYCLES: LATENCIES}
 
 #: Columns of runs and what they have to be, for one run a seed to be left.
 Labels: TypeAlias = Mapping[str, object]
 #: Two groups of runs, one run a seed each.
 Contrast: TypeAlias = "tuple[Labels, Labels]"
 
-#: ``lower``, ``higher``, ``no difference shown``, ``same run``, or what `cannot_tell` says.
+#: ``lower``, ``higher``, ``no difference shown``, `SAME_RUN`, `SAME_CYCLES`, or `cannot_tell`.
 Comparative: TypeAlias = str
 Difference: TypeAlias = PairedDifference | PairedMedian | SameRun
 
@@ -119,7 +121,10 @@ class Family:
             or words[item.direction if adjusted[name] <= 1 - CONFIDENCE else 0]
             for name, item in tested.items()
         }
-        return {name: told.get(name, SAME_RUN) for name in self.comparisons}
+        return {
+            name: item.word if isinstance(item, SameRun) else told[name]
+            for name, item in self.comparisons.items()
+        }
 
     def verdict(self, name: str) -> Comparative:
         """Return the verdict of one comparison."""
@@ -200,26 +205,34 @@ def _group(runs: pl.DataFrame, labels: Labels) -> pl.DataFrame:
     return runs.filter(*(pl.col(name) == value for name, value in labels.items())).sort("seed")
 
 
-def same_run(runs: pl.DataFrame, pair: Contrast) -> bool:
-    """Whether two groups of runs, one run a seed each, played every cycle alike.
+def played_alike(runs: pl.DataFrame, pair: Contrast) -> str:
+    """Return how two groups of runs, one run a seed each, played every cycle alike.
 
     Parameters
     ----------
     runs : DataFrame
-        One row per run. A table that was made of runs, and has no digest of their cycles, says
-        nothing: this is False.
+        One row per run. A table that was made of runs, and has no digests of their cycles, says
+        nothing.
+
+    Returns
+    -------
+    str
+        `SAME_RUN`, `SAME_CYCLES`, or nothing if they differ.
     """
-    if PLAYED not in runs.columns:
-        return False
-    first, second = (_group(runs, labels).select("seed", PLAYED) for labels in pair)
-    return first.equals(second, null_equal=False)
+    for word, column in EQUAL.items():
+        if column in runs.columns:
+            first, second = (_group(runs, labels).select("seed", column) for labels in pair)
+            if first.equals(second, null_equal=False):
+                return word
+    return ""
 
 
 def _contrast(runs: pl.DataFrame, metric: str, pair: Contrast) -> Difference:
     """Compare the first of a pair to the second; by medians where a column may be infinite."""
     first, second = (seed_values(runs, metric, labels) for labels in pair)
-    if same_run(runs, pair) and np.array_equal(first, second):
-        return SameRun(len(first))
+    word = played_alike(runs, pair)
+    if word and np.array_equal(first, second):
+        return SameRun(len(first), word)
     if has_median(metric):
         return paired_median(first, second)
     windows = windows_behind(*(_group(runs, labels) for labels in pair))

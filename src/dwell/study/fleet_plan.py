@@ -129,7 +129,8 @@ def plan_fleet(fleet: Fleet, *, seed: int = 1, progress: Progress | None = None)
     ]
     best = best_placements(loads, alone)
     cycles = min(CYCLES, MOST * len(cells))
-    played = FleetPrices(cells, fleet.shared, cycles).price(tuple(best))
+    prices = FleetPrices(cells, fleet.shared, cycles, fleet.disturbances)
+    played = prices.price(tuple(best))
     names = [cell.name for cell in cells]
     phi = sum(loads.costs(best, alone)) / len(cells)
     return FleetPlan(dict(zip(names, best, strict=True)), phi, played)

@@ -6,13 +6,14 @@ import hashlib
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from dwell.model.fleet import Fleet
 from dwell.record import FleetRun
+from dwell.study.family import EQUAL
 from dwell.study.judged_cost import judged_cost
-from dwell.study.summary import PLAYED, Summary, summarise
+from dwell.study.summary import Summary, summarise
 
 #: Columns that are the sum over cells.
 TOTALS = ("migrations", "guard_moves")
@@ -45,17 +46,20 @@ def summarise_fleet(run: FleetRun, judged: Fleet, labels: Mapping[str, str | int
     rates = {name: float(one.row["violation_rate"]) for name, one in found.items()}
     worst = max(rates, key=lambda name: rates[name])
     costs = [judged_cost(one, problems[name]) for name, one in run.cells.items()]
-    played = "".join(str(one.row[PLAYED]) for one in found.values())
     row = {
         **found[worst].row,
         "cost": sum(costs) / len(costs),
         **{name: sum(int(one.row[name]) for one in found.values()) for name in TOTALS},
-        PLAYED: hashlib.sha256(played.encode()).hexdigest()[:16],
+        **{name: _digest([one.row[name] for one in found.values()]) for name in EQUAL.values()},
         "cells": len(rates),
         "worst_cell": worst,
         "mean_violation_rate": sum(rates.values()) / len(rates),
     }
     return Summary(row, found[worst].costs, found[worst].within)
+
+
+def _digest(digests: Iterable[object]) -> str:
+    return hashlib.sha256("".join(map(str, digests)).encode()).hexdigest()[:16]
 
 
 def fleet_numbers(run: FleetRun) -> dict[str, Any]:

@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from dwell.study.summary import Row
 
 
+#: Column of runs that names what is independent in them, `WINDOW` or `RUN`.
+UNIT = "unit"
+WINDOW, RUN = "window", "run"
+
 #: Means of what cannot be below 0, as utilisations cannot.
 NOT_NEGATIVE = frozenset({"cost", "j_still", "l95_ms", "migrations", "moved", "returns"})
 
@@ -75,14 +79,17 @@ def over_seeds(
 
 
 def windows_behind(*groups: pl.DataFrame) -> int | None:
-    """Windows behind the runs of each of some groups: the fewest; None where it is not known.
+    """Windows behind the runs of each of some groups: the fewest; None if they tell nothing.
 
     Parameters
     ----------
     *groups : DataFrame
-        One row a run each; their column ``windows`` counts those after the warm-up.
+        One row a run each; their column ``windows`` counts those after the warm-up. None if a
+        table has no such column, or if the `UNIT` of a run is `RUN` (see `unit_of`).
     """
     if any("windows" not in runs.columns for runs in groups):
+        return None
+    if any(UNIT in runs.columns and RUN in runs[UNIT] for runs in groups):
         return None
     return min(int(runs["windows"].sum()) for runs in groups)
 

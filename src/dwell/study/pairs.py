@@ -107,9 +107,12 @@ class SameRun:
     ----------
     n : int
         Number of pairs.
+    word : str
+        The verdict: whether only the latencies are equal, or the loads, too.
     """
 
     n: int
+    word: str = "same run"
 
 
 def paired_difference(

@@ -7,7 +7,7 @@ another. What a window showed is the same for both.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import TYPE_CHECKING
@@ -17,7 +17,9 @@ from dwell.estimators.prices import Price, Question, known_prices, take_over
 from dwell.model import Problem
 from dwell.model.bounds import counted
 from dwell.study.hindsight import Hindsight
+from dwell.study.independence import unit_of
 from dwell.study.judged_cost import judged_cost
+from dwell.study.over_seeds import UNIT
 from dwell.study.own_metrics import own_metric
 from dwell.study.reference import CLAIRVOYANT, few_misses, play_alone, references
 from dwell.study.software import software
@@ -217,7 +219,8 @@ class Player:
             for contender in contenders:
                 seen = self._problem(contender, point)
                 # Candidates alone are played with the estimator `profile`, without shadow jobs.
-                is_static = contender.is_candidate(seen) and seen.controller.estimator == "profile"
+                own = seen.controller.estimator
+                is_static = contender.is_candidate(seen) and own in (None, "profile")
                 if known is not None and is_static:
                     run = known.statics[str(contender.policy)]
                 else:
@@ -256,20 +259,27 @@ class Player:
                 labels = _labels(item, contender.name)
                 summary = summarise_fleet(run, fleet, labels)
                 worst = run.cells[str(summary.row["worst_cell"])]
-                yield contender.name, point, None, self._with_metrics(summary, worst, labels)
+                cells = [(one.cell, one.scenario) for one in played.entries]
+                yield contender.name, point, None, self._completed(summary, worst, cells, labels)
 
     def _summary(self, run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Summary:
-        """Sum up a run, with the metrics of the study's own."""
-        summary = self._with_metrics(summarise(run, problem, labels), run, labels)
+        """Sum up a run of a cell."""
+        cells = ((problem, str(labels["scenario"])),)
+        summary = self._completed(summarise(run, problem, labels), run, cells, labels)
         if self.study.references:
             kept = few_misses(run, problem).tobytes()
             summary = replace(summary, compared={"kept": kept})
         return summary
 
-    def _with_metrics(self, summary: Summary, run: Run, labels: Mapping[str, str | int]) -> Summary:
-        """Add the metrics of the study's own to the row of a run."""
-        if not self.study.metrics:
-            return summary
+    def _completed(
+        self,
+        summary: Summary,
+        run: Run,
+        cells: Iterable[tuple[Problem, str]],
+        labels: Mapping[str, str | int],
+    ) -> Summary:
+        """Add the independent unit of the cells' runs, and the metrics of the study's own."""
+        summary = replace(summary, row={**summary.row, UNIT: unit_of(cells, self.study.windows)})
         taken = [name for name in self.study.metrics if name in summary.row or name in COMPARED]
         if taken:
             raise SimulationError(f"metrics.{taken[0]}: {TAKEN}")

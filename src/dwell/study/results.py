@@ -14,7 +14,7 @@ from dwell.errors import PolicyError, SimulationError
 from dwell.model import FrozenDict, Problem
 from dwell.model.bounds import counted
 from dwell.model.semantics import nearest
-from dwell.study.family import same_run
+from dwell.study.family import played_alike
 from dwell.study.intervals import Floats, Interval
 from dwell.study.over_seeds import (
     difference_of,
@@ -54,7 +54,8 @@ class StudyRuns(Displayed):
     costs : DataFrame
         One row a run and candidate: mean J ``estimated`` while it was not active (against the
         incumbent, switching term included), mean J ``measured`` while it was, both by the
-        contender's own objective.
+        contender's own objective, and ``shadow_fraction``, the share of cycles that each
+        alternative got as shadows while it was.
     latencies : DataFrame
         Distribution of final latencies over all seeds: ``share`` of the cycles that finished
         within ``latency_ms``, by point, scenario and policy. It stays below 1 where cycles were
@@ -161,7 +162,7 @@ class StudyRuns(Displayed):
         """
         first, second = (self.values(scenario, policy, column) for policy in policies)
         one, other = ({"scenario": scenario, "policy": policy} for policy in policies)
-        if same_run(self.runs, (one, other)) and np.array_equal(first, second):
+        if played_alike(self.runs, (one, other)) and np.array_equal(first, second):
             return Interval(0.0, math.nan, math.nan)
         windows = self.windows_behind(scenario, *policies)
         return difference_of(column, windows)(first, second)

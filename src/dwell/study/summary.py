@@ -54,6 +54,8 @@ PARTS = ("compute", "queue", "network")
 
 #: Column of what tells runs apart that differ in anything but their names.
 PLAYED = "played"
+#: Column of the latencies alone, which shadow jobs may leave as they are.
+LATENCIES = "latencies"
 
 #: K, the lengths of stretches of cycles, with m, the misses that are 5 % of one.
 STRETCHES = {20: 1, 100: 5}
@@ -76,7 +78,8 @@ class Summary:
     row : dict
         One value a column of ``Comparison.runs``.
     costs : list of dict
-        One a candidate: mean estimated J while it was not active, mean measured J while it was.
+        One a candidate: mean estimated J while it was not active, mean measured J while it was,
+        and the share of cycles that each alternative got as shadows while it was.
     within : int64 array
         Cycles that finished within each point of the latency grid.
     compared : mapping
@@ -204,9 +207,11 @@ def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Su
         **_misses(missed),
         **_actuator(cycles, counted, problem),
         **{f"{part}_ms": mean_of(cycles[f"{part}_ns"][counted]) / 1e6 for part in PARTS},
+        LATENCIES: hashlib.blake2b(final_ns.data, digest_size=8).hexdigest(),
         PLAYED: _played(final_ns, cycles.names("placement")[counted], used, problem),
     }
     incumbent, cost = decisions.names("incumbent"), windows["cost"][counts]
+    fractions = run.meta.get("shadow_fractions", {})
     costs: list[Row] = [
         {
             **labels,
@@ -214,6 +219,7 @@ def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Su
             "estimated": mean_of(decisions[f"j_{name}"][decided & ~incumbent.equal(name)]),
             "measured": mean_of(cost[those]),
             "windows": int(those.sum()),
+            "shadow_fraction": fractions.get(name, np.nan),
         }
         for name, those in active.items()
     ]
