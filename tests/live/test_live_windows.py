@@ -61,6 +61,7 @@ def cell() -> Problem:
         shadow_fraction=0.1,
         order_lead_cycles=2,
         min_dwell=1,
+        decide_cycles=40,
         min_improvement=0.0,
         fallbacks=(),
     )
@@ -307,7 +308,9 @@ def small(*, sinks: int = 1, grace_ms: float = 0.0, window_cycles: int = W) -> P
         },
     )
     pipeline = dataclasses.replace(problem.pipeline, period_ms=40.0, deadline_ms=40.0)
-    settings_ = dataclasses.replace(problem.controller, close_grace_ms=grace_ms, on="B")
+    settings_ = dataclasses.replace(
+        problem.controller, close_grace_ms=grace_ms, on="B", decide_cycles=window_cycles
+    )
     return dataclasses.replace(
         problem, pipeline=pipeline, controller=settings_, window_cycles=window_cycles
     )

@@ -37,6 +37,7 @@ def slow_cell(
         fallbacks=fallbacks or ("LOC",),
         initial="SO",
         min_dwell=1,
+        decide_cycles=window_cycles,
         estimator="profile",
     )
     pipeline = replace(cell.pipeline, period_ms=PERIOD_MS, deadline_ms=PERIOD_MS)

@@ -1,7 +1,8 @@
 from __future__ import annotations
 
 from collections.abc import Container, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import pytest
 
@@ -24,7 +25,6 @@ from dwell.testbed.chaos.light_cell import MIN_DWELL, WINDOW_CYCLES, document
 from dwell.testbed.chaos.stages import APPLY, HOLD
 
 RUN = 7
-APART = (MIN_DWELL + 1) * WINDOW_CYCLES
 
 
 @dataclass
@@ -185,16 +185,31 @@ def test_what_cannot_be_decoded_is_wrong(wire: Wire) -> None:
     assert wire.say(wire.keys.stamped(), b"\xff")
 
 
-@pytest.mark.parametrize("apart", [APART - 1, APART])
-def test_migrations_keep_their_distance(wire: Wire, apart: int) -> None:
+@pytest.mark.parametrize("early", [True, False])
+@pytest.mark.parametrize(
+    ("settings", "apart"),
+    [
+        ({"decide_cycles": WINDOW_CYCLES}, (MIN_DWELL + 1) * WINDOW_CYCLES),
+        # By the interval of decisions: max(N_min W, min_dwell_cycles) + d cycles.
+        ({"decide_cycles": 1}, MIN_DWELL * WINDOW_CYCLES + 1),
+        ({"decide_cycles": 2, "min_dwell": 0}, 2),
+        ({"decide_cycles": 1, "min_dwell": 0, "min_dwell_cycles": 5}, 6),
+    ],
+)
+def test_migrations_keep_their_distance(
+    problem: Problem, settings: dict[str, Any], apart: int, early: bool
+) -> None:
+    controller = replace(problem.controller, **settings)
+    wire = Wire(Judge(replace(problem, controller=controller)))
+    later = 10 + apart - early
     wire.stamp(0, 1, "SO")
     first = wire.order(1, "LOC")
     wire.accept(first, 2, "LOC", 10)
     wire.stamp(10, 2, "LOC")
     second = wire.order(2, "SO")
-    wire.accept(second, 3, "SO", 10 + apart)
-    wire.stamp(10 + apart, 3, "SO")
-    assert len(wire.judge.migrations()) == (apart < APART)
+    wire.accept(second, 3, "SO", later)
+    wire.stamp(later, 3, "SO")
+    assert len(wire.judge.migrations()) == early
     assert wire.judge.migrations() == []
 
 
