@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -104,6 +105,20 @@ def test_an_alias_bomb_is_refused(tmp_path: Path) -> None:
     _, faults = _read(tmp_path / "f.yaml", "\n".join(levels))
     (fault,) = faults
     assert "more than 100000 values" in fault.message
+
+
+def test_aliases_that_nest_too_deep_are_refused(tmp_path: Path) -> None:
+    levels = ["a0: &a0 [1]", *(f"a{i}: &a{i} [*a{i - 1}]" for i in range(1, 2_000))]
+    _, faults = _read(tmp_path / "f.yaml", "\n".join(levels))
+    (fault,) = faults
+    assert "nested deeper than 40 levels" in fault.message
+
+
+def test_a_pipe_is_refused_at_once(tmp_path: Path) -> None:
+    file = tmp_path / "f.yaml"
+    os.mkfifo(file)
+    with pytest.raises(ProblemError, match="not a regular file; name a cell file"):
+        read_yaml(str(file), Faults(str(file)))
 
 
 @given(

@@ -132,7 +132,10 @@ def test_a_pin_and_a_drain_move_the_cell(cell: RealCell) -> None:
         code, stdout, stderr = invoke("live", *words, "--cell", cell.file)
         return code, stdout + stderr
 
-    assert told("pin", "SO")[0] == 0
+    code, text = told("pin", "SO")
+    assert code == 0
+    assert "; pinned to SO" in text
+    assert "moving to" not in text
     cell.until(lambda status: status["placement"] == "SO")
     assert told("drain", "E") == (
         1,

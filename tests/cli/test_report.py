@@ -6,9 +6,11 @@ import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import polars as pl
 import pytest
 from mcap.reader import make_reader
 
@@ -108,6 +110,34 @@ def test_report_of_what_is_not_there(cell: Path) -> None:
     assert not Path("kept/report.html").exists()
     assert call("report", "nowhere").exit_code == 2
     assert call("report", ".").exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("table", "change", "words"),
+    [
+        ("windows", pl.exclude("warmup"), "lacks the column 'warmup'"),
+        ("windows", pl.all().cast(pl.String), "has the type String"),
+        ("cycles", pl.all().reverse(), "'cycle' does not grow"),
+        ("cycles", pl.all().head(3), "has 3 cycles; the windows have"),
+        ("cycles", pl.all().head(0), "has 0 cycles; the windows have"),
+        ("cycles", (pl.exclude("latency_ns"), pl.col("latency_ns") * -1), "which is negative"),
+        ("decisions", (pl.exclude("reason"), pl.lit("x").alias("reason")), "'reason' has 'x'"),
+    ],
+)
+def test_a_broken_run_is_refused_by_the_name_of_its_file(
+    tmp_path: Path, table: str, change: pl.Expr | Sequence[pl.Expr], words: str
+) -> None:
+    folder = kept(tmp_path / "run")
+    file = folder / f"{table}.parquet"
+    pl.read_parquet(file).select(change).write_parquet(file)
+    assert_refused(call("report", folder), f"{file}: ", words)
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "[1]", '{"schema_version": 3, "problem": 1}'])
+def test_a_run_with_a_broken_record_is_refused(tmp_path: Path, text: str) -> None:
+    folder = kept(tmp_path / "run")
+    (folder / "run.json").write_text(text)
+    assert_refused(call("report", folder))
 
 
 def test_a_page_that_cannot_be_written_is_a_failure(cell: Path) -> None:

@@ -75,6 +75,10 @@ ON_THE_WAY = {
     "double": (0.5,),
     "reorder": (0.5,),
 }
+#: Frames per period of a camera at another rate, in a cell whose cycles begin with its frames.
+FRAMES = (0.27, 0.67, 1.7)
+#: Periods between two looks at the status.
+LOOK = 2
 #: Words of the keys that the judge hears.
 HEARD = frozenset({"stamped", "order", "accepted", "done", "in"})
 
@@ -95,7 +99,8 @@ def faults_in_memory() -> tuple[Fault, ...]:
             for amount in amounts:
                 name = f"{kind} {link.name} {amount:g}"
                 faults.append(Fault(name, "slow", (link.name,), amount, kind))
-    return tuple(faults)
+    paces = (Fault(f"camera {share:g}", "pace", ("sensing@R1",), share) for share in FRAMES)
+    return *faults, *paces
 
 
 # ------------------------------------------------------------------------------------ the draw
@@ -267,6 +272,10 @@ class FaultyWorld(World):
         self.exec_of = exec_ms("SO")
         self._freezes: Counter[MemoryTransport] = Counter()
         problem = on(light_cell(), plan.wish or "SO")
+        self.frames_per_period = 1.0
+        paced = any(one.fault.how == "pace" for one in plan.faults)
+        if paced:
+            problem = replace(problem, live=replace(problem.live, release="frames"))
         settings = replace(problem.controller, decide_cycles=plan.decide_cycles)
         problem = replace(problem, controller=settings)
         super().__init__(
@@ -280,6 +289,23 @@ class FaultyWorld(World):
         self.judge = Judge(self.problem)
         self.wrong: list[str] = []
         self.network.taps.append(self._hear)
+        self._look()
+        if paced:
+            self._frame()
+
+    def _look(self) -> None:
+        """Hold the status against what the actuator has seen, again and again."""
+        self.network.call_at(self.network.now_ns + LOOK * self.period_ns, self._look)
+        if status := self._status():
+            self.wrong += self.judge.looked(status, self.seen)
+
+    def _frame(self) -> None:
+        """Have the source's camera bring a frame, again and again."""
+        every_ns = round(self.period_ns / self.frames_per_period)
+        self.network.call_at(self.network.now_ns + every_ns, self._frame)
+        end = self.network.end("sensing@R1")
+        if end is not None and not end.frozen:
+            self.worker("sensing@R1").framed(end.now_ns)
 
     def stage_of(self, role: Role) -> CellStage:
         return TellingStage(role, self.failing)
@@ -345,6 +371,9 @@ class FaultyWorld(World):
             case "drift":
                 self._set_clock(fault.whom[0], drift_ppm=fault.amount)
                 return lambda: self._set_clock(fault.whom[0])
+            case "pace":
+                self.frames_per_period = fault.amount
+                return lambda: setattr(self, "frames_per_period", 1.0)
             case "fill":
                 self.journal.full = True
                 return lambda: setattr(self.journal, "full", False)

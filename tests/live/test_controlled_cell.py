@@ -55,6 +55,25 @@ def ask(world: World, what: str, about: str = "") -> str:
     return heard[-1]
 
 
+def test_a_controller_that_is_not_in_charge_refuses_and_names_the_one_that_is(
+    problem: Problem,
+) -> None:
+    world = World(problem, policy="LOC")
+    world.run(3_000)
+    world.network.freeze(CONTROLLER)
+    world.run(1_200)
+    assert world.order("LOC", controller="laptop") == ""
+    world.network.thaw(CONTROLLER)
+    world.run(600)
+    for what, about in (("pin", "SO"), ("drain", "E"), ("unpin", "")):
+        assert ask(world, what, about) == "another controller: laptop is in charge"
+    assert ask(world, "status") == ""
+    world.run(3_000)
+    assert (world.cell.pinned, world.cell.drained, world.stamper.placement) == ("", set(), "LOC")
+    # It takes charge again when the other one is silent.
+    assert ask(world, "pin", "SO") == ""
+
+
 def test_every_order_takes_effect_and_no_cycle_is_lost(problem: Problem) -> None:
     world = alternating(problem)
     world.run(12_000)

@@ -157,6 +157,19 @@ def test_of_a_node_that_is_drained_nothing_need_be_heard(problem: Problem) -> No
     assert world.status["headline"] is None
 
 
+def test_another_version_on_a_node_that_is_drained_is_named_and_no_fault(
+    problem: Problem,
+) -> None:
+    world = running(problem)
+    world.cell.drained.add("R2")
+    found = world.status
+    why = "planning@R2 runs Dwell 9.9"
+    found["strangers"] = {"planning@R2": why, "planning@R2.shadow": why}
+    assert diagnose(world.problem, found) == ("ok", None)
+    found["drained"] = []
+    assert diagnose(world.problem, found) == ("degraded", f"{why}; {why}")
+
+
 def test_a_headline_names_a_few_and_counts_the_others(problem: Problem) -> None:
     world = running(problem)
     found = world.status

@@ -15,7 +15,7 @@ import pytest
 from msgspec.structs import replace as replaced
 
 from dwell.control import Guard, Probation
-from dwell.live import stamper, worker
+from dwell.live import health, stamper, worker
 from dwell.live.continuity import RESERVED
 from dwell.live.controlled_cell import ControlledCell
 from dwell.live.cycle_ledger import LiveCycle
@@ -230,6 +230,10 @@ def records_what_was_not(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(LiveCycle, "actuated", property(lambda _: True))
 
 
+def overlooks_the_actuator(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(health, "_uneven", lambda *_: iter(()))
+
+
 PLANTED: dict[str, tuple[Patch, Plan, str]] = {
     "order": (applies_what_is_behind, plan("LOC", "freeze control@R2"), "actuated after"),
     "age": (applies_what_is_old, plan("LOC", "freeze all of R2"), "after it was stamped"),
@@ -276,6 +280,7 @@ PLANTED: dict[str, tuple[Patch, Plan, str]] = {
         plan("LOC", "fail the actuator of sink.control@R2"),
         "the guard has moved",
     ),
+    "health": (overlooks_the_actuator, plan("LOC", "camera 0.27"), "status reads ok"),
     "record": (records_what_was_not, plan("LOC", "kill planning@R2"), "actuated by the record"),
 }
 

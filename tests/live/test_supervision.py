@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -60,6 +61,24 @@ def test_a_killed_process_is_started_again(supervisor: Supervisor, said: list[st
     until(supervisor, lambda: child.starts == 2)
     assert child.pid != first
     assert said == ["worker@E was killed by SIGKILL"]
+
+
+def test_a_state_folder_that_is_removed_is_made_again(
+    supervisor: Supervisor, tmp_path: Path, said: list[str]
+) -> None:
+    child = keep(supervisor, "worker@E", "import time; time.sleep(1000)")
+    until(supervisor, lambda: child.starts == 1)
+    first = child.pid
+    shutil.rmtree(tmp_path)
+    for _ in range(3):
+        supervisor.step()
+        supervisor.tend()
+    assert (child.pid, child.starts) == (first, 1)
+    assert child.file("pid").exists()
+    assert said == [supervisor.notes()] == [f"{tmp_path}: was removed, and is made again"]
+    assert first is not None
+    os.kill(first, signal.SIGKILL)
+    until(supervisor, lambda: child.starts == 2)
 
 
 def test_a_crash_loop_backs_off_and_is_reported(supervisor: Supervisor, said: list[str]) -> None:

@@ -9,7 +9,9 @@ expanded, are bounded; tags that make objects are refused.
 from __future__ import annotations
 
 import math
+import os
 import re
+import stat
 from collections.abc import Hashable
 
 import yaml
@@ -133,9 +135,17 @@ def _composed(text: str, faults: Faults) -> yaml.Node | None:
     return root
 
 
+def _open_at_once(path: str, flags: int) -> int:
+    """Open a file as `open` does; a pipe without a writer is not waited for."""
+    return os.open(path, flags | os.O_NONBLOCK)
+
+
 def _read_text(path: str, faults: Faults, what: str) -> str | None:
     try:
-        with open(path, "rb") as stream:
+        with open(path, "rb", opener=_open_at_once) as stream:
+            if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
+                faults.add("", f"not a regular file; name a {what} file")
+                return None
             data = stream.read(MAX_BYTES + 1)
     except FileNotFoundError:
         faults.add("", "no such file; check the path")
@@ -170,6 +180,11 @@ class _Builder:
         if self.count > MAX_VALUES:
             if self.count == MAX_VALUES + 1:
                 message = f"more than {MAX_VALUES} values, aliases expanded; use fewer aliases"
+                self.faults.add("", message, line=node.start_mark.line + 1)
+            return None
+        if len(steps) > MAX_DEPTH:
+            if not self.faults.at(""):
+                message = f"nested deeper than {MAX_DEPTH} levels, aliases expanded"
                 self.faults.add("", message, line=node.start_mark.line + 1)
             return None
         path = dotted(steps)

@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
 #: Time between two looks of ``status --watch``.
 WATCH_S = 1.0
+#: How long a move that was asked for is waited for.
+MOVES_S = 3.0
 
 Cpus = Annotated[
     str | None, option("LIST", "CPUs to use, as 0,2-3; those of this process if not given.")
@@ -411,6 +413,11 @@ def _ask(
 
     with OperatorClient(load_without_traces(cell), environment(keys, insecure=insecure)) as visitor:
         answer = visitor.ask(what, about)
+        # The answer comes before the move that was asked for.
+        until_s = time.monotonic() + MOVES_S
+        while answer.get("moving_to") and time.monotonic() < until_s:
+            time.sleep(0.1)
+            answer = visitor.ask("status")
     if as_json:
         print_json(answer)
         return

@@ -18,6 +18,7 @@ from dwell.live.continuity import Continuity, SetbackDetector
 from dwell.live.health import PATIENCE_NS, diagnose, silent_after_ns
 from dwell.live.live_windows import LiveWindows
 from dwell.live.messages import (
+    OTHER,
     Accepted,
     Answer,
     Ask,
@@ -650,7 +651,9 @@ class ControlledCell:
         self.place.transport.put(self.place.keys.answer(ask.number), encode(answer))
 
     def _do(self, ask: Ask, now_ns: int) -> str:
-        problem = self.place.problem
+        problem, told = self.place.problem, self._told
+        if ask.what != "status" and told is not None and told.refused.startswith(OTHER):
+            return told.refused
         match ask.what:
             case "status":
                 return ""

@@ -11,7 +11,7 @@
 ``absent``    no controller answers; only who asks can tell (`dwell.live.operator_client`)
 ============  ====================================================================================
 
-Processes on a node that is drained may be silent: somebody has said so.
+Processes on a node that is drained may be silent, or differ: an operator has taken it out.
 """
 
 from __future__ import annotations
@@ -78,7 +78,11 @@ def diagnose(problem: Problem, status: Mapping[str, Any]) -> tuple[Health, str |
     deaf = _hears_nobody(problem, status, members)
     stalled = _no_window(problem, status) or _no_cycle(status)
     faults = [] if deaf else list(_faults(status, members))
-    faults += status["strangers"].values()
+    faults += [
+        why
+        for who, why in status["strangers"].items()
+        if who.partition("@")[2].partition(".")[0] not in status["drained"]
+    ]
     if not deaf and _window_was_due(problem, status):
         faults += _symptoms(problem, status, members)
     if status["record"]:

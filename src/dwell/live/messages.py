@@ -21,6 +21,8 @@ MAX_CONTROL_BYTES = 262_144
 ACTUATED, NOT_APPLIED = HANDED_OVER = "actuated", "not_applied"
 #: Outcome of one that it keeps back, because it may be older than `max_age_ms`.
 STALE = "stale"
+#: Begins the refusal of an order while another controller is in charge.
+OTHER = "another controller"
 #: Signatures stand before what they are of (Ed25519).
 SIGNATURE_BYTES = 64
 

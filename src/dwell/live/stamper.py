@@ -17,6 +17,7 @@ from dwell.live.latencies import Intervals
 from dwell.live.messages import (
     ACTUATED,
     HANDED_OVER,
+    OTHER,
     Accepted,
     Beat,
     Completion,
@@ -274,7 +275,7 @@ class Stamper:
         """Return why an order is not accepted, or nothing."""
         other = self._charge not in ("", order.controller)
         if other and now_ns - self._charged_ns < LEASE_NS:
-            return f"another controller: {self._charge} is in charge"
+            return f"{OTHER}: {self._charge} is in charge"
         self._charge, self._charged_ns = order.controller, now_ns
         if order.run == 0 and order.term == 0 and not order.placement:
             return ""

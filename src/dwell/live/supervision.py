@@ -23,7 +23,7 @@ from dwell.files import write_whole
 from dwell.live.launcher import UNKNOWN_CODE, ForkServer, Running, Survivor
 from dwell.live.log import printable
 from dwell.live.process_group import ProcessGroup
-from dwell.live.state_files import InFlight, open_own
+from dwell.live.state_files import InFlight, make_folder, open_own
 
 #: Waits between two starts of a process that keeps dying.
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.05, 5.0
@@ -128,6 +128,8 @@ class Supervisor:
         self._say = say
         self._oom_kills = _oom_kills()
         self._launcher = launcher
+        # What has become of the folder, if it was removed, and when.
+        self._lost, self._lost_s = "", -math.inf
 
     def keep(self, who: str, command: Sequence[str]) -> SupervisedProcess:
         """Have a process run from now on."""
@@ -254,12 +256,25 @@ class Supervisor:
     def tend(self) -> None:
         """Look how much memory the processes have taken, and how much they have printed."""
         self._oom_kills = _oom_kills()
+        if self.children and not self.folder.is_dir():
+            self._make_folder()
         for child in self.children:
             if _shorten(child.file("log"), self._log_bytes):
                 child.log_begins = 0
             if child.process is not None and not child.file("pid").exists():
                 self._write_mark(child)  # there was no room for it
             self._weigh(child)
+
+    def _make_folder(self) -> None:
+        """Make the state folder again; a disk that is gone must not end the agent."""
+        lost = f"{self.folder}: was removed, and is made again"
+        try:
+            make_folder(self.folder)
+        except LiveError as error:
+            if (lost := str(error)) == self._lost:
+                return
+        self._lost, self._lost_s = lost, time.monotonic()
+        self._say(lost)
 
     def _weigh(self, child: SupervisedProcess) -> None:
         """Report a process whose memory has doubled since it had warmed up, at every doubling."""
@@ -308,7 +323,8 @@ class Supervisor:
         since_s = time.monotonic() - TOLD_S
         ailing = [child for child in self.children if child.ails]
         ailing.sort(key=lambda child: -child.failures)
-        notes = [child.note for child in ailing]
+        notes = [self._lost] if self._lost_s > since_s else []
+        notes += [child.note for child in ailing]
         notes += [child.told for child in self.children if child.told_s > since_s]
         notes += [child.growth for child in self.children if child.growth]
         return "; ".join(dict.fromkeys(notes))[:2000]

@@ -24,9 +24,9 @@ SILENT_WINDOWS = 2
 
 @dataclass(slots=True)
 class _Lead:
-    """Cycles between two windows: which are the first, how many, and what came of them."""
+    """Cycles between two windows: the first, how many, and how the actuators were served."""
 
-    first: int | None = None
+    first: LiveCycle | None = None
     count: int = 0
     applied: int = 0
     silences: int = 0
@@ -71,7 +71,7 @@ class Symptoms:
         """Cycles belong to no window: they count with the next."""
         lead = self._leads[-1]
         if lead.first is None and cycles:
-            lead.first = cycles[0].number
+            lead.first = cycles[0]
         lead.count += len(cycles)
         lead.applied += sum(map(self._is_applied, cycles))
         lead.silences += sum(cycle.silences for cycle in cycles)
@@ -141,12 +141,13 @@ class Symptoms:
         found: dict[str, list[Any]] = {"silences": [], "applied": [], "cycles": []}
         for window, lead in zip(self._recent, self._leads, strict=False):
             cycles = window.cycles
+            first = lead.first or cycles[0]
+            span_ns = cycles[0].at_ns - first.at_ns + window.span_ns
+            periods = max(span_ns / self._period_ns, lead.count + len(cycles))
             applied = lead.applied + sum(map(self._is_applied, cycles))
-            periods = lead.count + max(window.span_ns / self._period_ns, len(cycles))
-            first = cycles[0].number if lead.first is None else lead.first
             found["silences"].append(lead.silences + sum(cycle.silences for cycle in cycles))
             found["applied"].append(applied / periods)
-            found["cycles"].append((first, cycles[-1].number))
+            found["cycles"].append((first.number, cycles[-1].number))
         return found
 
     def _sink(self, sink: str, now_ns: int) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from dwell.model import Problem, Scenario
 from dwell.model.table_columns import TABLES
 from dwell.record.journal import JOURNAL, Journal, read_journal
 from dwell.record.json_documents import read_document
-from dwell.record.schema import SCHEMA_VERSION, require_version
+from dwell.record.schema import SCHEMA_VERSION, require_table, require_version
 from dwell.record.table_arrays import TableArrays, arrays_of
 
 if TYPE_CHECKING:
@@ -387,7 +387,27 @@ def open_run(path: str | os.PathLike[str]) -> Run:
         raise RunError(f"{folder}: incomplete run, without {', '.join(missing)}")
     more = [name for name in ON_REQUEST if (folder / f"{name}.parquet").is_file()]
     names = [*ALWAYS, *more]
-    return Run(meta, {name: read_table(folder / f"{name}.parquet") for name in names})
+    run = Run(meta, {})
+    run._tables |= {name: partial(_read_checked, run, name, folder) for name in names}
+    return run
+
+
+def _read_checked(run: Run, name: str, folder: Path) -> pl.DataFrame:
+    """Read a table of a run, and refuse one that is none."""
+    file = folder / f"{name}.parquet"
+    table = read_table(file)()
+    try:
+        problem = run.problem
+    except RunError:
+        return table  # whoever needs the cell is refused
+    require_table(name, problem, table, str(file))
+    if name == "windows" and run.is_simulated and len(table):
+        last = int(str(table["first_cycle"].max())) + problem.window_cycles
+        if (rows := len(run.cycles)) < last:
+            raise RunError(
+                f"{folder / 'cycles.parquet'}: has {rows} cycles; the windows have {last}"
+            )
+    return table
 
 
 def seal_run(path: str | os.PathLike[str], **meta: object) -> Run:

@@ -138,6 +138,38 @@ def _columns(
             yield one.name, column, kind
 
 
+def require_table(table: str, problem: Problem, frame: pl.DataFrame, source: str) -> None:
+    """Refuse a table without the columns of its kind, or with other values in them.
+
+    Raises
+    ------
+    RunError
+        If it is one; `source` begins the message.
+    """
+    import polars as pl
+
+    needed = column_types(table, problem)
+    for name, column, kind in _columns(table, problem, get_args(Feature)):
+        if name not in frame.columns:
+            if name in needed:
+                raise RunError(f"{source}: lacks the column {name!r}")
+            continue
+        series, names = frame[name], None if isinstance(kind, str) else kind
+        wanted = (pl.String, pl.Enum) if names or kind == "String" else (getattr(pl, str(kind)),)
+        if not isinstance(series.dtype, wanted):
+            raise RunError(f"{source}: column {name!r} has the type {series.dtype}")
+        if not column.null and series.null_count():
+            raise RunError(f"{source}: column {name!r} lacks values")
+        least = series.min() if series.dtype == pl.Int64 and table != "jobs" else 0
+        if isinstance(least, int) and least < 0:
+            raise RunError(f"{source}: column {name!r} has {least}, which is negative")
+        if names and (unknown := sorted({*series.drop_nulls().cast(pl.String)} - {*names})):
+            raise RunError(f"{source}: column {name!r} has {unknown[0]!r}, which the cell has not")
+    index = next(iter(needed))
+    if table in ("cycles", "windows") and not (frame[index].diff().drop_nulls() > 0).all():
+        raise RunError(f"{source}: column {index!r} does not grow")
+
+
 def row_of(types: Types, values: Values) -> Row:
     """Return values in the order of a table's columns.
 

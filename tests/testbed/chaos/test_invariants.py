@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Container, Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,8 +19,10 @@ from dwell.live.messages import (
     encode,
 )
 from dwell.model import Problem
+from dwell.testbed.chaos.actuations import Seen
 from dwell.testbed.chaos.invariants import Judge
 from dwell.testbed.chaos.light_cell import MIN_DWELL, WINDOW_CYCLES, document
+from dwell.testbed.chaos.stages import APPLY, HOLD
 
 RUN = 7
 
@@ -149,6 +152,33 @@ def test_jobs_run_where_the_stamp_says(wire: Wire) -> None:
     hops = (Hop("perception", "R1", 0, 0, 0),)
     done = Completion(Stamp(RUN, 1, 1, "SO", 0), "control", 0, "actuated", hops, "R2")
     assert "ran on R1" in "; ".join(wire.say(wire.keys.done("control"), encode(done)))
+
+
+@pytest.mark.parametrize(
+    ("cycles", "held_before", "bad"),
+    [
+        (range(9), {}, False),
+        (range(9), {4}, False),
+        (range(9), {1, 4}, True),
+        ([0, 1, 3, 4, 5, 6, 7, 8], {}, False),
+        ([0, 1, 3, 5, 6, 7, 8], {}, True),
+        ([0, 1, 3, 4, 5, 6, 7, 8], {7}, True),
+    ],
+)
+def test_no_status_is_ok_while_the_actuator_lacks_commands(
+    wire: Wire, cycles: Iterable[int], held_before: Container[int], bad: bool
+) -> None:
+    for cycle in range(9):
+        wire.stamp(cycle, 1, "SO")
+    seen = []
+    for cycle in cycles:
+        if cycle in held_before:
+            seen.append(Seen(HOLD, "SO", 1, 0, 0, 0, 0))
+        seen.append(Seen(APPLY, "SO", 1, cycle, cycle, 0, 0))
+    recent = {"cycles": [(0, 2), (3, 5), (6, 8)]}
+    found = wire.judge.looked({"health": "ok", "recent": recent}, seen)
+    assert [wrong.partition(":")[0] for wrong in found] == ["status reads ok"] * bad
+    assert not wire.judge.looked({"health": "degraded", "recent": recent}, seen)
 
 
 def test_what_cannot_be_decoded_is_wrong(wire: Wire) -> None:

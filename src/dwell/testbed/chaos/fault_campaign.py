@@ -273,6 +273,7 @@ class FaultCampaign:
             outcome.stall_ms = stalls.worst_ms(outcome.begin_ns, time.monotonic_ns())
             usable = False
         outcome.wrong += observer.look()
+        outcome.late += _untrue(cell, observer)
         if usable:
             recovered(observer.judge, outcome, cell.home)
             outcome.late += [*beyond(outcome), *moved_in_vain(observer.judge, fault, term)]
@@ -301,6 +302,17 @@ class FaultCampaign:
     def _count(self, cell: Harness, observer: ActuatorObserver) -> None:
         self.result.heard.update(observer.judge.counts)
         self.result.actuated += len(cell.actuations.applied)
+
+
+def _untrue(cell: Harness, observer: ActuatorObserver) -> list[str]:
+    """Return which looks at the status read `ok` though the actuator lacked commands."""
+    cell.actuations.look()
+    wrong = []
+    for at_ns, status in cell.looks:
+        seen = [one for one in cell.actuations.all if one.at_ns <= at_ns]
+        wrong += observer.judge.looked(status, seen)
+    cell.looks.clear()
+    return wrong
 
 
 def _settle(cell: Harness, rests_s: float, outcome: Outcome) -> None:

@@ -13,7 +13,7 @@ from dwell.live.wiring import lane_of, roles
 from dwell.model import Problem
 
 How: TypeAlias = Literal[
-    "kill", "freeze", "cut", "slow", "fail", "jump", "drift", "starve", "fill", "hog"
+    "kill", "freeze", "cut", "slow", "fail", "jump", "drift", "starve", "fill", "hog", "pace"
 ]
 
 #: What oscillators do, and what nobody's should.
@@ -35,7 +35,7 @@ class Fault:
         Processes, ``*E`` for all of a node; directions of a link, as ``R1->E``; nodes; ``runs`` for
         the disk that the runs are kept on.
     amount : float
-        Jump in ms, drift in parts per million, rate in Mbit/s.
+        Jump in ms, drift in parts per million, rate in Mbit/s, frames per period.
     kind : str
         Kind that shares its turns; `how` if left out.
     """
@@ -147,7 +147,7 @@ def hit_by(problem: Problem, fault: Fault) -> frozenset[str] | None:
     match fault.how:
         case "cut" | "slow" | "fail":
             return frozenset(fault.whom)
-        case "fill" | "hog":
+        case "fill" | "hog" | "pace":
             return frozenset()
         case "drift" if abs(fault.amount) <= WITHIN_PPM:
             return frozenset()

@@ -113,6 +113,8 @@ class Harness(Started):
         self.folder.mkdir(parents=True, exist_ok=True)
         self.actuations = Actuations(self.folder / OBSERVED)
         self.starved_cpus: frozenset[int] = frozenset()
+        #: Answers to `status` since they were judged last, with their instants on the true clock.
+        self.looks: list[tuple[int, Mapping[str, Any]]] = []
         self._small: dict[str, SmallDisk] = {}
         self._hog: DiskHog | None = None
         self._burner: Burner | None = None
@@ -367,9 +369,12 @@ class Harness(Started):
     def status(self) -> Mapping[str, Any]:
         """Return the controller's status; nothing where it does not answer."""
         try:
-            return self.testbed.sample(0.4)
+            told = self.testbed.sample(0.4)
         except LiveError:
             return {}
+        if not self.looks or self.looks[-1][1].get("windows") != told.get("windows"):
+            self.looks.append((time.monotonic_ns(), told))
+        return told
 
     def at_home(self) -> str:
         """Return what keeps the cell from being at home; nothing where it is."""

@@ -7,9 +7,9 @@ cell file.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from dwell.errors import LiveError
 from dwell.live.keys import MAIN, Keys
@@ -25,7 +25,11 @@ from dwell.live.messages import (
     decode,
 )
 from dwell.model import Problem
+from dwell.testbed.chaos.actuations import Seen
+from dwell.testbed.chaos.stages import APPLY, HOLD, ZERO
 
+#: Share of its commands that an actuator gets while a status may be `ok`.
+LEAST_APPLIED = 0.9
 #: Stamps and orders that are remembered.
 MEMORY = 10_000
 
@@ -202,6 +206,39 @@ class Judge:
         return min(instants, default=None)
 
     # ------------------------------------------------------------------------ routing
+
+    def looked(self, status: Mapping[str, Any], seen: Sequence[Seen]) -> list[str]:
+        """Hold a status that is `ok` against the actuator's calls until then.
+
+        Less than two of the last three windows, with the cycles before each, may have a call of
+        ``hold`` or ``zero``, or fewer than 0.9 of their commands.
+        """
+        if status.get("health") != "ok" or "recent" not in status:
+            return []
+        windows = status["recent"]["cycles"]
+        bad = [why for first, last in windows if (why := self._unserved(first, last, seen))]
+        return [f"status reads ok: {'; '.join(bad)}"] if len(bad) > 1 else []
+
+    def _unserved(self, first: int, last: int, seen: Sequence[Seen]) -> str:
+        """Return how the actuator lacked commands in some cycles."""
+        released_ns = [at_ns for cycle, at_ns in self.stamped_ns.items() if first <= cycle <= last]
+        passed_ns = max(released_ns, default=0) - min(released_ns, default=0)
+        due = max(passed_ns // self.problem.pipeline.period_ns + 1, len(released_ns))
+        applied = silences = 0
+        follows = False
+        for one in reversed(seen):
+            if one.what == APPLY:
+                if one.cycle < first:
+                    break
+                follows = one.cycle <= last
+                applied += follows
+            elif one.what in (HOLD, ZERO):
+                silences, follows = silences + follows, False
+        lacks = applied < LEAST_APPLIED * due
+        what = f"{applied} of {due} commands, {silences} silences in cycles {first} to {last}"
+        return what if silences or lacks else ""
+
+    # ------------------------------------------------------------------------- routing
 
     def _routed(self, key: str, header: Header) -> Iterable[str]:
         task, node, kind = key.split("/")[-3:]
