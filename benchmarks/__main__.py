@@ -23,6 +23,7 @@ BENCHMARKS = {
     "pricing": ("pricing", "measure"),
     "regimes": ("regimes", "measure"),
     "sooner": ("sooner", "measure"),
+    "errors": ("stated_errors", "measure"),
     "clairvoyant": ("clairvoyant", "measure"),
     "fleet": ("fleet", "measure"),
     "ledger": ("fleet_ledger", "measure"),
@@ -43,6 +44,7 @@ BENCHMARKS = {
     "page-cost": ("page_cost", "measure"),
     "live-fleet": ("fleet_live", "measure"),
     "restart": ("restart", "measure"),
+    "leaving": ("leaving", "measure"),
 }
 
 

@@ -3,10 +3,11 @@
 This process has one session for each process that a controller is connected to, which listens for
 all cells at once: every controller has all its connections. Each cell is stamped at 25 Hz; its
 completions come with their hops, twice as in a real cell, beats, loads and answers beside them. It
-is always bad where it is, so that the policy orders a move at the end of every window.
+is always bad where it is, so that the policy orders a move at every decision.
 
 Cells begin when they like, so that their windows close all over the time that one takes; beside
-that stands the worst case, in which all windows close in one instant.
+that stands the worst case, in which all windows close in one instant. Cells decide once per window,
+or four times.
 """
 
 from __future__ import annotations
@@ -78,17 +79,21 @@ def measure(quick: bool) -> Section:
     os.sched_setaffinity(0, range(os.cpu_count() or 1))
     seconds = 8.0 if quick else 20.0
     figures: list[Figure] = []
-    broke = {False: 0, True: 0}
-    cases = [(size, False) for size in ((10, 50) if quick else SIZES)]
-    cases += [(size, True) for size in ((50,) if quick else AT_ONCE)]
-    for size, at_once in cases:
-        if broke[at_once]:
+    broke: dict[tuple[bool, int], int] = {}
+    cases = [
+        (size, at_once, every)
+        for every in (WINDOW, WINDOW // 4)
+        for at_once, sizes in ((False, SIZES), (True, AT_ONCE))
+        for size in ([one for one in sizes if one in (10, 50)] if quick else sizes)
+    ]
+    for size, at_once, every in cases:
+        if broke.setdefault((at_once, every), 0):
             continue
-        found = _measured(size, seconds, at_once=at_once)
-        bound = size <= 50
+        found = _measured(size, seconds, at_once=at_once, every=every)
+        bound = size <= 50 and every == WINDOW
         figures += [
             Figure(
-                f"{size} cells{', all at once' if at_once else ''}: decision, p50",
+                f"{size} cells{_told(at_once=at_once, every=every)}: decision, p50",
                 [found["p50"]],
                 "ms",
             ),
@@ -102,11 +107,11 @@ def measure(quick: bool) -> Section:
             Figure("  the players' own delay, p99", [found["late"]], "ms"),
         ]
         if found["p99"] > PERIOD_MS / 2 or found["dropped"]:
-            broke[at_once] = size
+            broke[at_once, every] = size
     told = [
-        f"{'all at once' if at_once else 'spread over time'}: "
+        f"windows{_told(at_once=at_once, every=every) or ', spread over time'}: "
         + (f"breaks at {size} cells" if size else "did not break")
-        for at_once, size in broke.items()
+        for (at_once, every), size in broke.items()
     ]
     return Section(
         "Many cells at 25 Hz on one controller, from the instant a window is due to the order",
@@ -115,13 +120,18 @@ def measure(quick: bool) -> Section:
     )
 
 
-def _problem(number: int, folder: Path) -> tuple[Problem, Path]:
+def _told(*, at_once: bool, every: int) -> str:
+    often = f", a decision every {every} cycles" if every < WINDOW else ""
+    return f"{', all at once' if at_once else ''}{often}"
+
+
+def _problem(number: int, folder: Path, every: int) -> tuple[Problem, Path]:
     found = document(f"c{number}", period_ms=PERIOD_MS, fallbacks=())
     base = FIRST_PORT + number * PORTS_PER_CELL
     hosts = {node: {"port": base + 30 * i} for i, node in enumerate(found["nodes"])}
     found["live"]["hosts"] = hosts
     found["window_cycles"] = WINDOW
-    found["controller"].update(min_dwell=0, min_improvement=0.0)
+    found["controller"].update(min_dwell=0, min_improvement=0.0, decide_cycles=every)
     path = folder / f"c{number}.yaml"
     path.write_text(yaml.safe_dump(found, sort_keys=False))
     return dwell.load(path), path
@@ -150,7 +160,8 @@ class _Cell:
         stamp = Stamp(self.run, self.cycle, self.term, self.placement, now_ns)
         self.released[self.cycle] = now_ns
         self.cycle += 1
-        if self.cycle - self.first > 2 * WINDOW + 3 and (self.cycle - self.first) % WINDOW == 3:
+        every, age = self.problem.decide_cycles, self.cycle - self.first
+        if age > 2 * every + 3 and age % every == 3 % every:
             self.silent += 1
         self._put("stamper@R1", self.keys.stamped(), encode(stamp))
         return stamp
@@ -198,9 +209,10 @@ class _Cell:
         self.begun = True
         moves = order.placement not in ("", self.placement) and order.term == self.term
         if moves:
+            every = self.problem.decide_cycles
             due = [
                 self.released[number] + GRACE_NS
-                for number in range(self.first + WINDOW, self.cycle, WINDOW)
+                for number in range(self.first + every, self.cycle, every)
             ]
             past = [due_ns for due_ns in due if due_ns <= at_ns + EARLY_NS]
             if past:
@@ -259,21 +271,28 @@ class _Players:
         self._sessions[who].declare_subscriber(key, receive)
 
 
-def _measured(size: int, seconds: float, *, at_once: bool = False) -> dict[str, float]:
+def _measured(
+    size: int, seconds: float, *, at_once: bool = False, every: int = WINDOW
+) -> dict[str, float]:
     switch_s = sys.getswitchinterval()
     sys.setswitchinterval(0.0005)
     try:
         with ExitStack() as stack:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-            return _played(size, seconds, folder, stack, at_once=at_once)
+            made = [_problem(number, folder, every) for number in range(size)]
+            return _played(made, seconds, folder, stack, at_once=at_once)
     finally:
         sys.setswitchinterval(switch_s)
 
 
 def _played(
-    size: int, seconds: float, folder: Path, stack: ExitStack, *, at_once: bool
+    made: list[tuple[Problem, Path]],
+    seconds: float,
+    folder: Path,
+    stack: ExitStack,
+    *,
+    at_once: bool,
 ) -> dict[str, float]:
-    made = [_problem(number, folder) for number in range(size)]
     players = _Players([wire(problem) for problem, _ in made], stack)
     cells = [_Cell(i, problem, players.put) for i, (problem, _) in enumerate(made)]
     by_name = {cell.problem.name: cell for cell in cells}
@@ -301,7 +320,7 @@ def _played(
     until = time.monotonic() + START_S
     while not all(cell.begun for cell in cells):
         if time.monotonic() > until or process.poll() is not None:
-            raise RuntimeError(f"{size} cells: {(folder / 'log').read_text()[-500:]}")
+            raise RuntimeError(f"{len(made)} cells: {(folder / 'log').read_text()[-500:]}")
         time.sleep(0.05)
     _play(cells, 3.0, at_once=at_once)
     for cell in cells:

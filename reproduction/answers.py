@@ -65,7 +65,8 @@ def table(name: str, cells: pl.DataFrame) -> str:
         most = (
             max(known, key=lambda one: one["effect"]) if known else {"column": "–", "effect": None}
         )
-        told = [number(one["effect"]) if one["effect"] is not None else "–" for one in (most, span)]
+        effects = [one["effect"] for one in (most, span)]
+        told = ["–" if effect is None else number(float(effect)) for effect in effects]
         lines.append(f"| {scenario} | {most['column']} | {told[0]} | {told[1]} |")
     return "\n".join(lines)
 

@@ -156,7 +156,7 @@ def objects(
         *(estimator_by_name(name, canonical) for name in ("profile", "shadow", "scaling")),
         *(controller, controller.estimator, controller.course, proposal),
         Presence.of(canonical),
-        *(FallbackRound(["LOC"]), Failures.of(canonical), ShadowPlan(0, 9, 3, 0.05)),
+        *(FallbackRound(["LOC"]), Failures.of(canonical), ShadowPlan(0, 9, [0.05] * 3)),
         *(Guard(["LOC"], placement="SO", **guard), CellGuard(canonical)),
         Probation(30, health_cycles=10, patience_ns=1),
         ClosedWindow(ints[:, 0], ints[:, 0], 1, 0, np.zeros((3, 3)), LookedAt(0, 0, 1)),

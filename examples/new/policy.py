@@ -14,13 +14,13 @@ class Patient:
     # `--policy policy:Patient+corrected`.
     def __init__(self, initial: str = "LOC", patience: int = 3) -> None:
         self.incumbent = initial
-        self.patience = patience  # windows that another candidate must be the best
+        self.patience = patience  # decisions at which another candidate must be the best
         self.better: list[str] = []
 
     @classmethod
     def from_problem(cls, problem: Problem) -> Patient:
         """Make it for a cell: what the cell file says is in `problem`."""
-        return cls(problem.initial, problem.controller.min_dwell)
+        return cls(problem.initial)
 
     def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
         """Choose the placement for the next window, by name.

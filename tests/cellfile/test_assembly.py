@@ -8,6 +8,7 @@ import pytest
 
 from dwell.cellfile import from_document
 from dwell.errors import ProblemError
+from dwell.model.document import to_document
 from tests.cellfile.faulty import DOCUMENT, faults_of_document
 from tests.cells.many import document_of
 
@@ -37,6 +38,10 @@ def test_shadows_of_all_alternatives_are_at_most_all_cycles(estimator: str) -> N
     assert "each of 2 alternatives is more than all cycles; at most 0.5" in fault.message
     document["controller"] |= {"shadow_fraction": 0.5}
     assert from_document(document)
+    document["controller"] |= {"shadow_fraction": "auto"}
+    problem = from_document(document)
+    assert to_document(problem)["controller"]["shadow_fraction"] == "auto"
+    assert from_document(to_document(problem)) == problem
     # An estimator without shadows asks for none.
     for other in ("profile", "scaling"):
         document["controller"] |= {"estimator": other, "shadow_fraction": 1.0}

@@ -70,7 +70,9 @@ def test_the_example_becomes_a_problem() -> None:
     assert problem.objective.targets == Targets(40, 0.7, 0.7)
     assert problem.objective.caps == Caps(120, 0.98)
     assert problem.objective.tiers == {"R1": "robot", "E": "edge", "R2": "robot"}
-    assert problem.controller == ControllerSettings(on="E", initial="LOC", fallbacks=("LOC", "HYB"))
+    assert problem.controller == ControllerSettings(
+        on="E", initial="LOC", min_dwell=3, estimator="profile", fallbacks=("LOC", "HYB")
+    )
     assert problem.servo == Servo("double-integrator", 30, MovingTarget(50, 2), damping=8)
 
 

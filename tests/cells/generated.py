@@ -42,6 +42,7 @@ from dwell.model import (
     Weights,
 )
 from dwell.model.objective import Tier
+from tests.cells.once import once
 
 MS = 1_000_000
 # Turns are those of threads on one core with a quota that is noticed at ticks.
@@ -90,7 +91,7 @@ def make_problem(
             tiers={node.name: node.tier for node in nodes},
         ),
         scenarios={"disturbed": tuple(scenario)},
-        controller=controller or ControllerSettings(),
+        controller=once(controller or ControllerSettings(), window_cycles),
         window_cycles=window_cycles,
     )
 

@@ -34,7 +34,12 @@ def document_of(candidates: int, **controller: Any) -> dict[str, Any]:
         "tasks": {name: {"on": on} if name in MOVABLE else anchored for name in tasks},
         "flows": [{"from": one, "to": other} for one, other in itertools.pairwise(tasks)],
         "candidates": {"-".join(nodes): dict(zip(MOVABLE, nodes, strict=True)) for nodes in placed},
-        "controller": {"estimator": "corrected", **controller},
+        "controller": {
+            "estimator": "corrected",
+            "decide_cycles": candidates,
+            "min_dwell": 3,
+            **controller,
+        },
     }
 
 

@@ -23,6 +23,7 @@ from dwell.model import (
     Task,
     Weights,
 )
+from tests.cells.once import once
 
 NODES = {
     "R1": Node("R1", "robot", 4),
@@ -94,5 +95,5 @@ def problem(
         fabric=Fabric(nodes=NODES, links={f"{a}->{b}": Link(a, b, ran) for a, b in pairs}),
         candidates=candidates or CANDIDATES,
         objective=OBJECTIVE,
-        controller=controller or ControllerSettings(),
+        controller=once(controller or ControllerSettings(), 50),
     )

@@ -24,6 +24,7 @@ from dwell.model import (
     Weights,
 )
 from dwell.model.fabric import Scheduler
+from tests.cells.once import once
 
 WINDOW_CYCLES = 50
 
@@ -80,7 +81,7 @@ def random_dag(seed: int, settings: ControllerSettings | None = None) -> Problem
             caps=Caps(),
             tiers={"R": "robot", "E": "edge"},
         ),
-        controller=settings or ControllerSettings(),
+        controller=once(settings or ControllerSettings(), WINDOW_CYCLES),
         window_cycles=WINDOW_CYCLES,
     )
 

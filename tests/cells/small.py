@@ -31,6 +31,7 @@ from dwell.model import (
 )
 from dwell.study import Comparison
 from dwell.study.summary import latency_grid_ms
+from tests.cells.once import once
 
 SEEDS = tuple(range(1, 9))
 CANDIDATES = ("LOC", "SO", "HYB")
@@ -114,7 +115,7 @@ def make_problem(*, warmup_windows: int = 2, window_cycles: int = 10) -> Problem
             "robot-cpu-stress": (NodeDisturbance("R1", stress_threads=4),),
             "network-impairment": slow,
         },
-        controller=ControllerSettings(on="E", initial="LOC", min_dwell=1),
+        controller=once(ControllerSettings(on="E", initial="LOC", min_dwell=1), window_cycles),
         window_cycles=window_cycles,
         warmup_windows=warmup_windows,
     )
@@ -158,6 +159,7 @@ def make_comparison(
                             "estimated": (estimated or {}).get(name),
                             "measured": float(columns["cost"][i]) if active else None,
                             "windows": 1,
+                            "shadow_fraction": 0.0,
                         }
                     )
     problem = make_problem()

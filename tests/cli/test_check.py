@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ import yaml
 
 import dwell
 from dwell.model.document import to_document
+from tests.cells.camera import CAMERA
 from tests.cells.many import document_of
 from tests.cli.small_cell import CANONICAL, SMALL, assert_refused, call, read_json
 
@@ -31,6 +33,24 @@ def test_check_as_json(cell: Path) -> None:
     assert found["candidates"]["OFF"]["l95_ms"] == found["candidates"]["OFF"]["uncut_l95_ms"] == 4.0
     assert found["candidates"]["OFF"]["is_settled"] is True
     assert found["candidates"]["OFF"]["own_work"] == pytest.approx({"R": 0.05, "E": 0.025})
+
+
+@pytest.mark.parametrize(("estimator", "windows"), [("profile", 3), ("corrected", 0)])
+def test_check_says_how_often_it_decides_and_how_long_it_stays(
+    cell: Path, estimator: str, windows: int
+) -> None:
+    controller = f"controller: {{estimator: {estimator}, decide_cycles: 5, min_dwell_cycles: 8}}"
+    cell.write_text(f"{SMALL}\n{controller}\n", encoding="utf-8")
+    found = read_json(call("check", cell, "--json"))
+    assert found["controller"] == {
+        "policy": "dtp",
+        "estimator": estimator,
+        "decide_cycles": 5,
+        "min_dwell": windows,
+        "min_dwell_cycles": 8,
+    }
+    line = f"decisions: dtp with {estimator}, every 5 cycles; N_min {windows} windows"
+    assert line in call("check", cell).stdout.splitlines()
 
 
 def test_l95_of_a_cell_that_loses_cycles_is_a_number(cell: Path) -> None:
@@ -218,3 +238,38 @@ def test_every_one_of_many_candidates_is_priced(tmp_path: Path) -> None:
     names = list(document_of(100)["candidates"])
     assert [row[0] for row in rows[head + 1 :]] == names
     assert list(read_json(call("check", cell, "--json"))["candidates"]) == names
+
+
+def test_check_says_why_shadows_are_few(cell: Path) -> None:
+    # Under LOC `plan` sends its result back over the link that the 8 ms of a shadow's image hold.
+    cell.write_text(f"{CAMERA}controller: {{estimator: corrected}}\n", encoding="utf-8")
+    assert "shadows" not in call("check", cell).stdout
+    auto = f"{CAMERA}controller: {{estimator: corrected, shadow_fraction: auto"
+    cell.write_text(f"{auto}, min_improvement: 0.2}}\n", encoding="utf-8")
+    said = call("check", cell).stdout
+    assert "shadows: 0.05 under OFF\n" in said
+    assert re.search(r"^shadows: 0.01; at 0.05 LOC would miss 4.\d points more$", said, re.M)
+    found = read_json(call("check", cell, "--json"))["candidates"]
+    assert {name: one["shadow_fraction"] for name, one in found.items()} == {
+        "LOC": 0.01,
+        "OFF": 0.05,
+    }
+    assert [one["fraction"] for one in found["LOC"]["shadow_prices"]] == [0.05, 0.02, 0.01]
+    assert found["LOC"]["shadow_prices"][0]["violation_rate"] == pytest.approx(0.045, abs=0.005)
+    cell.write_text(f"{auto}}}\n", encoding="utf-8")
+    said = call("check", cell).stdout
+    assert "shadows: 0; at 0.005 LOC would miss 0." in said
+    assert "under LOC the estimator learns from the incumbent alone\n" in said
+
+
+def test_check_prices_no_shadows_for_an_estimator_without(cell: Path) -> None:
+    cell.write_text(f"{SMALL}controller: {{shadow_fraction: auto}}\n", encoding="utf-8")
+    assert "shadows" not in call("check", cell).stdout
+    assert "shadow_fraction" not in read_json(call("check", cell, "--json"))["candidates"]["LOC"]
+
+
+def test_check_refuses_a_share_that_is_no_number(cell: Path) -> None:
+    cell.write_text(f"{SMALL}controller: {{shadow_fraction: free}}\n", encoding="utf-8")
+    assert_refused(
+        call("check", cell), "controller.shadow_fraction", "'free'", "auto or a number from 0 to 1"
+    )

@@ -37,6 +37,7 @@ def status(window: int, **more: Any) -> dict[str, Any]:
         "guard_moves": 0,
         "window": {
             "number": window,
+            "last_cycle": window,
             "l95_ms": 31.25,
             "violation_rate": 0.025,
             "estimates": {"LOC": 1.0, "SO": 1.25, "HYB": None},

@@ -13,6 +13,7 @@ import yaml
 import dwell
 from dwell.errors import RunError
 from dwell.model import Constant
+from dwell.model.evolve import evolve
 from dwell.record import Run
 from tests.cells.many import document_of
 from tests.cli.small_cell import SMALL, assert_refused, call, read_json
@@ -229,7 +230,9 @@ def test_values_of_the_cell_are_set_for_one_run(cell: Path) -> None:
     assert problem.pipeline.tasks["plan"].on["R"].exec_ms == Constant(15.5)
     assert problem.objective.caps.latency_ms == 40
     assert problem.fabric.links["E->R"].loss == 0.1
-    assert dwell.open_run(Path("runs", folders[0])).problem == dwell.load(cell)
+    # The run says the N_min that the cell leaves to the estimator.
+    stated = evolve(dwell.load(cell), {"controller.min_dwell": 3})
+    assert dwell.open_run(Path("runs", folders[0])).problem == stated
 
 
 def test_a_long_list_of_values_still_names_a_folder(cell: Path) -> None:
@@ -263,6 +266,10 @@ def test_a_long_list_of_values_still_names_a_folder(cell: Path) -> None:
         ),
         (["deadline_ms=30"], ["--set deadline_ms: "]),
         (["controller.policy=dpt"], ["--set controller.policy: "]),
+        (
+            ["controller.decide_cycles=10", "window_cycles=5"],
+            ["decide_cycles: 10 is not allowed; it must be at most window_cycles = 5; lower"],
+        ),
         (["links=[]", "nodes.E.cores=2"], ["--set: ", "(with links=[], nodes.E.cores=2)"]),
     ],
 )
@@ -270,6 +277,16 @@ def test_a_setting_that_is_wrong_is_named(cell: Path, settings: list[str], said:
     result = call("run", cell, *(word for one in settings for word in ("--set", one)))
     assert_refused(result, f"{cell}: ", *said)
     assert not Path("runs").exists()
+
+
+def test_a_shorter_window_names_the_key_that_no_longer_fits(cell: Path) -> None:
+    cell.write_text(f"{SMALL}\ncontroller: {{decide_cycles: 8}}\n", encoding="utf-8")
+    result = call("run", cell, "--set", "window_cycles=5")
+    assert_refused(
+        result,
+        "--set window_cycles: controller.decide_cycles: 8 is not allowed",
+        "at most window_cycles = 5; lower decide_cycles, or raise window_cycles",
+    )
 
 
 def test_a_fault_of_the_cell_itself_is_its_own(cell: Path) -> None:

@@ -13,6 +13,8 @@ from dwell.control import ClosedWindow, Controller, Evidence, LookedAt
 from dwell.errors import DwellError, MetricError, ProblemError
 from dwell.estimators import Corrected, Learner, Shadow, Support
 from dwell.model import Problem, QoS
+from dwell.model.fleet import Fleet, FleetEntry
+from dwell.policies import DTP, LatencyFirst, MinimalPolicy, Static
 from tests.cells.deterministic import MOVES, cell
 from tests.cells.many import many
 
@@ -45,12 +47,17 @@ class Copycat:
         return dict.fromkeys(MOVES, observed)
 
 
+def fractions_of(controller: Controller) -> set[float]:
+    """Return the shares that the alternatives get, whatever the placement."""
+    return set(controller.shadow_fractions.values())
+
+
 @pytest.mark.parametrize(("name", "fraction"), SETTINGS.items())
 def test_who_learns_and_who_wants_shadows(name: str, fraction: float) -> None:
     controller = Controller(cell(estimator=name))
     assert controller.learns == (name != "profile")
     assert controller.supports == controller.learns
-    assert controller.shadow_fraction == fraction
+    assert fractions_of(controller) == {fraction}
 
 
 def test_a_policys_name_may_bring_its_estimator() -> None:
@@ -90,8 +97,8 @@ def test_what_an_estimator_was_made_with_goes_before_the_cell_file(
     estimator: type[Shadow] | type[Corrected],
 ) -> None:
     problem = cell(shadow_fraction=0.1)
-    assert Controller(problem, estimator=estimator(problem, 0.2)).shadow_fraction == 0.2
-    assert Controller(problem, estimator=estimator(problem, 0.0)).shadow_fraction == 0.0
+    assert fractions_of(Controller(problem, estimator=estimator(problem, 0.2))) == {0.2}
+    assert fractions_of(Controller(problem, estimator=estimator(problem, 0.0))) == {0.0}
 
 
 @pytest.mark.parametrize(
@@ -109,10 +116,10 @@ def test_more_shadows_than_cycles_are_refused(fraction: float, message: str) -> 
 
 
 def test_every_alternative_may_have_its_even_share() -> None:
-    assert Controller(cell(), estimator=Copycat(0.25)).shadow_fraction == 0.25
+    assert fractions_of(Controller(cell(), estimator=Copycat(0.25))) == {0.25}
     problem = cell(candidates=("LOC", "FAR", "OFF", "SINK"))
-    assert Controller(problem, estimator=Copycat(1 / 3)).shadow_fraction == 1 / 3
-    assert Controller(cell(candidates=("LOC",)), estimator=Copycat(1.0)).shadow_fraction == 1.0
+    assert fractions_of(Controller(problem, estimator=Copycat(1 / 3))) == {1 / 3}
+    assert fractions_of(Controller(cell(candidates=("LOC",)), estimator=Copycat(1.0))) == {1.0}
 
 
 def test_a_learner_is_started_on_a_copy_and_sees_every_window() -> None:
@@ -198,11 +205,17 @@ class Keeper:
 ERRORS = ("est_l95_error_ms", "est_violation_error")
 
 
+def in_windows(problem: Problem, cycles: int) -> Problem:
+    """Return the problem with other windows, each of which ends with a decision."""
+    controller = replace(problem.controller, decide_cycles=cycles)
+    return replace(problem, window_cycles=cycles, controller=controller)
+
+
 @pytest.mark.parametrize("policy", ["OFF", "keeper"])
 def test_without_learning_the_incumbents_estimate_is_what_was_observed(policy: str) -> None:
     """The kernel decides for the one, the controller for the other."""
     keeper = Keeper()
-    problem = replace(cell(estimator="profile"), window_cycles=20)
+    problem = in_windows(cell(estimator="profile"), 20)
     run = dwell.simulate(
         problem,
         scenario="disturbed",
@@ -219,7 +232,7 @@ def test_without_learning_the_incumbents_estimate_is_what_was_observed(policy: s
 
 def test_a_learners_estimate_of_the_incumbent_is_its_own() -> None:
     keeper = Keeper()
-    problem = replace(cell(), window_cycles=20)
+    problem = in_windows(cell(), 20)
     run = dwell.simulate(
         problem, scenario="disturbed", policy=keeper, estimator=Stubborn(), seed=1, windows=3
     )
@@ -264,6 +277,54 @@ def test_of_many_candidates_only_a_fraction_that_is_given_is_refused(
     estimator: type[Shadow] | type[Corrected],
 ) -> None:
     problem = many(22)
-    assert Controller(problem, estimator=estimator(problem)).shadow_fraction == 1 / 21
+    assert fractions_of(Controller(problem, estimator=estimator(problem))) == {1 / 21}
     with pytest.raises(ProblemError, match="each of 21 alternatives is more than all cycles"):
         Controller(problem, estimator=estimator(problem, 0.05))
+
+
+@pytest.mark.parametrize(
+    ("policy", "estimator"),
+    [
+        (None, "Corrected"),
+        ("dtp", "Corrected"),
+        ("cusum", "Corrected"),
+        ("atp", "Corrected"),
+        ("work-function", "Corrected"),
+        ("LOC", "Profile"),
+        ("latency-first", "Profile"),
+        ("atp-thresholds", "Profile"),
+        ("LOC+corrected", "Corrected"),
+        ("latency-first+corrected", "Corrected"),
+        (Keeper(), "Corrected"),
+    ],
+)
+def test_each_policy_has_its_usual_estimator(
+    policy: MinimalPolicy | str | None, estimator: str
+) -> None:
+    problem = dwell.load("examples/first.yaml")
+    controller = Controller(problem, policy)
+    assert type(controller.estimator).__name__ == estimator
+    assert controller.sends_shadows == (estimator == "Corrected")
+    named = replace(problem, controller=replace(problem.controller, estimator="scaling"))
+    if policy is None or not isinstance(policy, str) or "+" not in policy:
+        assert type(Controller(named, policy).estimator).__name__ == "Scaling"
+
+
+def test_an_object_of_our_policies_has_its_usual_estimator() -> None:
+    problem = dwell.load("examples/first.yaml")
+    static = Static(candidates=problem.candidates, initial="SO", objective=problem.objective)
+    first = LatencyFirst(candidates=problem.candidates)
+    moving = DTP(candidates=problem.candidates, objective=problem.objective)
+    found = [type(Controller(problem, one).estimator) for one in (static, first, moving)]
+    assert [kind.__name__ for kind in found] == ["Profile", "Profile", "Corrected"]
+
+
+def test_cells_of_a_fleet_that_stay_send_no_shadows() -> None:
+    cell = dwell.load("examples/first.yaml")
+    fleet = Fleet("two", (FleetEntry(cell, count=2),), ("E",))
+    for policy, estimator in (("SO", "Profile"), ("dtp", "Corrected")):
+        run = dwell.simulate_fleet(fleet, seed=1, windows=6, policy=policy)
+        assert {one.meta["estimator"] for one in run.cells.values()} == {estimator}
+        assert {one.problem.controller.min_dwell for one in run.cells.values()} == {
+            3 if estimator == "Profile" else 0
+        }

@@ -87,7 +87,8 @@ def test_the_cost_of_a_placement_that_loses_cycles_does_not_grow_with_its_window
     cell = dwell.load("examples/canonical.yaml")
     cost = {}
     for W in (25, 50, 100, 200, 400):
-        problem = replace(cell, window_cycles=W, warmup_windows=400 // W)
+        controller = replace(cell.controller, decide_cycles=W)
+        problem = replace(cell, window_cycles=W, warmup_windows=400 // W, controller=controller)
         runs = [
             dwell.simulate(
                 problem, scenario="robot-cpu-stress", policy="LOC", seed=seed, windows=9600 // W

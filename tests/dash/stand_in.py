@@ -82,8 +82,12 @@ class StandIn:
             "moves": {**dict.fromkeys(MOVED_BY, 0), "migrate": 2, "guard": 1},
             "bound_ms": 0.25,
             "unproven": False,
+            "silences": 3,
+            "release_ratio": 0.75,
             "window": {
                 "number": 11,
+                "last_cycle": 1_199,
+                "cycles": 100,
                 "violation_rate": 0.1,
                 "estimates": {"LOC": 1.5, "SO": None, "HYB": 2.5},
                 "utilisation": {"R1": 0.5, "R2": 0.25, "E": None},

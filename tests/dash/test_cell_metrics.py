@@ -127,6 +127,8 @@ def test_what_the_controller_tells(cell: StandIn) -> None:
     assert value(cell, "dwell_clock_bound_seconds") == 0.00025
     assert value(cell, "dwell_window_unproven") == 0
     assert value(cell, "dwell_violation_ratio") == 0.1
+    assert value(cell, "dwell_release_ratio") == 0.75
+    assert value(cell, "dwell_silences_total") == 3
     assert value(cell, "dwell_windows_total") == 12
     assert value(cell, "dwell_guard_fallback") == 0
 

@@ -35,6 +35,8 @@ JOB = {
 }
 WINDOW = {
     "number": 0,
+    "last_cycle": 99,
+    "cycles": 100,
     "placement": "LOC",
     "l95_ms": 31.5,
     "violation_rate": 0.1,

@@ -224,6 +224,16 @@ LINK = {"link": "R->E"}
             "live.max_age_ms",
             ("27 is less", "of SO, 28 ms"),
         ),
+        (
+            cell(controller={"decide_cycles": 5, "min_dwell_cycles": 4}),
+            "controller.min_dwell_cycles",
+            ("4 is less than decide_cycles = 5",),
+        ),
+        (
+            cell(controller={"min_dwell_cycles": 1}),
+            "controller.min_dwell_cycles",
+            ("1 is less than decide_cycles",),
+        ),
     ],
 )  # fmt: skip
 def test_what_is_never_meant_is_said(
@@ -257,6 +267,8 @@ def test_what_is_never_meant_is_said(
         servo(5),
         guarded(fallbacks=["SO", "LOC"], initial="SO"),
         guarded(),
+        cell(controller={"decide_cycles": 5, "min_dwell_cycles": 5}),
+        cell(controller={"decide_cycles": 5, "min_dwell_cycles": 0}),
         prioritised("priority"),
         # It shares the accelerator with nobody, or the other one has the same priority.
         on_one(

@@ -530,7 +530,7 @@ def test_tasks_that_wait_for_each_other_part_for_good(policy: str, estimator: st
     played = run(problem, policy, estimator, windows=40)
     ((window, name),) = moves(played)
     assert name == "OFF"
-    assert window in (0, problem.controller.min_dwell)
+    assert window in (0, problem.min_dwell)
     assert set(played.windows["violation_rate"][window + 1 :]) == {0.0}
 
 
@@ -560,7 +560,7 @@ def test_what_waits_where_it_runs_need_not_wait_elsewhere() -> None:
     problem = dwell.load(KNOWN_MOVES / "growing-queue.yaml")
     (window, name), *_ = moves(run(problem, "dtp", "scaling", windows=20))
     assert name == "SO"
-    assert window <= problem.controller.min_dwell + 2
+    assert window <= problem.min_dwell + 2
 
 
 @pytest.mark.parametrize("estimator", ["shadow", "corrected"])

@@ -30,7 +30,10 @@ def test_the_deadline_itself_is_in_time(deadline_ms: float, missed: float) -> No
 def test_windows_are_measured_as_in_python(window_cycles: int, scenario: str) -> None:
     canonical = dwell.load("examples/canonical.yaml")
     objective = replace(canonical.objective, caps=Caps(latency_ms=40.0))
-    problem = replace(canonical, objective=objective, window_cycles=window_cycles)
+    controller = replace(canonical.controller, decide_cycles=window_cycles)
+    problem = replace(
+        canonical, objective=objective, window_cycles=window_cycles, controller=controller
+    )
     run = dwell.simulate(problem, scenario=scenario, policy="SO", seed=1, windows=30)
     release_ns = run.cycles["release_ns"].to_numpy()
     latency_ns = run.cycles["latency_ns"].fill_null(NEVER_NS).to_numpy()

@@ -16,7 +16,6 @@ from dwell.testbed.chaos.harness import CLOCK_FILE, Harness, environment_of
 from dwell.testbed.chaos.light_cell import (
     EXEC_MS,
     MAX_AGE_MS,
-    MIN_DWELL,
     PERIOD_MS,
     document,
     exec_ms,
@@ -31,6 +30,7 @@ def wrong_record(
     cycles: Sequence[int],
     windows: Sequence[int],
     ordered: Sequence[int],
+    apart: int,
     told: Iterable[int],
     applied: Set[int],
 ) -> list[str]:
@@ -39,7 +39,9 @@ def wrong_record(
     Parameters
     ----------
     ordered : sequence of int
-        Windows after which the controller has migrated.
+        Cycles after which the controller has migrated.
+    apart : int
+        How many are between two of them at least.
     told, applied : of int
         Cycles that were actuated, by the record and by the actuator.
     """
@@ -48,9 +50,9 @@ def wrong_record(
         if any(later <= before for before, later in pairwise(numbers)):
             found.append(f"{name} does not grow")
     found += [
-        f"migrations after windows {before} and {later}"
+        f"migrations after cycles {before} and {later}"
         for before, later in pairwise(ordered)
-        if later - before < MIN_DWELL + 1
+        if later - before < apart
     ]
     if unknown := set(told) - applied:
         found.append(f"actuated by the record, not by the actuator: {sorted(unknown)[:5]}")
@@ -87,7 +89,8 @@ class RealCell(Harness):
         return wrong_record(
             run.cycles["number"].to_list(),
             run.windows["window"].to_list(),
-            ordered["window"].to_list(),
+            ordered["last_cycle"].to_list(),
+            self.problem.stay_cycles,
             told["number"].to_list(),
             {seen.cycle for seen in self.actuations.applied},
         )

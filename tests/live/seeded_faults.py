@@ -41,7 +41,7 @@ from dwell.testbed.chaos.actuations import Seen
 from dwell.testbed.chaos.faults import Fault, PlannedFault, bound_of, faults_of, planned, struck
 from dwell.testbed.chaos.harness import RECENT_PERIODS, away_from_home
 from dwell.testbed.chaos.invariants import Judge
-from dwell.testbed.chaos.light_cell import CANDIDATES, MIN_DWELL, document, exec_ms
+from dwell.testbed.chaos.light_cell import CANDIDATES, WINDOW_CYCLES, document, exec_ms
 from dwell.testbed.chaos.stages import APPLY, FRAME_BYTES, HOLD, NODES, SAID, ZERO
 from dwell.testbed.chaos.strike import (
     RECOVERED_S,
@@ -111,12 +111,15 @@ class Plan:
         One of `WISHES`.
     delay_ms : float
         Of every message.
+    decide_cycles : int
+        Cycles between two decisions.
     """
 
     seed: int
     wish: str
     delay_ms: float
     faults: tuple[PlannedFault, ...]
+    decide_cycles: int = WINDOW_CYCLES
 
     @classmethod
     def of(cls, seed: int) -> Self:
@@ -124,13 +127,16 @@ class Plan:
         draw = Random(f"plan {seed}")
         wish, delay_ms = draw.choice(WISHES), draw.choice((0.2, 1.0, 4.0))
         (count,) = draw.choices(COUNTS, SHARES)
-        return cls(seed, wish, delay_ms, tuple(islice(planned(seed, faults_in_memory()), count)))
+        faults = tuple(islice(planned(seed, faults_in_memory()), count))
+        every = Random(f"decisions {seed}").randint(1, WINDOW_CYCLES)
+        return cls(seed, wish, delay_ms, faults, every)
 
     def command(self) -> str:
         """Return the command that plays it."""
         words = ["python", "-m", "tests.live.seeded_faults", "--seed", str(self.seed)]
         if self != Plan.of(self.seed):
             words += ["--wish", self.wish, "--delay-ms", str(self.delay_ms)]
+            words += ["--decide-cycles", str(self.decide_cycles)]
             words += ["--play", *map(_written, self.faults)]
         return shlex.join(words)
 
@@ -150,24 +156,26 @@ def _read(text: str) -> PlannedFault:
 
 
 class Touring:
-    """A policy that goes round all candidates, and stays at each for a while."""
+    """A policy that goes round all candidates, and stays at each for some windows."""
 
     STAY = 4
 
     def __init__(self) -> None:
         self.names = tuple(CANDIDATES)
-        self.place = self.stayed = 0
+        self.place = self.stayed = self.stay = self.least = 0
 
     def start(self, problem: Problem) -> None:
         self.place = self.names.index(problem.initial)
+        self.stay = int(self.STAY * problem.decisions_per_window)
+        self.least = problem.min_dwell_decisions
 
     def adopt(self, name: str) -> None:
         # It goes on from there as soon as any policy may.
-        self.place, self.stayed = self.names.index(name), self.STAY - MIN_DWELL
+        self.place, self.stayed = self.names.index(name), self.stay - self.least
 
     def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
         self.stayed += 1
-        if self.stayed > self.STAY:
+        if self.stayed > self.stay:
             self.place, self.stayed = (self.place + 1) % len(self.names), 0
         return self.names[self.place]
 
@@ -259,6 +267,8 @@ class FaultyWorld(World):
         self.exec_of = exec_ms("SO")
         self._freezes: Counter[MemoryTransport] = Counter()
         problem = on(light_cell(), plan.wish or "SO")
+        settings = replace(problem.controller, decide_cycles=plan.decide_cycles)
+        problem = replace(problem, controller=settings)
         super().__init__(
             problem,
             delay_ms=plan.delay_ms,
@@ -526,11 +536,12 @@ def _staged(world: FaultyWorld, one: PlannedFault, at_ns: int) -> list[Callable[
 def _wrong_record(world: FaultyWorld) -> list[str]:
     """Return what is wrong with the record of the run."""
     cycles = columns(world, "cycles", "number", "actuated")
-    decisions = columns(world, "decisions", "window", "migrated", "reason")
+    decisions = columns(world, "decisions", "last_cycle", "migrated", "reason")
     return wrong_record(
         [number for number, _ in cycles],
         [window for (window,) in columns(world, "windows", "window")],
-        [window for window, migrated, reason in decisions if migrated and reason != "guard"],
+        [last for last, migrated, reason in decisions if migrated and reason != "guard"],
+        world.problem.stay_cycles,
         [number for number, actuated in cycles if actuated],
         {one.cycle for one in world.seen if one.what == APPLY},
     )
@@ -663,6 +674,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, help="play the faults of this seed")
     parser.add_argument("--wish", choices=WISHES, help="where the controller wants to be")
     parser.add_argument("--delay-ms", type=float, help="of every message")
+    parser.add_argument("--decide-cycles", type=int, help="cycles between two decisions")
     parser.add_argument("--play", nargs="*", type=_read, help="play these faults instead")
     parser.add_argument("--faults", type=int, default=0, help="so many, seed after seed")
     parser.add_argument("--out", type=Path, default=Path("build/seeded-faults"))
@@ -676,6 +688,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         plan,
         wish=plan.wish if asked.wish is None else asked.wish,
         delay_ms=plan.delay_ms if asked.delay_ms is None else asked.delay_ms,
+        decide_cycles=asked.decide_cycles or plan.decide_cycles,
         faults=plan.faults if asked.play is None else tuple(asked.play),
     )
     played = play(plan)

@@ -48,7 +48,8 @@ def canonical(window_cycles: int | None = None, **settings: Any) -> Problem:
     """Return the canonical cell with other windows, and settings of its controller."""
     cell = _canonical()
     if window_cycles is not None:
-        cell = replace(cell, window_cycles=window_cycles, warmup_windows=0)
+        controller = replace(cell.controller, decide_cycles=window_cycles)
+        cell = replace(cell, window_cycles=window_cycles, warmup_windows=0, controller=controller)
     return replace(cell, controller=replace(cell.controller, **settings))
 
 

@@ -9,7 +9,9 @@ from dataclasses import replace
 import pytest
 from msgspec.structs import replace as replaced
 
-from dwell.live.messages import Answer, Ask, Order, decode, encode
+from dwell.control import shadow_stamps
+from dwell.estimators import Corrected
+from dwell.live.messages import Answer, Ask, Order, Stamped, decode, encode
 from dwell.live.run_rows import Rows
 from dwell.live.transport.transport import Arrival
 from dwell.model import Problem
@@ -22,6 +24,16 @@ CONTROLLER = "controller@E"
 @pytest.fixture(scope="module")
 def problem() -> Problem:
     return canonical(20, min_dwell=1, estimator="profile")
+
+
+class Uneven(Corrected):
+    """An estimator that wants other shares of shadows under each placement."""
+
+    @classmethod
+    def from_problem(cls, problem: Problem) -> Uneven:
+        made = cls(problem)
+        made.shadow_fraction = {"LOC": 0.1, "SO": 0.4}
+        return made
 
 
 def alternating(problem: Problem) -> World:
@@ -69,6 +81,57 @@ def test_windows_begin_with_the_first_cycle_of_a_new_placement(problem: Problem)
         assert before != after
         # The order travels: the close is at the release of a cycle that has the old stamp.
         assert lead >= 1
+
+
+def listen(world: World) -> list[Stamped]:
+    """Return the list to which every stamp is added from now on."""
+    stamps: list[Stamped] = []
+    visitor = world.network.transport("visitor", "R1")
+    visitor.subscribe(
+        world.keys.stamped(), lambda sample: stamps.append(decode(sample.payload, Stamped))
+    )
+    # It has no wire of the cell's.
+    world.network.reach = None
+    return stamps
+
+
+def test_each_placement_has_its_own_share_of_shadows_from_its_first_cycle(
+    problem: Problem,
+) -> None:
+    """The order that leads to a placement carries its share."""
+    settings = replace(problem.controller, estimator=f"{__name__}:Uneven")
+    world = alternating(replace(problem, controller=settings))
+    world.run(2_000)
+    stamps = listen(world)
+    world.run(8_000)
+    names = list(problem.candidates)
+    for name, fraction in (("LOC", 0.1), ("SO", 0.4)):
+        mine = [stamp for stamp in stamps if stamp.placement == name]
+        assert len(mine) >= 60
+        for stamp in mine:
+            first, code = stamp.cycle, names.index(name)
+            (other,) = shadow_stamps(first, first + 1, code, len(names), fraction)
+            assert stamp.shadow == ("" if other < 0 else names[other])
+
+
+def test_the_stamper_sends_no_shadows_after_its_own_move_until_it_knows_the_share(
+    problem: Problem,
+) -> None:
+    settings = replace(
+        problem.controller, estimator=f"{__name__}:Uneven", fallbacks=("LOC",), initial="SO"
+    )
+    world = World(replace(problem, controller=settings), policy="SO")
+    world.run(2_000)
+    stamps = listen(world)
+    world.run(1_000)
+    assert {stamp.shadow for stamp in stamps} > {""}
+    for who in ("controller@E", "perception@E", "planning@E"):
+        world.kill(who)
+    world.run(500)
+    assert world.stamper.placement == "LOC"
+    stamps.clear()
+    world.run(2_000)
+    assert {stamp.shadow for stamp in stamps} == {""}
 
 
 def test_what_is_not_moved_has_no_lead(problem: Problem) -> None:

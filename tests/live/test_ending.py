@@ -84,3 +84,91 @@ def test_who_shall_outlive_its_terminal_does() -> None:
         process.send_signal(signal.SIGTERM)
         assert said(process) == "ends"
         process.kill()
+
+
+#: Ends helpers of a stage that is itself ended by the signals of this process.
+HELPERS = """
+import concurrent.futures, multiprocessing, os, signal, threading, time
+from dwell.live.ending import end_when_told
+
+def nap():
+    time.sleep(100)
+
+def fail():
+    raise ValueError
+
+def pool():
+    with multiprocessing.Pool(2) as helpers:
+        helpers.apply_async(nap)
+
+def broken_executor():
+    with concurrent.futures.ProcessPoolExecutor(2, fork) as helpers:
+        helpers.submit(nap)
+        helpers.submit(os._exit, 1)
+
+def joblib_pool():
+    from joblib import Parallel, delayed
+    try:
+        Parallel(2, backend="multiprocessing")([delayed(nap)(), delayed(fail)()])
+    except ValueError:
+        pass
+
+def at_once():
+    for number in (signal.SIGTERM, signal.SIGHUP) * 100:
+        helper = fork.Process(target=nap)
+        helper.start()
+        os.kill(helper.pid, number)
+        helper.join()
+        assert helper.exitcode == -number
+
+def in_a_thread():
+    thread = threading.Thread(target=at_once)
+    thread.start()
+    thread.join()
+
+def begin(begun):
+    begun.set()
+    nap()
+
+def interrupted():
+    begun = fork.Event()
+    helper = fork.Process(target=begin, args=(begun,))
+    helper.start()
+    begun.wait()
+    os.kill(helper.pid, signal.SIGINT)
+    helper.join()
+    assert helper.exitcode == 1  # of a KeyboardInterrupt
+
+def own_handler():
+    signal.signal(signal.SIGTERM, lambda *_: os._exit(7))
+    helper = fork.Process(target=nap)
+    helper.start()
+    helper.terminate()
+    helper.join()
+    assert helper.exitcode == 7
+
+fork = multiprocessing.get_context("fork")
+stopped = threading.Event()
+end_when_told(stopped, lambda: os._exit(9))
+CALL()
+assert not signal.pthread_sigmask(signal.SIG_BLOCK, [])
+os.kill(os.getpid(), signal.SIGHUP)
+assert stopped.wait(20)
+"""
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        "pool",
+        "broken_executor",
+        "joblib_pool",
+        "at_once",
+        "in_a_thread",
+        "interrupted",
+        "own_handler",
+    ],
+)
+def test_helpers_of_a_stage_can_be_ended_by_signals(how: str) -> None:
+    program = HELPERS.replace("CALL", how)
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)

@@ -221,7 +221,7 @@ def test_an_actuator_that_refuses_every_command_degrades_the_cell(problem: Probl
 def test_a_stage_that_fails_now_and_then_degrades_the_cell(
     problem: Problem, degraded_at: float, health: str
 ) -> None:
-    live = replace(problem.live, degraded_at=degraded_at)
+    live = replace(problem.live, degraded_at=degraded_at, max_age_ms=200)
     world = running(replace(problem, live=live), stages={"perception": Fifth})
     found, headline = told(world)
     assert found == health
@@ -300,6 +300,112 @@ def test_shadows_through_a_node_that_is_drained_may_fail(problem: Problem) -> No
         world.kill(who)
     world.run(2_000)
     assert told(world) == ("ok", "")
+
+
+# --------------------------------------------------------- commands that come too seldom
+
+
+class Camera:
+    """A source that has frames at a rate of its own, in a cell of 15 cycles a second."""
+
+    def __init__(self, problem: Problem, hz: float, max_age_ms: float) -> None:
+        pipeline = replace(problem.pipeline, period_ms=1_000 / 15, deadline_ms=1_000 / 15)
+        live = replace(problem.live, release="frames", max_age_ms=max_age_ms)
+        self.world = World(replace(problem, pipeline=pipeline, live=live), policy="LOC")
+        self.hz = hz
+        self._frame()
+
+    def _frame(self) -> None:
+        network = self.world.network
+        self.world.worker("sensing@R1").framed(network.now_ns)
+        network.call_at(network.now_ns + round(1e9 / self.hz), self._frame)
+
+
+@pytest.mark.parametrize(
+    ("hz", "max_age_ms", "words"),
+    [
+        (4, 200, "4 cycles a second of 15: cycles come every 250 ms, max_age_ms is 200"),
+        (10, 400, "10 cycles a second of 15"),
+        (26, 400, "26 cycles a second of 15"),
+    ],
+)
+def test_a_camera_at_another_rate_degrades_the_cell(
+    problem: Problem, hz: float, max_age_ms: float, words: str
+) -> None:
+    camera = Camera(problem, 15, max_age_ms)
+    camera.world.run(8_000)
+    assert told(camera.world) == ("ok", "")
+    camera.hz = hz
+    camera.world.run(1_500)
+    looks = []
+    for _ in range(60):
+        camera.world.run(250)
+        looks.append(told(camera.world))
+    assert {health for health, _ in looks} == {"degraded"}
+    assert all(words in headline for _, headline in looks[12:]), looks
+    camera.hz = 15
+    camera.world.run(8_000)
+    assert told(camera.world) == ("ok", "")
+
+
+def test_each_silence_is_counted_in_its_window_and_in_all(problem: Problem) -> None:
+    camera = Camera(problem, 4, 200)
+    world = camera.world
+    world.run(21_000)
+    found = world.status
+    assert found["recent"]["silences"] == [20, 20, 20]
+    assert world.arm.silences - 1 <= found["silences"] <= world.arm.silences
+    assert "hold() was called 60 times in the last 3 windows: cycles come" in found["headline"]
+    assert found["release_ratio"] == pytest.approx(4 / 15)
+
+
+@pytest.mark.parametrize("apart", [1, 2])
+def test_silences_in_two_of_three_windows_degrade_the_cell(problem: Problem, apart: int) -> None:
+    # No share of cycles that are lost degrades it.
+    live = replace(problem.live, max_age_ms=100, degraded_at=1)
+    world = running(replace(problem, live=live))
+    window_ms = problem.window_cycles * problem.pipeline.period_ms
+    for count in (1, 2):
+        cut = world.network.cut("*", "sink.control@R2", key="**/sink/**")
+        world.run(200)
+        world.network.heal(cut)
+        world.run(window_ms - 200)
+        assert told(world)[0] == "ok"
+        world.run((apart - 1) * window_ms if count == 1 else window_ms / 2)
+    assert told(world)[0] == "degraded"
+    assert "hold() was called 2 times in the last 3 windows" in told(world)[1]
+    world.run(3 * window_ms)
+    assert told(world) == ("ok", "")
+
+
+def test_two_windows_of_three_with_few_commands_degrade_the_cell(problem: Problem) -> None:
+    live = replace(problem.live, max_age_ms=200, degraded_at=0.08)
+    world = running(replace(problem, live=live))
+    window_ms = problem.window_cycles * problem.pipeline.period_ms
+    # In each of two windows 2 of 20, and none in the third: less than the share of all.
+    for _ in range(2):
+        cut = world.network.cut("*", "sink.control@R2", key="**/sink/**")
+        world.run(2 * problem.pipeline.period_ms)
+        world.network.heal(cut)
+        world.run(window_ms - 2 * problem.pipeline.period_ms)
+    world.run(window_ms / 2)
+    health, headline = told(world)
+    assert health == "degraded"
+    assert "93% of the commands are known to have been applied in the last 3 windows" in headline
+    world.run(2 * window_ms)
+    assert told(world) == ("ok", "")
+
+
+def test_cycles_that_a_move_keeps_out_of_all_windows_count(problem: Problem) -> None:
+    """The guard's moves begin a new window each time: most lost cycles are in none."""
+    world = running(problem)
+    for count in range(12):
+        cut = world.network.cut("*", "sink.control@R2", key="**/sink/**")
+        world.run(5 * problem.pipeline.period_ms)
+        world.network.heal(cut)
+        world.run(problem.window_cycles * problem.pipeline.period_ms + 250)
+        assert told(world)[0] == ("degraded" if count else "ok")
+    assert world.status["guard_moves"] > 5
 
 
 def test_a_cell_whose_stamps_nobody_hears_is_watched_all_the_same(problem: Problem) -> None:

@@ -8,8 +8,7 @@ import dataclasses
 import itertools
 import math
 import random
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -27,36 +26,30 @@ from dwell.estimators import Corrected, Profile
 from dwell.live.live_windows import LiveWindows
 from dwell.live.messages import Completion, Hop, Load, Stamp
 from dwell.live.offsets import Offsets
-from dwell.live.run_rows import Resume, Rows, columns_of
+from dwell.live.run_rows import Resume, columns_of
 from dwell.model import Caps, Execution, Flow, FrozenDict, Link, Node, Problem, QoS, Task
 from dwell.model.fabric import accelerator_tiers
 from dwell.model.instants import NEVER_NS
 from dwell.model.process import Constant
-from dwell.record import Journal, Run, seal_run
-from dwell.sim import engine
 from tests.cells.generated import make_problem
+from tests.live.replayed import (
+    SYNCHRONOUS,
+    UNKNOWN,
+    Clocks,
+    Event,
+    Played,
+    messages_of,
+    recorded,
+    replay,
+    settle,
+    simulate,
+    work_of,
+)
 
 MS, S = 1_000_000, 1_000_000_000
 CANONICAL = Path(__file__).parents[2] / "examples" / "canonical.yaml"
-UNKNOWN = -1
 
 # ------------------------------------------------------------------- a simulated run, played live
-
-
-@dataclass(slots=True)
-class Seen:
-    """What the simulator's controller was given."""
-
-    controller: Controller
-    windows: list[ClosedWindow] = field(default_factory=list)
-    evidence: list[Evidence] = field(default_factory=list)
-
-
-@dataclass(slots=True)
-class Played:
-    problem: Problem
-    run: Run
-    seen: Seen
 
 
 @pytest.fixture(scope="module")
@@ -74,34 +67,6 @@ def cell() -> Problem:
     return dataclasses.replace(problem, controller=controller, window_cycles=40)
 
 
-def simulate(problem: Problem, scenario: str, windows: int = 25) -> Played:
-    """Simulate a run and keep what its controller was given."""
-    kept: list[Seen] = []
-    decide = engine._Stamper._decide
-
-    def spy(self: engine._Stamper, index: int, boundary: int, close_ns: int) -> None:
-        if not kept:
-            kept.append(Seen(self.controller))
-        tables, first = self.arrays.tables, boundary - problem.window_cycles
-        window = ClosedWindow(
-            latency_ns=tables.latency_ns[0, first:boundary],
-            release_ns=self.release_ns[first:boundary],
-            close_ns=close_ns,
-            open_ns=int(self.release_ns[first]),
-            core_ns=(tables.closed[0, index] - tables.opened[0, index])[:3],
-            looked=self.controller.looked,
-        )
-        kept[0].windows.append(window)
-        assert self.evidence is not None
-        kept[0].evidence.append(self.evidence(first, boundary, close_ns))
-        decide(self, index, boundary, close_ns)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(engine._Stamper, "_decide", spy)
-        run = dwell.simulate(problem, scenario=scenario, seed=5, windows=windows, jobs=True)
-    return Played(problem, run, kept[0])
-
-
 @pytest.fixture(scope="module")
 def stressed(cell: Problem) -> Played:
     return simulate(cell, "robot-cpu-stress")
@@ -112,173 +77,6 @@ def impaired(cell: Problem) -> Played:
     # It moves, since it begins where it should not stay.
     controller = dataclasses.replace(cell.controller, initial="SO")
     return simulate(dataclasses.replace(cell, controller=controller), "network-impairment")
-
-
-Event = tuple[int, int, Callable[[LiveWindows, int], None]]
-
-
-@dataclass(slots=True)
-class Clocks:
-    """What nodes' clocks show; the reference's shows simulated time."""
-
-    ahead_ns: Mapping[str, int] = field(default_factory=dict)
-
-    def at(self, node: str, t_ns: int) -> int:
-        return t_ns + self.ahead_ns.get(node, 0)
-
-
-#: Core time of jobs by cycle, whether of its shadow, and task.
-Work = Mapping[tuple[int, bool, str], int]
-NO_WORK: Work = FrozenDict()
-
-
-def work_of(played: Played) -> Work:
-    """Core time of the jobs that had completed when their windows closed."""
-    work_ns = {}
-    firsts, tasks = played.run.windows["first_cycle"], list(played.problem.pipeline.tasks)
-    for first, evidence in zip(firsts, played.seen.evidence, strict=True):
-        for shadow, instants in ((False, evidence.cycles), (True, evidence.shadows)):
-            assert instants is not None
-            assert instants.work_ns is not None
-            for (row, column), ns in np.ndenumerate(instants.work_ns):
-                work_ns[first + row, shadow, tasks[column]] = int(ns)
-    return work_ns
-
-
-def messages_of(played: Played, clocks: Clocks, work_ns: Work = NO_WORK) -> list[Event]:
-    """Return what the processes of a live cell would have said in a simulated run.
-
-    Processes tell the core time of jobs of which `work_ns` has it.
-    """
-    problem, run = played.problem, played.run
-    flows = problem.pipeline.flows
-    into = {flow.target: flow.source for flow in flows}
-    through: dict[int, str] = {}
-    discarded: dict[int, int] = {}
-    names = list(problem.candidates)
-    firsts = run.windows["first_cycle"].to_list()
-    for first, evidence in zip(firsts, played.seen.evidence, strict=True):
-        assert evidence.shadows is not None
-        for row, code in enumerate(evidence.shadow_placement.tolist()):
-            if code >= 0:
-                through[first + row] = names[code]
-                discarded[first + row] = int(evidence.shadows.arrived_ns[row, -1])
-    hops: dict[tuple[int, bool], list[Hop]] = {}
-    jobs = run.jobs.filter(pl.col("end_ns").is_not_null(), pl.col("outcome") == "done")
-    for job in jobs.sort("cycle", "ready_ns", "end_ns").iter_rows(named=True):
-        task, node = job["task"], job["node"]
-        ready_ns = clocks.at(node, job["ready_ns"])
-        inputs = ((into[task], ready_ns),) if task in into else ()
-        start_ns, end_ns = (clocks.at(node, job[name]) for name in ("start_ns", "end_ns"))
-        whose = job["cycle"], bool(job.get("shadow"))
-        cpu_ns = work_ns.get((*whose, task), UNKNOWN)
-        hop = Hop(task, node, ready_ns, start_ns, end_ns, inputs, cpu_ns=cpu_ns)
-        hops.setdefault(whose, []).append(hop)
-    events: list[Event] = []
-    term, before = 1, None
-    for entry in run.cycles.iter_rows(named=True):
-        cycle, placement, released_ns = entry["cycle"], entry["placement"], entry["release_ns"]
-        term += before is not None and placement != before
-        before = placement
-        stamp = Stamp(7, 5000 + cycle, term, placement, released_ns, through.get(cycle, ""))
-        events.append((released_ns, 3, stamping(stamp)))
-        if entry["latency_ns"] is not None:
-            done_ns = released_ns + entry["latency_ns"]
-            mine = tuple(hops[cycle, False])
-            shown_ns = clocks.at("R2", done_ns)
-            done = Completion(stamp, "control", shown_ns, "actuated", mine, "R2")
-            events.append((done_ns, 1, completing(done)))
-        stop_ns = discarded.get(cycle, -1)
-        if stop_ns >= 0:
-            shown_ns = clocks.at("R2", stop_ns)
-            arrived = Hop("control", "R2", shown_ns, -1, -1, (("planning", shown_ns),))
-            own = [hop for hop in hops.get((cycle, True), ()) if hop.task != "control"]
-            ran = {hop.task for hop in own}
-            shared = [hop for hop in hops.get((cycle, False), ()) if hop.task not in ran]
-            shared = [hop for hop in shared if hop.task != "control"]
-            all_hops = (*shared, *own, arrived)
-            stopped = Completion(stamp, "control", shown_ns, "shadow", all_hops, "R2")
-            events.append((stop_ns, 1, completing(stopped)))
-    return events + loads_of(played, clocks)
-
-
-def stamping(stamp: Stamp) -> Callable[[LiveWindows, int], None]:
-    return lambda windows, at_ns: windows.stamped(stamp, at_ns)
-
-
-def completing(done: Completion) -> Callable[[LiveWindows, int], None]:
-    return lambda windows, at_ns: windows.completed(done, at_ns)
-
-
-def loading(load: Load) -> Callable[[LiveWindows, int], None]:
-    return lambda windows, at_ns: windows.loaded(load)
-
-
-def loads_of(played: Played, clocks: Clocks) -> list[Event]:
-    events: list[Event] = []
-    nodes = list(played.problem.fabric.nodes)
-    total = np.zeros((3, len(nodes)))
-    for window in played.seen.windows:
-        for at_ns in (window.open_ns, window.close_ns):
-            if at_ns == window.close_ns:
-                total += window.core_ns
-            for column, node in enumerate(nodes):
-                used = [round(value) for value in total[:, column]]
-                load = Load(node, 1, clocks.at(node, int(at_ns)), *used)
-                events.append((int(at_ns), 0, loading(load)))
-    return events
-
-
-def replay(
-    played: Played,
-    offsets: Offsets,
-    events: Iterable[Event],
-    *,
-    late: Callable[[Event], int] = lambda event: 0,
-    now: Callable[[int], int] = lambda t_ns: t_ns,
-    on_close: Callable[[LiveWindows, ClosedWindow, Rows], None] = lambda *_: None,
-) -> tuple[LiveWindows, Controller, list[ClosedWindow], list[Evidence], list[Rows]]:
-    """Play messages in the order of their arrival; close windows when they are due."""
-    controller = Controller(played.problem)
-    windows = LiveWindows(played.problem, offsets, controller)
-    closed: list[ClosedWindow] = []
-    evidence: list[Evidence] = []
-    rows: list[Rows] = []
-    timed = sorted(((event[0] + late(event), *event[1:]) for event in events), key=lambda e: e[:2])
-    for number, (t_ns, _, hear) in enumerate(timed):
-        hear(windows, now(t_ns))
-        following_ns = timed[number + 1][0] if number + 1 < len(timed) else t_ns
-        while (due_ns := windows.due_ns(now(t_ns))) is not None and due_ns <= now(following_ns):
-            window = windows.close()
-            assert window.evidence is not None
-            evidence.append(window.evidence())
-            closed.append(window)
-            settle(windows, controller, window)
-            rows.append(windows.record.rows())
-            on_close(windows, window, rows[-1])
-    rows.append(windows.record.rows())
-    return windows, controller, closed, evidence, rows
-
-
-def settle(windows: LiveWindows, controller: Controller, window: ClosedWindow) -> None:
-    """Have a closed window decided on."""
-    proposal = controller.propose(window)
-    assert windows.last is not None
-    windows.last.seen = proposal.seen
-    controller.settle(proposal)
-
-
-def recorded(tmp_path: Path, controller: Controller, rows: Sequence[Rows]) -> Run:
-    """Bring rows to tables, through the journal."""
-    meta = {"kind": "live", "cell": "canonical"}
-    journal = Journal(tmp_path / "run", run="7", meta=meta, columns=columns_of(controller))
-    for some in rows:
-        journal.append(some)
-    journal.close()
-    return seal_run(tmp_path / "run")
-
-
-SYNCHRONOUS = Offsets("E", "R1", system_bound_ns=0)
 
 
 def known_at_close(evidence: Evidence, window: ClosedWindow) -> np.ndarray[Any, Any]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import pytest
 
 import dwell
 from dwell.live.hosting import Hosted
-from dwell.live.messages import Header, Stamp
+from dwell.live.messages import Beat, Header, Stamp, decode
 from dwell.live.sink import Sink
 from dwell.live.stage import Message
 from dwell.live.transport.transport import Arrival
@@ -142,6 +143,48 @@ def test_a_hold_that_has_been_heard_is_not_repeated(refused: World, arm: Refusin
     refused.run(1_000)
     assert arm.silences == told
     refused.network.heal(cut)
+
+
+class Hanging(Arm):
+    """An actuator; while it is called, time passes, and another thread looks after its sink."""
+
+    def __init__(self, world: World, passes_ms: float) -> None:
+        super().__init__()
+        self.world, self.passes_ms = world, passes_ms
+        self.calls = {"apply": 0, "hold": 0}
+
+    def apply(self, command: Message) -> None:
+        self._pass("apply")
+
+    def hold(self) -> None:
+        self._pass("hold")
+
+    def _pass(self, method: str) -> None:
+        self.calls[method] += 1
+        self.world.sink.watch(self.world.network.now_ns + round(self.passes_ms * MS))
+
+
+@pytest.mark.parametrize("method", ["apply", "hold"])
+@pytest.mark.parametrize("passes_ms", [0, 500, 6_000])
+def test_a_sink_beats_while_its_actuator_does_not_return(
+    refused: World, method: str, passes_ms: float
+) -> None:
+    beats: list[Beat] = []
+
+    def hear(sample: Arrival) -> None:
+        if sample.key == refused.keys.beat("R2", "sink.control@R2"):
+            beats.append(decode(sample.payload, Beat))
+
+    refused.sink.actuator = arm = Hanging(refused, passes_ms)
+    if method == "hold":
+        refused.network.cut("*", "sink.control@R2", key="**/sink/**")
+    refused.network.taps.append(hear)
+    while not arm.calls[method]:
+        refused.run(1)
+    late = [beat for beat in beats if beat.sent_ns > refused.network.now_ns]
+    told = [(beat.ready, re.sub(r"cycle \d+: ", "", beat.note)) for beat in late]
+    hangs = f"sink of control on R2: {method}() has not returned for 6 s"
+    assert told == {0: [], 500: [(True, "")], 6_000: [(False, hangs)]}[round(passes_ms)]
 
 
 def test_the_highest_cycle_is_remembered_before_the_actuator_is_called(world: World) -> None:

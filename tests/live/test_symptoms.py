@@ -39,7 +39,10 @@ def test_of_a_lost_cycle_the_first_image_to_another_node_is_missed(
     assert max(found["violation_rates"]) > 0.5
     world.network.heal(cut)
     world.run(4_000)
-    assert symptoms(world)["recent"] == {"violation_rates": [0.0] * 3, "unreached": None}
+    found = symptoms(world)["recent"]
+    assert isinstance(found, dict)
+    assert (found["violation_rates"], found["unreached"]) == ([0.0] * 3, None)
+    assert (found["silences"], found["applied"]) == ([0] * 3, [1.0] * 3)
 
 
 def test_the_last_command_that_was_applied_has_an_age(problem: Problem) -> None:

@@ -31,6 +31,7 @@ def test_values_of_every_part() -> None:
             "objective.weights.switching": 0.25,
             "objective.caps": {"latency_ms": 90.0},
             "window_cycles": 20.0,
+            "controller.decide_cycles": 5,
         },
     )
     assert (found.pipeline.period_ms, found.pipeline.deadline_ms) == (40.0, 38.0)

@@ -118,6 +118,11 @@ PLACED = {"a": "R", "b": "R"}
         (lambda: ControllerSettings(migration="hot"), "migration", "warm, cold"),  # type: ignore[arg-type]
         (lambda: ControllerSettings(shadow_fraction=-0.1), "shadow_fraction", "from 0 to 1"),
         (lambda: ControllerSettings(shadow_fraction=1.1), "shadow_fraction", "from 0 to 1"),
+        (
+            lambda: ControllerSettings(shadow_fraction="Auto"),  # type: ignore[arg-type]
+            "shadow_fraction",
+            "auto or a number from 0 to 1",
+        ),
         (lambda: ControllerSettings(half_life_windows=0), "half_life_windows", "above 0"),
         (lambda: ControllerSettings(half_life_windows=math.nan), "half_life_windows", "above 0"),
         (lambda: Servo("arm", 1.0, TARGET), "plant", "double-integrator"),  # type: ignore[arg-type]
@@ -275,6 +280,8 @@ def test_all_alternatives_together_are_sent_every_cycle_at_most(
     assert problem.shadow_fraction == fraction
     given = replace(problem, controller=replace(problem.controller, shadow_fraction=0.001))
     assert given.shadow_fraction == 0.001
+    auto = replace(problem, controller=replace(problem.controller, shadow_fraction="auto"))
+    assert auto.shadow_fraction == fraction
 
 
 def test_a_lone_candidate_has_a_shadow_fraction_too() -> None:

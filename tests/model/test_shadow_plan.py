@@ -46,7 +46,7 @@ def test_the_same_cycles_are_sent_whatever_they_run_under(
 ) -> None:
     stamps = shadow_stamps(0, 500, active % candidates, candidates, percent / 100)
     expected = np.flatnonzero(stamps >= 0)
-    plan = ShadowPlan(0, 500, candidates, percent / 100)
+    plan = ShadowPlan(0, 500, [percent / 100] * candidates)
     np.testing.assert_array_equal(plan.sent, expected)
 
 
@@ -65,7 +65,7 @@ def test_an_even_share_sends_every_cycle_through_one_alternative(
 def test_rounding_up_sends_a_cycle_through_none() -> None:
     """Cycle 0 is the first alternative's; no cycle is beyond the last."""
     for candidates in range(2, 200):
-        plan = ShadowPlan(0, 5_000, candidates, 1 / (candidates - 1))
+        plan = ShadowPlan(0, 5_000, [1 / (candidates - 1)] * candidates)
         stamps = plan.stamps(0, 5_000, 0)
         assert stamps[0] == 1
         assert stamps.max() == candidates - 1

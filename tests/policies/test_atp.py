@@ -24,7 +24,8 @@ def timed(period_ms: float, window_cycles: int = 10) -> Problem:
     """The cell with windows of another length."""
     base = problem()
     pipeline = replace(base.pipeline, period_ms=period_ms, deadline_ms=period_ms)
-    return replace(base, pipeline=pipeline, window_cycles=window_cycles)
+    controller = replace(base.controller, decide_cycles=window_cycles)
+    return replace(base, pipeline=pipeline, window_cycles=window_cycles, controller=controller)
 
 
 def atp(min_dwell: int = 0, window_ms: float = 2000.0, every_ms: float = 2000.0) -> ATP:

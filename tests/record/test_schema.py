@@ -28,7 +28,7 @@ HEAD = """\
 @pytest.fixture(scope="module")
 def problem() -> Problem:
     cell = dwell.load(ROOT / "examples" / "canonical.yaml")
-    return replace(cell, window_cycles=20)
+    return replace(cell, window_cycles=20, controller=replace(cell.controller, decide_cycles=20))
 
 
 def declared(table: str, problem: Problem, *features: Feature) -> pl.Schema:

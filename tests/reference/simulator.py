@@ -791,7 +791,7 @@ class Simulation:
         *,
         given: Sequence[tuple[str, str | None]] | None = None,
         script: Sequence[str] = (),
-        fraction: float = 0.0,
+        fractions: Mapping[str, float] | None = None,
         guarded: bool = False,
         fickle: bool = False,
     ) -> None:
@@ -809,7 +809,7 @@ class Simulation:
 
         self.given = given
         self.script = list(script)
-        self.fraction = fraction
+        self.fractions = fractions or {}
         self.fickle = fickle
         # Candidates that were ordered, with the first cycle that each stamps.
         self.moves = [(0, problem.initial)]
@@ -1395,7 +1395,8 @@ class Simulation:
         wishes = [name for first, name in self.wishes if first <= cycle]
         if wishes and wishes[-1] is not None:
             return active, wishes[-1]
-        return active, shadow_stamp(cycle, active, list(self.problem.candidates), self.fraction)
+        fraction = self.fractions.get(active, 0.0)
+        return active, shadow_stamp(cycle, active, list(self.problem.candidates), fraction)
 
     def releaser(self, cycle: int) -> Callable[[], None]:
         def release() -> None:
@@ -1935,22 +1936,23 @@ def control(
     script: Sequence[str],
     *,
     shadows: Realisation | None = None,
-    fraction: float = 0.0,
+    fractions: Mapping[str, float] | None = None,
     guarded: bool = False,
     fickle: bool = False,
 ) -> Result:
     """Play a realisation under a controller that orders one name of a script at each decision.
 
-    `fraction` is the share of cycles that are also sent through each alternative. If it is
-    `guarded`, the cell's guard acts, and `shadows` are what its probes meet; a name that it holds
-    back is said again at the next decision, unless the controller is `fickle`.
+    `fractions` are the shares of cycles that are also sent through each alternative, by the
+    candidate that is active. If it is `guarded`, the cell's guard acts, and `shadows` are what its
+    probes meet; a name that it holds back is said again at the next decision, unless the controller
+    is `fickle`.
     """
     return Simulation(
         problem,
         realisation,
         shadows,
         script=script,
-        fraction=fraction,
+        fractions=fractions,
         guarded=guarded,
         fickle=fickle,
     ).run()

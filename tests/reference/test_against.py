@@ -9,7 +9,7 @@ import itertools
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, dataclass, field, replace
 from random import Random
 from typing import Any
 
@@ -132,7 +132,7 @@ class Level:
 class Probe(Level):
     """One that asks for shadow jobs and keeps everything it is given."""
 
-    def __init__(self, shadow_fraction: float) -> None:
+    def __init__(self, shadow_fraction: float | Mapping[str, float]) -> None:
         self.shadow_fraction = shadow_fraction
         self.evidence: list[Evidence] = []
         self.observed: list[QoS] = []
@@ -163,14 +163,15 @@ class Probe(Level):
 class Case:
     """A problem, a realisation of it, and a candidate for every decision.
 
-    A `shadow_fraction` of the cycles is also sent through each alternative. Where it is `guarded`,
-    the cell's guard acts; what it holds back is decided again, unless the policy is `fickle`.
+    By the active candidate, a share of the cycles is also sent through each alternative. Where it
+    is `guarded`, the cell's guard acts; what it holds back is decided again, unless the policy is
+    `fickle`.
     """
 
     problem: Problem
     real: Realisation
     names: tuple[str, ...]
-    shadow_fraction: float = 0.0
+    fractions: Mapping[str, float] = field(default_factory=dict)
     guarded: bool = False
     fickle: bool = False
 
@@ -208,7 +209,14 @@ def make_case(
     names = tuple(random_stamps(rng, problem, windows))
     real = dwell.draw(problem, scenario="disturbed", seed=seed, windows=windows)
     share = rng.choice([0.0, 0.1, 0.3, 1.0]) / len(problem.candidates) if orders else 0.0
-    case = Case(problem, real, names, share)
+    fractions: dict[str, float] = {}
+    if share:
+        # Of the largest share, none to all under each candidate.
+        parts = [rng.choice([0.0, 0.2, 1.0, 1.0]) for _ in problem.candidates]
+        parts[rng.randrange(len(parts))] = 1.0
+        named = zip(problem.candidates, parts, strict=True)
+        fractions = {name: share * part for name, part in named}
+    case = Case(problem, real, names, fractions)
     return deciding_often(case, Random(f"{seed} decides")) if orders else case
 
 
@@ -293,7 +301,7 @@ def script(case: Case) -> list[str]:
 
 
 def play(case: Case) -> Played:
-    probe = Probe(case.shadow_fraction) if case.shadow_fraction else None
+    probe = Probe(case.fractions) if case.fractions else None
     run = dwell.simulate_realisation(
         case.problem,
         case.real,
@@ -308,19 +316,20 @@ def play(case: Case) -> Played:
 
 def reference(case: Case) -> Result:
     names = list(case.problem.candidates)
-    # Whether a cycle is sent does not depend on what it runs under.
+    # What is drawn does not depend on what a cycle runs under.
+    most = max(case.fractions.values(), default=0.0)
     sent = [
         cycle
         for cycle in range(case.real.cycles)
-        if shadow_stamp(cycle, names[0], names, case.shadow_fraction) is not None
+        if shadow_stamp(cycle, names[0], names, most) is not None
     ]
     shadows = draw_shadows(case.problem, case.real, np.array(sent, int), others=case.guarded)
     return control(
         case.problem,
         case.real,
         script(case),
-        shadows=shadows if case.shadow_fraction or case.guarded else None,
-        fraction=case.shadow_fraction,
+        shadows=shadows if case.fractions or case.guarded else None,
+        fractions=case.fractions,
         guarded=case.guarded,
         fickle=case.fickle,
     )
@@ -498,7 +507,7 @@ def decision_differences(
     for row, expected in itertools.zip_longest(found, map(astuple, result.decisions)):
         if row != expected:
             yield f"decision {row}, expected {expected}"
-    if case.shadow_fraction:
+    if case.fractions:
         return  # the incumbent's entry is an estimate, not what was observed
     looks = {look.last: look for look in result.looks}
     for row in decisions.filter(pl.col("cycles") > 0).iter_rows(named=True):

@@ -150,7 +150,14 @@ class _Maker:
             wishes += [rng.choice(CANDIDATES)] * rng.randint(1, 12)
         names = (problem.initial, *wishes)
         share = rng.choice([0.0, 0.0, 0.1])
-        return Case(problem, real, names, share, guarded=True, fickle=rng.random() < 0.5)
+        return Case(
+            problem,
+            real,
+            names,
+            dict.fromkeys(problem.candidates, share) if share else {},
+            guarded=True,
+            fickle=rng.random() < 0.5,
+        )
 
 
 @pytest.fixture(params=["few", "the others"])

@@ -19,7 +19,7 @@ def _write_messages() -> None:
 
 
 def _write_runs() -> None:
-    for example in runs.EXAMPLES:
+    for example in (*runs.EXAMPLES, *runs.DEFAULTS):
         print(f"{example}: {runs.write(example)} runs")
 
 

@@ -15,11 +15,16 @@ import polars as pl
 import dwell
 from dwell.estimators.registry import REGISTRY as ESTIMATORS
 from dwell.model import Problem
+from dwell.model.evolve import evolve
 from dwell.policies.registry import REGISTRY as POLICIES
 
 ROOT = Path(__file__).parents[2]
 DATA = Path(__file__).parent / "data"
 EXAMPLES = ("canonical", "fan-in", "cloud", "live/cell", "visual_servoing/testbed")
+#: Cells that are played as they are, with the defaults of all settings that their files leave out.
+DEFAULTS = ("defaults/first", "defaults/live/cell", "defaults/visual_servoing/testbed")
+#: N_min and share of shadows where they are not 3 and 0.05.
+SETTINGS = {"visual_servoing/testbed": (2, 0.1)}
 TABLES = ("cycles", "windows", "decisions")
 #: Windows beyond the warm-up.
 WINDOWS = 7
@@ -28,7 +33,10 @@ DECIMALS = 6
 
 
 class Case(NamedTuple):
-    """What is played: all of it, and a guard where the cell has one."""
+    """What is played: all of it, and a guard where the cell has one.
+
+    An empty policy or estimator is the cell's.
+    """
 
     scenario: str
     policy: str
@@ -50,10 +58,28 @@ def cases(problem: Problem) -> Iterator[Case]:
                     yield Case(scenario, policy, estimator, guard, "1")
 
 
+def cases_of_defaults(problem: Problem) -> Iterator[Case]:
+    """Yield every scenario with two seeds."""
+    guard = "yes" if problem.controller.fallbacks else "no"
+    for scenario in problem.scenarios:
+        for seed in "12":
+            yield Case(scenario, "", "", guard, seed)
+
+
 @cache
 def load(example: str) -> Problem:
-    """Return an example's cell."""
-    return dwell.load(ROOT / "examples" / f"{example}.yaml")
+    """Return an example's cell, if not of `DEFAULTS` with one decision per window and a dwell."""
+    path = f"{example.removeprefix('defaults/')}.yaml"
+    problem = dwell.load(ROOT / "examples" / path)
+    if example in DEFAULTS:
+        return problem
+    least, fraction = SETTINGS.get(example, (3, 0.05))
+    settings = {
+        "controller.decide_cycles": problem.window_cycles,
+        "controller.min_dwell": least,
+        "controller.shadow_fraction": fraction,
+    }
+    return evolve(problem, settings)
 
 
 def play(example: str, case: Case, columns: Mapping[str, list[str]]) -> dict[str, str]:
@@ -70,8 +96,8 @@ def play(example: str, case: Case, columns: Mapping[str, list[str]]) -> dict[str
     run = dwell.simulate(
         problem,
         scenario=case.scenario,
-        policy=case.policy,
-        estimator=case.estimator,
+        policy=case.policy or None,
+        estimator=case.estimator or None,
         seed=int(case.seed),
         windows=problem.warmup_windows + WINDOWS,
         guard=case.guard == "yes",
@@ -143,7 +169,8 @@ def write(example: str) -> int:
             known[table] |= dict.fromkeys(getattr(run, table).columns)
     told = {table: list(names) for table, names in known.items()}
     columns.write_text(json.dumps(told, indent=1) + "\n")
-    rows = [{**case._asdict(), **play(example, case, told)} for case in cases(problem)]
+    which = cases_of_defaults if example in DEFAULTS else cases
+    rows = [{**case._asdict(), **play(example, case, told)} for case in which(problem)]
     with runs.open("w", newline="") as file:
         writer = csv.DictWriter(file, rows[0], lineterminator="\n")
         writer.writeheader()

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from tests.regression.runs import EXAMPLES, Case, play, read
+from tests.regression.runs import DEFAULTS, EXAMPLES, Case, play, read
 
 
-@pytest.mark.parametrize("example", EXAMPLES)
+@pytest.mark.parametrize("example", [*EXAMPLES, *DEFAULTS])
 def test_runs_are_those_that_were_written_down(example: str) -> None:
     known, columns = read(example)
-    assert len(known) > 30
+    assert len(known) > (3 if example in DEFAULTS else 30)
     changed: dict[Case, dict[str, tuple[str, str]]] = {}
     for case, before in known.items():
         now = play(example, case, columns)

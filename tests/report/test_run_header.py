@@ -33,6 +33,7 @@ def test_a_simulated_run_says_what_it_is_of() -> None:
     )
     assert header.policy_name == "Cusum"
     assert header.estimator == "Corrected"
+    assert header.shadows == "0.05 under LOC, 0.05 under SO, 0.05 under HYB"
     assert header.problem.candidates == PROBLEM.candidates
     assert header.problem.window_cycles == PROBLEM.window_cycles
     assert [one.kind for one in header.disturbed] == ["robot stress"]

@@ -11,18 +11,24 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 
 import dwell
 from dwell.cellfile.overrides import load_with
+from dwell.cli.check import class_faults
+from dwell.control import Controller
 from dwell.control.windows import missed_cycles, seen_l95_ms
 from dwell.cost import cost, hamming
 from dwell.errors import ProblemError
+from dwell.estimators import Estimator, Evidence, warnings_of
 from dwell.model import FrozenDict, Problem, QoS
 from dwell.model.fleet import Fleet, FleetEntry
 from dwell.model.window_close import window_close_ns
+from dwell.policies.atp_thresholds import find_pairs
 from dwell.record import Run
-from dwell.sim.engine import simulate_realisation
+from dwell.sim.engine import describe, simulate_realisation
 from dwell.study.hindsight import Hindsight
 from dwell.study.judged_cost import judged_costs
 from dwell.study.reference import play_alone, references
@@ -34,8 +40,8 @@ from tests.reference.algorithm_1 import switching as moved_share
 CANONICAL = dwell.load(EXAMPLES / "canonical.yaml")
 
 
-def often(problem: Problem, every: int | None, **settings: Any) -> Problem:
-    controller = replace(problem.controller, decide_cycles=every, **settings)
+def often(problem: Problem, every: int | None, **changes: Any) -> Problem:
+    controller = replace(problem.controller, decide_cycles=every, **changes)
     return replace(problem, controller=controller)
 
 
@@ -208,6 +214,54 @@ def test_a_placement_stays_for_the_dwell_and_one_decision_more(policy: str, ever
         assert moves > 0 or policy == "atp"
 
 
+class Fickle:
+    """Expects the least of every placement that is not in force, at each decision."""
+
+    def start(self, problem: Problem) -> None:
+        """Take the names."""
+        self.names, self.resources = tuple(problem.candidates), tuple(problem.fabric.resources)
+
+    def learn(self, evidence: Evidence) -> None:
+        """Learn nothing."""
+
+    def estimate(
+        self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
+    ) -> Mapping[str, QoS]:
+        """Prefer all but the incumbent."""
+        used = dict.fromkeys(self.resources, 0.0)
+        return {name: QoS(1.0, float(name == incumbent), used) for name in self.names}
+
+
+@settings(max_examples=40)
+@given(st.data())
+def test_windows_hold_a_bounded_number_of_moves(data: st.DataObject) -> None:
+    problem = random_problem(Random(data.draw(st.integers(0, 99), "cell")), orders=True)
+    width, windows = problem.window_cycles, 12
+    controller = replace(
+        problem.controller,
+        decide_cycles=data.draw(st.integers(1, width), "decide_cycles"),
+        min_dwell=data.draw(st.none() | st.integers(0, 3), "min_dwell"),
+        min_dwell_cycles=data.draw(st.just(0) | st.integers(0, 3 * width), "min_dwell_cycles"),
+        min_improvement=0.0,
+        escape=False,
+    )
+    problem = replace(problem, controller=controller)
+    policy = data.draw(st.sampled_from(["dtp", "atp"]), "policy")
+    if policy == "atp" and not find_pairs(problem.candidates, problem.objective.tiers):
+        policy = "dtp"
+    run = dwell.simulate(
+        problem, scenario="disturbed", policy=policy, estimator=Fickle(), seed=1, windows=windows
+    )
+    stated = run.problem.controller.min_dwell
+    assert stated is not None
+    assert stated == (3 if controller.min_dwell is None else controller.min_dwell)
+    least = max(stated * width, controller.min_dwell_cycles) + problem.decide_cycles
+    placed = run.cycles["placement"].cast(str).to_list()
+    took_effect = [cycle for cycle in range(1, len(placed)) if placed[cycle] != placed[cycle - 1]]
+    assert run.decisions["migrated"].sum() <= windows * width // least
+    assert all(after - before >= least for before, after in pairwise([0, *took_effect]))
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_cells_at_random_are_decided_on_in_time(seed: int) -> None:
     rng = Random(seed)
@@ -224,7 +278,7 @@ def test_cells_at_random_are_decided_on_in_time(seed: int) -> None:
         assert (np.diff(last)[stays] % every == 0).all()
 
 
-def test_one_decision_per_window_is_the_rule_of_windows() -> None:
+def test_without_an_interval_there_are_four_decisions_per_window() -> None:
     for policy in ("dtp", "cusum", "work-function", "atp", "latency-first"):
         for estimator in ("profile", "corrected"):
             runs = [
@@ -236,11 +290,68 @@ def test_one_decision_per_window_is_the_rule_of_windows() -> None:
                     seed=4,
                     windows=12,
                 )
-                for every in (None, CANONICAL.window_cycles)
+                for every in (None, CANONICAL.window_cycles // 4)
             ]
             for table in ("cycles", "windows", "decisions"):
                 one, other = (getattr(run, table) for run in runs)
                 assert one.equals(other)
+
+
+@pytest.mark.parametrize(
+    ("estimator", "windows"), [("profile", 3), ("corrected", 0), (Fickle(), 3)]
+)
+def test_a_run_says_the_dwell_that_its_estimator_gives(
+    estimator: Estimator | str, windows: int
+) -> None:
+    problem = often(CANONICAL, 25, min_dwell=None)
+    for policy in ("dtp", "atp", "atp-thresholds"):
+        named: dict[str, Any] = {"policy": policy, "estimator": estimator}
+        run = dwell.simulate(problem, **named, seed=1, windows=2)
+        assert run.problem.controller.min_dwell == windows
+        assert run.meta["parameters"]["min_dwell"] == 4 * windows
+        assert describe(problem, **named, seed=1, windows=2) == run.meta
+        stated = often(CANONICAL, 25, min_dwell=windows)
+        again = dwell.simulate(stated, **named, seed=1, windows=2)
+        assert again.decisions.equals(run.decisions)
+
+
+class Asks:
+    """A policy that keeps the dwell of its cell."""
+
+    def __init__(self, min_dwell: int | None) -> None:
+        self.min_dwell = min_dwell
+
+    @classmethod
+    def from_problem(cls, problem: Problem) -> Asks:
+        """Take the dwell that the controller states."""
+        return cls(problem.controller.min_dwell)
+
+    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
+        """Stay."""
+        return "LOC"
+
+
+def test_a_policy_of_a_users_own_gets_the_dwell_as_a_number() -> None:
+    problem = often(CANONICAL, 25, min_dwell=None, policy=f"{__name__}:Asks")
+    for estimator, windows in (("profile", 3), ("corrected", 0)):
+        made = Controller(problem, estimator=estimator).policy
+        assert isinstance(made, Asks)
+        assert made.min_dwell == windows
+    assert not [*class_faults(problem)]
+
+
+@pytest.mark.parametrize(("width", "every"), [(1, 1), (3, 1), (4, 1), (7, 1), (8, 2), (100, 25)])
+def test_the_interval_is_a_quarter_of_a_window(width: int, every: int) -> None:
+    assert replace(often(CANONICAL, None), window_cycles=width).decide_cycles == every
+
+
+def test_an_improvement_of_nothing_is_enough_if_none_is_asked_for() -> None:
+    problem = often(CANONICAL, 25, min_dwell=None, min_improvement=0)
+    for estimator in ("profile", "corrected"):
+        run = dwell.simulate(problem, policy="dtp", estimator=estimator, seed=3, windows=8)
+        gains = run.decisions.filter("migrated")["delta_j"]
+        assert (gains > 0).all()
+    assert not any("min_improvement" in fault.path for fault in warnings_of(problem))
 
 
 def test_it_is_at_most_a_window() -> None:

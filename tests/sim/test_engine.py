@@ -371,6 +371,6 @@ def test_a_realisation_of_another_problem_is_refused(cells: Mapping[str, Problem
     real = dwell.draw(cells["canonical"], seed=1, windows=2, scenario="baseline")
     with pytest.raises(SimulationError, match="draw it from the same problem"):
         dwell.simulate_realisation(cells["fan-in"], real)
-    wider = replace(cells["canonical"], window_cycles=50)
+    wider = replace(cells["canonical"], window_cycles=200)
     with pytest.raises(SimulationError, match="need"):
         dwell.simulate_realisation(wider, real)

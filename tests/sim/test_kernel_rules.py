@@ -61,7 +61,7 @@ def test_a_gain_equal_to_what_it_must_exceed_moves_nothing(rule: str) -> None:
         # For ATP and `a move` the price of the move is equal to the gain.
         problem = of_two_latencies(here_ms, here_ms - 5, 0.05 if rule in ("atp", "a move") else 0.0)
         given = {"candidates": problem.candidates, "objective": problem.objective}
-        assert plain_rule(Controller(problem, EXACT[rule](given))) is not None
+        assert plain_rule(Controller(problem, EXACT[rule](given), "profile")) is not None
         real = dwell.draw(problem, seed=1, windows=5)
         for by_window in (False, True):
             policy = EXACT[rule](given)

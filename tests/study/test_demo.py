@@ -51,8 +51,8 @@ def test_the_canonical_demo() -> None:
     )
     paper = {"baseline", "robot-cpu-stress", "edge-cpu-stress", "network-impairment"}
     assert paper < set(found.scenarios)
-    plain = ("LOC", "SO", "HYB", "atp", "dtp", "dtp, no caps", "latency-first")
-    assert found.policies == (*plain, "dtp+corrected", "cusum+corrected")
+    plain = ("LOC", "SO", "HYB", "atp", "DTP as printed", "dtp, no caps", "latency-first")
+    assert found.policies == (*plain, "DTP", "cusum+corrected")
     assert seen[-1] == (found.runs.height, found.runs.height)
 
 
@@ -64,7 +64,7 @@ def test_the_tenants_of_the_edge_are_varied_and_nothing_else() -> None:
         assert bursts is not None
         shares.append(bursts.share)
     assert shares == pytest.approx([0.0, 0.03, 0.0625, 0.1], abs=1e-6)
-    assert found.runs.height == 4 * 2 * 3
+    assert found.runs.height == 4 * 2 * 4
     canonical = canonical_demo(ROOT / "examples", seeds=1, windows=7, processes=1)
     own = found.runs.filter(found.runs[found.parameters[0]] == 3000.0)
     for scenario, policy, rate in own.select("scenario", "policy", "violation_rate").rows():

@@ -111,7 +111,7 @@ def test_a_study_tells_it_with_references_and_without() -> None:
         candidates=problem.candidates,
         initial="LOC",
         objective=problem.objective,
-        min_dwell=problem.controller.min_dwell,
+        min_dwell=problem.min_dwell,
     )
     study = Study(
         name="told",

@@ -23,15 +23,22 @@ from tests.study.test_validation import measured, with_meta
 WINDOWS = 102
 
 
-def test_of_a_policy_that_moves_what_was_decided_on_them_is_left_out_too() -> None:
+@pytest.mark.parametrize(
+    ("settings", "after"),
+    [
+        ({"min_dwell": 3}, {5, 6, 7, 8, 9, 10, 50, 51, 52, 53, 101}),
+        ({"min_dwell": None}, {5, 6, 7, 8, 9, 10, 50, 51, 52, 53, 101}),
+        ({"min_dwell": None, "estimator": "corrected"}, {5, 7, 50, 101}),
+        ({"min_dwell": 0, "min_dwell_cycles": 1}, {5, 6, 7, 8, 50, 51, 101}),
+    ],
+)
+def test_of_a_policy_that_moves_what_was_decided_on_them_is_left_out_too(
+    settings: dict[str, Any], after: set[int]
+) -> None:
     problem = make_problem()
-    controller = replace(problem.controller, min_dwell=3)
-    problem = replace(problem, controller=controller)
+    problem = replace(problem, controller=replace(problem.controller, **settings))
     last = WINDOWS - 1
-    for policy, left_out in (
-        ("LOC", {5, 7, 50, last}),
-        ("dtp", {5, 6, 7, 8, 9, 10, 50, 51, 52, 53, last}),
-    ):
+    for policy, left_out in (("LOC", {5, 7, 50, last}), ("dtp", after)):
         (name, run), *_ = measured(problem, "baseline", policy, 101).items()
         told = {"excluded": [5, 7, 50, last]}
         one = read_measured(name, with_meta(run, pressure=told), problem)

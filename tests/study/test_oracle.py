@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from statistics import fmean, stdev
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,6 +38,7 @@ from dwell.study import oracle
 from dwell.study.oracle import RAMP_PRICES, expected_costs, sets_of
 from dwell.study.reference import (
     CLAIRVOYANT,
+    CLAIRVOYANT_DWELL,
     ORACLE,
     ORACLE_DWELL,
     References,
@@ -102,6 +104,32 @@ def test_its_dwell_is_the_problem_s() -> None:
     assert free.tolist() == [3, 5, 7, 9, 11, 13]
     assert len(bound) >= 2
     assert min(np.diff([0, *bound])) >= 3
+
+
+@pytest.mark.parametrize(
+    ("settings", "apart"),
+    [
+        ({"min_dwell": 0, "min_dwell_cycles": 15}, (30, 30)),
+        ({"min_dwell": 1, "min_dwell_cycles": 25, "decide_cycles": 5}, (30, 40)),
+        ({"min_dwell": None, "estimator": "profile"}, (40, 40)),
+        ({"min_dwell": None, "estimator": "corrected"}, (10, 10)),
+        ({"min_dwell": None, "estimator": "corrected", "decide_cycles": 5}, (5, 10)),
+    ],
+)
+def test_references_keep_to_the_dwell_of_the_cell(
+    settings: dict[str, Any], apart: tuple[int, int]
+) -> None:
+    spans = [("AB"[k % 2], k, 1) for k in range(20)]
+    problem = two_nodes(4.0, stressed(*spans), switching=0.01)
+    problem = replace(problem, controller=replace(problem.controller, **settings))
+    found = references(problem, realise(problem, 20))
+    for title, least, every in (
+        (ORACLE_DWELL, apart[0], problem.decide_cycles),
+        (CLAIRVOYANT_DWELL, apart[1], W),
+    ):
+        moves = np.flatnonzero(np.diff(found.sequences[title].choice)) + 1
+        assert len(moves) >= 2
+        assert min(np.diff([0, *moves])) * every == least
 
 
 @pytest.mark.parametrize(
@@ -198,11 +226,11 @@ def test_the_dwell_in_windows_holds_for_shorter_stretches(decide_cycles: int) ->
     problem = two_nodes(4.0, turns, switching=0.05)
     realisation = realise(problem, 27)
     costs = expected_costs(problem, realisation, decide_cycles)
-    for min_dwell in (0, 2, 5):
-        plan, _ = planned(problem, realisation, costs, decide_cycles, min_dwell)
+    for dwell_cycles in (0, 2 * W, 33, 5 * W):
+        plan, _ = planned(problem, realisation, costs, decide_cycles, dwell_cycles)
         moves = np.flatnonzero(np.diff(plan.choice)) + 1
         assert len(moves) >= 2
-        assert min(np.diff([0, *moves])) * decide_cycles >= min_dwell * W + decide_cycles
+        assert min(np.diff([0, *moves])) * decide_cycles >= dwell_cycles + decide_cycles
 
 
 def test_nothing_is_planned_while_the_controller_is_down() -> None:

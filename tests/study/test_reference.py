@@ -41,6 +41,7 @@ from dwell.study.reference import (
 from dwell.study.script import Script
 from dwell.study.summary import summarise
 from tests.cells.late_cycles import late_problem, late_run, without_late_cycles
+from tests.cells.once import once
 from tests.cells.small import make_problem
 
 W = 10
@@ -73,7 +74,7 @@ def two_nodes(
             tiers=dict.fromkeys(nodes, "edge"),
         ),
         scenarios={"given": scenario},
-        controller=controller,
+        controller=once(controller, W),
         window_cycles=W,
         warmup_windows=2,
     )

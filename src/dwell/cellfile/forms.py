@@ -73,12 +73,12 @@ def _read_by(reader: Callable[[Any], Any], value: Any, path: str, faults: Faults
 
 @dataclass(frozen=True, slots=True)
 class NumberForm(Form):
-    """A finite number within a bound."""
+    """A finite number within a bound, or the bound's word."""
 
     bound: Bound
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
-        """Return the number, a float where the bound is none of whole numbers."""
+        """Return the number, a float where the bound is none of whole numbers, or the word."""
         return _read_by(self.number, value, path, faults)
 
     def number(self, value: Any) -> Any:
@@ -89,6 +89,8 @@ class NumberForm(Form):
         ValueError
             With what is wrong.
         """
+        if isinstance(value, str) and self.bound.holds(value):
+            return value
         if isinstance(value, bool) or not isinstance(value, int | float):
             remedy = unquoted(value) if isinstance(value, str) else ""
             raise ValueError(not_allowed(value, f"{self.bound}{remedy}"))
@@ -109,7 +111,7 @@ class NumberForm(Form):
         result["exclusiveMinimum" if bound.above else "minimum"] = plain(bound.low)
         if bound.high != math.inf:
             result["exclusiveMaximum" if bound.below else "maximum"] = plain(bound.high)
-        return result
+        return {"anyOf": [{"const": bound.word}, result]} if bound.word else result
 
 
 def unquoted(text: str) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
@@ -14,9 +15,11 @@ from dwell.cli.output import aligned, print_json, warn
 from dwell.display import milliseconds
 from dwell.errors import ExitCode, Fault, PolicyError, ProblemError
 from dwell.model.bounds import counted
+from dwell.model.controller_settings import AUTO
 
 if TYPE_CHECKING:
     from dwell.estimators.prices import Price
+    from dwell.estimators.shadow_price import ShadowPrice
     from dwell.model import Problem
 
 
@@ -56,9 +59,16 @@ def check(
     from dwell.estimators import warnings_of
     from dwell.estimators.cell_warnings import unpriced
     from dwell.estimators.prices import prices_of
+    from dwell.estimators.registry import resolved
+    from dwell.estimators.shadow_price import affordable
     from dwell.live.lint import lint
+    from dwell.model.evolve import evolve
+    from dwell.policies.registry import estimator_of
 
-    prices = prices_of(problem, scenario)
+    estimator = estimator_of(problem)
+    problem = resolved(evolve(problem, {"controller.estimator": estimator}), estimator)
+    prices, tried = prices_of(problem, scenario), _shadow_prices(problem)
+    fractions = {name: affordable(problem, shadows) for name, shadows in tried.items()}
     cycles = min(price.cycles for price in prices.values())
     warnings = (
         *warnings_of(problem),
@@ -68,9 +78,14 @@ def check(
     if as_json:
         rows = [_fault(warning) for warning in warnings]
         contents = {"valid": True, **_contents(problem), "priced_under": scenario}
-        print_json(contents | {"candidates": _priced(problem, prices), "warnings": rows})
+        candidates = _priced(problem, prices)
+        for name, fraction in fractions.items():
+            candidates[name]["shadow_fraction"] = fraction
+            candidates[name]["shadow_prices"] = [asdict(one) for one in tried[name]]
+        print_json(contents | {"candidates": candidates, "warnings": rows})
     else:
-        typer.echo(_summary(problem, prices, scenario))
+        notes = _shadow_notes(problem, tried, fractions)
+        typer.echo("\n".join((_summary(problem, prices, scenario), *notes)))
         warn(cell, warnings)
 
 
@@ -87,20 +102,23 @@ def _refuse(faults: Iterable[Fault], text: str, *, as_json: bool) -> NoReturn:
 def class_faults(problem: Problem) -> Iterator[Fault]:
     """Yield the faults of the policy and the estimator where these are a user's classes."""
     from dwell.estimators import by_name as make_estimator
+    from dwell.estimators.registry import resolved
     from dwell.model.bounds import CLASS_PATH
     from dwell.policies import by_name as make_policy
+    from dwell.policies.registry import estimator_of
 
-    settings = problem.controller
+    settings, estimator = problem.controller, estimator_of(problem)
+    try:
+        if CLASS_PATH.holds(estimator):
+            make_estimator(estimator, problem)
+        problem = resolved(problem, estimator)
+    except ProblemError as error:
+        yield Fault("controller.estimator", str(error))
     try:
         if CLASS_PATH.holds(settings.policy) and settings.policy not in problem.candidates:
             make_policy(settings.policy, problem)
     except PolicyError as error:
         yield Fault("controller.policy", str(error))
-    try:
-        if CLASS_PATH.holds(settings.estimator):
-            make_estimator(settings.estimator, problem)
-    except ProblemError as error:
-        yield Fault("controller.estimator", str(error))
 
 
 def _fault(fault: Fault) -> dict[str, Any]:
@@ -119,6 +137,13 @@ def _contents(problem: Problem) -> dict[str, Any]:
         "nodes": {name: node.tier for name, node in problem.fabric.nodes.items()},
         "links": list(problem.fabric.links),
         "scenarios": list(problem.scenarios),
+        "controller": {
+            "policy": problem.controller.policy,
+            "estimator": problem.controller.estimator,
+            "decide_cycles": problem.decide_cycles,
+            "min_dwell": problem.min_dwell,
+            "min_dwell_cycles": problem.controller.min_dwell_cycles,
+        },
     }
 
 
@@ -160,6 +185,7 @@ def _summary(problem: Problem, prices: Mapping[str, Price], scenario: str) -> st
         ]
         for name, price in prices.items()
     ]
+    controller, least = problem.controller, counted(problem.min_dwell, "window")
     span_s = min(price.cycles for price in prices.values()) * pipeline.period_ms / 1e3
     disturbed = f" for {span_s:.4g} s" if problem.scenario(scenario) else ""
     return "\n".join(
@@ -169,6 +195,8 @@ def _summary(problem: Problem, prices: Mapping[str, Price], scenario: str) -> st
             f"{counted(len(problem.fabric.links), 'link')}; "
             f"P {pipeline.period_ms:.4g} ms, D {pipeline.deadline_ms:.4g} ms, "
             f"W {counted(problem.window_cycles, 'cycle')}",
+            f"decisions: {controller.policy} with {controller.estimator}, every "
+            f"{counted(problem.decide_cycles, 'cycle')}; N_min {least}",
             f"can move: {', '.join(movable) or 'nothing'}",
             f"scenarios: {', '.join(problem.scenarios)}",
             "",
@@ -179,6 +207,34 @@ def _summary(problem: Problem, prices: Mapping[str, Price], scenario: str) -> st
             *(f"{name}: {note}" for name, price in prices.items() for note in _notes(price)),
         )
     )
+
+
+def _shadow_prices(problem: Problem) -> Mapping[str, Sequence[ShadowPrice]]:
+    """Return the prices that the shares of shadows follow from; nothing where they do not."""
+    from dwell.estimators.registry import shadowing
+    from dwell.estimators.shadow_price import shadow_prices
+
+    settings = problem.controller
+    is_priced = settings.estimator in shadowing() and settings.shadow_fraction == AUTO
+    return shadow_prices(problem) if is_priced else {}
+
+
+def _shadow_notes(
+    problem: Problem, tried: Mapping[str, Sequence[ShadowPrice]], fractions: Mapping[str, float]
+) -> Iterator[str]:
+    """Yield the shares of shadows, and why they are not larger."""
+    most = problem.shadow_fraction
+    if free := [name for name, fraction in fractions.items() if fraction == most]:
+        yield f"shadows: {most:g} under {', '.join(free)}"
+    for name, fraction in fractions.items():
+        if fraction == most:
+            continue
+        too_dear = tried[name][0 if fraction else -1]
+        more = f"miss {too_dear.violation_rate * 100:.1f} points more"
+        if problem.objective.weights.violations * too_dear.violation_rate < too_dear.cost / 2:
+            more = f"have an L95 {milliseconds(too_dear.l95_ms)} ms longer"
+        alone = "" if fraction else f"; under {name} the estimator learns from the incumbent alone"
+        yield f"shadows: {fraction:g}; at {too_dear.fraction:g} {name} would {more}{alone}"
 
 
 def _notes(price: Price) -> Iterator[str]:

@@ -448,10 +448,13 @@ def status_lines(status: dict[str, Any]) -> list[str]:
             f"{name} {'not measured' if share is None else f'{share:.0%}'}"
             for name, share in window["utilisation"].items()
         )
+        ratio = status["release_ratio"]
+        released = "" if ratio is None else f"released {ratio:.0%} of one cycle per period, "
         lines.append(
             f"window {window['number']}, {window['age_ms'] / 1e3:.1f} s ago: L95 "
             f"{milliseconds(window['l95_ms'])} ms, V_D {window['violation_rate']:.1%}, J "
-            f"{window['cost']:.3f}, {window['reason']}; utilisation {used}"
+            f"{window['cost']:.3f}, {window['reason']}; {released}silences {status['silences']}; "
+            f"utilisation {used}"
         )
     lines += [f"  {who:24} differs    {why}" for who, why in sorted(status["strangers"].items())]
     lines += [f"  {who:24} not heard" for who in status["silent"]]

@@ -233,8 +233,8 @@ class Screen:
         placement = state.status.get("placement") or "-"
         yield self._line("played", self._planned(state, columns), "")
         yield self._line("placed", self._placed(columns), placement, self._colours.get(placement))
-        numbered = groupby(self._states, lambda seen: seen.window.get("number"))
-        # Of each window, the state that saw it first.
+        numbered = groupby(self._states, lambda seen: seen.window.get("last_cycle"))
+        # Of each decision, the state that saw it first.
         windows = [(seen.at_s, seen.window) for _, states in numbered for seen in islice(states, 1)]
         for name, key, scale, unit, most, limit in (
             ("L95", "l95_ms", 1, "ms", DEADLINES * deadline_ms, deadline_ms),

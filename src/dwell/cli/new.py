@@ -25,7 +25,7 @@ class Origin(StrEnum):
     LIVE = "live"
 
 
-CELLS = {Origin.CANONICAL: "canonical.yaml", Origin.LIVE: "live/cell.yaml"}
+CELLS = {Origin.CANONICAL: "first.yaml", Origin.LIVE: "live/cell.yaml"}
 STAGES = {Origin.CANONICAL: "stages.py", Origin.LIVE: "live/stages.py"}
 
 #: First lines of the cell file, after the one for editors.

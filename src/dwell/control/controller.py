@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from operator import add
 from typing import NamedTuple, TypeAlias
 
@@ -14,23 +15,31 @@ from numpy.typing import NDArray
 
 from dwell.control.coordination import Asked, Coordination, Verdict, Wish
 from dwell.control.course import Course
-from dwell.control.windows import missed_cycles, seen_l95_ms, utilisation
-from dwell.cost import excess
+from dwell.control.windows import (
+    missed_cycles,
+    seen_costs,
+    seen_l95_ms,
+    utilisation,
+)
+from dwell.cost import excess, hamming
 from dwell.errors import Fault, MetricError, PolicyError, ProblemError
 from dwell.estimators import Estimator, Evidence
 from dwell.estimators import by_name as estimator_by_name
 from dwell.estimators.protocol import CellEstimator
+from dwell.estimators.registry import resolved
 from dwell.estimators.user_estimator import as_started
 from dwell.model import Caps, Decision, FrozenDict, Objective, Problem, QoS
 from dwell.model.bounds import CLASS_PATH
 from dwell.model.controller_settings import SHADOW_FRACTION
 from dwell.model.qos import NO_ERROR
 from dwell.model.semantics import too_many_shadows
+from dwell.model.shadow_plan import by_candidate
 from dwell.model.table_columns import DECISIONS, Feature, columns_of, those_with
 from dwell.model.user_classes import UserCall
 from dwell.policies import MinimalPolicy, parameters_of
 from dwell.policies import by_name as policy_by_name
 from dwell.policies.pricing import Pricing
+from dwell.policies.registry import estimator_of
 from dwell.policies.user_policy import as_proposer
 
 Ints: TypeAlias = NDArray[np.int64]
@@ -74,6 +83,8 @@ class ClosedWindow:
         Its number, and its cycles as the record counts them.
     evidence : callable, optional
         Makes the window's `Evidence`, for estimators that learn from it.
+    recent : ClosedWindow, optional
+        Its cycles since the last decision, which estimators get; the window itself if None.
     """
 
     latency_ns: Ints
@@ -83,6 +94,7 @@ class ClosedWindow:
     core_ns: Floats
     looked: LookedAt
     evidence: Callable[[], Evidence] | None = None
+    recent: ClosedWindow | None = None
 
     def __repr__(self) -> str:
         return f"<ClosedWindow of {len(self.latency_ns)} cycles>"
@@ -166,11 +178,13 @@ class Controller:
         estimator: Estimator | str | None = None,
         coordination: Coordination | None = None,
     ) -> None:
-        self.problem, self.coordination = problem, coordination
         if isinstance(policy, str):
             policy, estimator = _without_estimator(policy, estimator, problem)
         policy = policy or problem.controller.policy
-        estimator = estimator or problem.controller.estimator
+        estimator = estimator or estimator_of(problem, policy)
+        problem = resolved(problem, estimator)
+        #: The cell, with the N_min that it has with this estimator.
+        self.problem, self.coordination = problem, coordination
         #: Names of the policy and the estimator where these are classes of a user's own, else None.
         self._own = tuple(one if CLASS_PATH.holds(one) else None for one in (policy, estimator))
         decider = policy_by_name(policy, problem) if isinstance(policy, str) else policy
@@ -182,8 +196,9 @@ class Controller:
             self._estimator = as_started(made, problem, copied=made is estimator)
         if coordination is not None:
             coordination.meet(self._estimator)
-        #: Share of the cycles that the estimator wants sent through each alternative.
-        self.shadow_fraction = _shadow_fraction(self._estimator, problem)
+        #: Share of the cycles that the estimator wants sent through each alternative, by the
+        #: candidate that is active.
+        self.shadow_fractions = _shadow_fractions(self._estimator, problem)
         initial = self._policy.initial
         known = isinstance(initial, str) and initial in problem.candidates
         #: Where the cell is, as far as is known here.
@@ -264,7 +279,13 @@ class Controller:
             "policy": own_policy or (repr(policy) if known else type(policy).__name__),
             "parameters": parameters_of(policy),
             "estimator": own_estimator or type(self.estimator).__name__,
+            "shadow_fractions": dict(self.shadow_fractions),
         }
+
+    @property
+    def sends_shadows(self) -> bool:
+        """Whether the estimator wants shadows under any candidate."""
+        return any(self.shadow_fractions.values())
 
     @property
     def learns(self) -> bool:
@@ -289,13 +310,34 @@ class Controller:
             If the policy returns neither a decision nor a candidate's name.
         """
         self.looked = window.looked
+        metrics, shares = self._metrics(window), self.utilisation(window)
+        evidence = (window.recent or window).evidence
+        if evidence is not None:
+            self.learn(evidence)
+        recent = None if window.recent is None else self.utilisation(window.recent)
+        return self.propose_on(*metrics, shares, recent)
+
+    def _metrics(self, window: ClosedWindow) -> tuple[float, float, float]:
+        """Return L95 as it could be known (ms), V_D, and L95 as caps are compared with it."""
         age_ns = window.close_ns - window.release_ns
         missed = int(missed_cycles(window.latency_ns, age_ns, self._deadline_ns))
         l95_ms, uncut_ms = seen_l95_ms(window.latency_ns, age_ns, self._censor_ms)
-        shares = self.utilisation(window)
-        if window.evidence is not None:
-            self.learn(window.evidence)
-        return self.propose_on(float(l95_ms), missed / len(age_ns), float(uncut_ms), shares)
+        return float(l95_ms), missed / len(age_ns), float(uncut_ms)
+
+    def seen(self, window: ClosedWindow, names: Iterable[str]) -> tuple[float, float, float]:
+        """Return L95 (ms), V_D and J of a window without a decision.
+
+        Parameters
+        ----------
+        names : iterable of str
+            Candidate of the cycle before it, then the candidates of its cycles.
+        """
+        placed = self.problem.candidates
+        moved = sum(hamming(placed[b], placed[a]) for a, b in pairwise(names) if a != b)
+        l95_ms, violation_rate, _ = self._metrics(window)
+        busy = dict(zip(self.resources, self.utilisation(window)[0, :, None], strict=True))
+        of = np.array([l95_ms]), np.array([violation_rate]), busy, np.array([moved])
+        return l95_ms, violation_rate, float(seen_costs(self.problem, *of)[0])
 
     def propose_on(
         self,
@@ -672,18 +714,19 @@ def _without_estimator(
     return policy, named or estimator
 
 
-def _shadow_fraction(estimator: CellEstimator, problem: Problem) -> float:
-    """Share of the cycles that an estimator wants sent through each alternative.
+def _shadow_fractions(estimator: CellEstimator, problem: Problem) -> FrozenDict[str, float]:
+    """Share of the cycles that an estimator wants sent through each alternative, by candidate.
 
     Raises
     ------
     ProblemError
         If it is no share, or all alternatives together would get more than all cycles.
     """
-    fraction = estimator.shadow_fraction
     who = f"shadow_fraction of {type(estimator.given).__name__}"
-    SHADOW_FRACTION.check(who, fraction)
-    message = too_many_shadows(fraction, len(problem.candidates))
-    if message:
-        raise ProblemError([Fault(who, message)])
-    return float(fraction)
+    fractions = by_candidate(estimator.shadow_fraction, problem.candidates)
+    for fraction in fractions.values():
+        SHADOW_FRACTION.check(who, fraction)
+        message = too_many_shadows(fraction, len(problem.candidates))
+        if message:
+            raise ProblemError([Fault(who, message)])
+    return FrozenDict({name: float(fraction) for name, fraction in fractions.items()})

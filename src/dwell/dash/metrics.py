@@ -37,11 +37,12 @@ SENTENCES: Mapping[Kind, Mapping[str, str]] = {
         "dwell_health": "1 of the health that the cell has, 0 of every other.",
         "dwell_deadline_seconds": "Deadline of a cycle.",
         "dwell_guard_fallback": "Whether the cell is where its guard has put it.",
-        "dwell_violation_ratio": "Share of the cycles of the last window that missed.",
-        "dwell_estimated_cost": "Cost J of a candidate as estimated at the close of the last "
-        "window.",
-        "dwell_utilisation_ratio": "Utilisation of a resource in the last window, foreign work "
-        "included.",
+        "dwell_release_ratio": "Cycles released per period, over the time of three windows.",
+        "dwell_violation_ratio": "Share of the cycles that the last decision looked at that "
+        "missed.",
+        "dwell_estimated_cost": "Cost J of a candidate as estimated for the last decision.",
+        "dwell_utilisation_ratio": "Utilisation of a resource over the cycles that the last "
+        "decision looked at, foreign work included.",
         "dwell_clock_bound_seconds": "Largest error of the latencies of the last window, by the "
         "clocks.",
         "dwell_window_unproven": "Whether clocks or losses of messages leave the last window "
@@ -60,6 +61,8 @@ SENTENCES: Mapping[Kind, Mapping[str, str]] = {
         "dwell_missed_cycles": "Cycles since the observer began that missed.",
         "dwell_unread_cycles": "Cycles that dwell_cycle_latency_seconds lacks, since this process "
         "was too slow.",
+        "dwell_silences": "Calls of hold() or zero() since the controller began, except for one "
+        "that lasts.",
         "dwell_migrations": "Moves of the cell since the controller began, by reason; those of the "
         "guard among them.",
         "dwell_windows": "Closed windows of the run.",
@@ -149,6 +152,7 @@ class CellMetrics(Collector):
             ],
             "dwell_deadline_seconds": [({}, self._deadline_s)],
             "dwell_guard_fallback": [({}, status.get("fallback"))],
+            "dwell_release_ratio": [({}, status.get("release_ratio"))],
             "dwell_violation_ratio": [({}, window.get("violation_rate"))],
             "dwell_estimated_cost": [
                 ({"placement": name}, estimates.get(name)) for name in problem.candidates
@@ -173,6 +177,7 @@ class CellMetrics(Collector):
             ],
             "dwell_missed_cycles": [({}, now.missed)] if now.cycles else [],
             "dwell_unread_cycles": [({}, self._unread)],
+            "dwell_silences": [({}, status.get("silences"))],
             "dwell_migrations": [({"reason": one}, moves.get(one)) for one in MOVED_BY],
             "dwell_windows": [({}, status.get("windows"))],
         }

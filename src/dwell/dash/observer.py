@@ -82,10 +82,14 @@ class ObservedCycle:
 
 @dataclass(frozen=True, slots=True)
 class ObservedWindow:
-    """A closed window, and what was decided on it, as the controller's status tells it.
+    """A decision and its cycles, by the controller's status.
+
+    The cycles are a window, or the last W at most if `decide_cycles` is below W.
 
     Parameters
     ----------
+    number : int
+        Window of the last of its cycles.
     at_s : float
         Its close, in seconds since the first release of the run; as exact as the status is young.
     said : mapping
@@ -367,8 +371,9 @@ class Observer:
     # ------------------------------------------------------------------------ asking
 
     def _ask_on(self) -> None:
-        """Ask the controller again and again, so often that no window is left out."""
-        every_s = min(max(self.problem.window_ms / 2e3, LEAST_ASK_S), MOST_ASK_S)
+        """Ask the controller again and again, so often that few decisions are left out."""
+        apart_ms = self.problem.decide_cycles * self.problem.pipeline.period_ms
+        every_s = min(max(apart_ms / 2e3, LEAST_ASK_S), MOST_ASK_S)
         while not self._stopped.wait(every_s):
             self._look()
 
@@ -387,7 +392,7 @@ class Observer:
             at_s = self._now_s()
             window = status.get("window") or {}
             last = self.windows.last
-            if window and (last is None or window["number"] != last.number):
+            if window and (last is None or window["last_cycle"] != last.said["last_cycle"]):
                 close_s = max(at_s - window["age_ms"] / 1e3, 0.0)
                 self.windows.append(ObservedWindow(window["number"], close_s, window))
             for event in self._events(before, status, at_s):

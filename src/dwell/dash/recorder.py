@@ -158,6 +158,8 @@ class CellRecorder:
             "decisions",
             {
                 "window": window.number,
+                "last_cycle": said.get("last_cycle"),
+                "cycles": said.get("cycles"),
                 "incumbent": said.get("placement"),
                 "reason": said.get("reason"),
                 **{f"j_{name}": costs.get(name) for name in known.candidates},

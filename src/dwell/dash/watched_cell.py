@@ -18,7 +18,7 @@ MOST_CYCLES = 40_000
 #: Parts of a controller's status that the page shows as they are.
 SHOWN = (
     *("health", "headline", "mode", "fallback", "moving_to", "proving", "pinned", "drained"),
-    *("migrations", "guard_moves", "unproven", "bound_ms"),
+    *("migrations", "guard_moves", "unproven", "bound_ms", "silences", "release_ratio"),
 )
 
 
@@ -130,18 +130,19 @@ class WatchedCell:
 
     def _window_state(self, window: Mapping[str, Any]) -> Plain:
         seen = {name: window[name] for name in ("l95_ms", "violation_rate", "cost")}
-        ends = {one.number: one for one in self._windows[-3:]}
-        known, before = ends.get(window["number"]), ends.get(window["number"] - 1)
-        end_s = 0.0 if known is None else known.at_s
+        last, period_s = window["last_cycle"], self.problem.pipeline.period_ms / 1e3
+        recent = self._windows[-3:]
+        before = [one for one in recent if one.said["last_cycle"] < last][-1:]
+        end_s = next((one.at_s for one in recent if one.said["last_cycle"] == last), 0.0)
         return {
             "window": {
                 "number": window["number"],
-                "begin": end_s - self.problem.window_ms / 1e3,
+                "begin": end_s - window["cycles"] * period_s,
                 "end": end_s,
                 "placement": window["placement"],
                 "seen": seen,
             },
-            "predicted": before and _estimate(before.said, window["placement"]),
+            "predicted": _estimate(before[0].said, window["placement"]) if before else None,
             "used": window["utilisation"],
             "decision": {
                 "incumbent": window["placement"],

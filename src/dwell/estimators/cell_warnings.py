@@ -62,6 +62,7 @@ def warnings_of(problem: Problem) -> Iterator[Fault]:
     yield from _late_releases(problem)
     yield from _odd_traces(problem)
     yield from _stale_commands(problem)
+    yield from _short_dwell(problem)
     yield from _unstable_loops(problem, profile)
     yield from _without_effect(problem)
 
@@ -487,6 +488,17 @@ def _odd_traces(problem: Problem) -> Iterator[Fault]:
         elif span_ms > LONGEST_SPAN * period_ms:
             odd = f"{span_ms / 1e3:.4g} s, more than {LONGEST_SPAN:g} periods"
             yield Fault(table.file, f"its rows last {odd}; convert its instants to ms")
+
+
+def _short_dwell(problem: Problem) -> Iterator[Fault]:
+    """Yield a dwell that is shorter than the time between two decisions."""
+    cycles, every = problem.controller.min_dwell_cycles, problem.decide_cycles
+    if 0 < cycles < every:
+        yield Fault(
+            "controller.min_dwell_cycles",
+            f"{cycles} is less than decide_cycles = {every} and counts as {every}, because a move "
+            "is decided every decide_cycles only; raise it, lower decide_cycles, or remove it",
+        )
 
 
 def _stale_commands(problem: Problem) -> Iterator[Fault]:

@@ -10,11 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.estimators.evidence import Evidence
-from dwell.estimators.measured import Message, Part
+from dwell.estimators.link_rates import Rate, better_rate
+from dwell.estimators.measured import Message, Part, sending_ns
 from dwell.estimators.online import Online
-from dwell.estimators.pool import Pool
+from dwell.estimators.pool import Pool, share_error
 from dwell.estimators.prices import SEED
 from dwell.estimators.protocol import Support
+from dwell.estimators.shadow_price import fraction_of
 from dwell.estimators.slow_processes import unseen_error
 from dwell.model.controller_settings import HALF_LIFE_WINDOWS
 from dwell.model.problem import Problem
@@ -24,6 +26,8 @@ Floats: TypeAlias = NDArray[np.float64]
 #: Deviation of the logarithm of a price one window after a part was measured that is not as
 #: declared.
 WIDENING = 0.03
+#: Share of the time that a rate takes to send a message which is too short for that rate.
+EARLY = 0.9
 
 
 class Learning(Online):
@@ -32,7 +36,8 @@ class Learning(Online):
     Parameters
     ----------
     shadow_fraction : float, optional
-        Share of the cycles sent through each alternative; the cell file's where None.
+        Share of the cycles sent through each alternative; where None the cell file's, and where
+        that is `auto` by the active candidate (`dwell.estimators.shadow_price`).
     half_life_windows : float, optional
         The cell file's where None.
     seed : int
@@ -48,6 +53,7 @@ class Learning(Online):
     #: was not measured any more is as declared again.
     MEMORY: ClassVar[float]
     UNSEEN: ClassVar[float]
+    states_errors = True
 
     def __init__(
         self,
@@ -56,9 +62,7 @@ class Learning(Online):
         half_life_windows: float | None = None,
         seed: int = SEED,
     ) -> None:
-        settings = problem.controller
-        given = problem.shadow_fraction if shadow_fraction is None else shadow_fraction
-        self.shadow_fraction = given
+        settings, self._given_fraction = problem.controller, shadow_fraction
         half_life = settings.half_life_windows if half_life_windows is None else half_life_windows
         HALF_LIFE_WINDOWS.check("half_life_windows", half_life)
         #: In decisions.
@@ -74,15 +78,18 @@ class Learning(Online):
 
     def __repr__(self) -> str:
         return (
-            f"{type(self).__name__}(shadow_fraction={self.shadow_fraction:g}, "
-            f"regimes={self.regimes})"
+            f"{type(self).__name__}(shadow_fraction={self.shadow_fraction}, regimes={self.regimes})"
         )
 
     def start(self, problem: Problem) -> None:
         """Forget everything but the profile."""
+        given = self._given_fraction
+        self.shadow_fraction = fraction_of(problem) if given is None else given
         super().start(problem)
         #: Decisions that have been learnt from.
         self._window = 0
+        #: Links on which delays have changed, and the decision at which they last did.
+        self._doubts: dict[str, int] = {}
         self._pools = {
             part: Pool(reference, isinstance(part, Message))
             for part, reference in self._playing.declared.references.items()
@@ -90,8 +97,29 @@ class Learning(Online):
 
     def _take_in(self, demands: Mapping[Part, Floats], evidence: Evidence) -> None:
         self._window += 1
-        changed: list[Part] = []
         cycles = len(evidence.release_ns)
+        changed = self._learn(demands, cycles)
+        for pool in self._pools.values():
+            if pool.touched and self._window - pool.touched >= max(self.unseen, 1.0):
+                pool.reset()
+                self._has_changed = True
+        links = self._links_of_other_rates(demands, changed, evidence)
+        if links:
+            of = [part for part in self._pools if isinstance(part, Message) and part.link in links]
+            for part in of:
+                self._pools[part].reset()
+            demands = self._meter.demands(evidence, self._threads)
+            changed = [part for part in changed if part not in of]
+            changed += self._learn({part: demands[part] for part in of if part in demands}, cycles)
+            self._has_changed = True
+        self._regimes += len(changed) + len(links)
+        if changed:
+            self._has_changed = True
+            self._correct(changed, frozenset(demands))
+
+    def _learn(self, demands: Mapping[Part, Floats], cycles: int) -> list[Part]:
+        """Add values to the pools of their parts; return the parts whose regime has changed."""
+        changed = []
         # How often any part is compared with its reference in a window of the cell.
         tests = len(self._pools) * max(self.problem.window_cycles / cycles, 1.0)
         for part, values in demands.items():
@@ -100,14 +128,62 @@ class Learning(Online):
             if pool.learn(np.round(values, 6), self._window, self.memory, cycles, tests):
                 changed.append(part)
             self._has_grown |= not pool.is_declared
-        for pool in self._pools.values():
-            if pool.touched and self._window - pool.touched >= max(self.unseen, 1.0):
-                pool.reset()
-                self._has_changed = True
-        self._regimes += len(changed)
-        if changed:
-            self._has_changed = True
-            self._correct(changed, frozenset(demands))
+        return changed
+
+    def _links_of_other_rates(
+        self, demands: Mapping[Part, Floats], changed: Sequence[Part], evidence: Evidence
+    ) -> set[str]:
+        """Set the rates of links whose messages show another one, and return the links."""
+        links = set()
+        for part in changed:
+            if isinstance(part, Message):
+                self._doubts[part.link] = self._window
+        for link, since in self._doubts.items():
+            after = self._window - since
+            parts = [p for p in demands if isinstance(p, Message) and p.link == link]
+            declared, now = self.problem.fabric.links[link].rate_mbps, self._rates.get(link)
+            found = None
+            if now is not None and self._is_faster(evidence, parts, now.mbps):
+                found = Rate(declared)
+            # After 0, 1, 2, 4, ... decisions.
+            elif not after & (after - 1) and not all(self._pools[p].is_declared for p in parts):
+                found = self._better_rate(link, parts, evidence)
+            if found is not None:
+                links.add(link)
+                self._rates[link] = found
+                self._meter.set_rate(link, found.mbps)
+                if found.mbps == declared:
+                    del self._rates[link]
+        return links
+
+    def _is_faster(self, evidence: Evidence, parts: Sequence[Message], mbps: float) -> bool:
+        """Whether messages of a part took less time than a rate allows."""
+        times = self._meter.times(evidence)
+        least = [(times[part], sending_ns(self.problem, part, mbps) / 1e6) for part in parts]
+        return any(float(np.median(taken)) < EARLY * ms for taken, ms in least)
+
+    def _better_rate(self, link: str, parts: Sequence[Message], evidence: Evidence) -> Rate | None:
+        """Return the rate of a link that explains its messages better than the present one."""
+        references = {part: self._pools[part].reference for part in parts}
+        references = {part: one for part, one in references.items() if one.usual < math.inf}
+        if not references:
+            return None
+
+        def extra_ms(mbps: float) -> Floats:
+            delays = self._meter.delays(evidence, link, mbps)
+            extra = []
+            for part, reference in references.items():
+                late = (delays[part] > 0) | (reference.ordered[0] == 0)
+                extra.append(np.where(late, delays[part] - reference.usual, np.nan))
+            every: Floats = np.concatenate(extra)
+            arrived: Floats = every[every != math.inf]
+            return arrived
+
+        known = np.concatenate([one.values - one.usual for one in references.values()])
+        deviation_ms = float(np.abs(known[np.isfinite(known)]).mean())
+        declared = self.problem.fabric.links[link].rate_mbps
+        now = self._rates.get(link, Rate(declared)).mbps
+        return better_rate(extra_ms, now, declared, deviation_ms)
 
     def _correct(self, changed: Sequence[Part], measured: frozenset[Part]) -> None:
         """Correct what nobody measured by what has changed."""
@@ -144,11 +220,19 @@ class Learning(Online):
         return (self._window - decision) / self.problem.decisions_per_window
 
     def _known_error(self, name: str, rate: float) -> tuple[float, float]:
-        pools = [self._pools[part] for part in self._parts[name]]
-        measured = [pool for pool in pools if not pool.is_declared]
+        parts = self._parts[name]
+        sent_ms = [
+            sending_ns(self.problem, part, found.mbps) / 1e6 * found.error
+            for part in parts
+            if isinstance(part, Message) and (found := self._rates.get(part.link)) is not None
+        ]
+        measured = [pool for part in parts if not (pool := self._pools[part]).is_declared]
         if not measured:
-            return 0.0, 0.0
-        l95_ms = math.hypot(*(pool.error_ms for pool in measured))
+            return math.hypot(*sent_ms), 0.0
+        l95_ms = math.hypot(*(pool.error_ms for pool in measured), *sent_ms)
+        lost = [share_error(pool.lost, max(pool.measured, 1)) for pool in measured if pool.lost]
+        if lost:
+            l95_ms = math.hypot(l95_ms, self._playing.tail_error_ms(name, math.hypot(*lost)))
         widened = max(map(self._widening, measured)) * self._playing.played(name).l95_ms
         count = max(min(pool.measured for pool in measured), 1)
         return math.hypot(l95_ms, widened), unseen_error(rate, count)

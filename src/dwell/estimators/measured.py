@@ -83,7 +83,8 @@ class Meter:
         self._times = PartTimes(len(self._parts))
         costs = [_cost(problem, part) for part in self._parts]
         self._cost, self._usual_cost = np.array(costs), np.array(costs)
-        self._demands = PartTimes(len(self._parts), self._cost, *self._links())
+        self._link, repeats = self._links()
+        self._demands = PartTimes(len(self._parts), self._cost, self._link, repeats)
         nodes = problem.fabric.nodes
         #: Parts whose jobs need more of the core beside foreign threads, with their nodes.
         self._interfered = [
@@ -133,6 +134,23 @@ class Meter:
             work_ns = self.work_ns(shadows, evidence.shadow_placement, foreign)
             told = replace(told, shadows=replace(shadows, work_ns=work_ns))
         return self._take_apart(self._demands, told)
+
+    def set_rate(self, link: str, rate_mbps: float) -> None:
+        """Let the messages of a link be sent at a rate, and wait for each other there."""
+        number = list(self._problem.fabric.links).index(link)
+        for i, part in enumerate(self._parts):
+            if isinstance(part, Message) and part.link == link:
+                self._usual_cost[i] = sending_ns(self._problem, part, rate_mbps)
+                self._link[i] = number
+
+    def delays(self, evidence: Evidence, link: str, rate_mbps: float) -> dict[Part, Floats]:
+        """Demands of messages, of a link at some rate (see `demands`)."""
+        usual, joins = self._usual_cost.copy(), self._link.copy()
+        self.set_rate(link, rate_mbps)
+        self._cost[:] = self._usual_cost
+        found = self._take_apart(self._demands, evidence)
+        self._usual_cost[:], self._link[:] = usual, joins
+        return {part: values for part, values in found.items() if isinstance(part, Message)}
 
     def _take_apart(self, found: PartTimes, evidence: Evidence) -> dict[Part, Floats]:
         limit_ns = evidence.close_ns - self._patience_ns
@@ -237,12 +255,14 @@ class Meter:
         """
         links = self._problem.fabric.links.values()
         repeating = [one.name for one in links if one.in_order and one.retransmit_ms is not None]
-        waited = [one.name for one in links if one.rate_mbps < np.inf or one.name in repeating]
-        names = [part.link if isinstance(part, Message) else None for part in self._parts]
-        number = np.array(
-            [waited.index(name) if name in waited else -1 for name in names], np.int64
-        )
-        return number, np.array([name in repeating for name in names], np.int64)
+        number = {
+            one.name: place
+            for place, one in enumerate(links)
+            if one.rate_mbps < np.inf or one.name in repeating
+        }
+        names = [part.link if isinstance(part, Message) else "" for part in self._parts]
+        waits = np.array([number.get(name, -1) for name in names], np.int64)
+        return waits, np.array([name in repeating for name in names], np.int64)
 
     def _layout(self, active: int) -> CyclesLayout:
         """Return what cycles under a candidate, and their shadows, have for themselves."""
@@ -290,10 +310,11 @@ def _cost(problem: Problem, part: Part) -> float:
     return 1.0 / cores_of(node, problem.pipeline.tasks[part.task].on[part.node])
 
 
-def sending_ns(problem: Problem, message: Message) -> float:
-    """Time that the link of a message takes to send it, nanoseconds."""
+def sending_ns(problem: Problem, message: Message, rate_mbps: float | None = None) -> float:
+    """Time to send a message, nanoseconds, at a rate or, where None, the link's own."""
     bytes_of = {(flow.source, flow.target): flow.payload_bytes for flow in problem.pipeline.flows}
-    rate_mbps = problem.fabric.links[message.link].rate_mbps
+    if rate_mbps is None:
+        rate_mbps = problem.fabric.links[message.link].rate_mbps
     return float(round(8e3 * bytes_of[message.source, message.target] / rate_mbps))
 
 

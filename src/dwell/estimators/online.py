@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from dwell.cost import cost, cost_error, hamming
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.foreign_threads import ForeignThreads, Level, Stretches
+from dwell.estimators.link_rates import Rate
 from dwell.estimators.measured import Message, Meter, Part, groups, parts_of
 from dwell.estimators.presents import PlayedPrice, Playing, Present
 from dwell.estimators.prices import SEED, Price
@@ -30,11 +31,12 @@ from dwell.estimators.spans import patience_ns
 from dwell.model.frozen import FrozenDict
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS
+from dwell.model.shadow_plan import by_candidate
 
 Floats: TypeAlias = NDArray[np.float64]
 
 #: Steps that are played when the present changes, the first of which settles queues.
-FIRST_STEPS = 4
+FIRST_STEPS = 6
 #: How often a close goes on with candidates that it is not sure of, and how many steps each time.
 ROUNDS, STEPS = 2, 2
 #: How many standard errors a difference of two prices must be from what would decide otherwise.
@@ -50,8 +52,8 @@ class Online(CellEstimator):
 
     Attributes
     ----------
-    shadow_fraction : float
-        Share of the cycles sent through each alternative.
+    shadow_fraction : float, or mapping of str to float
+        Share of the cycles sent through each alternative, by the candidate that is active.
     seed : int
         Seed of what is played.
     """
@@ -74,6 +76,8 @@ class Online(CellEstimator):
             name: ForeignThreads(node, every) for name, node in problem.fabric.nodes.items()
         }
         self._down: frozenset[str] = frozenset()
+        #: Rates of links that are not as declared.
+        self._rates: dict[str, Rate] = {}
         self._shared: frozenset[str] = frozenset()
         #: Counts presents: changes, and every time that what is known of one has doubled.
         self.revision = 0
@@ -141,7 +145,8 @@ class Online(CellEstimator):
         """What is not as the cell declares it."""
         self._take_in_pending()
         threads = {name: one.beyond for name, one in self._foreign.items() if one.beyond}
-        return Present(FrozenDict(self._otherwise()), FrozenDict(threads), self._down)
+        rates_mbps = FrozenDict({link: rate.mbps for link, rate in self._rates.items()})
+        return Present(FrozenDict(self._otherwise()), FrozenDict(threads), self._down, rates_mbps)
 
     @property
     def _threads(self) -> dict[str, float]:
@@ -282,9 +287,10 @@ class Online(CellEstimator):
         """Candidates that have anything that is not as declared."""
         otherwise = self._otherwise()
         nodes = {name for name, foreign in self._foreign.items() if foreign.beyond} | self._down
-        if not otherwise and not nodes:
-            return []
         links = {part.link for part in otherwise if isinstance(part, Message)}
+        links |= self._rates.keys()
+        if not otherwise and not nodes and not links:
+            return []
         return [
             name
             for name, parts in self._parts.items()
@@ -319,6 +325,7 @@ class Online(CellEstimator):
         """Share of each resource that shadow jobs take while the cell is on a candidate."""
         problem, here = self.problem, self.problem.candidates[name]
         pipeline, resources = problem.pipeline, problem.fabric.resources
+        fraction = by_candidate(self.shadow_fraction, problem.candidates)[name]
         share = dict.fromkeys(resources, 0.0)
         for there in problem.candidates.values():
             for task in pipeline.diverging(here, there):
@@ -329,5 +336,5 @@ class Online(CellEstimator):
                 threads = execution.threads if execution.accelerator is None else 1
                 busy_ms = mean_ms(pipeline, pipeline.tasks[task], execution) * threads
                 capacity = resources[resource].capacity
-                share[resource] += self.shadow_fraction * busy_ms / pipeline.period_ms / capacity
+                share[resource] += fraction * busy_ms / pipeline.period_ms / capacity
         return FrozenDict(share)

@@ -32,6 +32,8 @@ SHIFTED, ALIKE = 4.0, 2.0
 MOVED = 0.75
 #: How much more than any stretch of the undisturbed cell another regime must deviate.
 MARGIN = 1.2
+#: How much longer than all others a first job takes that is cold: it loads what others find.
+COLD = 1.5
 #: Deviations that are a change within a window, of at least so many values.
 CHANGED, LEAST = 5.0, 36
 
@@ -63,10 +65,10 @@ class Reference:
     """
 
     __slots__ = (
-        "_block",
         "_extremes",
         "_in_order",
         "_patience_ms",
+        "block",
         "likeness",
         "lost",
         "ordered",
@@ -81,7 +83,7 @@ class Reference:
         kept: int | None = None,
         patience_ms: float = math.inf,
     ) -> None:
-        self.values, self._block = values[:kept], block
+        self.values, self.block = values[:kept], block
         self.usual = middle(values)
         self.lost = float(np.isinf(values).mean()) if len(values) else 0.0
         is_late = ((values > patience_ms) & np.isfinite(values)).any()
@@ -152,7 +154,7 @@ class Reference:
 
     def _together(self, size: int, cycles: int) -> float:
         """How many values of a longer stretch may be alike."""
-        return size * min(self._block / cycles, 1.0)
+        return size * min(self.block / cycles, 1.0)
 
     def _in_time(self, values: Floats) -> Floats:
         if self._patience_ms == math.inf:
@@ -186,10 +188,12 @@ class Pool:
     """
 
     __slots__ = (
+        "_alone",
         "_chunks",
         "_cycles",
         "_doubt",
         "_lasting",
+        "_run",
         "_shift",
         "additive",
         "held",
@@ -200,11 +204,15 @@ class Pool:
         "touched",
     )
 
+    #: The first job of all, if no other was measured in its window; else 0.
+    _alone: float
     _doubt: _Doubt | None
+    #: Successive decisions whose values are larger, or smaller, than most that were known before.
+    _run: _Doubt | None
 
     def __init__(self, reference: Reference, additive: bool) -> None:
         self.reference, self.additive = reference, additive
-        self.last = 0
+        self.last, self._alone = 0, 0.0
         self.reset()
 
     def __repr__(self) -> str:
@@ -225,11 +233,15 @@ class Pool:
 
     @property
     def error_ms(self) -> float:
-        """Standard error of what the values take in the mean."""
-        known = self.held[np.isfinite(self.held)]
+        """Standard error of the values' 95th percentile, and no less than of their mean."""
+        known = np.sort(self.held[np.isfinite(self.held)])
         if len(known) < 2:
             return 0.0
-        return float(known.std()) / math.sqrt(max(self.measured, 1))
+        count = max(self.measured, 2)
+        # Of few values the deviation is itself hardly known (see `Playing`).
+        few = (count + 1) / (count - 1)
+        of_mean = few * float(known.std()) / math.sqrt(count)
+        return max(of_mean, quantile_error(known, share_error(0.05, count)))
 
     def reset(self) -> None:
         """Return to what is declared."""
@@ -263,29 +275,59 @@ class Pool:
         tests : float
             How often any part is compared so in a window of the cell.
         """
-        self.last = window
+        is_first, self.last = not self.last, window
         cycles = len(values) if cycles is None else cycles
         # A copy: they are overwritten by the next window's.
         values = values[:: -(-len(values) // LARGEST)].copy()
         reference = self.reference
+        if not self.additive and len(reference.ordered):
+            values = self._without_cold(values, is_first)
         declared = reference.places(values)
         if not len(reference.values):
             # Never came to an end where it is as declared, so that nothing can be told from it.
-            is_first, self.is_declared = self.is_declared, False
+            was_declared, self.is_declared = self.is_declared, False
             self._add(values, declared, window, memory, cycles)
-            return is_first
+            return was_declared
         if self.is_declared:
             return self._leave_declared(values, declared, window, memory, cycles, tests)
-        apart = PlaceSums.among(values, np.sort(self.held))
         if self._is_over(values, declared, cycles):
             self.reset()
             return True
-        is_another = apart.is_large and apart.deviations(reference.likeness) >= SHIFTED
-        if is_another and len(self.held) >= ENOUGH:
-            self._begin_anew(values, window, cycles)
+        run = self._run_before(cycles) or _Doubt(np.sort(self.held), PlaceSums(0, 0.0, 0.0, 0.0), 0)
+        run = self._run_on(run, PlaceSums.among(values, run.before), cycles)
+        is_another = run.apart.is_large and run.apart.deviations(reference.likeness) >= SHIFTED
+        if is_another and len(run.before) >= ENOUGH:
+            self._begin_anew(self._since(run, values), window, run.cycles)
             return True
         self._add(values, declared, window, memory, cycles)
         return False
+
+    def _without_cold(self, values: Floats, is_first: bool) -> Floats:
+        """Drop the first job of all if it took far longer than all others."""
+        usual = COLD * float(self.reference.ordered[-1])
+        if is_first and len(values) > 1:
+            return values[int(values[0] > max(COLD * values[1:].max(), usual)) :]
+        if self._alone > max(COLD * values.max(), usual):
+            self.reset()
+        self._alone = float(values[0]) if is_first else 0.0
+        return values
+
+    def _run_before(self, cycles: int) -> _Doubt | None:
+        """Return the run of the decisions before; None if a stretch ends before this decision."""
+        run = self._run
+        return run if run is not None and run.cycles + cycles <= self.reference.block else None
+
+    def _run_on(self, run: _Doubt, apart: PlaceSums, cycles: int) -> _Doubt:
+        """Add values to a run, which goes on as long as most are larger, or smaller."""
+        run = _Doubt(run.before, run.apart + apart, run.cycles + cycles)
+        self._run = run if run.apart.is_large else None
+        return run
+
+    def _since(self, run: _Doubt, values: Floats) -> Floats:
+        """Return the values of a run, of which the newest have not been added."""
+        added = run.apart.size - len(values)
+        since = np.concatenate((self.held[max(len(self.held) - added, 0) :], values))
+        return since[-LARGEST:]
 
     def _is_over(self, values: Floats, declared: PlaceSums, cycles: int) -> bool:
         """Whether the regime is over: by all windows since its last value, where few came."""
@@ -314,10 +356,12 @@ class Pool:
         reference = self.reference
         # The chance of a deviation beyond x falls with exp(-x²/2).
         least = _least(tests)
-        if declared.is_large and reference.deviations(declared, cycles) >= least:
-            largest, _ = reference.extremes(declared.size, cycles, least)
-            if declared.largest > MARGIN * largest:
-                self._begin_anew(values, window, cycles)
+        none = _Doubt(reference.ordered, PlaceSums(0, 0.0, 0.0, 0.0), 0)
+        run = self._run_on(self._run_before(cycles) or none, declared, cycles)
+        if run.apart.is_large and reference.deviations(run.apart, run.cycles) >= least:
+            largest, _ = reference.extremes(run.apart.size, run.cycles, least)
+            if run.apart.largest > MARGIN * largest:
+                self._begin_anew(self._since(run, values), window, run.cycles)
                 return True
         self._add(values, declared, window, memory, cycles)
         if self._off_declared() < least:
@@ -382,7 +426,7 @@ class Pool:
         self._shift = self.reference.places(values)
         self._chunks = deque([_Chunk(window, self._shift, 0)])
         self.measured, self.touched = 0, window
-        self._cycles, self._lasting, self._doubt = 0, 0, None
+        self._cycles, self._lasting, self._doubt, self._run = 0, 0, None, None
 
     def _add(
         self, values: Floats, shift: PlaceSums, window: int, memory: float, cycles: int
@@ -483,14 +527,16 @@ def _mean_log(size: int, deviations: float) -> float:
 
 
 class _Doubt(NamedTuple):
-    """Successive windows under a regime whose values are as declared.
+    """Successive decisions whose values are compared with known ones together.
 
     Parameters
     ----------
     before : float64 array
-        What was held before them, ascending.
+        What was known before them, ascending.
     apart : PlaceSums
         Their values among those.
+    cycles : int
+        Cycles that they are from.
     """
 
     before: Floats
@@ -504,6 +550,25 @@ class _Chunk(NamedTuple):
     window: int
     shift: PlaceSums
     cycles: int
+
+
+def share_error(share: float, count: int) -> float:
+    """Return the standard error of a share among independent values."""
+    return math.sqrt(share * (1.0 - share) / count)
+
+
+def quantile_error(ordered: Floats, off: float) -> float:
+    """Return the error of the 95th percentile of ascending values whose place has an error.
+
+    The values at the places two errors off are the limits (Woodruff, DOI 10.2307/2280781); half
+    the distance to the farther one is the error.
+    """
+    last = len(ordered) - 1
+    low, usual, high = (
+        float(ordered[min(max(round(place * last), 0), last)])
+        for place in (0.95 - 2 * off, 0.95, 0.95 + 2 * off)
+    )
+    return max(high - usual, usual - low) / 2
 
 
 def newest(values: Floats) -> int:

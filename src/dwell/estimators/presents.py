@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from dwell.estimators.evidence import Evidence, Instants
 from dwell.estimators.measured import Message, Meter, Part, Site, cores_of, parts_of
-from dwell.estimators.pool import Reference
+from dwell.estimators.pool import Reference, quantile_error
 from dwell.estimators.prices import SEED, Question, most_windows, prices_of
-from dwell.estimators.sent_shadows import SentShadows, hindered, stamps_of
+from dwell.estimators.sent_shadows import SentShadows, stamps_of
 from dwell.estimators.slow_processes import slow_processes, unseen_error
 from dwell.estimators.spans import patience_ns
 from dwell.kernels.advance import logged_instants, play
@@ -35,6 +35,7 @@ from dwell.kernels.rows import Rows, row_types
 from dwell.model.fabric import Node
 from dwell.model.frozen import FrozenDict
 from dwell.model.problem import Problem
+from dwell.model.shadow_plan import ShadowFraction
 
 Floats: TypeAlias = NDArray[np.float64]
 Ints: TypeAlias = NDArray[np.int64]
@@ -69,14 +70,18 @@ class Present:
         mean, and so many less, all the time.
     down : frozenset of str
         Nodes that are down.
+    rates_mbps : mapping of str to float
+        Rates of links.
     """
 
     demands: Mapping[Part, Floats] = field(default_factory=FrozenDict)
     threads: Mapping[str, float] = field(default_factory=FrozenDict)
     down: frozenset[str] = frozenset()
+    rates_mbps: Mapping[str, float] = field(default_factory=FrozenDict)
 
     def __repr__(self) -> str:
         what = [*map(str, self.demands), *self.threads, *(f"{name} down" for name in self.down)]
+        what += [f"{name} at {mbps:.3g} Mbit/s" for name, mbps in self.rates_mbps.items()]
         return f"<Present: {', '.join(what) or 'as declared'}>"
 
 
@@ -100,6 +105,7 @@ class _Step(NamedTuple):
     violation_rate: float
     declared_rate: float
     own: Floats
+    latency_ns: Ints
 
 
 class _Twin:
@@ -147,8 +153,9 @@ class Playing:
     ----------
     seed : int
         Seed of what is as declared.
-    shadow_fraction : float
-        Share of the cycles that are also sent through each alternative.
+    shadow_fraction : float, or mapping of str to float
+        Share of the cycles that are also sent through each alternative, by the candidate that is
+        played.
 
     Attributes
     ----------
@@ -158,7 +165,9 @@ class Playing:
         Cycles that have been played of all candidates since the start.
     """
 
-    def __init__(self, problem: Problem, seed: int = SEED, shadow_fraction: float = 0.0) -> None:
+    def __init__(
+        self, problem: Problem, seed: int = SEED, shadow_fraction: ShadowFraction = 0.0
+    ) -> None:
         self.problem, self._seed, self._shadow_fraction = problem, seed, shadow_fraction
         self.declared = declared_of(problem, seed, shadow_fraction)
         self.prices = prices_of(problem, shadow_fraction=shadow_fraction)
@@ -168,7 +177,7 @@ class Playing:
         self.cycles = 0
         self._twins: dict[str, _Twin] = {}
 
-    def __reduce__(self) -> tuple[type[Playing], tuple[Problem, int, float]]:
+    def __reduce__(self) -> tuple[type[Playing], tuple[Problem, int, ShadowFraction]]:
         # The kernel's tables have addresses; a copy begins anew.
         return Playing, (self.problem, self._seed, self._shadow_fraction)
 
@@ -236,6 +245,7 @@ class Playing:
                     float(seen["missed"].mean()) / self._window,
                     float(self.declared.violation_rate[name][stretch].mean()),
                     tables.shares[0, stretch, 1].mean(axis=0),
+                    tables.latency_ns[0, first * self._window : twin.cursor].copy(),
                 )
             )
         twin.price = None
@@ -248,8 +258,13 @@ class Playing:
             twin.price = self._price(name, twin.steps)
         return twin.price
 
+    def tail_error_ms(self, name: str, off: float) -> float:
+        """Return the error of a candidate's L95 by the error of the share of lost cycles."""
+        latency_ns = np.concatenate([step.latency_ns for step in self._twins[name].steps])
+        return quantile_error(np.sort(np.minimum(latency_ns / 1e6, self.problem.censor_ms)), off)
+
     def _price(self, name: str, steps: Collection[_Step]) -> PlayedPrice:
-        l95, declared_l95, uncut, rates, declared_rates, own = zip(*steps, strict=True)
+        l95, declared_l95, uncut, rates, declared_rates, own, _ = zip(*steps, strict=True)
         known = self.prices[name]
         l95_ms, l95_error_ms = _estimated(
             l95,
@@ -351,15 +366,20 @@ class Playing:
             if part in self._hops:
                 layers = tables.layers[self._hops[part] :: len(self._hops)]  # shadows' come after
                 layers[layers != 0] = self._nothing_ns.ctypes.data
+        for link, mbps in present.rates_mbps.items():
+            tables.rates["rate_mbps"][self._segments_of(link)] = mbps
         for link, share in _lost(present).items():
-            row = tables.links[list(links).index(link)]
-            mine = slice(row["segment"], row["segment_end"])
+            mine = self._segments_of(link)
             if links[link].retransmit_ms is None:
                 tables.rates["loss"][mine] = share
             else:
                 # Attempts that were lost are in the delays, and what never came was held back.
                 tables.rates["loss"][mine] = 0.0
                 tables.segments["is_down"][mine] = share >= 0.5
+
+    def _segments_of(self, link: str) -> slice:
+        row = self._first.tables.links[list(self.problem.fabric.links).index(link)]
+        return slice(row["segment"], row["segment_end"])
 
     def _changes(self, present: Present) -> Rows:
         """Return the changes of nodes with the present's foreign threads."""
@@ -448,18 +468,18 @@ def _estimated(
     differences = list(map(sub, steps, declared))
     if not any(differences):
         return known, known_error
-    mean, error = _mean_and_error(steps)
+    mean, error = _mean_and_error(steps, usual)
     more, more_error = _mean_and_error(differences)
     if cycles is not None:
         error = max(error, unseen_error(mean, cycles))
         differing = sum(map(abs, differences)) / len(steps)
         more_error = max(more_error, unseen_error(differing, cycles))
     more_error = math.hypot(more_error, known_error)
-    is_better = more_error < max(error, usual / math.sqrt(len(steps)))
-    return (max(known + more, 0.0), more_error) if is_better else (mean, error)
+    return (max(known + more, 0.0), more_error) if more_error < error else (mean, error)
 
 
-def _mean_and_error(values: Sequence[float]) -> tuple[float, float]:
+def _mean_and_error(values: Sequence[float], usual: float = 0.0) -> tuple[float, float]:
+    """Return the mean, and its error had one value more deviated as is usual."""
     # Of few numbers; an array would take longer.
     count = len(values)
     # Of equal values exactly that, and no error.
@@ -469,8 +489,9 @@ def _mean_and_error(values: Sequence[float]) -> tuple[float, float]:
     squares = sum((value - mean) * (value - mean) for value in values)
     # Of few values the deviation is itself hardly known: about Student's t over 2.
     few = (count + 1) / (count - 1)
-    error = few * math.sqrt(squares / (count * (count - 1)))
-    return mean, error * math.sqrt(_correlation_factor(values, mean, squares))
+    variance = max(squares / (count - 1), (squares + usual * usual) / count)
+    factor = _correlation_factor(values, mean, squares)
+    return mean, few * math.sqrt(variance / count * factor)
 
 
 def _correlation_factor(values: Sequence[float], mean: float, squares: float) -> float:
@@ -519,7 +540,7 @@ def _with_short_windows(problem: Problem) -> Problem:
 
 def realised(problem: Problem, real: Realisation, present: Present) -> Realisation:
     """Return draws of the undisturbed cell with what a present has in the place of some of them."""
-    if not (present.demands or present.threads or present.down):
+    if present == Present():
         return real
     exec_ns, delay_ns, extra_ns = real.exec_ns.copy(), real.delay_ns.copy(), real.extra_ns.copy()
     places = np.arange(real.cycles)
@@ -536,6 +557,8 @@ def realised(problem: Problem, real: Realisation, present: Present) -> Realisati
         demands = _drawn(values, stretched, places)
         if part in known and demands is not None:
             times[known.index(part)] = demands
+    for name, mbps in present.rates_mbps.items():
+        rates[state[:, 1] == segments.links.index(name), 0] = mbps
     for name, share in _lost(present).items():
         mine = state[:, 1] == segments.links.index(name)
         if problem.fabric.links[name].retransmit_ms is None:
@@ -557,14 +580,16 @@ def realised(problem: Problem, real: Realisation, present: Present) -> Realisati
     )
 
 
-def declared_of(problem: Problem, seed: int = SEED, shadow_fraction: float = 0.0) -> Declared:
+def declared_of(
+    problem: Problem, seed: int = SEED, shadow_fraction: ShadowFraction = 0.0
+) -> Declared:
     """Return the undisturbed cell; what was asked before is not played again."""
     question = Question.of(problem, "baseline", seed, DRAWN, shadow_fraction)
     known = _known.pop(question, None)
     if known is None:
         short = _with_short_windows(question.problem)
-        if question.shadow_fraction:
-            known = _with_shadows(short, declared_of(question.problem, seed), shadow_fraction)
+        if question.shadow_fractions:
+            known = _with_shadows(short, declared_of(question.problem, seed), question)
         else:
             known = _played_as_declared(short, seed)
     _known[question] = known
@@ -630,13 +655,13 @@ def _played(first: Arrays, index: int) -> Arrays:
     return arrays
 
 
-def _with_shadows(problem: Problem, plain: Declared, shadow_fraction: float) -> Declared:
+def _with_shadows(problem: Problem, plain: Declared, question: Question) -> Declared:
     """Play again with shadow jobs the candidates that are hindered by them."""
-    shadows = SentShadows(problem, plain.realisation, shadow_fraction)
+    shadows = SentShadows(problem, plain.realisation, question.shadow_fractions)
     first = lay_out([(problem, plain.realisation)], shadows=[shadows.realisation])
     l95_ms, violation_rate = dict(plain.l95_ms), dict(plain.violation_rate)
     for index, name in enumerate(problem.candidates):
-        if name in hindered(problem):
+        if question.shadow_fractions[name]:
             arrays = first.copy()
             arrays.replace(stamps=stamps_of(first, index, shadows))
             play(arrays)

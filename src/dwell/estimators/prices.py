@@ -36,6 +36,7 @@ from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS
 from dwell.model.scenario import Scenario
+from dwell.model.shadow_plan import ShadowFraction, by_candidate
 
 Floats: TypeAlias = NDArray[np.float64]
 Ints: TypeAlias = NDArray[np.int64]
@@ -134,7 +135,7 @@ class Question:
     name: str
     seed: int
     cycles: int | None
-    shadow_fraction: float
+    shadow_fractions: Mapping[str, float]
     problem: Problem = field(compare=False, repr=False)
 
     @classmethod
@@ -144,9 +145,12 @@ class Question:
         scenario: str,
         seed: int,
         cycles: int | None,
-        shadow_fraction: float = 0.0,
+        shadow_fraction: ShadowFraction = 0.0,
     ) -> Question:
         """Ask for the prices of a problem (see `prices_of`), whose phase is nothing to it alone."""
+        fractions = by_candidate(shadow_fraction, problem.candidates)
+        # Who is not hindered costs the same with shadows and without.
+        sent = {name: fractions[name] if name in hindered(problem) else 0.0 for name in fractions}
         if problem.pipeline.phase_ms is not None:
             problem = problem.at_phase(None)
         return cls(
@@ -161,7 +165,7 @@ class Question:
             name=scenario,
             seed=seed,
             cycles=cycles,
-            shadow_fraction=shadow_fraction if shadow_fraction and hindered(problem) else 0.0,
+            shadow_fractions=FrozenDict(sent if any(sent.values()) else {}),
             problem=problem,
         )
 
@@ -175,7 +179,7 @@ def prices_of(
     *,
     seed: int = SEED,
     cycles: int | None = None,
-    shadow_fraction: float = 0.0,
+    shadow_fraction: ShadowFraction = 0.0,
 ) -> Mapping[str, Price]:
     """Return the price of every candidate; what was asked before is not played again.
 
@@ -187,8 +191,9 @@ def prices_of(
         Seed of the draws.
     cycles : int, optional
         How many cycles of each candidate count; as many as are needed where None.
-    shadow_fraction : float
-        Share of the cycles that are also sent through each alternative.
+    shadow_fraction : float, or mapping of str to float
+        Share of the cycles that are also sent through each alternative, by the candidate that is
+        priced.
 
     Raises
     ------
@@ -233,15 +238,15 @@ def _answer(question: Question) -> Mapping[str, Price]:
         most = windows  # more would change the share of the time that is disturbed
     found: dict[str, Price] = {}
     left = list(problem.candidates)
-    if question.shadow_fraction:
+    if question.shadow_fractions:
         found |= prices_of(problem, question.name, seed=question.seed, cycles=question.cycles)
-        left = [name for name in left if name in hindered(problem)]
+        left = [name for name in left if question.shadow_fractions[name]]
     while True:
         drawing = Drawing(problem, question.name, seed=question.seed, windows=windows, wraps=True)
         realisation = drawing.take(windows)
         shadows = None
-        if question.shadow_fraction:
-            shadows = SentShadows(problem, realisation, question.shadow_fraction)
+        if question.shadow_fractions:
+            shadows = SentShadows(problem, realisation, question.shadow_fractions)
         is_last = windows == most
         found |= {
             name: price_of(problem, realisation, name, shadows, is_last=is_last) for name in left

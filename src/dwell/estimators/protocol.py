@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping
-from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 from dwell.estimators.evidence import Evidence
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS
+from dwell.model.shadow_plan import ShadowFraction
 
 if TYPE_CHECKING:
     from dwell.estimators.presents import Present
@@ -31,7 +32,11 @@ class Support(NamedTuple):
 
 @runtime_checkable
 class Estimator(Protocol):
-    """Predicts the QoS of every candidate from what a window showed under the incumbent."""
+    """Predicts the QoS of every candidate from what a window showed under the incumbent.
+
+    Its class may have an attribute ``states_errors``, true if its estimates have standard errors
+    (`QoS.error`). N_min is then 0 where a cell gives none, else 3.
+    """
 
     def estimate(
         self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
@@ -67,9 +72,10 @@ class Learner(Protocol):
     """An estimator that learns from what happened to jobs and messages.
 
     It may have an attribute ``shadow_fraction``, the share of the cycles that it wants sent through
-    each alternative as well, and a method ``support()`` that gives a `Support` for each candidate.
-    It is started before a run. Policies compare its prediction of the incumbent with those of the
-    others, so that an error that all of them share decides nothing.
+    each alternative as well (one number, or one for each active candidate), and a method
+    ``support()`` that gives a `Support` for each candidate. It is started before a run. Policies
+    compare its prediction of the incumbent with those of the others, so that an error that all of
+    them share decides nothing.
     """
 
     def start(self, problem: Problem) -> None:
@@ -94,15 +100,18 @@ class CellEstimator(ABC):
     ----------
     learns, supports : bool
         Whether it is shown what happened to jobs, and says what stands behind its estimates.
-    shadow_fraction : float
-        Share of the cycles that it wants sent through each alternative.
+    states_errors : bool
+        Whether its estimates have standard errors (`QoS.error`).
+    shadow_fraction : float, or mapping of str to float
+        Share of the cycles that it wants sent through each alternative, by the active candidate.
     revision : int
         Counts what is new of `present`.
     """
 
     learns: bool = False
     supports: bool = False
-    shadow_fraction: float = 0.0
+    states_errors: ClassVar[bool] = False
+    shadow_fraction: ShadowFraction = 0.0
     revision: int = 0
 
     def __init_subclass__(cls) -> None:

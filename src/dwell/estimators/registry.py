@@ -9,15 +9,16 @@ of a user's own needs no entry: its name is ``package.module:Class``.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
 from dwell.errors import ProblemError, RunError
 from dwell.model.bounds import CLASS_PATH
+from dwell.model.controller_settings import USUAL_DWELL
 from dwell.model.entry_points import class_named, names_with
 from dwell.model.semantics import nearest_of
-from dwell.model.user_classes import make_user_class
+from dwell.model.user_classes import make_user_class, user_class
 
 if TYPE_CHECKING:
     from dwell.estimators.protocol import Estimator
@@ -113,12 +114,40 @@ def by_name(name: str, problem: Problem) -> Estimator:
     if CLASS_PATH.holds(name):
         own = make_user_class(name, problem, "estimate", "estimator", ProblemError)
         return cast("Estimator", own)
+    kind = _class_of(name, problem)
+    make = getattr(kind, "from_problem", None)
+    return cast("Estimator", kind(problem) if make is None else make(problem))
+
+
+def _class_of(name: str, problem: Problem) -> Any:
+    """Import the class of an estimator."""
+    if CLASS_PATH.holds(name):
+        return user_class(name, problem.folder, "estimator", ProblemError)
     path = REGISTRY[name].path if name in REGISTRY else None
     kind = class_named(name, path, GROUP, "estimator", ProblemError)
     if kind is None:
         raise ProblemError(f"unknown estimator {name!r}; {nearest_of(name, names(), 'estimators')}")
-    make = getattr(kind, "from_problem", None)
-    return cast("Estimator", kind(problem) if make is None else make(problem))
+    return kind
+
+
+def resolved(problem: Problem, estimator: Estimator | str) -> Problem:
+    """Return the problem with the N_min that it has with an estimator.
+
+    Where the cell gives none, N_min is 0 if the estimator's class has a true ``states_errors``: the
+    margin of those errors then prevents moves by chance.
+
+    Raises
+    ------
+    ProblemError
+        As `by_name`.
+    """
+    settings = problem.controller
+    if settings.min_dwell is not None:
+        return problem
+    kind = _class_of(estimator, problem) if isinstance(estimator, str) else type(estimator)
+    # A user's class needs no base class.
+    least = 0 if getattr(kind, "states_errors", False) is True else USUAL_DWELL
+    return replace(problem, controller=replace(settings, min_dwell=least))
 
 
 def name_in_run(meta: Mapping[str, Any]) -> str:

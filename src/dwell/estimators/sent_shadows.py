@@ -19,7 +19,7 @@ from dwell.kernels.random_draws import draw_shadows
 from dwell.kernels.realisation import Realisation
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
-from dwell.model.shadow_plan import ShadowPlan
+from dwell.model.shadow_plan import ShadowFraction, ShadowPlan, by_candidate
 
 #: Share of D for which a shadow may hold links of own messages and still hinder nobody.
 NEGLIGIBLE = 0.002
@@ -30,8 +30,8 @@ class SentShadows:
 
     Parameters
     ----------
-    fraction : float
-        Share of the cycles that each alternative gets.
+    fraction : float, or mapping of str to float
+        Share of the cycles that each alternative gets, by the candidate that is active.
 
     Attributes
     ----------
@@ -39,8 +39,11 @@ class SentShadows:
         What the shadow jobs meet.
     """
 
-    def __init__(self, problem: Problem, realisation: Realisation, fraction: float) -> None:
-        self._plan = ShadowPlan(0, realisation.cycles, len(problem.candidates), fraction)
+    def __init__(
+        self, problem: Problem, realisation: Realisation, fraction: ShadowFraction
+    ) -> None:
+        fractions = by_candidate(fraction, problem.candidates)
+        self._plan = ShadowPlan(0, realisation.cycles, [*fractions.values()])
         self._hindered = [name in hindered(problem) for name in problem.candidates]
         self.realisation = draw_shadows(problem, realisation, self._plan.sent, wraps=True)
 

@@ -314,7 +314,7 @@ class ControlledCell:
             self.moves["guard" if by_guard else "ordered"] += 1
         if by_guard:
             if self.windows is not None:
-                controller.looked = self.windows.between
+                controller.looked = self.windows.fell(run, term)
             controller.adopt(placement, left=left)
         else:
             if placement != course.placement:
@@ -440,7 +440,7 @@ class ControlledCell:
         """Return an order; whatever it is for, it says what is forked, and what is to be proven."""
         course, move = self.course, self._move
         where = course.run, course.term
-        fraction = self.controller.shadow_fraction
+        fraction = self.controller.shadow_fractions[placement or course.placement]
         forks = () if move is None else move.forks
         want = self._desired(now_ns) if move is None else move.name
         return Order(self._next_number(), self.name, *where, placement, fraction, forks, want)
@@ -531,7 +531,7 @@ class ControlledCell:
     # ------------------------------------------------------------------------- windows
 
     def wake(self, now_ns: int) -> int:
-        """Close the windows that are due, push a migration on, beat; returns what is due next."""
+        """Make the decisions that are due, push a migration on, beat; returns what is due next."""
         self._follow_clock(now_ns)
         if self._began_ns is None:
             self._began_ns = now_ns
@@ -558,20 +558,23 @@ class ControlledCell:
         return min(due_ns, now_ns) if self._unwritten else due_ns
 
     def _close(self, windows: LiveWindows, now_ns: int) -> None:
-        """Close a window and act on what the policy makes of it."""
+        """Make the decision that is due, and act on it."""
+        before = windows.last
         closed = windows.close(unix_ns=time.time_ns())
-        self._unwritten = True
+        self._unwritten = self._unwritten or windows.last is not before
         windows.spent(self.place.node, now_ns, self.place.who, time.process_time_ns())
         # The order before has not come about within a whole window.
         self._give_up(now_ns)
-        # Of a window that was mostly not heard of, what was heard says little.
-        last = windows.last
-        if last is None or 2 * last.heard < self.place.problem.window_cycles:
+        # Less than half of the cycles say little. A decision is late if the next one is due, too.
+        next_ns = windows.due_ns(now_ns) if windows.often else None
+        late = next_ns is not None and next_ns <= now_ns
+        looked = windows.looked
+        if late or looked is None or 2 * windows.heard < self.place.problem.decide_cycles:
             self.controller.miss()
             return
         course, proven = self.course, self._proven
         proposal = self.controller.propose(closed)
-        last.seen = proposal.seen
+        looked.seen = proposal.seen
         wanted = proposal.decision.name
         unproven = course.leaves_unproven(wanted, proven)
         permitted = course.placement if unproven else wanted
@@ -586,7 +589,8 @@ class ControlledCell:
             self.controller.reject(proposal, why)
         elif target == course.placement:
             self.controller.commit(proposal)
-        self._window, self._window_ns = last.shown(proposal, self.controller), now_ns
+        if windows.last is not None:
+            self._window, self._window_ns = looked.shown(proposal, self.controller), now_ns
         if target != course.placement:
             self._begin(target, now_ns, proposal if target == wanted else None)
 
@@ -602,6 +606,7 @@ class ControlledCell:
             return None
         if self._move is not None and self._move.proposal is not None:
             self.controller.commit(self._move.proposal)
+        self.windows.finish()
         return self.windows.record.rows(last=True)
 
     def _allowed(self, wanted: str, now_ns: int) -> str:

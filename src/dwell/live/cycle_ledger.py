@@ -180,6 +180,11 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
         reports = self.reports.values()
         return bool(reports) and all(done.outcome == ACTUATED for done in reports)
 
+    @property
+    def silences(self) -> int:
+        """How often an actuator was at rest before it applied a command of this cycle."""
+        return sum(done.rested and done.outcome == ACTUATED for done in self.reports.values())
+
     def came_to(self, *outcomes: str) -> bool:
         """Whether a sink has said that a command of it came to one of these."""
         return any(done.outcome in outcomes for done in self.reports.values())
@@ -392,7 +397,6 @@ class Ledger:
             used[:, column] = counted_ns
             if jobs_ns:
                 used[1, column] = jobs_ns[node]
-            load.forget(begin_ns)
             kinds = self._nodes[node].accelerators.items()
             if len(kinds) == 1 and told_ns >= HOOKED_SHARE * (end_ns - begin_ns):
                 ((kind, count),) = kinds
@@ -404,6 +408,11 @@ class Ledger:
                 busy_ns = hooked.get(name, own_ns + shadow_ns)
                 used[:, column] = busy_ns, own_ns, shadow_ns
         return used
+
+    def forget(self, before: LiveCycle) -> None:
+        """Drop the reports of loads that only earlier cycles need."""
+        for node, load in self.loads.items():
+            load.forget(self.span_ns(node, before, before.at_ns)[0])
 
     def spent_ns(self, cycles: Sequence[LiveCycle]) -> Counter[str]:
         """CPU time that the jobs of some cycles took, by node; of those that told it.

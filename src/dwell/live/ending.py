@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import FrameType
+from typing import TypeAlias
+
+Handler: TypeAlias = "Callable[[int, FrameType | None], object] | int | None"
 
 
 def end_when_told(stopped: threading.Event, at_once: Callable[[], None]) -> None:
@@ -30,6 +34,32 @@ def end_when_told(stopped: threading.Event, at_once: Callable[[], None]) -> None
             threading.Thread(target=stopped.set, name="ending", daemon=True).start()
         told = True
 
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
-            signal.signal(number, handle)
+    usual: dict[int, Handler] = {
+        number: signal.signal(number, handle)
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN
+    }
+    _restore_in_children(handle, usual)
+
+
+def _restore_in_children(handle: Handler, usual: Mapping[int, Handler]) -> None:
+    """Restore the usual handlers in children that this process forks.
+
+    A child of a stage has to end when it is terminated, also right after its start: the signals
+    are blocked until the child has its handlers.
+    """
+    masks = threading.local()
+
+    def block() -> None:
+        masks.before = signal.pthread_sigmask(signal.SIG_BLOCK, usual)
+
+    def unblock() -> None:
+        signal.pthread_sigmask(signal.SIG_SETMASK, masks.before)
+
+    def restore() -> None:
+        for number, handler in usual.items():
+            if signal.getsignal(number) is handle:
+                signal.signal(number, handler)
+        unblock()
+
+    os.register_at_fork(before=block, after_in_parent=unblock, after_in_child=restore)

@@ -33,6 +33,8 @@ LEAST_NS = 1_000_000_000
 PATIENCE_NS = 2_000_000_000
 #: Faults of single processes that the headline names.
 NAMED = 3
+#: Number of the last windows with a silence or too few commands that degrades a cell.
+BAD_WINDOWS = 2
 
 
 def silent_after_ns(problem: Problem) -> int:
@@ -45,12 +47,13 @@ def silent_after_ns(problem: Problem) -> int:
     return max(round(periods * problem.pipeline.period_ms * 1e6), LEAST_NS)
 
 
-def window_late_ns(problem: Problem) -> int:
-    """Return the age from which the last window is too old.
+def window_late_ns(problem: Problem, release_ratio: float | None = None) -> int:
+    """Return the age from which the last window is too old, at a ratio of releases.
 
     A window that a move interrupts begins anew.
     """
-    return round((2 * problem.window_ms + problem.controller.close_grace_ms) * 1e6) + PATIENCE_NS
+    windows_ms = 2 * problem.window_ms / min(release_ratio or 1.0, 1.0)
+    return round((windows_ms + problem.controller.close_grace_ms) * 1e6) + PATIENCE_NS
 
 
 def diagnose(problem: Problem, status: Mapping[str, Any]) -> tuple[Health, str | None]:
@@ -110,7 +113,7 @@ def _no_window(problem: Problem, status: Mapping[str, Any]) -> str | None:
     else:
         # A cell that starts has as long from its first cycle on, and to that from its last process.
         age_ms = status["joined_ms"] if begun_ms is None else begun_ms
-    if age_ms * 1e6 <= window_late_ns(problem):
+    if age_ms * 1e6 <= window_late_ns(problem, status.get("release_ratio")):
         return None
     return f"no window since {_time(age_ms)}"
 
@@ -149,10 +152,11 @@ def _symptoms(
             yield f"{role.who} has applied nothing since {_time(age_ms)}{_because(why)}"
     recent = status["recent"]
     rates = recent["violation_rates"]
+    placed = problem.candidates[status["placement"]].items()
+    names = [*(f"{task}@{node}" for task, node in placed), *(role.who for role in sinks)]
+    why = [*_unreached(problem, status, recent["unreached"]), *_notes(status, names)]
+    yield from _uneven(problem, status, why)
     if problem.live.degraded_by(rates):
-        placed = problem.candidates[status["placement"]].items()
-        names = [*(f"{task}@{node}" for task, node in placed), *(role.who for role in sinks)]
-        why = [*_unreached(problem, status, recent["unreached"]), *_notes(status, names)]
         rate = sum(rates) / len(rates)
         yield f"V_D is {rate:.0%} in the last {counted(len(rates), 'window')}{_because(why)}"
     for name, found in status["failing"].items():
@@ -164,6 +168,32 @@ def _symptoms(
             *_notes(status, [f"{task}@{node}.shadow" for task, node in placed]),
         ]
         yield f"the last {found['shadows']} shadows through {name} have failed{_because(why)}"
+
+
+def _uneven(problem: Problem, status: Mapping[str, Any], why: list[str]) -> Iterator[str]:
+    """Yield how releases differ from one per period, and which commands the actuators lacked."""
+    live, recent, ratio = problem.live, status["recent"], status["release_ratio"]
+    period_ms = problem.pipeline.period_ms
+    if ratio is not None and abs(ratio - 1) > live.degraded_at:
+        every_ms = period_ms / ratio
+        rates = f"{1e3 / every_ms:.3g} cycles a second of {1e3 / period_ms:.3g}"
+        if every_ms > problem.max_age_ms:
+            why = [f"cycles come every {every_ms:.0f} ms, max_age_ms is {problem.max_age_ms:g}"]
+            yield f"{rates}{_because(why)}"
+        else:
+            yield rates
+    silences, applied = recent["silences"], recent["applied"]
+    least = 1 - live.degraded_at
+    bad = [count > 0 or share < least for count, share in zip(silences, applied, strict=True)]
+    if sum(bad) < BAD_WINDOWS:
+        return
+    windows = f"in the last {counted(len(bad), 'window')}"
+    if any(silences):
+        times = counted(sum(silences), "time")
+        yield f"{live.silence}() was called {times} {windows}{_because(why)}"
+    elif not live.degraded_by(recent["violation_rates"]):
+        known = f"{sum(applied) / len(applied):.0%} of the commands are known to have been applied"
+        yield f"{known} {windows}{_because(why)}"
 
 
 def _notes(status: Mapping[str, Any], names: Sequence[str]) -> list[str]:

@@ -1,22 +1,26 @@
 """LiveWindows: stamps, completions and loads of a running cell in, closed windows out.
 
-Everything is put on the stamper's clock (see `offsets`), counted from the first release of the run.
-A window is W consecutive cycles by release and closes `close_grace_ms` after the release of the
-first cycle beyond them, or D after that of the last of them where this is later. Where the term or
-the placement changes before W cycles are there, or while an order is under way, the next window
-starts at the first cycle stamped anew; the cycles before it are lead, and belong to no window.
+All instants are on the stamper's clock (see `offsets`), from the first release of the run. A window
+is W consecutive cycles. It closes `close_grace_ms` after the release of the next cycle, or D after
+its last release if that is later. When the term or the placement changes within a window, or while
+an order is under way, the window starts again with the first cycle of the new stamp. The cycles
+before it are lead and belong to no window.
 
-Messages are lost, late, and come twice. A cycle is known by its stamp or by its completion; one of
-which neither was heard, between two that are known, is taken to have been released between them.
-Nobody knows whether it has completed, nor the one before it: it counts for neither, and its window
-is unproven. Numbers that a restarted stamper has left out were never cycles: there,
-fewer periods have passed than numbers.
+If `decide_cycles` is below W, this rule applies to the cycles between two decisions. Windows then
+continue over ordered moves. They start again with a move of the guard and after an outage of the
+stamper, and the next decision records them. Overdue decisions are missed.
+
+Messages are lost, late and doubled. A stamp or a completion makes a cycle known. An unknown cycle
+between two known cycles counts as released between them. Whether it has completed is unknown, and
+so is the completion of the cycle before it: neither counts, and the window is unproven. Numbers
+that a restarted stamper has left out were never cycles: fewer periods have passed than numbers.
 """
 
 from __future__ import annotations
 
 import bisect
 from collections.abc import Iterable
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 
@@ -44,6 +48,25 @@ CLOCK_BREAK_NS = 60_000_000_000
 KEPT_CYCLES = 1_000
 
 
+@dataclass(slots=True)
+class _Stretch:
+    """Consecutive cycles of the line: the next window, or the evidence of the next decision.
+
+    Parameters
+    ----------
+    size : int
+        Number of cycles.
+    at : int
+        Place in the line of the first cycle after the previous stretch.
+    begun : (int, bool), optional
+        Its first place, and whether an order is awaited, while nothing has changed either.
+    """
+
+    size: int
+    at: int = 0
+    begun: tuple[int, bool] | None = None
+
+
 class LiveWindows:
     """Closes the windows of one cell.
 
@@ -59,6 +82,11 @@ class LiveWindows:
     ----------
     origin_ns : int or None
         First release of the run, on the stamper's clock; None before a stamp was heard.
+    last, looked : LiveWindow or None
+        The last window, and the cycles that the last decision looked at. They are the same if
+        the cell decides once per window.
+    heard : int
+        Number of heard cycles since the previous decision.
     ignored : int
         Messages about unknown placements, sinks or nodes, or cycles of long ago.
     """
@@ -75,7 +103,8 @@ class LiveWindows:
         self.problem, self.offsets, self._controller = problem, offsets, controller
         self.origin_ns = resume.origin_ns
         self.last: LiveWindow | None = None
-        self.ignored = 0
+        self.looked: LiveWindow | None = None
+        self.heard = self.ignored = 0
         self._ledger = Ledger(problem, offsets)
         self._symptoms = Symptoms(problem, self._ledger)
         self._processes = ProcessLoads()
@@ -91,14 +120,19 @@ class LiveWindows:
             resume=resume,
             kept=4 * self._size + KEPT_CYCLES,
         )
-        # Cycles that are in no closed window yet, by release; and all that are remembered.
+        #: Whether decisions come more often than windows close.
+        self.often = problem.decide_cycles < self._size
+        self._window = _Stretch(self._size)
+        self._stretch = _Stretch(problem.decide_cycles) if self.often else self._window
+        # The last decided cycles that the next decision may look at, then the cycles that are in no
+        # closed window yet, by release; and all that are remembered.
         self._line: list[LiveCycle] = []
         self._by_key: dict[tuple[int, int], LiveCycle] = {}
         self._newest: tuple[LiveCycle, int | None] | None = None
         # The term that a migration leaves, while it is under way.
         self._left: tuple[int, int] | None = None
-        # What `_begin` found, as long as nothing has changed that.
-        self._beginning: tuple[int, bool] | None = None
+        # The term of the guard's last move, and the term that the controller knows.
+        self._fell = self._entered = (0, 0)
         self._lead = 0
         self._next_window = resume.window
 
@@ -143,7 +177,8 @@ class LiveWindows:
         if self._ledger.complete(cycle):
             self.record.newest_done = max(self.record.newest_done, cycle.key)
         # Before its window closes, rather than all at once then, where the clocks' bound allows.
-        self._ledger.settle(cycle, most_ns=None if cycle.row >= 0 else self._proven_ns)
+        settled = cycle.row >= 0 or cycle.told
+        self._ledger.settle(cycle, most_ns=None if settled else self._proven_ns)
         self.record.touch(cycle)
 
     def measured(self, run: int, intervals: Iterable[tuple[int, int]]) -> None:
@@ -179,11 +214,27 @@ class LiveWindows:
         run, term : int
             The term that it leaves.
         """
-        self._left, self._beginning = (run, term), None
+        self._left = run, term
+        self._begin_again()
 
     def refused(self) -> None:
         """The migration will not come about: windows go on where they were."""
-        self._left = self._beginning = None
+        self._left = None
+        self._begin_again()
+
+    def fell(self, run: int, term: int) -> LookedAt:
+        """Begin the next window with a move of the guard; returns its place in the record.
+
+        Parameters
+        ----------
+        run, term : int
+            The term that begins with it.
+        """
+        self._fell = run, term
+        self._begin_again()
+        count = sum((one.run, one.term) < self._fell for one in self._line[self._window.at :])
+        count *= self.often
+        return LookedAt(self._next_window, self.record.next_row + count - 1, 0)
 
     def forget(self, run: int, cycle: int) -> None:
         """Take a cycle, and those after it, for never released: what told of them was wrong."""
@@ -194,7 +245,9 @@ class LiveWindows:
         last = max(self._by_key.values(), key=lambda known: known.key, default=None)
         self._newest = None if last is None else (last, last.stamped_ns)
         self.record.newest_done = min(self.record.newest_done, (run, cycle - 1))
-        self._beginning = None
+        for one in (self._window, self._stretch):
+            one.at = min(one.at, len(self._line))
+        self._begin_again()
 
     def set_back(self, back_ns: int) -> None:
         """The controller's clock has been set back: what was heard by it was heard before that."""
@@ -215,7 +268,7 @@ class LiveWindows:
                 self._identify(known, stamp)
         elif self._newest is None or key > self._newest[0].key:
             return self._append(stamp, at_ns)
-        elif self._line and key > self._line[0].key:
+        elif (line := self._line[max(self._window.at, self._stretch.at) :]) and key > line[0].key:
             return self._insert(stamp)
         else:
             # Before the first one heard, or of long ago.
@@ -225,7 +278,7 @@ class LiveWindows:
     def _identify(self, cycle: LiveCycle, stamp: Stamp) -> None:
         cycle.identify(stamp)
         if cycle.row < 0:
-            self._beginning = None
+            self._begin_again()
         self.record.touch(cycle)
 
     def _append(self, stamp: Stamp, at_ns: int | None) -> LiveCycle:
@@ -245,13 +298,14 @@ class LiveWindows:
         self._newest = cycle, at_ns
         if len(line) > self._longest:
             # Nobody has said what became of an order.
-            self._drop(len(line) - self._size)
+            self._leave(len(line) - self._size)
         return cycle
 
     def _add(self, cycle: LiveCycle) -> None:
-        if not self._line or cycle.segment != self._line[-1].segment:
-            self._beginning = None
-        self._line.append(cycle)
+        line = self._line
+        if not line or cycle.segment != line[-1].segment or cycle.number > line[-1].number + 1:
+            self._begin_again()
+        line.append(cycle)
         self._by_key[cycle.key] = cycle
 
     def _follow(
@@ -264,7 +318,7 @@ class LiveWindows:
             return
         own_ns = max(own_ns, self._period_ns)
         self.origin_ns = stamp.released_ns - newest.at_ns - own_ns
-        self._drop(len(self._line))
+        self._leave(len(self._line))
 
     def _between(self, last: LiveCycle, following: LiveCycle) -> Iterable[LiveCycle]:
         """Cycles nobody heard of between two that are known."""
@@ -281,48 +335,73 @@ class LiveWindows:
     def _insert(self, stamp: Stamp) -> LiveCycle | None:
         """Put a cycle where it belongs, among numbers that seemed to have been left out."""
         line = self._line
-        cycle = LiveCycle.of(stamp, line[0].origin_ns)
+        cycle = LiveCycle.of(stamp, line[-1].origin_ns)
         place = bisect.bisect(line, cycle.key, key=lambda other: other.key)
         if not line[place - 1].at_ns <= cycle.at_ns <= line[place].at_ns:
             self.ignored += 1
             return None
         line.insert(place, cycle)
         self._by_key[cycle.key] = cycle
-        self._beginning = None
+        self._begin_again()
         return cycle
 
     # -------------------------------------------------------------- when a window closes
 
-    def _begin(self) -> tuple[int, bool]:
-        """Place in the line where the open window starts, and whether an order is awaited."""
-        if self._beginning is None:
-            start, segment = 0, self._line[0].segment if self._line else None
-            ordered = self._is_left(self._line[0]) if self._line else self._left is not None
-            for place, cycle in enumerate(self._line):
-                if not cycle.heard or cycle.segment == segment:
-                    continue
-                if place - start >= self._size and not ordered:
-                    break
-                start, segment, ordered = place, cycle.segment, self._is_left(cycle)
-            self._beginning = start, ordered
-        return self._beginning
+    def _begin_again(self) -> None:
+        """Forget where window and stretch begin."""
+        self._window.begun = self._stretch.begun = None
 
-    def _is_left(self, cycle: LiveCycle) -> bool:
-        """Whether a cycle is of a term that a migration leaves, or of one before it."""
-        return self._left is not None and (cycle.run, cycle.term) <= self._left
+    def _begin(self, one: _Stretch) -> tuple[int, bool]:
+        """Place in the line where a stretch starts, and whether an order is awaited."""
+        course = self._controller.course
+        if self._entered != (course.run, course.term):
+            self._entered = course.run, course.term
+            self._begin_again()
+        line, start = self._line, one.at
+        if one.begun is None and start < len(line):
+            ordered = self._waits(one, line[start])
+            for place in range(start + 1, len(line)):
+                if not line[place].heard or not self._is_begun(one, line[start], place):
+                    continue
+                if place - start >= one.size and not ordered:
+                    break
+                start, ordered = place, self._waits(one, line[place])
+            one.begun = start, ordered
+        return one.begun or (start, True)
+
+    def _is_begun(self, one: _Stretch, first: LiveCycle, place: int) -> bool:
+        """Whether a stretch that has begun with a cycle begins again at a place in the line."""
+        before, cycle = self._line[place - 1 : place + 1]
+        if self.often and (cycle.run != before.run or cycle.number > before.number + 1):
+            # The stamper was down.
+            return True
+        if self.often and one is self._window:
+            return (first.run, first.term) < self._fell <= (cycle.run, cycle.term)
+        return cycle.segment != first.segment
+
+    def _waits(self, one: _Stretch, cycle: LiveCycle) -> bool:
+        """Whether a cycle has a term that a migration leaves, or an earlier term.
+
+        If decisions are more frequent than windows, a cycle also waits if the controller does not
+        know its term.
+        """
+        term = cycle.run, cycle.term
+        if self.often and (one is self._window or term != self._entered):
+            return one is not self._window
+        return self._left is not None and term <= self._left
 
     def due_ns(self, now_ns: int) -> int | None:
-        """Return when the next window closes, on the controller's clock; None if that is not known.
+        """Return when the next decision is due, on the controller's clock; None if not known.
 
         Parameters
         ----------
         now_ns : int
             The clock's time: a cycle that has been heard of has been released.
         """
-        start, ordered = self._begin()
-        if ordered or len(self._line) <= start + self._size:
+        end = self._end()
+        if end is None:
             return None
-        beyond = self._line[start + self._size]
+        beyond = self._line[end]
         if beyond.stamped_ns is None:
             beyond.stamped_ns = now_ns
         released_ns, bound_ns = self.offsets.from_reference(
@@ -330,92 +409,160 @@ class LiveWindows:
         )
         if bound_ns >= UNBOUNDED_NS:
             released_ns = beyond.stamped_ns
-        return min(released_ns, beyond.stamped_ns) + self._close_ns(start) - beyond.at_ns
+        return min(released_ns, beyond.stamped_ns) + self._close_ns(end) - beyond.at_ns
 
-    def _close_ns(self, start: int) -> int:
-        """Close of the window that starts at a place in the line, since the origin."""
-        last, beyond = self._line[start + self._size - 1 : start + self._size + 1]
+    def _end(self) -> int | None:
+        """Place in the line of the first cycle after the next decision's."""
+        start, ordered = self._begin(self._stretch)
+        end = start + self._stretch.size
+        return None if ordered or len(self._line) <= end else end
+
+    def _close_ns(self, end: int) -> int:
+        """Close of the window that ends before a place in the line, since the origin."""
+        last, beyond = self._line[end - 1 : end + 1]
         return int(window_close_ns(self.problem, last.at_ns, beyond.at_ns))
 
     def close(self, *, unix_ns: int | None = None) -> ClosedWindow:
-        """Close the window that is due.
+        """Close the windows that have ended, and return the cycles of the decision.
 
         Returns
         -------
         ClosedWindow
-            Its instants count from the first release of the run; more is in `last`.
+            Its instants count from the first release of the run; more is in `looked`.
 
         Raises
         ------
         LiveError
-            If none is due: fewer than W + 1 cycles are known, or a migration is under way.
+            If none is due: fewer than `decide_cycles` + 1 cycles are known, or a migration is under
+            way.
         """
-        start, ordered = self._begin()
-        if ordered or len(self._line) <= start + self._size:
+        end = self._end()
+        if end is None:
             raise LiveError("no window is due")
-        self._drop(start)
         self._left = None
-        cycles = self._line[: self._size]
-        close_ns = self._close_ns(0)
-        for cycle, following in pairwise(self._line[: self._size + 1]):
+        begin, oldest = end - self._stretch.size, self._line[0]
+        self.heard = sum(cycle.heard for cycle in self._line[begin:end])
+        while (first := self._begin(self._window)[0]) + self._size <= end:
+            self.looked, closed = self._close_window(first, unix_ns)
+        if self.often:
+            self.looked, closed = self._look(begin, end)
+        self._ledger.forget(oldest)
+        self._stretch.at = end
+        self._forget_line(min(self._window.at, max(end - (self._size if self.often else 0), 0)))
+        return closed
+
+    def _close_window(self, start: int, unix_ns: int | None) -> tuple[LiveWindow, ClosedWindow]:
+        """Close the window that starts at a place in the line, and record it."""
+        self._drop(start)
+        end = start + self._size
+        closed, cycles = self._closed(start, end), self._line[start:end]
+        for cycle in cycles:
+            cycle.window, cycle.close_ns = self._next_window, closed.close_ns
+        self.last = last = self._seen(cycles, closed, self._line[end].at_ns, unix_ns)
+        if self.often and 2 * last.heard >= self._size:
+            # The cycle before it shows whether a move takes effect with its first cycle.
+            names = [cycle.placement for cycle in self._line[max(start - 1, 0) : end]]
+            last.seen = self._controller.seen(closed, names)
+        self._take_off(end)
+        self.record.close(last)
+        self._symptoms.closed(last)
+        self._next_window += 1
+        self._lead = 0
+        return last, closed
+
+    def _look(self, begin: int, end: int) -> tuple[LiveWindow, ClosedWindow]:
+        """Return the last W cycles under the placement in force, with the stretch in them."""
+        first, line = begin, self._line
+        while first > max(end - self._size, 0) and not self._is_begun(
+            self._stretch, line[first - 1], first
+        ):
+            first -= 1
+        closed = self._closed(first, end)
+        closed.recent = self._closed(begin, end)
+        return self._seen(line[first:end], closed, line[end].at_ns), closed
+
+    def _closed(self, begin: int, end: int) -> ClosedWindow:
+        """Return the cycles between two places in the line as policies and estimators get them."""
+        cycles, close_ns = self._line[begin:end], self._close_ns(end)
+        for cycle, following in pairwise(self._line[max(begin, self._window.at) : end + 1]):
             self._ledger.settle(cycle)
-            cycle.window, cycle.close_ns = self._next_window, close_ns
             cycle.deaf = not (cycle.heard and following.heard)
-        self._take_off(self._size)
+        window = self._next_window if cycles[-1].window is None else cycles[-1].window
+        row = self.record.next_row + end - 1 - self._window.at
         release_ns = np.array([cycle.at_ns for cycle in cycles], np.int64)
         shadows = sends_shadows(self._controller)
         known = told(cycles)
-        closed = ClosedWindow(
+        return ClosedWindow(
             latency_ns=np.array([cycle.latency_ns for cycle in known], np.int64),
             release_ns=np.array([cycle.at_ns for cycle in known], np.int64),
             close_ns=close_ns,
             open_ns=int(release_ns[0]),
             core_ns=self._ledger.core_ns(cycles, close_ns),
-            looked=LookedAt(self._next_window, cycles[-1].row, self._size),
+            looked=LookedAt(window, row, end - begin),
             evidence=partial(self._ledger.evidence, cycles, release_ns, close_ns, shadows=shadows),
         )
+
+    def _seen(
+        self,
+        cycles: list[LiveCycle],
+        closed: ClosedWindow,
+        beyond_ns: int,
+        unix_ns: int | None = None,
+    ) -> LiveWindow:
+        """Return cycles as the record and the status show them."""
         bound_ns = max(cycle.bound_ns for cycle in cycles)
-        self.last = LiveWindow(
-            number=self._next_window,
+        return LiveWindow(
+            number=closed.looked.window,
             cycles=cycles,
-            close_ns=close_ns,
+            span_ns=beyond_ns - cycles[0].at_ns,
+            close_ns=closed.close_ns,
             lead=self._lead,
             heard=sum(cycle.heard for cycle in cycles),
             bound_ns=bound_ns,
             unproven=bound_ns > self._proven_ns or any(cycle.untold for cycle in cycles),
-            rate_at_close=violation_rate(known, self._deadline_ns),
+            rate_at_close=violation_rate(told(cycles), self._deadline_ns),
             used=self._controller.utilisation(closed),
             closed_unix_ns=unix_ns,
         )
-        self.record.close(self.last)
-        self._symptoms.closed(self.last)
-        self._next_window += 1
-        self._lead = 0
-        return closed
 
-    @property
-    def between(self) -> LookedAt:
-        """What a move of the guard's looks at: nothing, and the next window begins with it."""
-        return LookedAt(self._next_window, self.record.next_row - 1, 0)
+    def finish(self) -> None:
+        """Record the decided cycles that belong to no window."""
+        self._drop(self._stretch.at)
 
-    def _drop(self, count: int) -> None:
-        """Leave cycles at the line's beginning to no window."""
-        for cycle in self._line[:count]:
+    def _leave(self, end: int) -> None:
+        """Leave the cycles before a place in the line out of windows and decisions."""
+        self._drop(end)
+        self._stretch.at = max(self._stretch.at, end)
+        self._forget_line(end)
+
+    def _drop(self, end: int) -> None:
+        """Record the cycles before a place in the line as lead."""
+        for cycle in self._line[self._window.at : end]:
             self._ledger.settle(cycle)
-        self._lead += count
-        self._take_off(count)
+        self._symptoms.led(self._line[self._window.at : end])
+        self._lead += max(end - self._window.at, 0)
+        self._take_off(end)
 
-    def _take_off(self, count: int) -> None:
-        """Move cycles from the line to the record, and forget those of long ago."""
-        for old in self.record.add(self._line[:count]):
+    def _take_off(self, end: int) -> None:
+        """Move cycles up to a place in the line to the record, and forget those of long ago."""
+        cycles = self._line[self._window.at : end]
+        for old in self.record.add(cycles):
             if self._by_key.get(old.key) is old:
                 del self._by_key[old.key]
+        self._window.at = max(end, self._window.at)
+        self._begin_again()
+
+    def _forget_line(self, count: int) -> None:
+        """Drop the first cycles of the line, which no decision needs any more."""
         del self._line[:count]
-        self._beginning = None
+        self._window.at -= count
+        if self.often:
+            self._stretch.at -= count
+        self._begin_again()
 
     def symptoms(self, now_ns: int) -> dict[str, object]:
         """Return what the cycles say of the cell's health, as plain values (see `Symptoms`)."""
-        return self._symptoms.status(reversed(self._by_key.values()), now_ns)
+        return self._symptoms.status(list(reversed(self._by_key.values())), now_ns)
 
     def status(self) -> dict[str, object]:
         """Return how the windows are, as plain values."""
@@ -423,7 +570,7 @@ class LiveWindows:
         status: dict[str, object] = {
             "windows": self._next_window,
             "origin_ns": self.origin_ns,
-            "cycles": self.record.next_row + len(self._line),
+            "cycles": self.record.next_row + len(self._line) - self._window.at,
             "ignored_messages": self.ignored,
             "clock_breaks": self.offsets.breaks,
         }

@@ -170,6 +170,9 @@ class Completion(_Array, frozen=True):
     group_ns : int
         CPU time that the control group of the sink's node had taken by `done_ns`; -1 where that is
         not known.
+    rested : bool
+        Whether the actuator was at rest when the command came: the sink had called `hold` or
+        `zero` since the last command that was applied.
     """
 
     stamp: Stamp
@@ -179,6 +182,7 @@ class Completion(_Array, frozen=True):
     hops: Hops
     node: Name
     group_ns: Spent = -1
+    rested: bool = False
 
 
 class Heard(_Array, frozen=True):
@@ -242,7 +246,8 @@ class Order(_Array, frozen=True):
     placement : str
         Candidate; empty to change nothing.
     shadow_fraction : float
-        Share of the cycles sent through each alternative.
+        Share of the cycles sent through each alternative, under the placement that the order leads
+        to.
     forks : tuple of (str, str)
         For `Stamp.forks` from now on.
     want : str

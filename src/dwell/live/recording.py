@@ -181,7 +181,7 @@ class RunRecorder:
             "cell": self.problem.name,
             "scenario": "live",
             **self.controller.described(),
-            "problem": to_document(self.problem),
+            "problem": to_document(self.controller.problem),
             "versions": {
                 "dwell": __version__,
                 **{name: importlib.metadata.version(name) for name in packages},

@@ -20,6 +20,7 @@ from dwell.live.messages import (
     Carried,
     Completion,
     Header,
+    Heard,
     Load,
     Stamp,
     decode,
@@ -101,9 +102,6 @@ class RolePlace:
     def __post_init__(self) -> None:
         phase_ms = self.problem.pipeline.first_release_ms
         require(phase_ms == 0, "phase_ms", phase_ms, "0 in a live cell, which begins when it is up")
-        every, width = self.problem.decide_cycles, self.problem.window_cycles
-        bound = f"window_cycles = {width} in a live cell, which decides once per window"
-        require(every == width, "controller.decide_cycles", every, bound)
         self.keys = Keys(self.problem.name)
         self.period_ns = self.problem.pipeline.period_ns
 
@@ -111,6 +109,11 @@ class RolePlace:
     def patience_ns(self) -> int:
         """Age beyond which what was heard counts no more: g periods."""
         return self.problem.controller.guard_cycles * self.period_ns
+
+    @property
+    def hang_ns(self) -> int:
+        """Time from which on a call of a user's code hangs."""
+        return max(10 * self.period_ns, 1_000_000_000)
 
     @property
     def stamper(self) -> tuple[str, str]:
@@ -432,12 +435,17 @@ class Pulse:
 
     def send(self, now_ns: int) -> None:
         """Send a beat."""
-        place = self.place
         self._sent_ns = now_ns
         ready, note = self._state()
-        note = note or self._repeated(now_ns)
+        self._put(now_ns, ready, note or self._repeated(now_ns), self.detector.heard())
+
+    def send_alone(self, now_ns: int, *, ready: bool, note: str) -> None:
+        """Send a beat without a look at the role: from another thread, while the role is busy."""
+        self._put(now_ns, ready, note, ())
+
+    def _put(self, now_ns: int, ready: bool, note: str, heard: tuple[Heard, ...]) -> None:
+        place = self.place
         term, placement = self._holds() if self._holds is not None else (0, "")
-        heard = self.detector.heard()
         beat = Beat(
             *(place.who, place.node, place.life, now_ns, ready, heard, term, placement),
             *(self._digest, printable(note)[:2000], __version__),

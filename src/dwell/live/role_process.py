@@ -12,7 +12,16 @@ import msgspec
 
 from dwell.errors import LiveError
 from dwell.live.control_group import ControlGroup, own_group
-from dwell.live.hosting import PLAIN, Clock, Hosted, Platform, keep_collections_short, work
+from dwell.live.failures import start_thread
+from dwell.live.hosting import (
+    LONGEST_SLEEP_S,
+    PLAIN,
+    Clock,
+    Hosted,
+    Platform,
+    keep_collections_short,
+    work,
+)
 from dwell.live.log import Log
 from dwell.live.lowest_class import take_lowest_class
 from dwell.live.messages import Header
@@ -93,6 +102,7 @@ def _run(
     sink = Sink(place, role.task, actuator, highest)
     if group is not None:
         sink.group_clock = group.taken_ns
+    start_thread("actuator", _watch, sink, clock, stopped)
     hosted = _host(sink, place, stopped, clock)
     # A command that is being applied comes first; the role takes no other one.
     with hosted.lock:
@@ -105,6 +115,11 @@ def _host(role: RoleLogic, place: RolePlace, stopped: threading.Event, clock: Cl
     keep_collections_short()
     hosted.run()
     return hosted
+
+
+def _watch(sink: Sink, clock: Clock, stopped: threading.Event) -> None:
+    while not stopped.wait(LONGEST_SLEEP_S):
+        sink.watch(clock())
 
 
 def bring_to_rest(sink: Sink, patience_s: float = ENDING_S) -> bool:

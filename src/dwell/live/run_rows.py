@@ -12,6 +12,7 @@ import math
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -50,10 +51,12 @@ class Resume:
 
 @dataclass(eq=False, slots=True)
 class LiveWindow:
-    """A closed window as it is recorded.
+    """A closed window as it is recorded, or the cycles that a decision has looked at.
 
     Parameters
     ----------
+    span_ns : int
+        Time from its first release to the first release beyond it.
     close_ns : int
         Since the origin.
     lead : int
@@ -75,6 +78,7 @@ class LiveWindow:
 
     number: int
     cycles: list[LiveCycle]
+    span_ns: int
     close_ns: int
     lead: int
     heard: int
@@ -86,13 +90,15 @@ class LiveWindow:
     seen: tuple[float | None, ...] = (None, None, None)
 
     def shown(self, proposal: Proposal, controller: Controller) -> dict[str, Any]:
-        """Return the window, and what was proposed on it, as people look at it."""
+        """Return a proposal and its cycles as the status shows them."""
         decision, names = proposal.decision, controller.problem.candidates
         l95_ms, _, cost = proposal.seen
         columns = controller.decision_columns[-len(proposal.priced) :]
         priced = dict(zip(columns, proposal.priced, strict=True))
         return {
             "number": self.number,
+            "last_cycle": proposal.looked.last_cycle,
+            "cycles": proposal.looked.cycles,
             "placement": self.cycles[0].placement,
             "l95_ms": l95_ms,
             "violation_rate": self.rate_at_close,
@@ -117,7 +123,7 @@ class LiveWindow:
 
 def sends_shadows(controller: Controller) -> bool:
     """Whether cycles may be sent through alternatives: to measure them, or to prove them."""
-    return bool(controller.shadow_fraction or controller.problem.controller.fallbacks)
+    return controller.sends_shadows or bool(controller.problem.controller.fallbacks)
 
 
 def columns_of(controller: Controller, *, jobs: bool = False) -> Columns:
@@ -212,6 +218,7 @@ class RunRows:
         for row, cycle in self._in_flight.items():
             if self._outcome(cycle) != cycle.outcome:
                 self._changed[row] = cycle
+        decided = (decision_values(self._controller, row) for row in self._controller.decisions)
         values: dict[str, Iterable[Values]] = {
             "cycles": [self._cycle_values(self._changed[row]) for row in sorted(self._changed)],
             "windows": [
@@ -219,17 +226,20 @@ class RunRows:
                 for number in sorted(self._changed_windows)
                 if number in self._windows
             ],
-            "decisions": [
-                decision_values(self._controller, row) for row in self._controller.decisions
-            ],
+            "decisions": list(decided if last else takewhile(self._is_recorded, decided)),
             **(self._job_values(last=last) if self._jobs else {}),
         }
         rows = {name: [row_of(self._columns[name], of) for of in values[name]] for name in values}
         # What is recorded is not kept: a controller runs for months.
-        self._controller.decisions.clear()
+        del self._controller.decisions[: len(rows["decisions"])]
         self._changed.clear()
         self._changed_windows.clear()
         return rows
+
+    def _is_recorded(self, decision: Values) -> bool:
+        """Whether the record has the cycles of a decision."""
+        last = decision["last_cycle"]
+        return isinstance(last, int) and last < self.next_row
 
     def _outcome(self, cycle: LiveCycle) -> str:
         if cycle.came_to(NOT_APPLIED):

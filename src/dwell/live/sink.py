@@ -53,6 +53,10 @@ class Sink:
         # Of the last command, and of the last silence: what the actuator has raised.
         self.trouble = self._restless = ""
         self._alarm_ns: int | None = None
+        # Whether `hold` or `zero` was called since the last command.
+        self._rests = False
+        # The call of the actuator that has not returned yet, and its begin.
+        self._call: tuple[str, int] | None = None
         # One that takes over from another is as impatient for the next command as that one was.
         self._takes_over = self.newest >= (0, 0)
 
@@ -75,11 +79,11 @@ class Sink:
             self.place.complain(LiveError(reason))
             return
         group_ns = self.group_clock()
-        outcome = self._gate(header, now_ns)
+        outcome, rested = self._gate(header, now_ns), self._rests
         if outcome == ACTUATED and not self._apply(header, sample.payload, now_ns):
             outcome = NOT_APPLIED
         self.counts[outcome] += 1
-        ways = header.hops, self.place.node, group_ns
+        ways = header.hops, self.place.node, group_ns, rested
         done = Completion(header.stamp, self.task, now_ns, outcome, *ways)
         self.place.put_twice(self.place.keys.done(self.task), done)
 
@@ -111,12 +115,15 @@ class Sink:
             expected = self.actuator.inputs.get(self.task)
             command = read_payload(header.kind, payload, expected)
             released_ns, _ = self.offsets.from_reference(self.place.node, stamp.released_ns)
+            self._call = f"cycle {stamp.cycle}: apply()", now_ns
             self.actuator.apply(Message(command, stamp.cycle, released_ns, age_ms))
         except Exception as error:  # the user's code
             self.trouble = self._complain(f"cycle {stamp.cycle}: apply()", error)
             return False
+        finally:
+            self._call = None
         self.trouble = self._restless = ""
-        self._alarm_ns = alarm_ns
+        self._alarm_ns, self._rests = alarm_ns, False
         return True
 
     def rest(self, how: Rest) -> bool:
@@ -129,9 +136,21 @@ class Sink:
         self._restless = ""
         return True
 
+    @property
+    def _where(self) -> str:
+        return f"sink of {self.task} on {self.place.node}"
+
+    def watch(self, now_ns: int) -> None:
+        """Beat while the actuator does not return; called by a thread of its own."""
+        call = self._call
+        if call is None or (waits_ns := now_ns - call[1]) < self.place.period_ns:
+            return
+        hangs = waits_ns > self.place.hang_ns
+        note = f"{self._where}: {call[0]} has not returned for {waits_ns / 1e9:.0f} s"
+        self.pulse.send_alone(now_ns, ready=not hangs, note=note if hangs else "")
+
     def _complain(self, what: str, error: BaseException) -> str:
-        where = f"sink of {self.task} on {self.place.node}"
-        trouble = f"{where}: {what} raised {type(error).__name__}: {error}"
+        trouble = f"{self._where}: {what} raised {type(error).__name__}: {error}"
         self.place.complain(LiveError(trouble))
         return trouble
 
@@ -150,7 +169,10 @@ class Sink:
         back = self._alarm_ns is not None and self._alarm_ns > now_ns + self.max_age_ns
         if self._alarm_ns is not None and (back or now_ns >= self._alarm_ns):
             self.counts["silences"] += not self._restless
-            rests = self.rest("zero" if self.place.problem.live.silence == "zero" else "hold")
+            how = self.place.problem.live.silence
+            self._call, self._rests = (f"{how}()", now_ns), True
+            rests = self.rest(how)
+            self._call = None
             self._alarm_ns = None if rests else now_ns + self.max_age_ns
         due_ns = self.pulse.wake(now_ns)
         return due_ns if self._alarm_ns is None else min(due_ns, self._alarm_ns)

@@ -15,6 +15,7 @@ from dwell.live.control_group import UNKNOWN
 from dwell.live.keys import CONTROLLER
 from dwell.live.latencies import Intervals
 from dwell.live.messages import (
+    ACTUATED,
     HANDED_OVER,
     Accepted,
     Beat,
@@ -167,7 +168,8 @@ class Stamper:
                 case "done" | "ended":
                     done = self.place.completion(sample)
                     self._completed(done, now_ns)
-                    if word == "done" and done.stamp.run == self.run:
+                    applied = word == "done" and done.outcome == ACTUATED
+                    if applied and done.stamp.run == self.run:
                         direct = self.place.keys.came_directly(sample.key)
                         self.intervals.completed(done, now_ns, newest=self.cycle, direct=direct)
         except LiveError as error:
@@ -327,6 +329,8 @@ class Stamper:
         if by_guard:
             self._ahead = None
             self._forks = ()
+            # Only the controller knows the share of the fallback; its next order has it.
+            self._fraction = 0.0
         self.moves.append((self._next, placement, "guard" if by_guard else "order"))
         del self.moves[:-1_000]
         self._partial.clear()

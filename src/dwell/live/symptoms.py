@@ -7,8 +7,8 @@ counts here is what arrived, was applied, and came in time.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator
-from itertools import islice
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from dwell.live.cycle_ledger import SHADOW, Ledger, LiveCycle
@@ -22,6 +22,16 @@ from dwell.model.live import RECENT_WINDOWS
 SILENT_WINDOWS = 2
 
 
+@dataclass(slots=True)
+class _Lead:
+    """Cycles between two windows: which are the first, how many, and what came of them."""
+
+    first: int | None = None
+    count: int = 0
+    applied: int = 0
+    silences: int = 0
+
+
 class Symptoms:
     """See the module; instants are of the controller's clock."""
 
@@ -30,11 +40,15 @@ class Symptoms:
         self._guard_cycles = problem.controller.guard_cycles
         self._failures = problem.controller.failures_in_a_row
         self._deadline_ns = problem.pipeline.deadline_ns
+        self._period_ns = problem.pipeline.period_ns
         self._begun_ns: int | None = None
         self._recent: deque[LiveWindow] = deque(maxlen=RECENT_WINDOWS)
+        # The cycles before each of them, and before the next.
+        self._leads: deque[_Lead] = deque([_Lead()], maxlen=RECENT_WINDOWS + 1)
         # By sink: when a command was heard to be applied last, and what came of the last command.
         self._applied_ns: dict[str, int] = {}
         self._outcomes: dict[str, str] = {}
+        self._silences = 0
 
     def begun(self, at_ns: int) -> None:
         """A cycle was heard of."""
@@ -46,10 +60,21 @@ class Symptoms:
         self._outcomes[completion.sink] = completion.outcome
         if completion.outcome == ACTUATED:
             self._applied_ns[completion.sink] = at_ns
+            self._silences += completion.rested
 
     def closed(self, window: LiveWindow) -> None:
         """A window has closed."""
         self._recent.append(window)
+        self._leads.append(_Lead())
+
+    def led(self, cycles: Sequence[LiveCycle]) -> None:
+        """Cycles belong to no window: they count with the next."""
+        lead = self._leads[-1]
+        if lead.first is None and cycles:
+            lead.first = cycles[0].number
+        lead.count += len(cycles)
+        lead.applied += sum(map(self._is_applied, cycles))
+        lead.silences += sum(cycle.silences for cycle in cycles)
 
     def set_back(self, back_ns: int) -> None:
         """Go on by a clock that has been set back."""
@@ -57,19 +82,22 @@ class Symptoms:
             self._begun_ns -= back_ns
         self._applied_ns = {sink: at_ns - back_ns for sink, at_ns in self._applied_ns.items()}
 
-    def status(self, newest: Iterable[LiveCycle], now_ns: int) -> dict[str, Any]:
+    def status(self, newest: Sequence[LiveCycle], now_ns: int) -> dict[str, Any]:
         """Return them as plain values.
 
         Parameters
         ----------
-        newest : iterable of LiveCycle
+        newest : sequence of LiveCycle
             Cycles, the last one first.
 
         Returns
         -------
         dict
-            ``begun_ms``: time since the first cycle was heard of, None before. ``recent``: V_D of
-            the last windows, and the message that most of their lost cycles lack. ``sinks``: age of
+            ``begun_ms``: time since the first cycle was heard of, None before. ``silences``: calls
+            of ``hold`` or ``zero`` that a command has followed. ``release_ratio``: cycles released
+            per period, over the time of three windows; None before the first has passed.
+            ``recent``: V_D and `_commands` of the last windows, and the message that most of their
+            lost cycles lack. ``sinks``: age of
             the last command that was applied, or None, and what came of the last one. ``failing``:
             by candidate, how many of its last shadows failed in a row, at most g + 1, and the
             message that the last one lacks. Messages are source and target, as ``task@node``.
@@ -77,15 +105,49 @@ class Symptoms:
         begun_ns = self._begun_ns
         return {
             "begun_ms": None if begun_ns is None else round((now_ns - begun_ns) / 1e6, 1),
+            "silences": self._silences,
+            "release_ratio": self._release_ratio(newest),
             "recent": {
                 "violation_rates": [
                     window.violation_rate(self._deadline_ns) for window in self._recent
                 ],
+                **self._commands(),
                 "unreached": self._mostly_unreached(),
             },
             "sinks": {sink: self._sink(sink, now_ns) for sink in sorted(self._ledger.sinks)},
             "failing": dict(self._failing(newest)),
         }
+
+    def _release_ratio(self, newest: Sequence[LiveCycle]) -> float | None:
+        """Cycles released per period, over the time of three windows."""
+        if not newest:
+            return None
+        window_ns, last_ns = self._size * self._period_ns, newest[0].at_ns
+        begin_ns = last_ns - RECENT_WINDOWS * window_ns
+        before = (count for count, cycle in enumerate(newest) if cycle.at_ns <= begin_ns)
+        count = next(before, len(newest) - 1)
+        span_ns = last_ns - newest[count].at_ns
+        return None if span_ns < window_ns else count * self._period_ns / span_ns
+
+    def _is_applied(self, cycle: LiveCycle) -> bool:
+        return cycle.told or (cycle.actuated and self._ledger.complete(cycle))
+
+    def _commands(self) -> dict[str, list[Any]]:
+        """Return silences, applied commands and cycles of the last windows and of their leads.
+
+        ``applied`` is the number of commands per period that are known to have been applied,
+        ``cycles`` the first and the last cycle.
+        """
+        found: dict[str, list[Any]] = {"silences": [], "applied": [], "cycles": []}
+        for window, lead in zip(self._recent, self._leads, strict=False):
+            cycles = window.cycles
+            applied = lead.applied + sum(map(self._is_applied, cycles))
+            periods = lead.count + max(window.span_ns / self._period_ns, len(cycles))
+            first = cycles[0].number if lead.first is None else lead.first
+            found["silences"].append(lead.silences + sum(cycle.silences for cycle in cycles))
+            found["applied"].append(applied / periods)
+            found["cycles"].append((first, cycles[-1].number))
+        return found
 
     def _sink(self, sink: str, now_ns: int) -> dict[str, Any]:
         at_ns = self._applied_ns.get(sink)
@@ -103,12 +165,12 @@ class Symptoms:
         counts = Counter(ways for ways in unreached if ways is not None)
         return max(counts, key=counts.__getitem__, default=None)
 
-    def _failing(self, newest: Iterable[LiveCycle]) -> Iterator[tuple[str, dict[str, Any]]]:
+    def _failing(self, newest: Sequence[LiveCycle]) -> Iterator[tuple[str, dict[str, Any]]]:
         """Yield candidates whose last shadows all failed; cycles within g of the newest may not."""
         most = self._failures
         fails: dict[str, list[LiveCycle]] = {}
         succeeded = set()
-        for place, cycle in enumerate(islice(newest, self._guard_cycles, None)):
+        for place, cycle in enumerate(newest[self._guard_cycles :]):
             if not cycle.shadow or cycle.shadow in succeeded:
                 continue
             known = fails.get(cycle.shadow)

@@ -627,7 +627,7 @@ class Worker:
 
     def _state(self) -> tuple[bool, str]:
         where = f"{self.task} on {self.place.node}"
-        limit_ns = max(10 * self.place.period_ns, 1_000_000_000)
+        limit_ns = self.place.hang_ns
         if self.busy_since_ns is not None and self._now_ns - self.busy_since_ns > limit_ns:
             since_s = (self._now_ns - self.busy_since_ns) / 1e9
             cycle = self._busy_cycle

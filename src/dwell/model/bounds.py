@@ -64,6 +64,8 @@ class Bound:
         Whether `low`, and `high`, are themselves outside.
     whole : bool
         Whether only whole numbers are inside.
+    word : str
+        A text that is allowed, too, unless it is empty.
     """
 
     low: float
@@ -71,9 +73,12 @@ class Bound:
     above: bool = False
     below: bool = False
     whole: bool = False
+    word: str = ""
 
     def holds(self, value: object) -> bool:
         """Whether `value` is a number inside; a truth value is no number, and NaN is in none."""
+        if self.word and value == self.word:
+            return True
         if isinstance(value, bool) or not isinstance(value, numbers.Real):
             return False
         if self.whole and not isinstance(value, numbers.Integral):
@@ -90,6 +95,7 @@ class Bound:
     def __str__(self) -> str:
         """Return ``a number from 0 to 1e9``, or what the bound is."""
         kind = "a whole number" if self.whole else "a number"
+        kind = f"{self.word} or {kind}" if self.word else kind
         low, high = short(self.low), short(self.high)
         if self.high == math.inf:
             return f"{kind} above {low}" if self.above else f"{kind} of at least {low}"

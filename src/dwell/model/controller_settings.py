@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 from dwell.model.bounds import MAX_COUNT, MIN_DWELL, MIN_IMPROVEMENT, TIME_MS, Bound
@@ -10,9 +11,12 @@ from dwell.model.declaration import declared, key
 GUARD_CYCLES = Bound(2, MAX_COUNT, whole=True)
 PROBE_CYCLES = Bound(1, MAX_COUNT, whole=True)
 HALF_LIFE_WINDOWS = Bound(0, MAX_COUNT, above=True)
+AUTO = "auto"
 SHADOW_FRACTION = Bound(0, 1)
 DECIDE_CYCLES = Bound(1, MAX_COUNT, whole=True)
 MIN_DWELL_CYCLES = Bound(0, MAX_COUNT, whole=True)
+#: N_min where a cell gives none and the estimator states no errors.
+USUAL_DWELL = 3
 
 
 @declared()
@@ -32,9 +36,14 @@ class ControllerSettings:
         "Cycles between two decisions, at most W.",
         DECIDE_CYCLES,
         default=None,
-        usual="W: one decision per window",
+        usual="W/4, rounded down, and at least 1",
     )
-    min_dwell: int = key("Windows that a placement stays at least (N_min).", MIN_DWELL, default=3)
+    min_dwell: int | None = key(
+        "Windows that a placement stays at least (N_min).",
+        MIN_DWELL,
+        default=None,
+        usual="0 with an estimator that states its errors, else 3",
+    )
     min_dwell_cycles: int = key(
         "Cycles that a placement stays at least, where N_min windows are fewer.",
         MIN_DWELL_CYCLES,
@@ -48,16 +57,18 @@ class ControllerSettings:
     escape: bool = key(
         "Whether an incumbent over a cap may leave before the hysteresis is met.", default=False
     )
-    estimator: str = key(
+    estimator: str | None = key(
         "How the QoS of candidates is estimated; also `package.module:Class` of your own.",
-        default="profile",
-    )
-    shadow_fraction: float | None = key(
-        "Share of cycles that are also sent through each alternative, where the estimator uses "
-        "shadow jobs.",
-        SHADOW_FRACTION,
         default=None,
-        usual="0.05, or 1/(alternatives) where that is less",
+        usual="`corrected`; `profile` for a placement that never moves, `latency-first` and "
+        "`atp-thresholds`",
+    )
+    shadow_fraction: float | Literal["auto"] = key(
+        "Share of cycles that are also sent through each alternative, where the estimator uses "
+        "shadow jobs; `auto`: by placement, the largest of at most 0.05 that costs the cell's own "
+        "cycles next to nothing.",
+        replace(SHADOW_FRACTION, word=AUTO),
+        default=AUTO,
     )
     half_life_windows: float = key(
         "Windows after which a measurement counts half.", HALF_LIFE_WINDOWS, default=2.0

@@ -86,7 +86,8 @@ class LiveSettings:
         default=25,
     )
     degraded_at: float = key(
-        "Share of missed cycles in the last three windows above which the cell is degraded.",
+        "Share of the cycles of the last three windows above which the cell is degraded: missed, "
+        "not applied, or released too often or too seldom.",
         Bound(0, 1),
         default=0.1,
     )

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from dwell.display import Displayed
 from dwell.errors import Fault, ProblemError
 from dwell.model.bounds import MAX_COUNT, Bound, counted, require
-from dwell.model.controller_settings import ControllerSettings
+from dwell.model.controller_settings import USUAL_DWELL, ControllerSettings
 from dwell.model.declaration import declared, key
 from dwell.model.fabric import Fabric
 from dwell.model.frozen import FrozenDict, shortened
@@ -80,9 +80,9 @@ class Problem(Displayed):
         require_length(1, self.window_cycles, self.pipeline.period_ms, "window_cycles")
         if self.servo is not None:
             self.servo.require_seen(self.pipeline.period_ms)
-        every, bound = self.decide_cycles, f"at most window_cycles = {self.window_cycles}"
-        holds = every <= self.window_cycles
-        require(holds, "controller.decide_cycles", every, f"{bound}; lower it, or raise that")
+        every, width = self.decide_cycles, self.window_cycles
+        bound = f"at most window_cycles = {width}; lower decide_cycles, or raise window_cycles"
+        require(every <= width, "controller.decide_cycles", every, bound)
         phased = self.pipeline.first_release_ms > 0 and self.live.release == "frames"
         bound = "timer in a cell with a phase_ms, which a camera's frames do not keep"
         require(not phased, "live.release", self.live.release, bound)
@@ -107,7 +107,7 @@ class Problem(Displayed):
                 f"windows of {counted(self.window_cycles, 'cycle')}, "
                 f"{self.warmup_windows} of warm-up",
                 f"controller on {self.controller_node}: {controller.policy}, "
-                f"{controller.estimator}, begins with {self.initial}>",
+                f"{controller.estimator or 'its usual estimator'}, begins with {self.initial}>",
             )
         )
 
@@ -208,7 +208,7 @@ class Problem(Displayed):
     def decide_cycles(self) -> int:
         """Cycles between two decisions."""
         given = self.controller.decide_cycles
-        return self.window_cycles if given is None else given
+        return max(self.window_cycles // 4, 1) if given is None else given
 
     @property
     def decisions_per_window(self) -> float:
@@ -216,11 +216,25 @@ class Problem(Displayed):
         return self.window_cycles / self.decide_cycles
 
     @property
+    def min_dwell(self) -> int:
+        """N_min, windows; where the cell gives none, as with an estimator that states no errors."""
+        given = self.controller.min_dwell
+        return USUAL_DWELL if given is None else given
+
+    @property
+    def dwell_cycles(self) -> int:
+        """Cycles that a placement stays at least: max(N_min W, `min_dwell_cycles`)."""
+        return max(self.min_dwell * self.window_cycles, self.controller.min_dwell_cycles)
+
+    @property
     def min_dwell_decisions(self) -> int:
-        """Decisions that a placement stays at least: of N_min windows, or `min_dwell_cycles`."""
-        settings = self.controller
-        cycles = max(settings.min_dwell * self.window_cycles, settings.min_dwell_cycles)
-        return -(-cycles // self.decide_cycles)
+        """Decisions that a placement stays at least."""
+        return -(-self.dwell_cycles // self.decide_cycles)
+
+    @property
+    def stay_cycles(self) -> int:
+        """Least number of cycles from one move of a policy that dwells to its next."""
+        return (self.min_dwell_decisions + 1) * self.decide_cycles
 
     @property
     def censor_ms(self) -> float:
@@ -234,12 +248,12 @@ class Problem(Displayed):
 
     @property
     def shadow_fraction(self) -> float:
-        """Share of the cycles also sent through each alternative, of an estimator with shadows.
+        """Largest share of the cycles also sent through each alternative, if the estimator does so.
 
-        Where none is given 0.05, or all cycles over the number of alternatives where that is less.
+        With `auto` 0.05, or 1/(alternatives) if that is less; see `dwell.estimators.shadow_price`.
         """
         given = self.controller.shadow_fraction
-        if given is not None:
+        if not isinstance(given, str):
             return given
         return min(SHADOWED, 1 / max(len(self.candidates) - 1, 1))
 

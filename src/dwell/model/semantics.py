@@ -144,11 +144,13 @@ def find_unregistered(
         if settings.policy not in parts.candidates and not CLASS_PATH.holds(settings.policy):
             known = [*policies, *names]
             yield from _unknown("controller.policy", "policy", settings.policy, known)
-        if not CLASS_PATH.holds(settings.estimator):
-            path = "controller.estimator"
-            yield from _unknown(path, "estimator", settings.estimator, estimators)
-        given = settings.shadow_fraction if settings.estimator in shadowing else None
-        if given is not None and (message := too_many_shadows(given, len(names))):
+        estimator = settings.estimator
+        if estimator is not None and not CLASS_PATH.holds(estimator):
+            yield from _unknown("controller.estimator", "estimator", estimator, estimators)
+        # The usual estimator sends shadow jobs.
+        sends = estimator is None or estimator in shadowing
+        given = settings.shadow_fraction if sends else None
+        if isinstance(given, float | int) and (message := too_many_shadows(given, len(names))):
             yield Fault("controller.shadow_fraction", message)
     yield from _columns(parts)
 

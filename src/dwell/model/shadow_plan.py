@@ -2,10 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TypeAlias
+
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.model.frozen import FrozenDict
+
 GOLDEN = (np.sqrt(5) - 1) / 2
+
+#: Share of the cycles that each alternative gets: one number, or one per candidate that is active.
+ShadowFraction: TypeAlias = float | Mapping[str, float]
+
+
+def by_candidate(fraction: ShadowFraction, candidates: Iterable[str]) -> FrozenDict[str, float]:
+    """Return the share that each alternative gets while each of the candidates is active."""
+    if isinstance(fraction, Mapping):
+        return FrozenDict({name: fraction.get(name, 0.0) for name in candidates})
+    return FrozenDict(dict.fromkeys(candidates, fraction))
 
 
 def shadow_stamps(
@@ -33,37 +48,49 @@ def shadow_stamps(
     -------
     int16 array, shape (last - first,)
     """
-    plan = ShadowPlan(first, last, candidates, fraction)
+    plan = ShadowPlan(first, last, [fraction] * candidates)
     return plan.stamps(first, last, active)
 
 
 class ShadowPlan:
-    """Which cycles of a stretch are also sent through an alternative (see `shadow_stamps`)."""
+    """Which cycles of a stretch are also sent through an alternative (see `shadow_stamps`).
 
-    def __init__(self, first: int, last: int, candidates: int, fraction: float) -> None:
-        self._first, self._candidates = first, candidates
-        #: Which alternative each cycle is sent through; the last one stands for none.
-        self._place = np.full(last - first, max(candidates - 1, 0), np.int16)
-        if fraction > 0 and candidates > 1:
-            turned = np.arange(first, last) * GOLDEN
-            turned -= np.floor(turned)
-            turned /= fraction
-            np.minimum(turned, candidates - 1, out=turned)
-            self._place[:] = turned
+    Parameters
+    ----------
+    fractions : sequence of float
+        Share of the cycles that each alternative gets, by the candidate that is active.
+    """
+
+    def __init__(self, first: int, last: int, fractions: Sequence[float]) -> None:
+        self._first, self._last, self._fractions = first, last, tuple(fractions)
+        self._none = max(len(self._fractions) - 1, 0)
+        turned = np.arange(first, last) * GOLDEN
+        turned -= np.floor(turned)
+        #: Which alternative each cycle is sent through, by the share; the last stands for none.
+        self._places = {fraction: self._placed(turned, fraction) for fraction in set(fractions)}
 
     def __repr__(self) -> str:
-        first = self._first
-        return f"ShadowPlan(cycles {first} to {first + len(self._place)}, {len(self.sent)} sent)"
+        return f"ShadowPlan(cycles {self._first} to {self._last}, {len(self.sent)} sent)"
+
+    def _placed(self, turned: NDArray[np.float64], fraction: float) -> NDArray[np.int16]:
+        if not (fraction > 0 and self._none):
+            return np.full(len(turned), self._none, np.int16)
+        return np.minimum(turned / fraction, self._none).astype(np.int16)
 
     @property
     def sent(self) -> NDArray[np.int64]:
-        """The cycles that are sent through any, whatever they run under, ascending."""
-        return self._first + np.flatnonzero(self._place < self._candidates - 1)
+        """The cycles that are sent through any, under the candidate that sends most, ascending.
+
+        Those of the others are among them.
+        """
+        most = self._places[max(self._fractions)]
+        return self._first + np.flatnonzero(most < self._none)
 
     def stamps(self, first: int, last: int, active: int) -> NDArray[np.int16]:
         """Return the stamps of some of the cycles where they run under a candidate."""
-        alternatives = [i for i in range(self._candidates) if i != active]
+        alternatives = [i for i in range(len(self._fractions)) if i != active]
+        place = self._places[self._fractions[active]]
         stamps: NDArray[np.int16] = np.array([*alternatives, -1], np.int16)[
-            self._place[first - self._first : last - self._first]
+            place[first - self._first : last - self._first]
         ]
         return stamps

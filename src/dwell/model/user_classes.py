@@ -50,11 +50,8 @@ def make_user_class(
         An `error`, if there is no such module or class, the module raises when it is imported,
         the class wants arguments or raises, or its object has no such method.
     """
-    who = f"{what} {name!r}"
-    module_name, _, attribute = name.partition(":")
-    kind = _named(name, problem.folder, "class", who, error)
-    if not isinstance(kind, type):
-        raise error(f"{who}: {attribute!r} in {module_name} is no class")
+    who, attribute = f"{what} {name!r}", name.partition(":")[2]
+    kind = user_class(name, problem.folder, what, error)
     if not callable(getattr(kind, method, None)):
         raise error(f"{who}: the class is no {what}: it has no method {method}")
     from_problem = getattr(kind, "from_problem", None)
@@ -72,6 +69,29 @@ def make_user_class(
     except Exception as fault:
         call = f"{attribute}()" if from_problem is None else f"{attribute}.from_problem(problem)"
         raise error(f"{who}: {call} failed: {describe_raised(fault, users=True)}") from fault
+
+
+def user_class(name: str, folder: str | None, what: str, error: type[DwellError]) -> type:
+    """Return a user's class.
+
+    Parameters
+    ----------
+    name, what
+        As in `make_user_class`.
+    folder : str, optional
+        Its modules are preferred to installed modules.
+
+    Raises
+    ------
+    DwellError
+        An `error`, if there is no such module or class, or the module raises when it is imported.
+    """
+    who = f"{what} {name!r}"
+    kind = _named(name, folder, "class", who, error)
+    if not isinstance(kind, type):
+        module_name, _, attribute = name.partition(":")
+        raise error(f"{who}: {attribute!r} in {module_name} is no class")
+    return kind
 
 
 class UserCall(NamedTuple):

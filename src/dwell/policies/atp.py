@@ -45,7 +45,7 @@ from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.qos import NO_ERROR, Decision, QoS
 from dwell.policies.atp_thresholds import ATPThresholds
-from dwell.policies.incumbent import check_parameter
+from dwell.policies.incumbent import CandidatePolicy, check_parameter
 
 
 class _Shown(NamedTuple):
@@ -89,6 +89,8 @@ class ATP(ATPThresholds):
         Time between two decisions, milliseconds; rounded to whole windows when a run starts. A
         policy that was never started decides at every close.
     """
+
+    usual_estimator = CandidatePolicy.usual_estimator
 
     def __init__(
         self,

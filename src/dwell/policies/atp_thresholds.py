@@ -86,6 +86,9 @@ class ATPThresholds(PricingPolicy):
         tasks, or no two candidates make a pair.
     """
 
+    # It reads no estimates.
+    usual_estimator = "profile"
+
     def __init__(
         self,
         *,

@@ -9,8 +9,8 @@ cases decided:
   unless the estimator learns: both sides of Delta J are then its predictions.
 * Delta J must exceed Delta_min and the `dwell.cost.margin` of the two estimates, which is 0 where
   they say no errors, by more than `dwell.cost.GAIN_TOLERANCE`.
-* n_d counts windows since the last migration and blocks while n_d < N_min. Two migrations are
-  therefore at least N_min + 1 windows apart, and K windows hold at most
+* n_d counts decisions since the last migration and blocks while n_d < N_min. Two migrations are
+  therefore at least N_min + 1 decisions apart, and K decisions hold at most
   floor(K / (N_min + 1)) of them, whatever the metrics do.
 * The minimum goes to the incumbent on a tie, then to the order of the candidates. If it is the
   incumbent, the window is a hold whatever Delta J says, and n_d grows.

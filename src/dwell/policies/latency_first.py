@@ -27,6 +27,7 @@ class LatencyFirst(CandidatePolicy):
     """
 
     by_price = True
+    usual_estimator = "profile"
 
     def _decide(self, observed: QoS, estimates: Mapping[str, QoS] | None) -> tuple[Decision, None]:
         known, now = self._known(estimates), self.incumbent

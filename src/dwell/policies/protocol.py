@@ -63,6 +63,8 @@ class Proposer(ABC):
         What it prices by; the problem's where None.
     guarded : bool
         Whether a guard may move the cell.
+    usual_estimator : str
+        Estimator where neither the cell nor the caller names one.
     by_price : bool
         Whether it moves to any candidate that is cheap enough, so that in a fleet another one may
         be taken in the place of its own.
@@ -71,6 +73,7 @@ class Proposer(ABC):
     initial: str | None = None
     objective: Objective | None = None
     guarded: bool = True
+    usual_estimator: ClassVar[str] = "corrected"
     by_price: ClassVar[bool] = False
 
     @property

@@ -21,8 +21,10 @@ from dwell.model.user_classes import make_user_class
 
 if TYPE_CHECKING:
     from dwell.model.problem import Problem
-    from dwell.policies.protocol import Policy
+    from dwell.policies.protocol import MinimalPolicy, Policy
 
+#: The policy that every candidate's name means.
+STATIC = "dwell.policies.static:Static"
 #: Group of the entry points by which other packages add policies.
 GROUP = "dwell.policies"
 
@@ -134,7 +136,7 @@ def by_name(name: str, problem: Problem) -> Policy:
     if name in REGISTRY and name in problem.candidates:
         raise PolicyError(f"{name!r} is a policy's name and a candidate's; rename the candidate")
     if name in problem.candidates:
-        static = class_at("dwell.policies.static:Static")
+        static = class_at(STATIC)
         return cast(
             "Policy",
             static(candidates=problem.candidates, initial=name, objective=problem.objective),
@@ -153,6 +155,29 @@ def by_name(name: str, problem: Problem) -> Policy:
 def estimates(name: str) -> bool:
     """Return whether a policy reads estimates; one that is not of ours is taken to do so."""
     return name not in REGISTRY or REGISTRY[name].estimates
+
+
+def estimator_of(problem: Problem, policy: MinimalPolicy | str | None = None) -> str:
+    """Return the estimator that a cell names, or else the usual one of a policy.
+
+    Parameters
+    ----------
+    policy : policy, str, or None
+        The cell's where None.
+    """
+    from dwell.policies.protocol import Proposer
+
+    if problem.controller.estimator is not None:
+        return problem.controller.estimator
+    given = policy or problem.controller.policy
+    kind: type = Proposer
+    if not isinstance(given, str):
+        kind = type(given)
+    elif given in problem.candidates:
+        kind = class_at(STATIC)
+    elif given in REGISTRY:
+        kind = class_at(REGISTRY[given].path)
+    return (kind if issubclass(kind, Proposer) else Proposer).usual_estimator
 
 
 def name_of_class(kind: str) -> str | None:

@@ -22,6 +22,8 @@ class Static(CandidatePolicy):
     """
 
     guarded = False
+    # Shadow jobs would load a placement that never moves.
+    usual_estimator = "profile"
 
     def _decide(self, observed: QoS, estimates: Mapping[str, QoS] | None) -> tuple[Decision, None]:
         costs = self._costs(estimates)

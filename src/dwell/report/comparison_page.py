@@ -177,7 +177,7 @@ def _beliefs(comparison: Comparison, blocks: PolicyBlocks) -> Table:
     import polars as pl
 
     means = comparison.costs.group_by("scenario", "policy", "candidate", maintain_order=True).agg(
-        pl.col("estimated").mean(), pl.col("measured").mean()
+        pl.col("estimated", "measured", "shadow_fraction").mean()
     )
     alone = comparison.runs.group_by("scenario", "policy", maintain_order=True).agg(
         pl.col("cost").mean().alias("alone")
@@ -191,6 +191,7 @@ def _beliefs(comparison: Comparison, blocks: PolicyBlocks) -> Table:
         Measure("estimated", "estimated while idle", decimals=2),
         Measure("measured", "measured while active", decimals=2),
         Measure("alone", "measured alone", decimals=2),
+        Measure("shadow_fraction", "shadows per alternative", "%", 100.0, 1),
     ]
     return Table(
         f"{blocks.prefix}beliefs",

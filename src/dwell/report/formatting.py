@@ -214,7 +214,8 @@ def _shown(name: str, remark: str = "") -> str:
     shown += f"-{known.variant}" if known.variant else ""
     brackets = "; ".join(filter(None, (remark, known.belief)))
     shown += f" ({brackets})" if brackets else ""
-    return f"{shown}, {known.rest}" if known.rest else shown
+    glue = " " if known.rest.startswith("as ") else ", "
+    return f"{shown}{glue}{known.rest}" if known.rest else shown
 
 
 def shown_scenario(name: str) -> str:

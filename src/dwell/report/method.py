@@ -7,9 +7,11 @@ from collections.abc import Iterable, Sequence
 
 from dwell.display import decimals_for
 from dwell.estimators.registry import REGISTRY as ESTIMATORS
+from dwell.estimators.registry import resolved
 from dwell.model import LinkDisturbance, Node, NodeDisturbance, Problem, Process, Trace
 from dwell.model.bounds import counted
 from dwell.model.disturbed import on_node
+from dwell.policies.registry import estimator_of
 from dwell.report.formatting import OURS, Measure, percent, shown_contender, write_ms, write_number
 from dwell.report.page import Block, Definitions
 from dwell.report.palette import FAMILIES, Palette, contended
@@ -45,6 +47,8 @@ def method_blocks(
 
 def cell_definitions(problem: Problem) -> dict[str, str]:
     """Return what a cell is, and what its controller does, by headings."""
+    estimator = estimator_of(problem)
+    problem = resolved(problem, estimator)
     pipeline, controller = problem.pipeline, problem.controller
     span_s = problem.window_ms / 1e3
     nodes = problem.fabric.nodes.values()
@@ -64,9 +68,10 @@ def cell_definitions(problem: Problem) -> dict[str, str]:
         "caps": _caps(problem),
         "controller": f"on {problem.controller_node}, begins with {problem.initial}",
         "decisions": f"every {counted(problem.decide_cycles, 'cycle')}",
-        "N_min": counted(controller.min_dwell, "window"),
+        "N_min": counted(problem.min_dwell, "window"),
+        **({"dwell": f"{least} cycles at least"} if (least := controller.min_dwell_cycles) else {}),
         "Δ_min": f"{controller.min_improvement:g}",
-        "estimator": controller.estimator,
+        "estimator": estimator,
     }
 
 
@@ -189,6 +194,8 @@ def describe_contenders(problem: Problem, names: Iterable[str]) -> dict[str, str
         if any(one.family == family for one in known):
             remark = f" {OURS}" if family == "atp" else ""
             sentences[shown_contender(family)] = f"{policy.sentence}{remark}"
+    if "DTP as printed" in names:
+        sentences["DTP as printed"] = "has the profile, one decision per window, and N_min = 3."
     parts = {part for one in known for part in (one.variant, one.belief)}
     for form, texts in (("… ({})", BELIEFS), ("…-{}", VARIANTS)):
         sentences |= {form.format(name): text for name, text in texts.items() if name in parts}

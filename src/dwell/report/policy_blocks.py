@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dwell.model.bounds import counted
+from dwell.policies.registry import estimator_of
 from dwell.report.charts import (
     NO_LIMIT,
     PART_COLOURS,
@@ -96,7 +97,7 @@ class PolicyBlocks:
             for column in ("scenario", "policy")
         )
         self.palette = Palette.of(
-            self.problem.candidates, self.policies, self.problem.controller.estimator
+            self.problem.candidates, self.policies, estimator_of(self.problem)
         )
         #: By what the policies are called in figures.
         self.styles = {shown_contender(name): self.palette.policies[name] for name in self.policies}

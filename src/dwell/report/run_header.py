@@ -29,6 +29,8 @@ class RunHeader(NamedTuple):
     disturbed : tuple of Disturbed
         What was done to nodes and links: as it was played, where the run says so, and as its
         scenario has it elsewhere.
+    shadows : str
+        Share of cycles that each alternative gets as shadows, by placement; a dash for none.
     recovered : mapping of str to object
         Losses of a live run's journal.
     """
@@ -39,6 +41,7 @@ class RunHeader(NamedTuple):
     policy: str
     estimator: str
     seed: str
+    shadows: str
     versions: Mapping[str, str]
     disturbed: tuple[Disturbed, ...]
     tracking: Tracking | None
@@ -67,6 +70,12 @@ class RunHeader(NamedTuple):
             policy=str(meta.get("policy") or "–"),
             estimator=str(meta.get("estimator") or "–"),
             seed="–" if meta.get("seed") is None else str(meta["seed"]),
+            shadows=", ".join(
+                f"{share:g} under {name}"
+                for name, share in meta.get("shadow_fractions", {}).items()
+                if share
+            )
+            or "–",
             versions=meta.get("versions", {}),
             disturbed=tuple(disturbed(disturbances, problem.fabric)),
             tracking=Tracking.of(meta),

@@ -461,6 +461,7 @@ class _RunPage:
                 "record": f"{header.kind}, seed {header.seed}",
                 "policy": header.policy,
                 "estimator": header.estimator,
+                "shadows": header.shadows,
                 "window": f"{counted(header.problem.window_cycles, 'cycle')} of {period}, deadline "
                 f"{write_ms(header.deadline_ms)}",
                 "versions": ", ".join(f"{name} {text}" for name, text in header.versions.items()),

@@ -110,7 +110,6 @@ def simulate_realisation(
     played = cast("PlayedRealisation", _play(*asked) or _play(*asked, shadow=True))
     meta = partial(
         meta_of,
-        problem,
         played.controller,
         scenario=realisation.scenario,
         seed=realisation.seed,
@@ -145,7 +144,7 @@ def describe(
     """
     problem.scenario(scenario)
     controller = Controller(problem, policy, estimator)
-    meta = meta_of(problem, controller, scenario=scenario, seed=seed, windows=windows, guard=guard)
+    meta = meta_of(controller, scenario=scenario, seed=seed, windows=windows, guard=guard)
     return Run(meta, {}).meta
 
 
@@ -259,10 +258,9 @@ def play_cells(
 
 def _shadow_plan(cell: PlayedCell, probes: bool) -> ShadowPlan | None:
     """Return which cycles of a cell have a shadow; None where it needs none."""
-    fraction = cell.controller.shadow_fraction
-    if not (probes or fraction > 0):
+    if not (probes or cell.controller.sends_shadows):
         return None
-    return ShadowPlan(0, cell.realisation.cycles, len(cell.problem.candidates), fraction)
+    return ShadowPlan(0, cell.realisation.cycles, [*cell.controller.shadow_fractions.values()])
 
 
 def _check_fit(problem: Problem, realisation: Realisation) -> None:
@@ -569,7 +567,6 @@ def _evidence(
 
 
 def meta_of(
-    problem: Problem,
     controller: Controller,
     *,
     scenario: str,
@@ -580,12 +577,12 @@ def meta_of(
     """Return what the record of a simulated run says of it."""
     return {
         "kind": "simulated",
-        "cell": problem.name,
+        "cell": controller.problem.name,
         "scenario": scenario,
         **controller.described(),
         "guard": guard and controller.guarded,
         "seed": seed,
         "windows": windows,
-        "problem": to_document(problem),
+        "problem": to_document(controller.problem),
         "versions": versions(),
     }

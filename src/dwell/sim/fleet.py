@@ -116,7 +116,7 @@ def _meta_of(
 ) -> dict[str, Any]:
     """Return what the record of a cell says: also by which streams `draw` repeats its draws."""
     meta = meta_of(
-        *(played.problem, played.controller),
+        played.controller,
         scenario=cell.entry.scenario,
         seed=seed,
         windows=played.realisation.windows,

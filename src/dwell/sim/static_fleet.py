@@ -63,7 +63,8 @@ class StaticFleet:
             If some cell may move.
         """
         problems, cells = [*phased(fleet, self.seed)], self._play(fleet)
-        missed, used = [], {}
+        missed: list[NDArray[np.bool_]] = []
+        used: dict[str, float] = {}
         for problem, cell in zip(problems, cells, strict=True):
             width, closed = problem.window_cycles, int(cell.tables.cells[0]["window"])
             first, last = problem.warmup_windows, closed

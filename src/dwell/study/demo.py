@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from dwell.errors import ProblemError, TraceError
 from dwell.model import Problem
+from dwell.model.controller_settings import AUTO
 from dwell.model.progress import Progress
 from dwell.study.comparison import Comparison, compare
 from dwell.study.runner import StudyResult, run_study
@@ -24,13 +25,19 @@ from dwell.study.study import Contender, load_study
 if TYPE_CHECKING:
     import polars as pl
 
-#: Policies beside every candidate as a static placement.
+#: The defaults of the settings for which the cells have the paper's.
+USUAL = {
+    "controller.decide_cycles": None,
+    "controller.min_dwell": None,
+    "controller.shadow_fraction": AUTO,
+}
+#: Policies with every candidate as a static placement. The cells have the paper's settings.
 POLICIES = (
     "atp",
-    "dtp",
+    Contender("DTP as printed", "dtp"),
     Contender("dtp, no caps", "dtp", settings={"objective.caps": {}}),
     "latency-first",
-    Contender("dtp+corrected", "dtp", "corrected"),
+    Contender("DTP", "dtp", "corrected", USUAL),
     Contender("cusum+corrected", "cusum", "corrected"),
 )
 SEEDS = 20

@@ -18,7 +18,7 @@ import numpy as np
 
 from dwell.calibration.speeds import Usual, at_speed_of
 from dwell.errors import DwellError, RunError
-from dwell.estimators.registry import name_in_run
+from dwell.estimators.registry import name_in_run, resolved
 from dwell.model import Problem
 from dwell.model.document import disturbance_document, relocated, to_document
 from dwell.model.scenario import Disturbance, Scenario
@@ -115,7 +115,7 @@ def read_measured(name: str, run: Run, problem: Problem, usual: Usual | None = N
     try:
         excluded = excluded_windows(meta)
         estimator = name_in_run(meta)
-        policy, problem = _policy(run, recorded, own, problem)
+        policy, problem = _policy(run, recorded, own, resolved(problem, estimator))
         warmup = int(run.windows["warmup"].sum())
         items = _as_played(recorded, own, problem, scenario, run)
         problem = replace(
@@ -128,7 +128,7 @@ def read_measured(name: str, run: Run, problem: Problem, usual: Usual | None = N
             excluded |= {
                 window + step
                 for window in excluded
-                for step in range(1, problem.controller.min_dwell + 1)
+                for step in range(1, -(-problem.dwell_cycles // problem.window_cycles) + 1)
                 if window + step < run.windows.height
             }
     except DwellError as error:

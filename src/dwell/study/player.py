@@ -219,7 +219,8 @@ class Player:
             for contender in contenders:
                 seen = self._problem(contender, point)
                 # Candidates alone are played with the estimator `profile`, without shadow jobs.
-                is_static = contender.is_candidate(seen) and seen.controller.estimator == "profile"
+                own = seen.controller.estimator
+                is_static = contender.is_candidate(seen) and own in (None, "profile")
                 if known is not None and is_static:
                     run = known.statics[str(contender.policy)]
                 else:

@@ -33,8 +33,10 @@ from dwell.control.windows import busiest, moved_shares, seen_l95_ms
 from dwell.cost import price
 from dwell.errors import SimulationError
 from dwell.estimators import Profile
+from dwell.estimators.registry import resolved
 from dwell.model import FrozenDict, Problem
 from dwell.model.window_close import window_close_ns
+from dwell.policies.registry import estimator_of
 from dwell.study.clairvoyant import Sequence, clairvoyant, priced
 from dwell.study.oracle import expected_costs
 from dwell.study.script import Script, is_up
@@ -154,7 +156,8 @@ def references(problem: Problem, realisation: Realisation) -> References:
     statics = play_alone(problem, realisation)
     costs = {name: mean_cost(run) for name, run in statics.items()}
     alone = np.stack([window_costs(run, problem, realisation) for run in statics.values()], axis=1)
-    decide_cycles, least = problem.decide_cycles, problem.controller.min_dwell
+    decide_cycles = problem.decide_cycles
+    least = resolved(problem, estimator_of(problem)).dwell_cycles
     expected = expected_costs(problem, realisation, decide_cycles)
     sequences, runs, promised = {}, {}, {}
     for title, known, cycles, dwell in (
@@ -180,7 +183,7 @@ def references(problem: Problem, realisation: Realisation) -> References:
 
 
 def planned(
-    problem: Problem, realisation: Realisation, costs: Floats, decide_cycles: int, min_dwell: int
+    problem: Problem, realisation: Realisation, costs: Floats, decide_cycles: int, dwell_cycles: int
 ) -> tuple[Sequence, float]:
     """Plan the cheapest sequence, and return it with its mean J of a window.
 
@@ -190,8 +193,8 @@ def planned(
         J of every stretch between decisions, in windows' J: half of a window has half of its J.
     decide_cycles : int
         Cycles of a stretch; the last one may be shorter.
-    min_dwell : int
-        N_min, windows.
+    dwell_cycles : int
+        Cycles that a placement stays at least, before the stretch that a move is decided on.
 
     Returns
     -------
@@ -211,7 +214,7 @@ def planned(
         costs,
         switching,
         initial=tuple(problem.candidates).index(problem.initial),
-        min_dwell=min(-(-min_dwell * width // decide_cycles), len(costs)),
+        min_dwell=min(-(-dwell_cycles // decide_cycles), len(costs)),
         counts=np.where(warmup, WARMUP_SHARE, 1.0),
         decides=seen,
     )
@@ -342,6 +345,6 @@ def _in_time(problem: Problem) -> Problem:
         order_delay_ms=0.0,
         order_lead_cycles=0,
         migration="warm",
-        decide_cycles=None,
+        decide_cycles=problem.window_cycles,
     )
     return replace(problem, controller=settings)

@@ -54,7 +54,8 @@ class StudyRuns(Displayed):
     costs : DataFrame
         One row a run and candidate: mean J ``estimated`` while it was not active (against the
         incumbent, switching term included), mean J ``measured`` while it was, both by the
-        contender's own objective.
+        contender's own objective, and ``shadow_fraction``, the share of cycles that each
+        alternative got as shadows while it was.
     latencies : DataFrame
         Distribution of final latencies over all seeds: ``share`` of the cycles that finished
         within ``latency_ms``, by point, scenario and policy. It stays below 1 where cycles were

@@ -16,6 +16,7 @@ from dwell.model import FrozenDict
 from dwell.model.bounds import CLASS_PATH
 from dwell.model.document import to_document
 from dwell.model.user_classes import object_digest, source_digest, user_function
+from dwell.policies.registry import estimator_of
 from dwell.record.fleet_run import fleet_document
 from dwell.study.study import Contender, Point, Study
 
@@ -130,10 +131,10 @@ def _used(contender: Contender, point: Point) -> Iterator[tuple[object, str | No
     if estimator is not None:
         yield estimator, problem.folder
     elif fleet is None:
-        yield problem.controller.estimator, problem.folder
+        yield estimator_of(problem, contender.policy), problem.folder
     else:
         for one in fleet.entries:
-            named = one.estimator or fleet.estimator or one.cell.controller.estimator
+            named = one.estimator or fleet.estimator or estimator_of(one.cell)
             yield named, one.cell.folder
 
 

@@ -78,7 +78,8 @@ class Summary:
     row : dict
         One value a column of ``Comparison.runs``.
     costs : list of dict
-        One a candidate: mean estimated J while it was not active, mean measured J while it was.
+        One a candidate: mean estimated J while it was not active, mean measured J while it was,
+        and the share of cycles that each alternative got as shadows while it was.
     within : int64 array
         Cycles that finished within each point of the latency grid.
     compared : mapping
@@ -210,6 +211,7 @@ def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Su
         PLAYED: _played(final_ns, cycles.names("placement")[counted], used, problem),
     }
     incumbent, cost = decisions.names("incumbent"), windows["cost"][counts]
+    fractions = run.meta.get("shadow_fractions", {})
     costs: list[Row] = [
         {
             **labels,
@@ -217,6 +219,7 @@ def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Su
             "estimated": mean_of(decisions[f"j_{name}"][decided & ~incumbent.equal(name)]),
             "measured": mean_of(cost[those]),
             "windows": int(those.sum()),
+            "shadow_fraction": fractions.get(name, np.nan),
         }
         for name, those in active.items()
     ]

@@ -20,7 +20,7 @@ from dwell.cellfile.study_paths import with_settings
 from dwell.errors import LiveError, PolicyError, ProblemError
 from dwell.model import Problem
 from dwell.model.document import to_document
-from dwell.policies.registry import by_name, estimates, names
+from dwell.policies.registry import by_name, estimates, estimator_of, names
 from dwell.record.campaign_folder import TRACES
 from dwell.testbed.trace_names import rename_traces
 from dwell.version import __version__
@@ -192,7 +192,7 @@ def entrant(problem: Problem, name: str) -> Entrant:
     if estimator is None:
         # With the profile no shadow jobs load the nodes.
         blind = not estimates(policy) or policy in problem.candidates
-        estimator = "profile" if blind else problem.controller.estimator
+        estimator = "profile" if blind else estimator_of(problem, policy)
     known = Entrant(name, policy, estimator)
     try:
         known.problem(problem)

@@ -22,11 +22,12 @@ from pathlib import Path
 from typing import Any
 
 from dwell.errors import LiveError
+from dwell.estimators.registry import resolved
 from dwell.live.hosting import clock_of
 from dwell.live.operator_client import OperatorClient
 from dwell.model import Host, Link, LinkDisturbance, Normal, Problem
 from dwell.model.scenario import Disturbance
-from dwell.policies.registry import by_name
+from dwell.policies.registry import by_name, estimator_of
 from dwell.record import open_run
 from dwell.testbed.conditions import Conditions
 from dwell.testbed.inventory import Inventory
@@ -303,8 +304,8 @@ def run_on_hosts(
     DwellError
         If something cannot be played there, or the cell does not come up.
     """
-    by_name(policy, problem)
     problem = problem.under(policy)
+    by_name(problem.controller.policy, resolved(problem, estimator_of(problem)))
     timeline = timeline_of(problem, scenario, seed=seed, seconds=seconds)
     hosts = RealHosts(problem, inventory, out, name=name, more=["--jobs"] if jobs else [])
     require_commands(inventory, timeline.items)

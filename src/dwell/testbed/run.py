@@ -11,7 +11,7 @@ from dwell.errors import LiveError
 from dwell.estimators import registry as estimators
 from dwell.live.hosting import clock_of
 from dwell.model import Problem
-from dwell.policies.registry import by_name
+from dwell.policies.registry import by_name, estimator_of
 from dwell.record import Run, open_run
 from dwell.testbed.doctor import examine
 from dwell.testbed.netns_testbed import NetnsTestbed
@@ -104,12 +104,13 @@ def run_once(
     """
     if policy is not None:
         problem = problem.under(policy)
-    by_name(problem.controller.policy, problem)
+    estimator = estimator_of(problem)
+    by_name(problem.controller.policy, estimators.resolved(problem, estimator))
     timeline = timeline_of(problem, scenario, seed=seed, seconds=seconds, outages=True)
     arguments = ["--jobs"] if jobs else []
     testbed = NetnsTestbed(problem, out, name=name, seed=seed, more=arguments)
     require_machine(problem)
-    estimators.by_name(problem.controller.estimator, problem)
+    estimators.by_name(estimator, problem)
     played = Played(problem, scenario, seed, timeline)
     samplers: list[Sampler] = []
     try:

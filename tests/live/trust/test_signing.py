@@ -231,7 +231,7 @@ def test_a_controller_whose_clock_is_behind_learns_the_numbers(
     cell = world.cell
     assert cell._number > 1 << 61
     assert world.stamper._newest > 1 << 61
-    assert world.stamper._fraction == cell.controller.shadow_fraction
+    assert world.stamper._fraction == cell.controller.shadow_fractions["SO"]
 
 
 def test_orders_in_any_order_end_where_the_last_says(

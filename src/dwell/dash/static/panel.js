@@ -116,6 +116,8 @@ export const facts = (root, cell, state) => {
   parts.push(`age of the command ${state.age_ms === null || state.age_ms === undefined ? "–" : `${number(state.age_ms, 0)} ms`}`);
   if (cell.live) {
     parts.push(`migrations: ${count(state.migrations ?? 0)}, moves of the guard: ${count(state.guard_moves ?? 0)}`);
+    if (state.release_ratio !== null && state.release_ratio !== undefined) parts.push(`released ${percent(state.release_ratio, 0)} of P`);
+    if (state.silences !== null && state.silences !== undefined) parts.push(`silences: ${count(state.silences)}`);
     parts.push(`answer of the controller ${ago(state.answer_age_ms)} old`);
     if (state.unproven) parts.push("clocks unproven");
     if (state.bound_ms !== null && state.bound_ms !== undefined) parts.push(`clocks within ${number(state.bound_ms, 1)} ms`);

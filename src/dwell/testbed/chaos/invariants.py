@@ -164,9 +164,10 @@ class Judge:
     def migrations(self) -> list[str]:
         """Return the controller's migrations since the last call that came too early.
 
-        They are N_min + 1 windows apart; the guard's moves do not count.
+        They are `Problem.stay_cycles` apart, so that K windows hold at most K·W over that; the
+        guard's moves do not count.
         """
-        apart = (self.problem.controller.min_dwell + 1) * self.problem.window_cycles
+        apart = self.problem.stay_cycles
         violations = []
         before: Term | None = None
         previous: Term | None = None

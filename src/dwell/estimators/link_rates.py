@@ -1,0 +1,92 @@
+"""Link rates: a lower rate of a link is distinguished from a longer delay.
+
+A longer delay is the same for all messages. A lower rate delays a message by its own bytes and by
+the bytes in front of it. So messages of several loads show the rate: at the true rate the extra
+delays of all of them are the same.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.kernels.elementary import logarithms
+
+Floats: TypeAlias = NDArray[np.float64]
+
+#: Rates that are tried first: the largest, a share of it, and so on.
+FASTEST_MBPS, SHARE, TRIED = 1000.0, 0.6, 18
+#: Then rates up to so much away from the best one, in so many steps each way.
+NEARER, STEPS = (0.4, 0.05, 0.006), 8
+#: A rate above this share of the declared one is the declared one.
+LOWER = 0.9
+#: Gain of log-likelihood by which a rate explains messages better than a delay.
+GAIN = 8.0
+#: Least deviation of a delay, milliseconds.
+LEAST_MS = 0.05
+
+
+class Rate(NamedTuple):
+    """Rate of a link, with its standard error as a share of it."""
+
+    mbps: float
+    error: float = 0.0
+
+
+def better_rate(
+    extra_ms: Callable[[float], Floats], now_mbps: float, declared_mbps: float, deviation_ms: float
+) -> Rate | None:
+    """Return the rate that explains messages better than a rate with a delay; None if none does.
+
+    Parameters
+    ----------
+    extra_ms : callable
+        Extra delay of every message at a rate; NaN where it arrived too early for that rate.
+    deviation_ms : float
+        Mean absolute deviation of the delay as declared.
+    """
+
+    def spread_ms(mbps: float) -> float:
+        values = extra_ms(mbps)
+        if np.isnan(values).any():
+            return np.inf
+        return float(np.abs(values - np.median(values)).mean())
+
+    count, least_ms = len(extra_ms(now_mbps)), max(deviation_ms, LEAST_MS)
+    before_ms = spread_ms(now_mbps) if count else 0.0
+    if count * _log(before_ms, least_ms) < GAIN:
+        return None
+    fastest = min(declared_mbps, FASTEST_MBPS)
+    best = min(_slower(fastest), key=spread_ms)
+    if count * _log(before_ms, max(spread_ms(best), least_ms)) < GAIN / 2:
+        return None
+    for width in NEARER:
+        # From the fastest, which is the first of equal ones.
+        best = min(
+            (best * (1 + width * k / STEPS) for k in range(STEPS, -STEPS, -1)), key=spread_ms
+        )
+    # Each of both has a location and a scale of exponential deviations (Laplace), which is not
+    # smaller than the declared one.
+    after_ms = max(spread_ms(best), least_ms)
+    if count * _log(before_ms, after_ms) < GAIN:
+        return None
+    if best > LOWER * fastest:
+        return Rate(declared_mbps)
+    lever_ms = float((extra_ms(fastest) - extra_ms(best)).std())
+    return Rate(best, after_ms / (max(lever_ms, after_ms) * math.sqrt(count)))
+
+
+def _slower(mbps: float) -> Iterator[float]:
+    for _ in range(TRIED):
+        yield mbps
+        mbps *= SHARE
+
+
+def _log(value: float, least: float) -> float:
+    if value == math.inf:
+        return value
+    return float(logarithms(np.array([max(value / least, 1.0)]))[0])
