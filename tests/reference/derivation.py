@@ -36,7 +36,7 @@ class Record:
         self.windows = {row["window"]: row for row in run.windows.iter_rows(named=True)}
         document = self.meta["problem"]
         self.width: int = document["window_cycles"]
-        self.every: int = document["controller"].get("decide_cycles", self.width)
+        self.every = run.problem.decide_cycles
         self.parameters = self.meta["parameters"]
         first = {name: next(iter(task["on"])) for name, task in document["tasks"].items()}
         self.places = {name: {**first, **moves} for name, moves in document["candidates"].items()}

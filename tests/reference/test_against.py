@@ -282,7 +282,7 @@ def make_guarded(
     names = list(case.problem.candidates)
     settings = replace(
         case.problem.controller,
-        decide_cycles=None,
+        decide_cycles=case.problem.window_cycles,
         fallbacks=tuple(rng.sample(names, rng.randint(1, len(names)))),
         guard_cycles=rng.choice([2, 2, 3, 4]),
         probe_cycles=rng.choice([1, 2, 2, 6]),

@@ -347,7 +347,11 @@ def test_without_start_and_state_a_cold_migration_is_a_warm_one(seed: int) -> No
         problem = replace(
             case.problem,
             pipeline=replace(pipeline, tasks=tasks),
-            controller=replace(case.problem.controller, migration=migration, decide_cycles=None),
+            controller=replace(
+                case.problem.controller,
+                migration=migration,
+                decide_cycles=case.problem.window_cycles,
+            ),
         )
         windows = case.real.windows
         real = dwell.draw(problem, scenario="disturbed", seed=seed, windows=windows)
