@@ -259,7 +259,7 @@ bool keep_newest(Jobs& jobs, f64* scratch) {
     if (one.task != other.task) return one.task < other.task;
     return one.end_ns != other.end_ns ? one.end_ns < other.end_ns : one.row < other.row;
   });
-  const auto sweep = [&](bool slowed_only, RanJob* out) {
+  const auto sweep = [&](bool slowed_only, bool keeps) {
     i64 kept = 0;
     for (RanJob* first = jobs.begin(); first != jobs.end();) {
       RanJob* last = first;
@@ -269,15 +269,15 @@ bool keep_newest(Jobs& jobs, f64* scratch) {
       n = last - first;
       for (const RanJob* job = first; job != last; ++job) slowed += job->slowed > kSlowed ? 1 : 0;
       if (!slowed_only || static_cast<f64>(slowed) / static_cast<f64>(n) >= kMost) {
-        if (out != nullptr) std::copy(first, last, out + kept);
+        if (keeps) std::copy(first, last, jobs.first + kept);
         kept += n;
       }
       first = last;
     }
     return kept;
   };
-  const bool any = sweep(true, nullptr) > 0;
-  jobs.n = sweep(any, jobs.first);
+  const bool any = sweep(true, false) > 0;
+  jobs.n = sweep(any, true);
   return any;
 }
 
