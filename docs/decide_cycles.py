@@ -31,8 +31,8 @@ WINDOWS = 300
 PASSES = ((25,), (5, 10, 50, 100))
 #: Panels of the figure, and what each of them shows.
 PANELS = {
-    "missed_less": "V_D, points",
-    "cost_less": "J, %",
+    "missed_less": "difference of V_D, points",
+    "cost_less": "difference of J, %",
     "undone": "moves undone in 100 windows",
 }
 #: What the shortest interval may have, in the scenarios in which moves gain little.
@@ -76,7 +76,7 @@ def summarised(runs: pl.DataFrame) -> pl.DataFrame:
 def figure(summary: pl.DataFrame) -> Figure:
     """Draw every measure over the interval, a line per scenario."""
     styles = Palette.of((), SCENARIOS).policies
-    drawn = curves(summary, Measure("mean", "difference"), styles, "cycles between decisions")
+    drawn = curves(summary, Measure("mean", "mean over seeds"), styles, "cycles between decisions")
 
     def draw(width: float) -> Spec:
         return {**drawn(width), "resolve": {"scale": {"y": "independent"}}}
