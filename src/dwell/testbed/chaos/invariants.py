@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from dwell.errors import LiveError
+from dwell.estimators.registry import resolved
 from dwell.live.keys import MAIN, Keys
 from dwell.live.messages import (
     HANDED_OVER,
@@ -25,6 +26,7 @@ from dwell.live.messages import (
     decode,
 )
 from dwell.model import Problem
+from dwell.policies.registry import estimator_of
 from dwell.testbed.chaos.actuations import Seen
 from dwell.testbed.chaos.stages import APPLY, HOLD, ZERO
 
@@ -76,6 +78,9 @@ class Judge:
     # Terms that an order has brought about which was heard to be accepted.
     _moved: set[int] = field(default_factory=set)
     _looked: int = -1
+
+    def __post_init__(self) -> None:
+        self.problem = resolved(self.problem, estimator_of(self.problem))
 
     def hear(self, at_ns: int, key: str, payload: bytes, header: bytes) -> Iterable[str]:
         """Take a message in; returns its violations."""
