@@ -116,14 +116,26 @@ class Stretches:
         return 100 * sum(back) / (len(names) / self.problem.window_cycles)
 
 
-def settings(problem: Problem, every: int, *, printed: bool = False) -> Problem:
-    """Return the cell under DTP with `corrected`, with N_min 3 where it is as printed, else 0."""
+def cell() -> Problem:
+    """Return the first example, which leaves the controller's settings out, with all scenarios."""
+    scenarios = load_study(STUDY).points[0].problem.scenarios
+    return replace(dwell.load(ROOT / "examples" / "first.yaml"), scenarios=scenarios)
+
+
+def settings(problem: Problem, every: int) -> Problem:
+    """Return the cell with another interval between decisions; the rest by default."""
+    if every == problem.decide_cycles:
+        return problem
+    return replace(problem, controller=replace(problem.controller, decide_cycles=every))
+
+
+def once_per_window(problem: Problem) -> Problem:
+    """Return the cell with one decision per window, N_min 3 and shadows of 5 %."""
     controller = replace(
         problem.controller,
-        policy="dtp",
-        estimator="corrected",
-        decide_cycles=every,
-        min_dwell=3 if printed else 0,
+        decide_cycles=problem.window_cycles,
+        min_dwell=3,
+        shadow_fraction=0.05,
     )
     return replace(problem, controller=controller)
 
@@ -158,19 +170,19 @@ class Compared:
 def compared(
     scenario: str, seed: int, windows: int, intervals: Sequence[int] = INTERVALS
 ) -> Iterator[Compared]:
-    """Yield the figures of every interval, the ratio to the oracle for a quarter of W."""
-    problem = load_study(STUDY).points[0].problem
-    width, warm = problem.window_cycles, problem.warmup_windows
-    usual = played(settings(problem, width, printed=True), scenario, seed, windows)
+    """Yield the figures of every interval, with the ratio to the oracle for the default."""
+    problem = cell()
+    warm = problem.warmup_windows
+    usual = played(once_per_window(problem), scenario, seed, windows)
     for every in intervals:
-        cell = settings(problem, every)
-        one = played(cell, scenario, seed, windows)
+        often = settings(problem, every)
+        one = played(often, scenario, seed, windows)
         last = min(one.count, usual.count)
         mean = [each.costs[warm:last].mean() for each in (one, usual)]
         rates = [each.missed[warm:last].mean() for each in (one, usual)]
         over = None
-        if every == width // 4:
-            best = of_oracle(cell, scenario, seed, windows).costs[warm:last].mean()
+        if every == problem.decide_cycles:
+            best = of_oracle(often, scenario, seed, windows).costs[warm:last].mean()
             over = 100 * float(mean[0] / best - 1)
         yield Compared(
             scenario,
@@ -207,4 +219,4 @@ def measure(quick: bool) -> Section:
             if over:
                 above = Goal(high=over_oracle)
                 figures.append(Figure(f"{what}: J above the oracle's", over, "%", above))
-    return Section("Decisions within windows: DTP with `corrected`, N_min 0", figures)
+    return Section("Decisions within windows, by default every 25 cycles", figures)
