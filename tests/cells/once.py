@@ -1,10 +1,10 @@
-"""The settings of a controller that decides once per window."""
+"""Cells whose controllers decide once per window."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from dwell.model import ControllerSettings
+from dwell.model import ControllerSettings, Problem
 
 
 def once(settings: ControllerSettings, window_cycles: int) -> ControllerSettings:
@@ -15,3 +15,9 @@ def once(settings: ControllerSettings, window_cycles: int) -> ControllerSettings
         min_dwell=3 if settings.min_dwell is None else settings.min_dwell,
         estimator=settings.estimator or "profile",
     )
+
+
+def with_windows(problem: Problem, window_cycles: int) -> Problem:
+    """Return a cell with windows of another length, which decides once in each."""
+    settings = replace(problem.controller, decide_cycles=window_cycles)
+    return replace(problem, window_cycles=window_cycles, controller=settings)

@@ -94,10 +94,10 @@ def test_a_study_may_be_given_its_length_in_seconds(tmp_path: Path) -> None:
 def test_seconds_of_windows_that_differ_in_length_are_refused(tmp_path: Path) -> None:
     told = {"dwell-study": 1, "name": "s", "cell": str(CANONICAL), "policies": ["LOC"]}
     study = tmp_path / "study.yaml"
-    study.write_text(yaml.safe_dump({**told, "parameters": {"window_cycles": [50, 100]}}))
+    study.write_text(yaml.safe_dump({**told, "parameters": {"window_cycles": [100, 200]}}))
     refused = call("study", study, "--seconds", "20")
     assert refused.exit_code == 2
-    assert "--seconds 20: windows last 1.66667, 3.33333 s here; give --windows" in refused.stderr
+    assert "--seconds 20: windows last 3.33333, 6.66667 s here; give --windows" in refused.stderr
 
 
 @pytest.mark.parametrize(

@@ -231,7 +231,7 @@ def test_values_of_the_cell_are_set_for_one_run(cell: Path) -> None:
     assert problem.objective.caps.latency_ms == 40
     assert problem.fabric.links["E->R"].loss == 0.1
     # The run says the N_min that the cell leaves to the estimator.
-    stated = evolve(dwell.load(cell), {"controller.min_dwell": 3})
+    stated = evolve(dwell.load(cell), {"controller.min_dwell": 0})
     assert dwell.open_run(Path("runs", folders[0])).problem == stated
 
 

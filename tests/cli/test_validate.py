@@ -66,7 +66,7 @@ def test_json_has_the_predicted_moves() -> None:
     run.save("dtp")
     told = read_json(call("validate", "dtp", "--cell", CALIBRATED, "--seeds", "2", "--json"))
     assert told["moves"]
-    labels = {"scenario": "stress", "policy": "dtp+profile", "run": "dtp"}
+    labels = {"scenario": "stress", "policy": "dtp+corrected", "run": "dtp"}
     assert told["moves"] == [labels | row for row in predicted_moves(run).to_dicts()]
 
 

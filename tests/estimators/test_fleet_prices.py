@@ -20,6 +20,7 @@ from dwell.kernels.arrays import lay_out
 from dwell.model import FrozenDict, Problem
 from dwell.model.fleet import Fleet, FleetEntry
 from dwell.sim.fleet import phased, simulate_fleet
+from tests.cells.once import with_windows
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 CANONICAL = dwell.load(EXAMPLES / "canonical.yaml")
@@ -176,7 +177,7 @@ def test_a_table_has_a_level_for_every_cell_and_grows() -> None:
 
 
 def test_others_of_another_kind_are_beside_those_of_one() -> None:
-    big = replace(CANONICAL, name="big", window_cycles=50)
+    big = replace(with_windows(CANONICAL, 50), name="big")
     fleet = fleet_of(FleetEntry(CANONICAL, 2), FleetEntry(big, 1))
     cells = [
         PricedCell(c.name, p, c.streams) for c, p in zip(fleet.cells, phased(fleet, 1), strict=True)

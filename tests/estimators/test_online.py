@@ -35,6 +35,7 @@ from dwell.model import (
 from dwell.record import Run
 from tests.cells.deterministic import MOVES, cell, truth
 from tests.cells.generated import make_problem, random_problem, random_stamps
+from tests.cells.once import once, with_windows
 from tests.estimators.windows import GONE, Row, local_row, off_row, seen_window, window
 
 CANONICAL = Path(__file__).parents[2] / "examples" / "canonical.yaml"
@@ -221,7 +222,8 @@ def test_a_node_that_is_still_at_work_is_not_down(kind: Kind) -> None:
 
 def test_a_node_that_goes_down_and_comes_back() -> None:
     problem = cell(scenario=[NodeDisturbance("E", at_s=4.0, for_s=4.0, down=True)])
-    problem = replace(problem, controller=ControllerSettings(on="R"))
+    settings = once(ControllerSettings(on="R"), problem.window_cycles)
+    problem = replace(problem, controller=settings)
     for kind in (Shadow, Corrected):
         decisions = dwell.simulate(
             problem,
@@ -277,7 +279,7 @@ def test_a_start_forgets(kind: Kind) -> None:
 def test_another_problem_has_its_own_profile(kind: Kind) -> None:
     estimator = kind(cell())
     estimator.learn(seen_window())
-    estimator.start(replace(cell(candidates=("LOC", "OFF")), window_cycles=20))
+    estimator.start(with_windows(cell(candidates=("LOC", "OFF")), 20))
     assert estimate(estimator).keys() == {"LOC", "OFF"}
 
 
@@ -329,7 +331,7 @@ def test_a_window_in_which_nothing_was_seen(kind: Kind) -> None:
 
 @pytest.mark.parametrize("kind", [Shadow, Corrected])
 def test_samples_that_come_one_by_one(kind: Kind) -> None:
-    problem = replace(cell(), window_cycles=1)
+    problem = with_windows(cell(), 1)
     estimator = kind(problem)
     for _ in range(6):
         estimator.learn(
@@ -413,7 +415,7 @@ def test_any_cell_gets_estimates_that_a_policy_can_use(seed: int, estimator: str
         "half_life_windows": rng.choice([0.01, 2.0, 50.0]),
     }
     problem = replace(problem, controller=ControllerSettings(**settings), window_cycles=W)
-    names = [*random_stamps(rng, problem, windows), problem.initial]
+    names = [*random_stamps(rng, problem, 8 * windows), problem.initial]
     decisions = dwell.simulate(
         problem,
         scenario="disturbed",

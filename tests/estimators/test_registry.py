@@ -34,8 +34,9 @@ def test_an_unknown_name() -> None:
 
 @pytest.mark.parametrize("name", list(REGISTRY))
 def test_those_that_send_shadow_jobs_say_so(name: str) -> None:
-    sent = getattr(by_name(name, PROBLEM), "shadow_fraction", 0.0) > 0
-    assert sent == (name in shadowing())
+    sent = getattr(by_name(name, PROBLEM), "shadow_fraction", 0.0)
+    most = max(sent.values()) if isinstance(sent, Mapping) else sent
+    assert (most > 0) == (name in shadowing())
 
 
 class Unsure:

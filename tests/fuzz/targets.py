@@ -31,6 +31,7 @@ from dwell.live.trust.authority import Authority
 from dwell.live.trust.keyring import Keyring
 from dwell.live.trust.roster import Roster
 from dwell.live.trust.signing import Seals
+from tests.cells.once import with_windows
 from tests.live.small_world import Bench, Passing, World
 
 NODES = ("R1", "E", "R2")
@@ -232,7 +233,7 @@ class FrozenError(AssertionError):
 def _deciding() -> World:
     """A cell whose controller closes a window every 10 cycles."""
     problem = dwell.load("examples/canonical.yaml")
-    quick = replace(problem, window_cycles=10, warmup_windows=0)
+    quick = replace(with_windows(problem, 10), warmup_windows=0)
     found = World(quick, policy="SO")
     found.run(1_000)
     return found

@@ -17,6 +17,7 @@ from dwell.live.run_rows import Rows, columns_of
 from dwell.live.sink import Sink
 from dwell.model import Problem
 from dwell.record import column_types
+from tests.cells.once import with_windows
 from tests.live.small_world import EXEC_MS, MS, Recorded, World
 
 CPU_NS = 1_234_567
@@ -26,12 +27,12 @@ OTHERS_NS = 70_000
 @pytest.fixture(scope="module")
 def problem() -> Problem:
     cell = dwell.load("examples/canonical.yaml")
-    return replace(
+    cell = replace(
         cell,
         controller=replace(cell.controller, fallbacks=(), close_grace_ms=40),
         pipeline=replace(cell.pipeline, deadline_ms=33.0),
-        window_cycles=20,
     )
+    return with_windows(cell, 20)
 
 
 class Spent:

@@ -16,6 +16,7 @@ from dwell.testbed import doctor
 from dwell.testbed.cgroups import find_cgroups
 from dwell.testbed.doctor import Finding, examine
 from dwell.testbed.probe import Lateness
+from tests.cells.once import with_windows
 from tests.testbed.machine import no_groups, no_hosts
 
 ROOT = Path(__file__).parents[2]
@@ -144,7 +145,7 @@ def test_a_machine_that_stands_still_at_times_is_told_so(monkeypatch: pytest.Mon
     assert "100% of the windows of 2 s" in finding.found
     assert finding.remedy
     # Windows that are so short that most of them had none, but not enough.
-    short = replace(with_quotas(), window_cycles=1)
+    short = with_windows(with_quotas(), 1)
     finding = doctor._standstill([short], 2.5)
     share = int(re.findall(r"(\d+)% of the windows", finding.found)[0])
     assert 5 < share < 60

@@ -250,6 +250,8 @@ class Realisation:
 
     def until(self, cycles: int) -> Realisation:
         """Return its first cycles; its last window is incomplete where they end in it."""
+        if cycles == self.cycles:
+            return self
         return replace(
             self,
             release_ns=self.release_ns[: cycles + 1],

@@ -19,6 +19,7 @@ from dwell.live.trust.roster import Roster, Subject
 from dwell.live.wiring import roles
 from dwell.model import Problem
 from tests.cells.generated import random_problem
+from tests.cells.once import with_windows
 from tests.live.memory_transport import MemoryTransport, matcher
 from tests.live.small_world import Alternating, Counting, World, stateful
 from tests.live.trust.rosters import roster_of
@@ -102,7 +103,7 @@ def test_whatever_a_cell_says_may_be_said(
     """With states that move, and with shadows."""
     settings = replace(problem.controller, estimator="shadow", min_dwell=1)
     moving = stateful(problem, "planning", 100)
-    problem = replace(moving, window_cycles=20, controller=settings)
+    problem = with_windows(replace(moving, controller=settings), 20)
     wall = wall_of(problem, roster_of(problem))
     said = said_in(problem, 200, monkeypatch)
     assert {who for who, _ in said} == {role.who for role in roles(problem)}
