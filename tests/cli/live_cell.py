@@ -96,6 +96,8 @@ class RealCell:
         # Other work on this machine may not look like a fault.
         document["live"] |= {"release": "frames", "max_age_ms": 400, "degraded_at": 1}
         document["controller"] |= {"guard_cycles": 20, "policy": "LOC"}
+        # Tests count windows, and act between two decisions.
+        document["controller"]["decide_cycles"] = document["window_cycles"]
         nodes = list(document["nodes"])
         first = free_ports(3 * 40)
         for i, node in enumerate(nodes):

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import dwell
+from dwell.model import Problem
 from dwell.model.fleet import Fleet, FleetEntry
 from dwell.record import FleetRun, Journal, Run, column_types
+from tests.cells.once import once
 from tests.cli.small_cell import SMALL
 
 
@@ -17,7 +20,7 @@ def small_run(
     folder.parent.mkdir(exist_ok=True)
     file = folder.parent / "small.yaml"
     file.write_text(SMALL, encoding="utf-8")
-    problem = dwell.load(file)
+    problem = deciding_once(dwell.load(file))
     run = dwell.simulate(
         problem, scenario="stress", policy=policy, seed=seed, windows=windows, jobs=jobs
     )
@@ -30,12 +33,16 @@ def small_fleet(folder: Path, *, cells: int = 3, windows: int = 40, jobs: bool =
     folder.parent.mkdir(exist_ok=True)
     file = folder.parent / "small.yaml"
     file.write_text(SMALL, encoding="utf-8")
-    problem = dwell.load(file)
+    problem = deciding_once(dwell.load(file))
     entries = (FleetEntry(problem, cells - 1, scenario="stress"), FleetEntry(problem))
     fleet = Fleet("pack", entries, ("E",), phases="even")
     run = dwell.simulate_fleet(fleet, seed=1, windows=windows, jobs=jobs)
     run.save(folder)
     return run
+
+
+def deciding_once(problem: Problem) -> Problem:
+    return replace(problem, controller=once(problem.controller, problem.window_cycles))
 
 
 class WrittenRun:

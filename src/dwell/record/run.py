@@ -401,12 +401,10 @@ def _read_checked(run: Run, name: str, folder: Path) -> pl.DataFrame:
     except RunError:
         return table  # whoever needs the cell is refused
     require_table(name, problem, table, str(file))
-    if name == "windows" and run.is_simulated and len(table):
-        last = int(str(table["first_cycle"].max())) + problem.window_cycles
-        if (rows := len(run.cycles)) < last:
-            raise RunError(
-                f"{folder / 'cycles.parquet'}: has {rows} cycles; the windows have {last}"
-            )
+    if name == "cycles" and run.is_simulated and len(windows := run.windows):
+        last = int(str(windows["first_cycle"].max())) + problem.window_cycles
+        if len(table) < last:
+            raise RunError(f"{file}: has {len(table)} cycles; the windows have {last}")
     return table
 
 
