@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -179,7 +180,8 @@ def test_shadow_jobs_meet_the_present_too() -> None:
 
 def test_dtp_settles_on_the_candidate_that_is_best_with_shadows() -> None:
     problem = random_dag(40)
-    settings = {"decide_cycles": problem.window_cycles, "min_dwell": 3, "shadow_fraction": 0.05}
+    settings: dict[str, Any] = {"decide_cycles": problem.window_cycles, "min_dwell": 3}
+    settings["shadow_fraction"] = 0.05
     problem = replace(problem, controller=replace(problem.controller, **settings))
     run = dwell.simulate(problem, policy="dtp", estimator="corrected", seed=1, windows=60).windows
     assert set(run["placement"][10:]) == {"C1"}
