@@ -48,9 +48,12 @@ constexpr f64 kSlowed = 1.02, kMost = 0.9;
 constexpr f64 kChanged = 5.0;
 constexpr i64 kLeast = 36;
 
+// Without it, std::sort of numbers is a function of the C++ library with clang, which links none.
+constexpr auto kIsLess = [](f64 one, f64 other) { return one < other; };
+
 f64 median(f64* values, i64 n) {
   f64* middle = values + n / 2;
-  std::nth_element(values, middle, values + n);
+  std::nth_element(values, middle, values + n, kIsLess);
   if (n % 2 != 0) return *middle;
   return (*std::max_element(values, middle) + *middle) / 2.0;
 }
@@ -198,7 +201,7 @@ i64 next_candidate(const Window& window, i64 begin, i64 after) {
 i64 newest(const f64* values, i64 n, f64* scratch) {
   if (n < kLeast) return 0;
   std::copy(values, values + n, scratch);
-  std::sort(scratch, scratch + n);
+  std::sort(scratch, scratch + n, kIsLess);
   const i64 ends[] = {n / 4, n / 2, 3 * n / 4};
   i64 before[] = {0, 0, 0}, all = 0;
   for (i64 i = 0; i < n; ++i) {
@@ -329,7 +332,7 @@ DWELL_EXPORT i64 dwell_level(const NodeJobs* node, const Window* window, i64 sha
   }
   const bool is_slowed = keep_newest(jobs, values);
   for (i64 i = 0; i < jobs.n; ++i) values[i] = jobs.first[i].threads;
-  std::sort(values, values + jobs.n);
+  std::sort(values, values + jobs.n, kIsLess);
   // The middle of what ran beside none of the bursts, which come for less of the time.
   const f64 place = (1.0 - node->bursts) / 2;
   const f64 off = std::sqrt(place * (1.0 - place) / static_cast<f64>(jobs.n));
