@@ -127,8 +127,6 @@ def test_other_entries_stay(quiet: Fleet) -> None:
 class Rates:
     """A player whose V_D by size, the same under every seed, is known."""
 
-    is_static = True
-
     def __init__(self, *rates: float) -> None:
         self.rates = rates
 

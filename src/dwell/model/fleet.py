@@ -153,6 +153,11 @@ class Fleet:
         return name if name in entry.cell.candidates else None
 
     @property
+    def is_static(self) -> bool:
+        """Whether no cell moves."""
+        return all(self.candidate_of(entry) is not None for entry in self.entries)
+
+    @property
     def disturbances(self) -> Scenario:
         """What the scenarios of its cells do to shared nodes; equal ones count once."""
         return tuple(dict.fromkeys(item for entry in self.entries for item in self._of(entry)))

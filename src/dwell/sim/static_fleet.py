@@ -62,10 +62,9 @@ class StaticFleet:
         SimulationError
             If some cell may move.
         """
-        problems, cells = [*phased(fleet, self.seed)], self._play(fleet)
         missed: list[NDArray[np.bool_]] = []
         used: dict[str, float] = {}
-        for problem, cell in zip(problems, cells, strict=True):
+        for problem, _, cell in self._play(fleet):
             width, closed = problem.window_cycles, int(cell.tables.cells[0]["window"])
             first, last = problem.warmup_windows, closed
             latency_ns = cell.tables.latency_ns[0, first * width : last * width]
@@ -82,29 +81,27 @@ class StaticFleet:
 
     def waiting(self, fleet: Fleet) -> Waiting:
         """Return where the cycles that missed have waited, of all cells."""
-        problems, reals = self._realisations(fleet)
-        cells = self._play(fleet, jobs=True)
         whole = Waiting()
-        for problem, real, arrays in zip(problems, reals, cells, strict=True):
+        for problem, real, arrays in self._play(fleet, jobs=True):
             whole += waiting_of(problem, real, arrays)
         return whole
 
-    def _play(self, fleet: Fleet, *, jobs: bool = False) -> list[CellArrays]:
-        problems, reals = self._realisations(fleet)
-        pairs = [*zip(problems, reals, strict=True)]
+    def _play(
+        self, fleet: Fleet, *, jobs: bool = False
+    ) -> list[tuple[Problem, Realisation, CellArrays]]:
+        pairs = self._realisations(fleet)
         whole = lay_out(pairs, shared=fleet.shared, log_jobs=jobs)
-        for row, (cell, problem) in enumerate(zip(fleet.cells, problems, strict=True)):
+        for row, (cell, (problem, _)) in enumerate(zip(fleet.cells, pairs, strict=True)):
             placed = fleet.candidate_of(cell.entry)
             if placed is None:
                 raise SimulationError(f"{cell.name} may move")
             whole.tables.stamps[row] = list(problem.candidates).index(placed)
         play(whole)
-        return [CellArrays(whole, i) for i in range(len(problems))]
+        return [(*pair, CellArrays(whole, i)) for i, pair in enumerate(pairs)]
 
-    def _realisations(self, fleet: Fleet) -> tuple[list[Problem], list[Realisation]]:
-        problems = [*phased(fleet, self.seed)]
-        reals = []
-        for cell, problem in zip(fleet.cells, problems, strict=True):
+    def _realisations(self, fleet: Fleet) -> list[tuple[Problem, Realisation]]:
+        pairs = []
+        for cell, problem in zip(fleet.cells, phased(fleet, self.seed), strict=True):
             key = (problem.name, cell.copy, cell.entry.scenario)
             phase_ms = problem.pipeline.first_release_ms
             known = self._drawn.get(key)
@@ -115,8 +112,8 @@ class StaticFleet:
             drawn_at_ms, real = known
             if drawn_at_ms != phase_ms:
                 real = _released_at(fleet, problem, real)
-            reals.append(real.until(cycles_within(problem, self.duration_ns)))
-        return problems, reals
+            pairs.append((problem, real.until(cycles_within(problem, self.duration_ns))))
+        return pairs
 
 
 def _released_at(fleet: Fleet, problem: Problem, real: Realisation) -> Realisation:

@@ -35,8 +35,6 @@ SEEDS = tuple(range(1, 11))
 DRAWS = tuple(range(1, 101))
 CYCLES_OF_A_DRAW = 200
 MOST = 128
-#: Cycles of a cell beyond which a warning says how long the run is.
-MANY_CYCLES = 2_000_000
 #: Share of cycles that one cell alone may miss where an excess over it is of any use.
 USELESS = 0.5
 ROUNDING = 1e-12
@@ -241,16 +239,10 @@ class FleetPlayer:
             fleet = with_twins(fleet, node, count)
         return fleet
 
-    @property
-    def is_static(self) -> bool:
-        """Whether no cell moves."""
-        fleet = self.fleet
-        return all(fleet.candidate_of(entry) is not None for entry in fleet.entries)
-
     def __call__(self, unit: Sizes) -> list[PlayedSize]:
         """Play every size."""
         fleets = [self.of(size) for size in range(unit.first, unit.last + 1)]
-        if self.is_static:
+        if self.fleet.is_static:
             static = StaticFleet(seed=unit.seed, duration_ns=self.duration_ns)
             return [PlayedSize.of(*static.play(fleet)) for fleet in fleets]
         return [self._moving(fleet, unit.seed) for fleet in fleets]
@@ -278,7 +270,7 @@ class FleetPlayer:
         waited = Waiting()
         fleet, duration_ns = self.of(robots), self.duration_ns
         for seed in seeds[:WAITING_SEEDS]:
-            if self.is_static:
+            if self.fleet.is_static:
                 waited += StaticFleet(seed=seed, duration_ns=duration_ns).waiting(fleet)
             else:
                 waited += waiting_in_fleet(fleet, seed=seed, duration_ns=duration_ns)
@@ -338,7 +330,7 @@ def capacity_of(
     fleet = fleet.changed(policy=policy, phases=phases)
     _require_capacity(fleet)
     fleet.with_count(most)
-    is_static = FleetPlayer(fleet, 0).is_static
+    is_static = fleet.is_static
     draws = fleet.phases == "random"
     if cycles is None and draws and is_static:
         fleet, cycles = _with_short_warmup(fleet), CYCLES_OF_A_DRAW
@@ -354,7 +346,7 @@ def capacity_of(
         search.every_size(known)
     else:
         search.by_bisection(known[: len(SEEDS)] if draws and seeds is None else known, known)
-    found = sizes.capacity(fleet, most, "every size" if is_static else "bisection")
+    found = sizes.capacity(fleet, "every size" if is_static else "bisection")
     beyond = min(found.robots + 1, found.curve[-1].robots)
     return replace(found, limits=player.limiting(beyond, known))
 
@@ -439,9 +431,7 @@ class _Sizes:
         # One seed gives no interval.
         return (end(rate) if rate.known else rate.value) > self.limit + ROUNDING
 
-    def capacity(
-        self, fleet: Fleet, most: int, searched: Literal["every size", "bisection"]
-    ) -> Capacity:
+    def capacity(self, fleet: Fleet, searched: Literal["every size", "bisection"]) -> Capacity:
         """Return what it comes to."""
         names = dict.fromkeys(fleet.policy_of(entry) for entry in fleet.entries)
         robots, largest = self._largest(_value), max(self.played)
