@@ -171,6 +171,18 @@ class RealCell:
         logs = "\n".join(f"{p.name}: {p.read_text()}" for p in self.folder.glob("*.log"))
         raise AssertionError(f"it has not come about: {json.dumps(found, indent=1)}\n{logs}")
 
+    def show(self, holds: Callable[[str], object], *options: str) -> str:
+        """Print the status, by the command, until its output is as wanted; then it exits with 0."""
+        limit_s = time.monotonic() + PATIENCE_S
+        stdout = ""
+        while time.monotonic() < limit_s:
+            code, stdout, _ = invoke("live", "status", *options, "--cell", self.file)
+            if holds(stdout):
+                assert code == 0
+                return stdout
+            time.sleep(0.02)
+        raise AssertionError(f"the status never read so; the last one: {stdout}")
+
     def note(self, who: str) -> Callable[[dict[str, Any]], str]:
         return lambda status: str(status["processes"].get(who, {}).get("note", ""))
 

@@ -53,18 +53,15 @@ def test_frames_begin_the_cycles(cell: RealCell) -> None:
 
 
 def test_status_says_who_is_there(cell: RealCell) -> None:
-    cell.until(lambda status: status["health"] == "ok")
-    code, stdout, _ = invoke("live", "status", "--cell", cell.file)
-    assert code == 0
+    # Other work on this machine may make the guard move the cell between two looks.
+    stdout = cell.show(lambda stdout: stdout.startswith("light-follower: LOC\n"))
     lines = stdout.splitlines()
-    assert lines[0] == "light-follower: LOC"
     assert lines[1].startswith("mode control, term ")
     assert lines[2].startswith("window ")
     shown = {line.split()[0] for line in lines[3:]}
     assert shown == {role.who for role in roles(cell.problem)} - {"controller@E"}
-    code, stdout, _ = invoke("live", "status", "--check", "--json", "--cell", cell.file)
-    found = json.loads(stdout)
-    assert (code, found["health"], found["headline"]) == (0, "ok", None)
+    stdout = cell.show(lambda stdout: json.loads(stdout)["health"] == "ok", "--check", "--json")
+    assert json.loads(stdout)["headline"] is None
 
 
 def test_processes_are_placed_one_by_one(cell: RealCell) -> None:
