@@ -15,11 +15,10 @@ from dwell.live.transport.transport import Arrival, Lane, Transport
 from dwell.live.transport.zenoh import ZenohSettings, ZenohTransport
 from dwell.live.wiring import SESSIONS, Locator, Role, WiringEntry
 from tests.live.memory_transport import Network
+from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).resolve().parents[3]
 
-#: Never waited for where everything works.
-PATIENCE_S = 20.0
 #: Between two ends of a new connection Zenoh delivers everything at first, then nothing for a
 #: moment, and then what is subscribed to: one message that is heard does not promise the next.
 STEADY = 3
