@@ -6,12 +6,10 @@ import json
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +21,7 @@ from dwell.live.operator_client import OperatorClient
 from dwell.live.wiring import PORTS_PER_ROLE, roles
 from dwell.model.document import to_document
 from tests.cli.small_cell import ROOT, call
+from tests.ports import free_ports
 from tests.waiting import PATIENCE_S
 
 EXAMPLE = ROOT / "examples" / "live"
@@ -55,16 +54,6 @@ class Perception:
 def busy():
     return 0.875
 """
-
-
-def free_ports(count: int) -> int:
-    """Return the first of so many ports that nobody has."""
-    for first in range(20_000 + os.getpid() % 1_000, 32_000, count):
-        with ExitStack() as stack, suppress(OSError):
-            for port in range(first, first + count):
-                stack.enter_context(socket.create_server(("127.0.0.1", port)))
-            return first
-    raise AssertionError("no ports")
 
 
 def invoke(*arguments: str | Path) -> tuple[int, str, str]:

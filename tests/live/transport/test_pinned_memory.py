@@ -21,7 +21,7 @@ from dwell.live.wiring import Session, longest_message_bytes, wire
 from dwell.model import Host, Problem
 from tests.live.test_security import issued, tls
 from tests.live.test_wiring import cell, housed
-from tests.live.transport.meshes import free_ports
+from tests.ports import free_ports
 from tests.waiting import PATIENCE_S
 
 MB = 1 << 20
