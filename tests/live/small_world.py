@@ -94,12 +94,13 @@ class MemoryBook:
 
     def __init__(self) -> None:
         self.entry: StamperState | None = None
+        self.first: StamperState | None = None
 
     def read(self) -> StamperState | None:
         return self.entry
 
     def write(self, entry: StamperState) -> None:
-        self.entry = entry
+        self.entry, self.first = entry, self.first or entry
 
 
 class MemoryHighest:
@@ -296,6 +297,7 @@ class World:
         self.roles: dict[str, object] = {}
         self.lives = 0
         self.run_id = 1
+        self.boot = ""
         self.number = 0
         self.policy = policy
         self.seals = seals or {}
@@ -312,10 +314,10 @@ class World:
         end = self.network.transport(who, role.node, clock=clock)
         subject = CONTROLLER if role.kind == "controller" else role.node
         seals = self.seals.get(subject)
-        place = RolePlace(self.problem, who, role.node, end, self.lives, seals=seals)
+        place = RolePlace(self.problem, who, role.node, end, self.life_of(role), seals=seals)
         made: Stamper | Sink | Quiet | ControlledCell | Bench
         if role.kind == "stamper":
-            made = Stamper(place, self.book, self.run_id, end.now_ns)
+            made = Stamper(place, self.book, self.time_of_day(role), end.now_ns, self.boot)
         elif role.kind == "sink":
             made = Sink(place, role.task, self.actuator_of(role), self.highest[role.task])
         elif role.kind == "agent":
@@ -335,6 +337,14 @@ class World:
             made = Bench(self.network, end, worker, self.exec_ns_of(role))
         self.roles[who] = made
         self.network.attach(end, made)
+
+    def life_of(self, role: Role) -> int:
+        """Life of a process that starts."""
+        return self.lives
+
+    def time_of_day(self, role: Role) -> int:
+        """Time of day that a process reads at its start."""
+        return self.run_id
 
     def stage_of(self, role: Role) -> CellStage:
         """Make the stage of a worker."""
