@@ -25,7 +25,7 @@ from dwell.live.supervision import Supervisor
 from dwell.live.transport.transport import Arrival
 from dwell.live.trust.signing import Seals
 from dwell.live.wiring import Role, roles, wire
-from dwell.live.worker import Job, Worker
+from dwell.live.worker import Chore, Job, Worker
 from dwell.model import Host, Problem, QoS
 from dwell.policies import MinimalPolicy
 from tests.live.memory_transport import Clock, MemoryTransport, Network, NetworkConditions, hears
@@ -193,6 +193,8 @@ class Bench:
     ) -> None:
         self.network, self.end, self.worker, self.exec_ns = network, end, worker, exec_ns
         worker.started = True
+        #: How long calls of the stage about its state take.
+        self.chore_ns: dict[str, int] = {}
         #: Instant of the network at which it looks next whether there is something to do.
         self._look_ns = -1
 
@@ -214,8 +216,14 @@ class Bench:
             self.end.wakes.append(self.work)
             return
         worker, now_ns = self.worker, self.end.now_ns
-        while (chore := worker.next_chore()) is not None:
-            worker.do_chore(chore)
+        if (chore := worker.next_chore(now_ns)) is not None:
+            result = worker.do_chore(chore)
+            end = partial(self._finish_chore, chore, result, now_ns)
+            if lasts_ns := self.chore_ns.get(chore.call, 0):
+                self.network.call_at(self.network.now_ns + lasts_ns, end)
+            else:
+                end()
+            return
         job = worker.next_job(now_ns)
         if job is not None:
             output, age = worker.run(job, now_ns)
@@ -231,6 +239,15 @@ class Bench:
     def _look(self, look_ns: int) -> None:
         if look_ns == self._look_ns:
             self.work()
+
+    def _finish_chore(self, chore: Chore, result: tuple[bytes, str], started_ns: int) -> None:
+        if self.end.closed:
+            return
+        if self.end.frozen:
+            self.end.wakes.append(lambda: self._finish_chore(chore, result, started_ns))
+            return
+        self.worker.finish_chore(chore, *result, started_ns, self.end.now_ns)
+        self.work()
 
     def _finish(self, job: Job, output: Message | None, started_ns: int, age: int) -> None:
         if self.end.closed:

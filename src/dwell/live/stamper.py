@@ -210,6 +210,9 @@ class Stamper:
             age_ns = max(beat.sent_ns - heard.at_ns, 0)
             presence.heard(f"{heard.node}->{beat.node}", now_ns - age_ns)
         worker, _, extra = beat.who.partition(".")
+        if beat.moving and self._forks and beat.who in self._workers():
+            # An order asked for its state, so its cycles wait.
+            self.guard.restart()
         if extra in ("", "1") and "@" in worker:
             if beat.ready:
                 presence.heard(worker, now_ns)
@@ -418,6 +421,11 @@ class Stamper:
             self._move(name, by_guard=True)
         self._begun, self._next_ns = True, now_ns
         return True
+
+    def _workers(self) -> Iterator[str]:
+        """Names of the workers under the placement that holds."""
+        placed = self.place.problem.candidates[self.placement]
+        return (f"{task}@{node}" for task, node in placed.items())
 
     def _gates(self) -> Iterator[str]:
         """Names of the sinks' processes under the placement that holds."""
