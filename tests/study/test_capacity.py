@@ -168,6 +168,22 @@ def test_no_smaller_size_may_be_over_the_limit(monkeypatch: pytest.MonkeyPatch) 
     assert (useless.robots, useless.reason) == (0, "one cell alone misses 60% of its deadlines")
 
 
+@pytest.mark.parametrize(
+    ("period_ms", "phases", "cycles"), [(0.5, "even", 4_000_000), (0.05, "random", 4_000_000)]
+)
+def test_many_cycles_of_a_cell_next_to_a_slow_one_are_warned_of(
+    period_ms: float, phases: str, cycles: int
+) -> None:
+    slow = one_job(name="slow", period_ms=1000.0)
+    fast = one_job(0.01, name="fast", period_ms=period_ms, deadline_ms=period_ms)
+    fleet = fleet_of((slow, 1), (fast, 1)).changed(policy="OFF", phases=phases)
+    (told,) = capacity.long_runs(fleet)
+    assert told.path == "cells[1].cell"
+    assert f"counts {cycles:,} cycles of fast" in told.message
+    assert "slow needs" in told.message
+    assert not [*capacity.long_runs(fleet_of((slow, 1)))]
+
+
 def test_what_cannot_be_answered_is_refused(quiet: Fleet) -> None:
     def told(fleet: Fleet, **more: object) -> list[str]:
         with pytest.raises(ProblemError) as error:

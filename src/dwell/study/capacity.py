@@ -9,7 +9,7 @@ played until the limit is passed for certain; the sizes of a policy are found by
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import fmean
 from typing import Any, Literal, NamedTuple
@@ -35,6 +35,8 @@ SEEDS = tuple(range(1, 11))
 DRAWS = tuple(range(1, 101))
 CYCLES_OF_A_DRAW = 200
 MOST = 128
+#: Counted cycles of a cell in one run above which there is a warning.
+MANY_CYCLES = 2_000_000
 #: Share of cycles that one cell alone may miss where an excess over it is of any use.
 USELESS = 0.5
 ROUNDING = 1e-12
@@ -332,9 +334,7 @@ def capacity_of(
     fleet.with_count(most)
     is_static = fleet.is_static
     draws = fleet.phases == "random"
-    if cycles is None and draws and is_static:
-        fleet, cycles = _with_short_warmup(fleet), CYCLES_OF_A_DRAW
-    duration_ns = _duration_ns(fleet, CYCLES if cycles is None else cycles)
+    fleet, duration_ns = _length(fleet, cycles)
     player = FleetPlayer(fleet, duration_ns, twins or {})
     known = tuple(seeds or (DRAWS if draws else SEEDS))
     # A run has one draw of phases, and windows that differ.
@@ -573,10 +573,33 @@ def _with_short_warmup(fleet: Fleet) -> Fleet:
     return replace(fleet, entries=tuple(entries))
 
 
-def _duration_ns(fleet: Fleet, cycles: int) -> int:
-    """Return how long a fleet is played so that each cell counts so many cycles, in windows."""
+def _length(fleet: Fleet, cycles: int | None) -> tuple[Fleet, int]:
+    """Return a fleet as it is played, and how long: each cell counts so many cycles, in windows."""
+    if cycles is None and fleet.phases == "random" and fleet.is_static:
+        fleet, cycles = _with_short_warmup(fleet), CYCLES_OF_A_DRAW
+    needed = CYCLES if cycles is None else cycles
     cells = [entry.cell for entry in fleet.entries]
-    return fleet.warmup_ns + max(-(-cycles // c.window_cycles) * c.window_ns for c in cells)
+    counted_ns = max(-(-needed // cell.window_cycles) * cell.window_ns for cell in cells)
+    return fleet, fleet.warmup_ns + counted_ns
+
+
+def long_runs(fleet: Fleet, cycles: int | None = None) -> Iterator[Fault]:
+    """Yield a warning for each cell of which a run counts more than `MANY_CYCLES` cycles.
+
+    All cells are played as long as the slowest one needs (see `capacity_of`).
+    """
+    played, duration_ns = _length(fleet, cycles)
+    counted_ns = duration_ns - played.warmup_ns
+    slowest = max((entry.cell for entry in played.entries), key=lambda cell: cell.window_ns)
+    for i, entry in enumerate(played.entries):
+        count = counted_ns // entry.cell.pipeline.period_ns
+        if count > MANY_CYCLES:
+            yield Fault(
+                f"cells[{i}].cell",
+                f"a run counts {count:,} cycles of {entry.cell.name}, above {MANY_CYCLES:,}, since "
+                f"{slowest.name} needs {counted_ns / 1e9:g} s; if that takes too long, ask for "
+                "these cells alone",
+            )
 
 
 def _require_capacity(fleet: Fleet) -> None:

@@ -61,6 +61,10 @@ class FleetPlan:
         priced = map(self.played.qos, range(len(self.placements)))
         return {name: qos for name, qos in zip(self.placements, priced, strict=True) if qos}
 
+    def above(self, limit: float) -> list[str]:
+        """Return the cells that miss a larger share of their deadlines than a limit."""
+        return [name for name, qos in self.cells.items() if qos.violation_rate > limit]
+
     def regret(self, run: FleetRun) -> float:
         """How far Φ of a run, by what its windows show, is above that of the plan: a share of it.
 
