@@ -243,7 +243,7 @@ def capacity(
             changes.append(WhatIf(change.text, change.capacity(**settings, progress=shown)))
     served = None
     if asked is not None and found.robots < asked:
-        with working(f"looking for a change that serves {asked} robots"):
+        with progress(f"looking for a change that serves {asked} robots"):
             served = served_by(read, asked, **settings)
     if page is not None or figures is not None:
         shown_page = capacity_page(read.name, found, changes)
