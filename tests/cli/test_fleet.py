@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 from dwell.record import FleetRun, open_fleet
+from dwell.study.capacity import FleetPlayer
+from dwell.study.played_sizes import PlayedSize, Sizes
 from tests.cli.small_cell import ROOT, SMALL, assert_refused, call, read_json
 
 FLEET = """\
@@ -212,6 +214,36 @@ def test_a_capacity_on_a_terminal_with_what_would_change_it(crowd: Path) -> None
     assert (other.exit_code, "was made from something else" in other.stderr) == (2, True)
     assert Path("capacity/pair-OFF-sync.html").read_text(encoding="utf-8") == page
     assert call(*command, "--what-if").exit_code == 0
+
+
+def test_an_interrupted_capacity_keeps_its_sizes_and_goes_on(
+    crowd: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = ("fleet", "capacity", crowd, "--policy", "OFF", "--phases", "sync", *FEW, "--json")
+    whole = read_json(call(*command))
+    assert not Path("capacity").exists()
+    play = FleetPlayer.__call__
+
+    def interrupted(self: FleetPlayer, unit: Sizes) -> list[PlayedSize]:
+        if unit.seed > 3:
+            raise KeyboardInterrupt
+        return play(self, unit)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(FleetPlayer, "__call__", interrupted)
+        result = call(*command)
+    assert (result.exit_code, result.stdout) == (130, "")
+    file = Path("capacity/pair-OFF-sync.played")
+    assert f"interrupted: the results of 18 runs are in {file}; the same command" in result.stderr
+
+    def others(self: FleetPlayer, unit: Sizes) -> list[PlayedSize]:
+        assert unit.seed > 3
+        return play(self, unit)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(FleetPlayer, "__call__", others)
+        assert read_json(call(*command)) == whole
+    assert not Path("capacity").exists()
 
 
 def test_a_capacity_warns_of_cells_that_are_played_for_long(

@@ -14,7 +14,8 @@ from dwell.errors import ProblemError
 from dwell.model import evolve
 from dwell.model.fleet import Fleet, FleetEntry
 from dwell.study import capacity
-from dwell.study.capacity import Capacity, PlayedSize, Sizes, capacity_of
+from dwell.study.capacity import Capacity, capacity_of
+from dwell.study.played_sizes import KeptSizes, PlayedSize, Sizes
 from dwell.study.twins import with_twins
 from dwell.study.what_ifs import changes_of, served_by
 from tests.cells.fleets import fleet_of, one_job, within
@@ -92,6 +93,45 @@ def test_it_is_the_same_however_many_processes_there_are() -> None:
         for count in (1, 2)
     )
     assert one == two
+
+
+class StopError(Exception):
+    """Ends a study on the way."""
+
+
+@pytest.mark.parametrize("policy", ["OFF", "latency-first"])
+def test_an_interrupted_study_goes_on(tmp_path: Path, policy: str) -> None:
+    fleet = fleet_of((within(one_job(), 6.1), 1))
+    settings: dict[str, Any] = {"policy": policy, "phases": "even", "most": 24, **FEW}
+    whole = capacity_of(fleet, **settings)
+    file = tmp_path / "capacity" / "one.played"
+    told: list[int] = []
+
+    def stop(done: int, most: int) -> None:
+        told.append(done)
+        if len(told) == 2:
+            raise StopError
+
+    with pytest.raises(StopError):
+        capacity_of(fleet, **settings, kept=KeptSizes(file), progress=stop)
+    kept = KeptSizes(file)
+    assert kept.count > 0
+    before = file.read_text()
+    assert capacity_of(fleet, **settings, kept=kept) == whole
+    # Nothing was played twice.
+    assert file.read_text().startswith(before)
+    lines = file.read_text().splitlines()
+    assert len(set(lines)) == len(lines)
+    # A line that is cut does not count, nor do the results of another fleet.
+    file.write_text(before + lines[-1][:-20])
+    for _ in range(2):
+        assert capacity_of(fleet, **settings, kept=KeptSizes(file)) == whole
+    assert len(file.read_text().splitlines()) == len(lines) + 1
+    other = fleet_of((within(one_job(), 4.0), 1))
+    expected = capacity_of(other, **settings)
+    assert capacity_of(other, **settings, kept=KeptSizes(file)) == expected
+    KeptSizes(file).remove()
+    assert not file.parent.exists()
 
 
 def test_synchronous_cameras_cost_a_third(quiet: Fleet) -> None:

@@ -220,35 +220,43 @@ def capacity(
     from dwell.record.fleet_run import fleet_document
     from dwell.report.capacity_page import capacity_page
     from dwell.study.capacity import capacity_of, long_runs
+    from dwell.study.played_sizes import KeptSizes
     from dwell.study.what_ifs import WhatIf, changes_of, served_by
 
     _require_limit(limit)
     read = _read(file, phases, policy=policy)
-    page = out
-    if page is None and not as_json:
-        names = ", ".join(dict.fromkeys(read.policy_of(one) for one in read.entries))
-        page = Path("capacity", file_name(f"{read.name}-{names}-{read.phases}.html"))
+    names = ", ".join(dict.fromkeys(read.policy_of(one) for one in read.entries))
+    usual = Path("capacity", file_name(f"{read.name}-{names}-{read.phases}.html"))
+    page = out or (None if as_json else usual)
     mark = mark_of(fleet_document(read), limit, most, what_if)
     if page is not None:
         require_own(page, mark)
     warn(file, long_runs(read))
-    settings: dict[str, Any] = {"limit": limit, "most": most, "processes": processes}
-    with progress(f"playing up to {most} robots") as shown:
-        found = capacity_of(read, **settings, progress=shown)
+    kept = KeptSizes((out or usual).with_suffix(".played"))
+    settings: dict[str, Any] = {"limit": limit, "most": most, "processes": processes, "kept": kept}
     changes = []
-    # Numbers of robots compare where the limit is on the same.
-    settings["on_excess"] = found.limit_on == "excess"
-    for change in changes_of(read) if what_if else ():
-        with progress(f"what if: {change.text}") as shown:
-            changes.append(WhatIf(change.text, change.capacity(**settings, progress=shown)))
     served = None
-    if asked is not None and found.robots < asked:
-        with progress(f"looking for a change that serves {asked} robots"):
-            served = served_by(read, asked, **settings)
+    try:
+        with progress(f"playing up to {most} robots") as shown:
+            found = capacity_of(read, **settings, progress=shown)
+        # Numbers of robots compare where the limit is on the same.
+        settings["on_excess"] = found.limit_on == "excess"
+        for change in changes_of(read) if what_if else ():
+            with progress(f"what if: {change.text}") as shown:
+                changes.append(WhatIf(change.text, change.capacity(**settings, progress=shown)))
+        if asked is not None and found.robots < asked:
+            with progress(f"looking for a change that serves {asked} robots"):
+                served = served_by(read, asked, **settings)
+    except KeyboardInterrupt:
+        runs = counted(kept.count, "run")
+        interrupted(
+            f"the results of {runs} are in {kept.file}; the same command goes on from there"
+        )
     if page is not None or figures is not None:
         shown_page = capacity_page(read.name, found, changes)
         with working("writing the report"):
             write_report(shown_page, page, figures=figures, static=False, mark=mark)
+    kept.remove()
     if as_json:
         more: dict[str, Any] = {"what_if": [one.as_json() for one in changes]} if what_if else {}
         if asked is not None:
