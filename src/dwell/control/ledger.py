@@ -175,14 +175,28 @@ class FleetLedger:
 
     def _promising(self, index: int) -> list[str]:
         """Candidates by which the table's Φ falls by more than is owed; best first."""
-        found = []
+        found, here = [], self.placements[index]
+        at_stake = self.alone[index][here] + self._beyond_table(index)
         for name in self.cells[index].problem.candidates:
-            if name != self.placements[index]:
-                rise = self.loads.rise(self._at, index, self.placements[index], name)
-                rise += self.alone[index][name] - self.alone[index][self.placements[index]]
+            if name != here:
+                rise = self.loads.rise(self._at, index, here, name)
+                rise += self.alone[index][name] - at_stake
                 if exceeds(-rise, self.owed(index, name)) or self._helps_the_worst(index, name):
                     found.append((rise, name))
         return [name for _, name in sorted(found)[:LOOKS]]
+
+    def _beyond_table(self, index: int) -> float:
+        """J of a cell as played, less what the table says, where foreign load is on shared nodes.
+
+        The table knows no foreign load beyond the declared: it takes such a node for idle.
+        """
+        if not any(one.threads.keys() & self.shared for one in self.presents):
+            return 0.0
+        self.prices.begin(self.presents)
+        cell, here = self.prices.price(tuple(self.placements)).cells[index], self.placements[index]
+        load = self._at.loads.get(self.loads.resource(index, here) or "", 0.0)
+        says = self.alone[index][here] + self.loads.wait(index, here, load)
+        return 0.0 if cell is None else cell.cost - says
 
     def _helps_the_worst(self, index: int, name: str) -> bool:
         """Whether the table thinks so."""
