@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from dwell.control.coordination import Asked, Coordination, Verdict, Wish
 from dwell.control.course import Course
+from dwell.control.watchdog import SeenWindow
 from dwell.control.windows import (
     missed_cycles,
     seen_costs,
@@ -440,7 +441,8 @@ class Controller:
         """Have the fleet look at what the policy has decided."""
         decision, incumbent = proposal.decision, self.course.placement
         by_price = self._policy.by_price
-        wish = Wish(decision, estimates, incumbent, self._estimator, by_price)
+        seen = SeenWindow(*proposal.seen[:2], *proposal.looked[1:])
+        wish = Wish(decision, estimates, incumbent, self._estimator, by_price, seen)
         verdict = coordination.consider(wish)
         proposal.verdict, name = verdict, verdict.name
         if name != decision.name:
@@ -611,7 +613,7 @@ class Controller:
         if proposal.verdict is not None:
             asked = proposal.verdict.asked
             if why is None and proposal.verdict.why is not None:
-                why = f"{proposal.wished}: {proposal.verdict.why}"
+                why = f"{proposal.wished or incumbent}: {proposal.verdict.why}"
         window, *cycles = proposal.looked
         dwell_cycles = decision.dwell * self.problem.decide_cycles
         dwell = dwell_cycles // self.problem.window_cycles

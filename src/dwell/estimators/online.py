@@ -97,20 +97,23 @@ class Online(CellEstimator):
         #: Whether the present is another one, or has newer values of the same.
         self._has_changed = self._has_grown = False
 
-    def share(self, nodes: Collection[str], cells: int) -> None:
-        """Take note of nodes whose other jobs are those of a fleet's cells, and accounted for.
+    def share(self, nodes: Collection[str], cells: int, *, known: bool = True) -> None:
+        """Take note of nodes whose other jobs are those of a fleet's cells (see `CellEstimator`).
 
         Jobs there say nothing of waits, since the jobs of other cells are not in the evidence. They
         say how many foreign threads there are where it is known next to how many threads of the
         fleet they ran. Cells take turns in sending shadows there.
         """
-        self._shared, self._declared = frozenset(nodes), {}
+        shared, self._declared = frozenset(nodes), {}
+        self._shared = shared if known else frozenset()
         self._meter = Meter(self.problem, self._shared)
+        for link, rate in self._rates.items():
+            self._meter.set_rate(link, rate.mbps)
         self._stretches = Stretches(self.problem, self._shared)
-        for name, sent in self._sent.items():
+        for name in self.problem.candidates:
             of = {
-                one: share / cells if one.partition(".")[0] in self._shared else share
-                for one, share in sent.items()
+                one: share / cells if one.partition(".")[0] in shared else share
+                for one, share in self._sent_under(name).items()
             }
             self._sent[name] = FrozenDict(of)
 

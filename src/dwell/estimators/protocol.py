@@ -148,6 +148,12 @@ class CellEstimator(ABC):
         """Say what stands behind the estimates, where it supports them."""
         return {}
 
-    def share(self, nodes: Collection[str], cells: int) -> None:
-        """Take note of nodes whose other jobs are those of a fleet's cells, and accounted for."""
+    def share(self, nodes: Collection[str], cells: int, *, known: bool = True) -> None:
+        """Take note of nodes whose other jobs are those of a fleet's cells.
+
+        Parameters
+        ----------
+        known : bool
+            Whether their load is accounted for; if not, it counts as foreign.
+        """
         return
