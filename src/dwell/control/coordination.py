@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.control.watchdog import SeenWindow
+from dwell.control.watchdog import Doubts, SeenWindow
 from dwell.estimators.protocol import CellEstimator
 from dwell.model import Decision, QoS
 
@@ -52,6 +52,8 @@ class Wish(NamedTuple):
         may be taken in the place of its own.
     seen : SeenWindow, optional
         What the decision looks at.
+    doubts : Doubts, optional
+        Candidates of the cell whose windows were not what was played.
     """
 
     decision: Decision
@@ -60,6 +62,7 @@ class Wish(NamedTuple):
     estimator: CellEstimator
     by_price: bool
     seen: SeenWindow | None = None
+    doubts: Doubts | None = None
 
 
 class Coordination(Protocol):

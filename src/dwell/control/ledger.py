@@ -34,7 +34,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.control.coordination import Coordination, Verdict, Wish
-from dwell.control.watchdog import NOT_AS_PLAYED, Played, SeenWindow, Watchdog
+from dwell.control.watchdog import (
+    NOT_AS_PLAYED,
+    WAS_NOT_AS_PLAYED,
+    Doubts,
+    Played,
+    SeenWindow,
+    Watchdog,
+)
 from dwell.cost import GAIN_TOLERANCE, exceeds, excess, hamming, price
 from dwell.estimators.fleet_prices import CellTerms, FleetPrice, FleetPrices, PricedCell
 from dwell.estimators.load_table import LoadTable, load_table
@@ -115,6 +122,8 @@ class FleetLedger:
         self.turn_ns = max(round(problem.window_ms * 1e6) for problem in problems)
         self.absent: set[int] = set()
         self._watchdogs = [Watchdog(problem.window_cycles) for problem in problems]
+        #: Candidates of each cell that are doubted at its last close.
+        self._doubted: list[set[str]] = [set()] * len(self.cells)
         self._declared = [prices_of(problem) for problem in problems]
         #: How often Φ has become another function; and of each cell what it was when it was last
         #: looked at.
@@ -136,25 +145,27 @@ class FleetLedger:
             self._moves += 1
             self._changes += 1
 
-    def watch(self, index: int, seen: SeenWindow, estimator: CellEstimator) -> bool:
+    def watch(self, index: int, seen: SeenWindow, doubts: Doubts, estimator: CellEstimator) -> bool:
         """Compare a window with what was played; returns whether that is what was seen.
 
         A cell whose estimator learns leaves Φ when it is not, and comes back when it is again. As
         long as it is away, its estimator takes all load of shared nodes for foreign.
         """
-        dog = self._watchdogs[index]
-        if not dog.is_due(seen, self._moves):
-            return dog.trusts
-        self._begin()
-        cell, name = self.prices.price(tuple(self.placements)).cells[index], self.placements[index]
-        problem = self.cells[index].problem
-        if cell is None:
-            return dog.trusts
-        played = Played.of(cell.windows, self._declared[index][name], problem.window_cycles)
-        if dog.compare(seen, played) and estimator.learns:
-            self.absent ^= {index}
-            self._changes += 1
-            estimator.share(self.shared, len(self.cells), known=dog.trusts)
+        dog, name = self._watchdogs[index], self.placements[index]
+        if dog.is_due(seen, self._moves):
+            self._begin()
+            cell = self.prices.price(tuple(self.placements)).cells[index]
+            cycles = self.cells[index].problem.window_cycles
+            if cell is not None:
+                played = Played.of(cell.windows, self._declared[index][name], cycles)
+                if dog.compare(seen, played) and estimator.learns:
+                    self.absent ^= {index}
+                    self._changes += 1
+                    estimator.share(self.shared, len(self.cells), known=dog.trusts)
+                    doubts.change(name, seen.last_cycle, trusts=dog.trusts)
+        doubted = doubts.at(seen.last_cycle)
+        self._changes += doubted != self._doubted[index]
+        self._doubted[index] = doubted
         return dog.trusts
 
     def _begin(self) -> None:
@@ -192,6 +203,9 @@ class FleetLedger:
             return self._refused(index, wished)
         asked: tuple[float, float] | None = None
         for name in names:
+            if name in self._doubted[index]:
+                self._refusals[index][name] = WAS_NOT_AS_PLAYED
+                continue
             before, after = self._played(index, name)
             asked = self._phi(before), self._phi(after)
             why = self._objection(index, name, before, after)
@@ -346,8 +360,9 @@ class Seat(Coordination):
         self.ledger.place(self._index, wish.incumbent)
         self.ledger.note(self._index, wish.estimates, wish.estimator)
         is_as_played = True
-        if wish.seen is not None and len(self.ledger.cells) > 1:
-            is_as_played = self.ledger.watch(self._index, wish.seen, wish.estimator)
+        if wish.seen is not None and wish.doubts is not None and len(self.ledger.cells) > 1:
+            asked = wish.seen, wish.doubts, wish.estimator
+            is_as_played = self.ledger.watch(self._index, *asked)
         verdict = self.ledger.consider(self._index, wish.decision, by_price=wish.by_price)
         if is_as_played or verdict.why or verdict.name != wish.incumbent:
             return verdict

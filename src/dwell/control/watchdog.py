@@ -14,14 +14,19 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.estimators.prices import L95_SHARE, RATE, SETTLING, Price
+from dwell.estimators.prices import L95_SHARE, RATE, Price
 from dwell.estimators.slow_processes import unseen_error
+from dwell.model import QoS
+from dwell.model.qos import NO_ERROR
 
 Floats: TypeAlias = NDArray[np.float64]
 
 FACTOR, WINDOWS = 4.0, 2
-#: Reason in the record of a decision.
+#: For how many windows a candidate is doubted first, after its model was not trusted.
+DOUBTED = 8
+#: Reasons in the record of a decision.
 NOT_AS_PLAYED = "seen is not what was played"
+WAS_NOT_AS_PLAYED = "windows there were not what was played"
 
 
 class SeenWindow(NamedTuple):
@@ -63,19 +68,32 @@ class Played(NamedTuple):
         count = len(windows)
         l95_ms, rate = windows.mean(axis=0).tolist()
         # Of few values the deviation is itself hardly known.
-        few = (count + 1) / max(count - 1, 1)
+        few, usual = (count + 1) / max(count - 1, 1), price.deviations(window_cycles)
         between = (few * windows.std(axis=0)).tolist()
-        usual = math.sqrt(max(price.cycles / window_cycles - SETTLING, 1.0))
-        errors = (
-            max(between[0] / math.sqrt(count), L95_SHARE * l95_ms),
-            max(between[1] / math.sqrt(count), unseen_error(rate, count * window_cycles), RATE),
-        )
-        return cls(
-            l95_ms,
-            rate,
-            math.hypot(errors[0], max(between[0], usual * price.l95_error_ms)),
-            math.hypot(errors[1], max(between[1], usual * price.violation_error)),
-        )
+        error = between[0] / math.sqrt(count), between[1] / math.sqrt(count)
+        deviations = max(between[0], usual[0]), max(between[1], usual[1])
+        return cls._of((l95_ms, rate), error, deviations, count * window_cycles)
+
+    @classmethod
+    def of_estimate(cls, qos: QoS, deviations: tuple[float, float], window_cycles: int) -> Played:
+        """Tell it from an estimate, and by how much windows differ."""
+        means = qos.l95_ms, qos.violation_rate
+        return cls._of(means, qos.error or NO_ERROR, deviations, window_cycles)
+
+    @classmethod
+    def _of(
+        cls,
+        means: tuple[float, float],
+        error: tuple[float, float],
+        deviations: tuple[float, float],
+        cycles: int,
+    ) -> Played:
+        l95_ms, rate = means
+        # Prices are played until they are known so well.
+        l95_error_ms = max(error[0], L95_SHARE * l95_ms)
+        rate_error = max(error[1], unseen_error(rate, cycles), RATE)
+        l95_deviation_ms = math.hypot(l95_error_ms, deviations[0])
+        return cls(l95_ms, rate, l95_deviation_ms, math.hypot(rate_error, deviations[1]))
 
     def agrees_with(self, seen: SeenWindow) -> bool:
         """Whether a window is within `FACTOR` deviations."""
@@ -94,6 +112,10 @@ class Watchdog:
     ----------
     window_cycles : int
         W.
+    after : int
+        Cycle after which windows count.
+    trusts : bool
+        Whether the model is trusted at first.
 
     Attributes
     ----------
@@ -101,23 +123,23 @@ class Watchdog:
         Whether the model is trusted.
     """
 
-    def __init__(self, window_cycles: int) -> None:
+    def __init__(self, window_cycles: int, after: int = -1, *, trusts: bool = True) -> None:
         self._window_cycles = window_cycles
-        self.trusts, self._against, self._last, self._places = True, 0, -1, -1
+        self.trusts, self._against, self._last, self._moves = trusts, 0, after, 0
 
     def __repr__(self) -> str:
         return f"<Watchdog: {'' if self.trusts else 'not '}as played>"
 
-    def is_due(self, seen: SeenWindow, places: int) -> bool:
-        """Whether a window can be compared: a whole one, after all that changed.
+    def is_due(self, seen: SeenWindow, moves: int = 0) -> bool:
+        """Whether a window can be compared: a whole one, after all moves.
 
         Parameters
         ----------
-        places : int
-            Counts changes of placements that matter to the cell; windows before one do not count.
+        moves : int
+            How many moves there were that matter to the cell.
         """
-        if places != self._places:
-            self._places, self._last = places, seen.last_cycle
+        if moves != self._moves:
+            self._moves, self._last = moves, seen.last_cycle
         whole = self._window_cycles
         return seen.cycles >= whole and seen.last_cycle - whole >= self._last
 
@@ -129,3 +151,38 @@ class Watchdog:
             return False
         self.trusts, self._against = not self.trusts, 0
         return True
+
+
+class Doubts:
+    """Candidates that are doubted.
+
+    Parameters
+    ----------
+    window_cycles : int
+        W.
+    """
+
+    def __init__(self, window_cycles: int) -> None:
+        self._window_cycles = window_cycles
+        #: Of each candidate the cycle until which it is doubted, and for how many windows.
+        self._until: dict[str, int] = {}
+        self._spans: dict[str, int] = {}
+
+    def __repr__(self) -> str:
+        return f"<Doubts of {', '.join(self._until) or 'nothing'}>"
+
+    def change(self, name: str, cycle: int, *, trusts: bool) -> None:
+        """Take note that the model of a candidate is trusted from a close on, or is not."""
+        if trusts:
+            self._until.pop(name, None)
+            return
+        self._spans[name] = 2 * self._spans.get(name, DOUBTED // 2)
+        self.go_on(name, cycle)
+
+    def go_on(self, name: str, cycle: int) -> None:
+        """Take note of a close at which it is still not trusted."""
+        self._until[name] = cycle + self._spans[name] * self._window_cycles
+
+    def at(self, cycle: int) -> set[str]:
+        """Return the candidates that are doubted at a cycle."""
+        return {name for name, until in self._until.items() if cycle <= until}

@@ -192,6 +192,10 @@ class Online(CellEstimator):
                 estimates = self._priced(names, foreign)
         return estimates
 
+    def deviations(self, name: str) -> tuple[float, float]:
+        """Return standard deviations of one window under a candidate (see `CellEstimator`)."""
+        return self._playing.deviations(name)
+
     def _priced(self, names: list[str], foreign: Foreign) -> dict[str, QoS]:
         """Every candidate's metrics; of those that are played by what they have come to."""
         played = {name: self._playing.played(name) for name in names}

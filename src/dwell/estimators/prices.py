@@ -107,6 +107,14 @@ class Price:
         error = self.l95_error_ms, self.violation_error
         return QoS(self.l95_ms, self.violation_rate, used, self.uncut_l95_ms, error)
 
+    def deviations(self, window_cycles: int) -> tuple[float, float]:
+        """Return standard deviations of one window: of its L95, milliseconds, and its V_D.
+
+        They are told from the errors of the means, which know of slow processes.
+        """
+        root = math.sqrt(max(self.cycles / window_cycles - SETTLING, 1.0))
+        return root * self.l95_error_ms, root * self.violation_error
+
     @property
     def is_good_enough(self) -> bool:
         """Whether no more has to be played."""

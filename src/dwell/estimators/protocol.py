@@ -144,6 +144,13 @@ class CellEstimator(ABC):
     ) -> Mapping[str, QoS]:
         """As `Estimator.estimate`."""
 
+    def deviations(self, name: str) -> tuple[float, float] | None:
+        """Return standard deviations of one window under a candidate: of L95 (ms), and of V_D.
+
+        None where they are not known, so that no window can be compared with the estimate.
+        """
+        return None
+
     def support(self) -> Mapping[str, Support]:
         """Say what stands behind the estimates, where it supports them."""
         return {}
