@@ -5,7 +5,8 @@ canonical cell, and 4 to 16 more foreign threads on E, begins at window 15 of 45
 compared with cells that ask nobody, on the same draws: mean J under `sum`, J of the worst cell
 under `worst`, and V_D, from window 20 on; the share of windows from 25 on whose cell was in Φ.
 
-`--alarms` counts how often a cell leaves Φ where nothing happens, per 300 windows.
+`--alarms` counts how often the watchdog stops trusting a model where nothing happens, per 300
+windows of a cell: in the fleet, and in cells alone that replay recordings (`benchmarks.regimes`).
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -21,8 +23,9 @@ from typing import NamedTuple
 import polars as pl
 
 import dwell
+from benchmarks import regimes
 from benchmarks.canonical import CELL
-from dwell.control.watchdog import NOT_AS_PLAYED
+from dwell.control.watchdog import NOT_AS_PLAYED, Played, SeenWindow, Watchdog
 from dwell.model import NodeDisturbance, Problem, Scenario
 from dwell.model.fleet import Coordination, Fleet, FleetEntry, FleetObjective
 from dwell.record.fleet_run import FleetRun
@@ -128,15 +131,42 @@ def table(cells: int, seeds: Sequence[int], pool: ProcessPoolExecutor) -> Iterat
             )
 
 
+@contextmanager
+def counted_alarms() -> Iterator[list[None]]:
+    """Count how often any watchdog stops trusting a model."""
+    found: list[None] = []
+    compare = Watchdog.compare
+
+    def counting(self: Watchdog, seen: SeenWindow, played: Played) -> bool:
+        changed = compare(self, seen, played)
+        if changed and not self.trusts:
+            found.append(None)
+        return changed
+
+    Watchdog.compare = counting  # type: ignore[method-assign]
+    try:
+        yield found
+    finally:
+        Watchdog.compare = compare  # type: ignore[method-assign]
+
+
 def alarms(cells: int, windows: int, seed: int) -> float:
     """Return how often a cell of an undisturbed fleet leaves Φ, per 300 windows."""
     fleet = fleet_of(problem_of("baseline", tenants=True), cells, "ledger")
-    run = dwell.simulate_fleet(fleet, seed=seed, windows=windows, estimator="corrected")
-    left = 0
-    for _, rows in run.decisions.group_by("cell"):
-        away = rows["refused"].fill_null("").str.ends_with(NOT_AS_PLAYED).to_numpy()
-        left += int((away[1:] & ~away[:-1]).sum())
-    return 300 * left / (cells * windows)
+    with counted_alarms() as found:
+        dwell.simulate_fleet(fleet, seed=seed, windows=windows, estimator="corrected")
+    return 300 * len(found) / (cells * windows)
+
+
+def alarms_alone(name: str, windows: int, seed: int) -> float:
+    """Return how often a cell alone mistrusts an estimate, on any candidate, per 300 windows."""
+    problem = dwell.load(CELL) if name == "canonical" else regimes.cells()[name]
+    with counted_alarms() as found:
+        for placed in problem.candidates:
+            dwell.simulate(
+                problem, policy=placed, estimator="corrected", seed=seed, windows=windows
+            )
+    return 300 * len(found) / (windows * len(problem.candidates))
 
 
 def main() -> None:
@@ -150,8 +180,12 @@ def main() -> None:
     seeds = range(1, args.seeds + 1)
     with ProcessPoolExecutor(args.jobs) as pool:
         if args.alarms:
-            found = pool.map(partial(alarms, args.cells, 300), seeds)
-            print(*(f"seed {seed}: {one:.2f}\n" for seed, one in zip(seeds, found, strict=True)))
+            found = list(pool.map(partial(alarms, args.cells, 300), seeds))
+            print(f"{args.cells} canonical cells: {sum(found) / len(found):.2f}", flush=True)
+            recorded = regimes.cells() if regimes.TRACES.is_dir() else {}
+            for name in ("canonical", *recorded):
+                found = list(pool.map(partial(alarms_alone, name, 300), seeds))
+                print(f"{name}: {sum(found) / len(found):.2f}", flush=True)
             return
         for line in table(args.cells, seeds, pool):
             print(line, end="", flush=True)

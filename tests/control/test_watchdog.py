@@ -11,7 +11,7 @@ import pytest
 import dwell
 from dwell.control.watchdog import NOT_AS_PLAYED, Doubts, Played, SeenWindow, Watchdog
 from dwell.estimators.prices import prices_of
-from dwell.model import Constant, Episodes, NodeDisturbance, Problem
+from dwell.model import Bursts, Constant, Episodes, NodeDisturbance, Problem
 from dwell.model.fleet import Coordination, Fleet, FleetEntry
 from dwell.record import FleetRun
 from tests.cells.examples import EXAMPLES
@@ -88,6 +88,21 @@ def test_what_few_windows_have_not_met_is_in_the_deviation() -> None:
     assert played.l95_deviation_ms > 0.01 * price.l95_ms
     assert played.agrees_with(seen(99, price.l95_ms, 0.01, 100))
     assert not played.agrees_with(seen(99, price.l95_ms, 0.5, 100))
+
+
+def test_two_bad_windows_in_succession_may_be_declared() -> None:
+    """Bursts of five windows, in one of ten: their price is that of the mean."""
+    problem = dwell.load(EXAMPLES / "canonical.yaml")
+    edge = problem.fabric.nodes["E"]
+    window_ms = problem.window_ms
+    bursts = Bursts(Constant(45 * window_ms), Constant(5 * window_ms), threads=32)
+    nodes = {**problem.fabric.nodes, "E": replace(edge, bursts=bursts)}
+    problem = replace(problem, fabric=replace(problem.fabric, nodes=nodes))
+    price = prices_of(problem)["SO"]
+    assert price.violation_rate < 0.2
+    deviations = price.l95_deviation_ms, price.violation_deviation
+    played = Played.of_estimate(price.qos, deviations, problem.window_cycles)
+    assert played.agrees_with(seen(99, problem.censor_ms, 1.0, 100))
 
 
 # ------------------------------------------------------------------------------------- in a fleet

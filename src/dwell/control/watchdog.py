@@ -1,6 +1,6 @@
 """Watchdog: whether a cell's windows show what was played for it.
 
-A window disagrees if its V_D or L95 is further from the played one than `FACTOR` deviations. A
+A window disagrees if its V_D or L95 is further from the played one than `AGREES` deviations. A
 deviation has two parts: the standard error of what was played, and by how much windows differ
 there. Windows that are compared share no cycle. After `WINDOWS` of them that disagree the model of
 the cell is not trusted, until as many agree.
@@ -14,14 +14,14 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.estimators.prices import L95_SHARE, RATE, Price
+from dwell.estimators.prices import AGREES, L95_SHARE, RATE, Price
 from dwell.estimators.slow_processes import unseen_error
 from dwell.model import QoS
 from dwell.model.qos import NO_ERROR
 
 Floats: TypeAlias = NDArray[np.float64]
 
-FACTOR, WINDOWS = 4.0, 2
+WINDOWS = 2
 #: For how many windows a candidate is doubted first, after its model was not trusted.
 DOUBTED = 8
 #: Reasons in the record of a decision.
@@ -68,10 +68,13 @@ class Played(NamedTuple):
         count = len(windows)
         l95_ms, rate = windows.mean(axis=0).tolist()
         # Of few values the deviation is itself hardly known.
-        few, usual = (count + 1) / max(count - 1, 1), price.deviations(window_cycles)
+        few = (count + 1) / max(count - 1, 1)
         between = (few * windows.std(axis=0)).tolist()
         error = between[0] / math.sqrt(count), between[1] / math.sqrt(count)
-        deviations = max(between[0], usual[0]), max(between[1], usual[1])
+        deviations = (
+            max(between[0], price.l95_deviation_ms),
+            max(between[1], price.violation_deviation),
+        )
         return cls._of((l95_ms, rate), error, deviations, count * window_cycles)
 
     @classmethod
@@ -96,12 +99,12 @@ class Played(NamedTuple):
         return cls(l95_ms, rate, l95_deviation_ms, math.hypot(rate_error, deviations[1]))
 
     def agrees_with(self, seen: SeenWindow) -> bool:
-        """Whether a window is within `FACTOR` deviations."""
+        """Whether a window is within `AGREES` deviations."""
         l95_off_ms = abs(seen.l95_ms - self.l95_ms)
         rate_off = abs(seen.violation_rate - self.violation_rate)
         return (
-            l95_off_ms <= FACTOR * self.l95_deviation_ms
-            and rate_off <= FACTOR * self.violation_deviation
+            l95_off_ms <= AGREES * self.l95_deviation_ms
+            and rate_off <= AGREES * self.violation_deviation
         )
 
 

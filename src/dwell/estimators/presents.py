@@ -268,7 +268,8 @@ class Playing:
 
     def deviations(self, name: str) -> tuple[float, float]:
         """Return standard deviations of one window: of its L95, milliseconds, and its V_D."""
-        usual = self.prices[name].deviations(self.problem.window_cycles)
+        price = self.prices[name]
+        usual = price.l95_deviation_ms, price.violation_deviation
         steps = self._twins[name].steps if self._twins else ()
         if len(steps) < 2:
             return usual
