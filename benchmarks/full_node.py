@@ -25,7 +25,7 @@ import polars as pl
 import dwell
 from benchmarks import regimes
 from benchmarks.canonical import CELL
-from dwell.control.watchdog import NOT_AS_PLAYED, Played, SeenWindow, Watchdog
+from dwell.control.watchdog import NOT_AS_PLAYED, Expected, SeenWindow, Watchdog
 from dwell.model import NodeDisturbance, Problem, Scenario
 from dwell.model.fleet import Coordination, Fleet, FleetEntry, FleetObjective
 from dwell.record.fleet_run import FleetRun
@@ -137,7 +137,7 @@ def counted_alarms() -> Iterator[list[None]]:
     found: list[None] = []
     compare = Watchdog.compare
 
-    def counting(self: Watchdog, seen: SeenWindow, played: Played) -> bool:
+    def counting(self: Watchdog, seen: SeenWindow, played: Expected) -> bool:
         changed = compare(self, seen, played)
         if changed and not self.trusts:
             found.append(None)

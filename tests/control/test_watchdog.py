@@ -9,14 +9,14 @@ import polars as pl
 import pytest
 
 import dwell
-from dwell.control.watchdog import NOT_AS_PLAYED, Doubts, Played, SeenWindow, Watchdog
+from dwell.control.watchdog import NOT_AS_PLAYED, Doubts, Expected, SeenWindow, Watchdog
 from dwell.estimators.prices import prices_of
 from dwell.model import Bursts, Constant, Episodes, NodeDisturbance, Problem
 from dwell.model.fleet import Coordination, Fleet, FleetEntry
 from dwell.record import FleetRun
 from tests.cells.examples import EXAMPLES
 
-AS_PLAYED = Played(30.0, 0.1, 1.0, 0.01)
+AS_PLAYED = Expected(30.0, 0.1, 1.0, 0.01)
 #: Canonical windows are 3.33 s long: from the twelfth to the thirtieth something happens.
 AT_S, FOR_S = 40.0, 60.0
 
@@ -84,7 +84,7 @@ def test_what_few_windows_have_not_met_is_in_the_deviation() -> None:
     problem = dwell.load(EXAMPLES / "canonical.yaml")
     price = prices_of(problem)["SO"]
     windows = np.column_stack((np.full(8, price.l95_ms), np.zeros(8)))
-    played = Played.of(windows, price, problem.window_cycles)
+    played = Expected.of(windows, price, problem.window_cycles)
     assert played.l95_deviation_ms > 0.01 * price.l95_ms
     assert played.agrees_with(seen(99, price.l95_ms, 0.01, 100))
     assert not played.agrees_with(seen(99, price.l95_ms, 0.5, 100))
@@ -101,7 +101,7 @@ def test_two_bad_windows_in_succession_may_be_declared() -> None:
     price = prices_of(problem)["SO"]
     assert price.violation_rate < 0.2
     deviations = price.l95_deviation_ms, price.violation_deviation
-    played = Played.of_estimate(price.qos, deviations, problem.window_cycles)
+    played = Expected.of_estimate(price.qos, deviations, problem.window_cycles)
     assert played.agrees_with(seen(99, problem.censor_ms, 1.0, 100))
 
 

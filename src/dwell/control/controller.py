@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dwell.control.coordination import Asked, Coordination, Verdict, Wish
 from dwell.control.course import Course
-from dwell.control.watchdog import Doubts, Played, SeenWindow, Watchdog
+from dwell.control.watchdog import Doubts, Expected, SeenWindow, Watchdog
 from dwell.control.windows import (
     missed_cycles,
     seen_costs,
@@ -469,7 +469,7 @@ class Controller:
         estimate, deviations = estimates.get(incumbent), self._estimator.deviations(incumbent)
         if not isinstance(estimate, QoS) or deviations is None or not self._watchdog.is_due(seen):
             return
-        played = Played.of_estimate(estimate, deviations, self.problem.window_cycles)
+        played = Expected.of_estimate(estimate, deviations, self.problem.window_cycles)
         if self._watchdog.compare(seen, played):
             self._doubts.change(incumbent, last_cycle, trusts=self._watchdog.trusts)
 

@@ -38,7 +38,7 @@ from dwell.control.watchdog import (
     NOT_AS_PLAYED,
     WAS_NOT_AS_PLAYED,
     Doubts,
-    Played,
+    Expected,
     SeenWindow,
     Watchdog,
 )
@@ -157,7 +157,7 @@ class FleetLedger:
             cell = self.prices.price(tuple(self.placements)).cells[index]
             cycles = self.cells[index].problem.window_cycles
             if cell is not None:
-                played = Played.of(cell.windows, self._declared[index][name], cycles)
+                played = Expected.of(cell.windows, self._declared[index][name], cycles)
                 if dog.compare(seen, played) and estimator.learns:
                     self.absent ^= {index}
                     self._changes += 1

@@ -2,7 +2,7 @@
 
 A window disagrees if its V_D or L95 is further from the played one than `AGREES` deviations. A
 deviation has two parts: the standard error of what was played, and by how much windows differ
-there. Windows that are compared share no cycle. After `WINDOWS` of them that disagree the model of
+there. The compared windows share no cycle. After `WINDOWS` of them that disagree the model of
 the cell is not trusted, until as many agree.
 """
 
@@ -45,7 +45,7 @@ class SeenWindow(NamedTuple):
     cycles: int
 
 
-class Played(NamedTuple):
+class Expected(NamedTuple):
     """What windows come to: means, and the deviation of one window from them."""
 
     l95_ms: float
@@ -54,7 +54,7 @@ class Played(NamedTuple):
     violation_deviation: float
 
     @classmethod
-    def of(cls, windows: Floats, price: Price, window_cycles: int) -> Played:
+    def of(cls, windows: Floats, price: Price, window_cycles: int) -> Expected:
         """Tell it from windows that were played.
 
         Parameters
@@ -62,8 +62,7 @@ class Played(NamedTuple):
         windows : float64 array, shape (n, 2)
             L95, milliseconds, and V_D of each.
         price : Price
-            The same candidate as declared. Much more has been played of it, so that it knows of
-            what the few windows may not have met.
+            The same candidate as declared: it has many more windows, so it includes rare events.
         """
         count = len(windows)
         l95_ms, rate = windows.mean(axis=0).tolist()
@@ -78,7 +77,7 @@ class Played(NamedTuple):
         return cls._of((l95_ms, rate), error, deviations, count * window_cycles)
 
     @classmethod
-    def of_estimate(cls, qos: QoS, deviations: tuple[float, float], window_cycles: int) -> Played:
+    def of_estimate(cls, qos: QoS, deviations: tuple[float, float], window_cycles: int) -> Expected:
         """Tell it from an estimate, and by how much windows differ."""
         means = qos.l95_ms, qos.violation_rate
         return cls._of(means, qos.error or NO_ERROR, deviations, window_cycles)
@@ -90,7 +89,7 @@ class Played(NamedTuple):
         error: tuple[float, float],
         deviations: tuple[float, float],
         cycles: int,
-    ) -> Played:
+    ) -> Expected:
         l95_ms, rate = means
         # Prices are played until they are known so well.
         l95_error_ms = max(error[0], L95_SHARE * l95_ms)
@@ -146,7 +145,7 @@ class Watchdog:
         whole = self._window_cycles
         return seen.cycles >= whole and seen.last_cycle - whole >= self._last
 
-    def compare(self, seen: SeenWindow, played: Played) -> bool:
+    def compare(self, seen: SeenWindow, played: Expected) -> bool:
         """Compare a window that is due; returns whether the model is trusted from now on or not."""
         self._last = seen.last_cycle
         self._against = 0 if played.agrees_with(seen) == self.trusts else self._against + 1

@@ -49,9 +49,9 @@ class WindowRows:
     tasks, flows : int
         Number of tasks and flows.
     beside : int64 array, shape (n, 1 or 2, tasks, 2), optional
-        For each job of the cycles, then of their shadows: integrals, over the time that it ran, of
-        the threads that the jobs of all cells wanted of its server, its own included; and, of a
-        shadow's job, that own jobs of all cells wanted. Only where cells share nodes.
+        Two integrals over the run of each job, of the cycles and then of their shadows. The first
+        is of the threads of all cells on its server, its own included. The second, for shadow
+        jobs, is of the threads of the own jobs of all cells. Only where cells share nodes.
     """
 
     def __init__(self, table: Ints, tasks: int, flows: int, beside: Ints | None = None) -> None:
