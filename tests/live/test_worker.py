@@ -20,7 +20,7 @@ from dwell.live.transport.transport import Arrival, Receive
 from dwell.live.worker import Worker
 from dwell.model import Problem
 from tests.live.small_world import MS, Bench, Counting, Passing, World, canonical, stateful
-from tests.waiting import wait_until
+from tests.waiting import PATIENCE_S, wait_until
 
 
 @pytest.fixture(scope="module")
