@@ -68,7 +68,9 @@ class FleetLedger:
         Nodes that are one computer for all cells.
     objective : {"sum", "worst"}
     table : LoadTable, optional
-        What proposes; made of the cells where None.
+        Proposes moves; made of `tabled` where None.
+    tabled : sequence of PricedCell, optional
+        Cells at the phases that the table is made for; `cells` where None.
     prices : FleetPrices, optional
         What plays.
     progress : callable, optional
@@ -97,12 +99,13 @@ class FleetLedger:
         objective: FleetObjective = "sum",
         *,
         table: LoadTable | None = None,
+        tabled: Sequence[PricedCell] | None = None,
         prices: FleetPrices | None = None,
         progress: Progress | None = None,
     ) -> None:
         self.cells, self.shared, self.objective = tuple(cells), tuple(shared), objective
         problems = [cell.problem for cell in cells]
-        self.table = load_table(cells, shared, progress) if table is None else table
+        self.table = table or load_table(tabled or cells, shared, progress)
         self.prices = prices or FleetPrices(cells, shared)
         self.loads = Loads(self.table)
         self._terms = [CellTerms(problem, shared) for problem in problems]
