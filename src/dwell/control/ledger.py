@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from dwell.control.coordination import Coordination, Verdict, Wish
 from dwell.control.fleet_rank import FleetRank
-from dwell.control.loads import Loads
+from dwell.control.table_loads import Loads
 from dwell.cost import exceeds, excess, hamming
 from dwell.estimators.fleet_prices import CellTerms, FleetPrice, FleetPrices, PricedCell
 from dwell.estimators.load_table import LoadTable, load_table
