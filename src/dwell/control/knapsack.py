@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.control.loads import Loads
+from dwell.control.table_loads import Loads
 
 #: Levels of the load of a resource, and levels that are computed together, which bounds memory.
 LEVELS, TOGETHER = 400, 40

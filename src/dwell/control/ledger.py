@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from dwell.control.coordination import Coordination, Verdict, Wish
 from dwell.control.fleet_rank import FleetRank
-from dwell.control.loads import Loads
+from dwell.control.table_loads import Loads
 from dwell.control.watchdog import (
     NOT_AS_PLAYED,
     WAS_NOT_AS_PLAYED,

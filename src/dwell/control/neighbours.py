@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
-from dwell.control.loads import AtLoad, Loads
+from dwell.control.table_loads import AtLoad, Loads
 from dwell.estimators.fleet_prices import PricedCell
 
 #: Value of placements; the smaller one is better.

@@ -15,8 +15,8 @@ import numpy as np
 
 from dwell.control.fleet_rank import FleetRank
 from dwell.control.knapsack import cheapest
-from dwell.control.loads import Loads
 from dwell.control.neighbours import Neighbours, Rank, descend
+from dwell.control.table_loads import Loads
 from dwell.estimators.fleet_prices import CellTerms, FleetPrice, FleetPrices
 from dwell.estimators.load_table import load_table
 from dwell.estimators.prices import SEED, prices_of
