@@ -577,6 +577,11 @@ class LiveWindows:
             return {**found, "stages": {}, "flows": {}, "slow": [], "counted_cycles": None}
         newest = self._newest[0]
         slow = self._stages.slow(self.problem.candidates[newest.placement], newest.key)
+        recent = found["recent"]
+        if (ways := recent["unreached"]) is not None:
+            source, target = ways[0], ways[1].partition("@")[0]
+            if self._stages.withholds(source, target, newest.key):
+                recent["unreached"] = None
         stages = self._stages.status(newest.key, now_ns, partial(self._span_ns, newest.run))
         return {**found, **stages, "slow": list(slow)}
 
