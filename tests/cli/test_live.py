@@ -66,6 +66,20 @@ def test_status_says_who_is_there(cell: RealCell) -> None:
     assert json.loads(stdout)["headline"] is None
 
 
+def test_status_shows_times_of_stages_and_counts_of_flows(cell: RealCell) -> None:
+    status = cell.until(lambda status: status["stages"].get("perception@R1", {}).get("jobs"))
+    one = status["stages"]["perception@R1"]
+    assert 0 < one["exec_median_ms"] <= one["exec_p95_ms"]
+    flow = status["flows"]["camera@R1->perception@R1"]
+    ends = ("taken", "replaced", "dropped", "lost", "in_flight")
+    assert flow["sent"] == sum(flow[end] for end in ends) > 0
+    assert flow["bytes_per_s"] > 0
+    lines = cell.show(lambda stdout: "camera@R1->" in stdout, "--stages").splitlines()
+    (row,) = (line for line in lines if line.startswith("  perception@R1   "))
+    assert len(row.split()) == 6 or "ready" in row
+    assert any(line.startswith("flow ") and "in_flight" in line for line in lines)
+
+
 def test_processes_are_placed_one_by_one(cell: RealCell) -> None:
     def pid(who: str) -> int:
         return int(json.loads((cell.state("R1") / f"{who}.pid").read_text())["pid"])

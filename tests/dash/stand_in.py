@@ -84,6 +84,36 @@ class StandIn:
             "unproven": False,
             "silences": 3,
             "release_ratio": 0.75,
+            "stages": {
+                "perception@R1": {
+                    "exec_median_ms": 12.0,
+                    "exec_p95_ms": 20.0,
+                    "jobs": 50,
+                    "replaced": 4,
+                    "dropped": 1,
+                    "inputs_total": {"taken": 900, "replaced": 40, "dropped": 10},
+                },
+                "planning@R2": {
+                    "exec_median_ms": None,
+                    "exec_p95_ms": None,
+                    "jobs": 0,
+                    "replaced": 0,
+                    "dropped": 0,
+                    "inputs_total": {"taken": 0, "replaced": 0, "dropped": 0},
+                },
+            },
+            "flows": {
+                "perception@R1->planning@R2": {
+                    "sent": 50,
+                    "taken": 45,
+                    "replaced": 0,
+                    "dropped": 1,
+                    "lost": 3,
+                    "in_flight": 1,
+                    "bytes_per_s": 4_000.0,
+                    "bytes_total": 123_456,
+                },
+            },
             "window": {
                 "number": 11,
                 "last_cycle": 1_199,

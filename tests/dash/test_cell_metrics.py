@@ -130,12 +130,20 @@ def test_what_the_controller_tells(cell: StandIn) -> None:
     assert value(cell, "dwell_release_ratio") == 0.75
     assert value(cell, "dwell_silences_total") == 3
     assert value(cell, "dwell_windows_total") == 12
+    stage = {"task": "perception", "node": "R1"}
+    assert value(cell, "dwell_stage_seconds", **stage, quantile="0.5") == 0.012
+    assert value(cell, "dwell_stage_seconds", **stage, quantile="0.95") == 0.02
+    assert value(cell, "dwell_stage_inputs_total", **stage, outcome="replaced") == 40
+    ends = {"source": "perception@R1", "target": "planning@R2"}
+    assert value(cell, "dwell_flow_bytes_total", **ends) == 123_456
     assert value(cell, "dwell_guard_fallback") == 0
 
 
 def test_what_is_not_known_is_absent(cell: StandIn) -> None:
     assert value(cell, "dwell_utilisation_ratio", node="E", kind="cpu") is None
     assert value(cell, "dwell_estimated_cost", placement="SO") is None
+    idle = {"task": "planning", "node": "R2", "quantile": "0.5"}
+    assert value(cell, "dwell_stage_seconds", **idle) is None
     cell.status = {**cell.status, "bound_ms": None}
     assert value(cell, "dwell_clock_bound_seconds") is None
     cell.status = {"health": "absent"}

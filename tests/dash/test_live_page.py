@@ -225,6 +225,8 @@ def test_a_person_pins_it_in_a_browser(acting: Served) -> None:
         wait_for(shown, "document.querySelector('[data-task=planning]').dataset.node === 'R2'")
         acting.act("unpin", {})
         wait_for(shown, "document.querySelector('.heard-said').textContent.includes('ready')")
+        wait_for(shown, "document.querySelector('.stages').textContent.includes('camera@R1->')")
+        assert shown.locator(".stages tbody").first.locator("tr").count() >= 4
 
 
 @in_browser

@@ -203,7 +203,8 @@ def test_rules_and_dashboard_ask_for_series_that_there_are() -> None:
         *("dwell_cycle_latency_seconds_sum", "dwell_cycle_latency_seconds_count"),
         *("dwell_cycle_latency_seconds_created", "dwell_violation_ratio", "dwell_windows_total"),
         *("dwell_unread_cycles_total", "dwell_task_placement_info"),
-        *("dwell_silences_total", "dwell_release_ratio"),
+        *("dwell_silences_total", "dwell_release_ratio", "dwell_stage_seconds"),
+        *("dwell_stage_inputs_total", "dwell_flow_bytes_total"),
     }
 
 

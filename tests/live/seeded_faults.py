@@ -85,6 +85,8 @@ OLD_S, COMMAND_S, UP_NS = 30.0, 8.0, 20_000_000_000
 TODAY_NS = 1_700_000_000_000_000_000
 #: Periods between two looks at the status.
 LOOK = 2
+#: Outcomes of the messages of a flow.
+ENDS = "taken", "replaced", "dropped", "lost", "in_flight"
 #: Words of the keys that the judge hears.
 HEARD = frozenset({"stamped", "order", "accepted", "done", "in"})
 
@@ -152,6 +154,15 @@ class Plan:
             words += ["--decide-cycles", str(self.decide_cycles)]
             words += ["--play", *map(_written, self.faults)]
         return shlex.join(words)
+
+
+def unbalanced(status: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the flows of a status whose messages do not add up."""
+    return {
+        name: one
+        for name, one in status["flows"].items()
+        if one["sent"] != sum(one[end] for end in ENDS) or min(one[end] for end in ENDS) < 0
+    }
 
 
 def _written(one: PlannedFault) -> str:
@@ -309,6 +320,7 @@ class FaultyWorld(World):
         self.network.call_at(self.network.now_ns + LOOK * self.period_ns, self._look)
         if status := self._status():
             self.wrong += self.judge.looked(status, self.seen)
+            self.wrong += map(str, unbalanced(status).items())
 
     def _frame(self) -> None:
         """Have the source's camera bring a frame, again and again."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
@@ -14,12 +14,13 @@ from dwell.live import role as role_module
 from dwell.live.agent import Agent
 from dwell.live.controlled_cell import ControlledCell, Recorder
 from dwell.live.keys import CONTROLLER, Keys
-from dwell.live.messages import Ask, Order, encode
+from dwell.live.messages import Ask, Order, StageCounts, encode
 from dwell.live.recording import RunRecorder
 from dwell.live.role import RolePlace
 from dwell.live.run_rows import Resume, Rows, columns_of
 from dwell.live.sink import Sink
 from dwell.live.stage import CellActuator, CellStage, Message
+from dwell.live.stage_counts import StageBook
 from dwell.live.stamper import Stamper, StamperState
 from dwell.live.supervision import Supervisor
 from dwell.live.transport.transport import Arrival
@@ -312,6 +313,8 @@ class World:
         self.arms = {name: Arm() for name in sinks}
         self.arm = self.arms[sinks[0]]
         self.roles: dict[str, object] = {}
+        #: By worker: the memory of its counts, which outlives it.
+        self.books: dict[str, bytearray] = {}
         self.lives = 0
         self.run_id = 1
         self.boot = ""
@@ -338,7 +341,7 @@ class World:
         elif role.kind == "sink":
             made = Sink(place, role.task, self.actuator_of(role), self.highest[role.task])
         elif role.kind == "agent":
-            made = Quiet(place)
+            made = Quiet(place, partial(self._counts, role.node))
         elif role.kind == "controller":
             controller = Controller(self.problem, self.policy)
             recorder = self.recorder_of(controller)
@@ -346,14 +349,24 @@ class World:
         else:
             stage = self.stage_of(role)
             standby = f"{role.task}@{role.node}" if role.kind == "standby" else ""
-            worker = Worker(
-                place, role.task, stage, shadow=role.kind == "shadow", stands_by=standby
-            )
+            shadow, book = role.kind == "shadow", self._book(role)
+            worker = Worker(place, role.task, stage, shadow=shadow, stands_by=standby, book=book)
             # All that it reads is the network's: a run is the same whatever the machine does.
             worker.cpu_clock = lambda: self.network.now_ns
             made = Bench(self.network, end, worker, self.exec_ns_of(role))
         self.roles[who] = made
         self.network.attach(end, made)
+
+    def _book(self, role: Role) -> StageBook:
+        """Open the counts of a worker."""
+        kept = partial(self.books.setdefault, role.who)
+        return StageBook(self.problem, role.task, role.node, lambda size: kept(bytearray(size)))
+
+    def _counts(self, node: str) -> Iterator[StageCounts]:
+        """Yield the counts of a node's workers, as its agent reads them."""
+        for role in self._roles.values():
+            if role.node == node and role.kind in ("worker", "standby"):
+                yield from self._book(role).report(role.who)
 
     def life_of(self, role: Role) -> int:
         """Life of a process that starts."""
@@ -503,6 +516,7 @@ class Recorded(World):
 class Quiet(Agent):
     """An agent without processes to look after."""
 
-    def __init__(self, place: RolePlace) -> None:
-        super().__init__(place, Supervisor(None, print, PlainLauncher()), lambda: 0)  # type: ignore[arg-type]
+    def __init__(self, place: RolePlace, stages: Callable[[], Iterable[StageCounts]]) -> None:
+        supervisor = Supervisor(None, print, PlainLauncher())  # type: ignore[arg-type]
+        super().__init__(place, supervisor, lambda: 0, stages=stages)
         self.cpu_clock = lambda: 0

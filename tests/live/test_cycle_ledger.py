@@ -253,3 +253,18 @@ def test_a_cycle_is_actuated_where_its_command_was(outcome: str) -> None:
     assert not one.actuated
     one.take(completion(one, outcome), None)
     assert one.actuated == (outcome == "actuated")
+
+
+def test_jobs_of_the_warm_up_are_no_evidence(ledger: Ledger, problem: Problem) -> None:
+    warming = cycle()
+    jobs = tuple(replace(one, warmup=one.task == "perception") for one in hops())
+    warming.take(replace(completion(warming), hops=jobs), None)
+    close_ns = RELEASE_NS + 40 * MS
+    found = ledger.evidence([warming], np.array([RELEASE_NS]), close_ns, shadows=False).cycles
+    assert found.start_ns is not None
+    assert found.work_ns is not None
+    column = list(problem.pipeline.tasks).index("perception")
+    for instants in (found.ready_ns, found.start_ns, found.end_ns, found.work_ns):
+        known = instants[0] != UNKNOWN
+        assert known.tolist() == [place != column for place in range(len(known))]
+    assert (found.arrived_ns[0] != UNKNOWN).all()

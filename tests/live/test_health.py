@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -13,7 +14,7 @@ from dwell.live.stage import Message
 from dwell.live.wiring import roles
 from dwell.model import Problem
 from tests.live.memory_transport import Clock
-from tests.live.small_world import MS, Arm, Passing, World, canonical, on
+from tests.live.small_world import EXEC_MS, MS, Arm, Bench, Passing, World, canonical, on
 
 
 class Raising(Passing):
@@ -239,8 +240,10 @@ def test_a_stage_that_fails_now_and_then_degrades_the_cell(
     found, headline = told(world)
     assert found == health
     if health == "degraded":
-        assert "V_D is 20% in the last 3 windows: messages of perception@R1 do not" in headline
-        assert "process() raised ValueError: too dark" in headline
+        # A stage that sends nothing is no link that loses something.
+        assert "do not reach" not in headline
+        why = r"V_D is 20% in the last 3 windows: perception on R1: cycle \d+: process\(\) raised"
+        assert re.search(f"{why} ValueError: too dark", headline)
         world.worker("perception@R1").stage = Passing("perception")
         two_windows(world)
         assert told(world) == ("ok", "")
@@ -446,3 +449,79 @@ def test_a_cell_that_starts_slowly_lacks_no_window_yet(problem: Problem) -> None
     world.start("perception@R1")
     world.run(1_000)
     assert told(world) == ("ok", "")
+
+
+# ---------------------------------------------------------------------------- slow stages
+
+
+class Nothing(Passing):
+    """A stage that forgets to return its output."""
+
+    def process(self, inputs: Mapping[str, Message]) -> Message:
+        return None  # type: ignore[return-value]
+
+
+def with_input(problem: Problem, task: str, depth: int) -> Problem:
+    tasks = dict(problem.pipeline.tasks)
+    tasks[task] = replace(tasks[task], depth=depth)
+    return replace(problem, pipeline=replace(problem.pipeline, tasks=tasks))
+
+
+@pytest.mark.parametrize("max_age_ms", [None, 500.0], ids=["stale", "late"])
+@pytest.mark.parametrize("placement", ["LOC", "SO"])
+def test_a_stage_that_takes_longer_than_a_period_is_named(
+    problem: Problem, placement: str, max_age_ms: float | None
+) -> None:
+    controller = replace(problem.controller, fallbacks=())
+    live = replace(problem.live, max_age_ms=max_age_ms)
+    cell = on(replace(problem, live=live, controller=controller), placement)
+    world = World(cell, policy=placement, exec_ms={**EXEC_MS, "perception": 76.0})
+    named = 0
+    detector = f"perception@{cell.candidates[placement]['perception']}"
+    for _ in range(100):
+        world.run(100)
+        health, headline = told(world)
+        assert "do not reach" not in headline
+        assert "by the clocks" not in headline
+        named += bool(
+            re.search(rf"{detector} takes 76 ms of 33: \d+ of \d+ inputs were replaced", headline)
+        )
+    assert (health, named > 80) == ("degraded", True)
+    assert world.status["slow"][0]["stage"] == detector
+    # It is over.
+    bench = world.roles[detector]
+    assert isinstance(bench, Bench)
+    bench.exec_ns = 10 * MS
+    world.run(6_000)
+    assert told(world) == ("ok", "")
+    assert world.status["slow"] == []
+
+
+def test_inputs_that_queue_at_a_slow_stage_are_no_lost_messages(problem: Problem) -> None:
+    cell = with_input(on(replace(problem, window_cycles=20), "SO"), "perception", 0)
+    cell = replace(cell, controller=replace(cell.controller, fallbacks=()))
+    world = World(cell, policy="SO", exec_ms={**EXEC_MS, "perception": 76.0})
+    world.run(3_000)
+    for _ in range(50):
+        world.run(100)
+        _, headline = told(world)
+        assert "perception@E takes 76 ms of 33" in headline
+        assert "do not reach" not in headline
+        assert "by the clocks" not in headline
+
+
+def test_a_note_about_memory_hides_no_other(problem: Problem) -> None:
+    world = World(problem, policy="LOC", stages={"control": Nothing})
+    world.run(8_000)
+    found = world.status
+    grown = "control@R2: its memory has grown from 90 to 300 MB; does its stage leak?"
+    found["processes"] = {
+        "agent@R2": found["processes"]["agent@R2"] | {"note": grown},
+        **{who: one for who, one in found["processes"].items() if who != "agent@R2"},
+    }
+    health, headline = diagnose(world.problem, found)
+    assert health == "stalled"
+    assert headline is not None
+    first = headline.partition(";")[0]
+    assert re.search(r"returned a NoneType, not a Message, \d+ calls in a row", first)
+    assert grown not in headline

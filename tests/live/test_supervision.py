@@ -290,6 +290,28 @@ def test_memory_that_grows_is_reported(tmp_path: Path) -> None:
         supervisor.stop()
     assert supervisor.notes().startswith("perception@E: its memory has grown from ")
     assert supervisor.notes() in said
+    # It grows no more.
+    (child,) = supervisor.children
+    child.peak_s -= supervision.TOLD_S
+    assert supervisor.notes() == ""
+
+
+def test_memory_that_grows_on_is_told_on(tmp_path: Path) -> None:
+    supervisor = supervise(tmp_path, print, warm_s=0.2, growth_bytes=8 << 20)
+    child = supervisor.keep("perception@E", [sys.executable, "-c", LEAK])
+    try:
+        supervisor.step()
+
+        def grown() -> bool:
+            supervisor.tend()
+            return bool(supervisor.notes())
+
+        wait_until(grown)
+        child.peak_s -= supervision.TOLD_S
+        assert supervisor.notes() == ""
+        wait_until(grown)
+    finally:
+        supervisor.stop()
 
 
 def test_a_log_does_not_grow_for_ever(tmp_path: Path) -> None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from dwell.live.wiring import Role
 from dwell.model import Problem
-from tests.live.small_world import World, canonical, on
+from tests.live.small_world import MS, World, canonical, on
 
 
 @pytest.fixture(scope="module")
@@ -79,3 +80,17 @@ def test_shadows_of_long_ago_say_nothing(problem: Problem) -> None:
     world.stamper._fraction = 0.0
     world.run(3 * 20 * cell.pipeline.period_ms)
     assert symptoms(world)["failing"] == {}
+
+
+def test_shadows_that_were_replaced_are_no_lost_messages(problem: Problem) -> None:
+    class Slow(World):
+        def exec_ns_of(self, role: Role) -> int:
+            return 90 * MS if role.who == "perception@E.shadow" else super().exec_ns_of(role)
+
+    cell = canonical(20, estimator="shadow", shadow_fraction=0.5)
+    world = Slow(cell, policy="LOC")
+    world.run(3_000)
+    for _ in range(30):
+        world.run(100)
+        for one in symptoms(world)["failing"].values():  # type: ignore[attr-defined]
+            assert one["unreached"] != ("perception@E", "planning@R2")

@@ -156,6 +156,9 @@ def status(
     watch: Annotated[
         bool, flag("--watch", "Look again every second; with --json, a line each time.")
     ] = False,
+    stages: Annotated[
+        bool, flag("--stages", "Show times of stages and counts of flows, too.")
+    ] = False,
     keys: Keys = None,
     insecure: Insecure = False,
     as_json: Json = False,
@@ -171,7 +174,7 @@ def status(
     problem = load_without_traces(cell)
     with OperatorClient(problem, environment(keys, insecure=insecure)) as visitor:
         if watch:
-            _watch(visitor, as_json=as_json)
+            _watch(visitor, stages=stages, as_json=as_json)
         answer = visitor.look()
     absent = answer["health"] == "absent"
     if as_json:
@@ -179,12 +182,12 @@ def status(
     elif absent:
         typer.echo(f"error: {answer['headline']} {running_elsewhere(problem)}".rstrip(), err=True)
     else:
-        typer.echo("\n".join(status_lines(answer)))
+        typer.echo("\n".join(status_lines(answer, stages=stages)))
     if absent or (check and answer["headline"]):
         raise typer.Exit(ExitCode.FAILED)
 
 
-def _watch(visitor: OperatorClient, *, as_json: bool) -> NoReturn:
+def _watch(visitor: OperatorClient, *, stages: bool, as_json: bool) -> NoReturn:
     """Show how a cell is every second, until interrupted."""
     screen = sys.stdout.isatty() and not as_json
     while True:
@@ -193,9 +196,9 @@ def _watch(visitor: OperatorClient, *, as_json: bool) -> NoReturn:
         if as_json:
             typer.echo(json_text(answer, None))
         elif screen:
-            typer.echo(_drawn(status_lines(answer)), nl=False)
+            typer.echo(_drawn(status_lines(answer, stages=stages)), nl=False)
         else:
-            typer.echo("\n".join((*status_lines(answer), "")))
+            typer.echo("\n".join((*status_lines(answer, stages=stages), "")))
         time.sleep(max(until_s - time.monotonic(), 0.0))
 
 
@@ -425,8 +428,14 @@ def _ask(
         typer.echo(line)
 
 
-def status_lines(status: dict[str, Any]) -> list[str]:
-    """Return a status as lines of text: first what is wrong, and who is not well."""
+def status_lines(status: dict[str, Any], *, stages: bool = False) -> list[str]:
+    """Return a status as lines of text: first what is wrong, and who is not well.
+
+    Parameters
+    ----------
+    stages : bool
+        Whether times of stages and counts of flows follow.
+    """
     headline = status["headline"]
     lines = [f"{status['cell']} is {status['health']}: {headline}"] if headline else []
     if status["health"] == "absent":
@@ -470,4 +479,22 @@ def status_lines(status: dict[str, Any]) -> list[str]:
         state = "ready" if process["ready"] else "not ready" if process["heard"] else "silent"
         note = f"  {process['note']}" if process["note"] else ""
         lines.append(f"  {who:24} {state:10} {process['age_ms']:8.0f} ms{note}")
+    return lines + _stage_lines(status) if stages else lines
+
+
+def _stage_lines(status: dict[str, Any]) -> list[str]:
+    """Return tables of stages and flows; without a complete window, that there is none yet."""
+    if not status.get("stages"):
+        return ["stages and flows: no window has been counted yet"]
+    columns: tuple[str, ...] = ("jobs", "replaced", "dropped")
+    lines = [f"{'stage':32}median ms   p95 ms{''.join(f'{name:>10}' for name in columns)}"]
+    for name, one in status["stages"].items():
+        times = (one["exec_median_ms"], one["exec_p95_ms"])
+        shown = "".join(f"{'-' if ms is None else f'{ms:.1f}':>9}" for ms in times)
+        lines.append(f"  {name:30}{shown}{''.join(f'{one[name]:10}' for name in columns)}")
+    columns = "sent", "taken", "replaced", "dropped", "lost", "in_flight"
+    lines.append(f"{'flow':32}{''.join(f'{name:>10}' for name in columns)}      kB/s")
+    for name, one in status["flows"].items():
+        counts = "".join(f"{one[name]:10}" for name in columns)
+        lines.append(f"  {name:30}{counts}{one['bytes_per_s'] / 1e3:10.1f}")
     return lines

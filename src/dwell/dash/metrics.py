@@ -22,7 +22,7 @@ from dwell.live.failures import start_thread
 from dwell.live.health import Health
 from dwell.live.wiring import roles
 
-Kind: TypeAlias = Literal["counter", "gauge", "info"]
+Kind: TypeAlias = Literal["counter", "gauge", "info", "summary"]
 
 #: Upper bounds of the latencies that are counted together; the cell's deadline is one more.
 BUCKETS_S = (
@@ -52,6 +52,9 @@ SENTENCES: Mapping[Kind, Mapping[str, str]] = {
         "dwell_certificate_expiry_timestamp_seconds": "Beginning of the day on which a certificate "
         "ends.",
     },
+    "summary": {
+        "dwell_stage_seconds": "Time of a stage's jobs from start to end in the last window.",
+    },
     "info": {
         "dwell_placement": "Placement of the newest cycle.",
         "dwell_task_placement": "Where a task runs under the placement of the newest cycle.",
@@ -66,10 +69,12 @@ SENTENCES: Mapping[Kind, Mapping[str, str]] = {
         "dwell_migrations": "Moves of the cell since the controller began, by reason; those of the "
         "guard among them.",
         "dwell_windows": "Closed windows of the run.",
+        "dwell_stage_inputs": "Inputs of a stage since its state folder was made, by outcome.",
+        "dwell_flow_bytes": "Payloads sent in a flow since its sender's state folder was made.",
     },
 }
 #: What follows the name of a metric in its samples.
-SUFFIXES: Mapping[Kind, str] = {"counter": "_total", "gauge": "", "info": "_info"}
+SUFFIXES: Mapping[Kind, str] = {"counter": "_total", "gauge": "", "info": "_info", "summary": ""}
 
 #: Labels beside the cell's, and the value; None where nobody knows it.
 Samples: TypeAlias = Iterable[tuple[Mapping[str, str], float | None]]
@@ -140,8 +145,8 @@ class CellMetrics(Collector):
         placed: Mapping[str, str] = problem.candidates.get(placement, {})
         # Of a controller that does not answer, nothing is known.
         status: Mapping[str, Any] = {} if health == "absent" else now.status
-        window, moves, processes = (
-            status.get(name) or {} for name in ("window", "moves", "processes")
+        window, moves, processes, stages, flows = (
+            status.get(name) or {} for name in ("window", "moves", "processes", "stages", "flows")
         )
         estimates, used = window.get("estimates") or {}, window.get("utilisation") or {}
         bound_ms, resources = status.get("bound_ms"), problem.fabric.resources
@@ -163,6 +168,11 @@ class CellMetrics(Collector):
             ],
             "dwell_clock_bound_seconds": [({}, None if bound_ms is None else bound_ms / 1e3)],
             "dwell_window_unproven": [({}, status.get("unproven"))],
+            "dwell_stage_seconds": [
+                ({**_stage(name), "quantile": quantile}, None if ms is None else ms / 1e3)
+                for name, one in stages.items()
+                for quantile, ms in (("0.5", one["exec_median_ms"]), ("0.95", one["exec_p95_ms"]))
+            ],
             "dwell_process_heard": [({"process": who}, heard[who]) for who in heard if status],
             "dwell_process_ready": [
                 ({"process": who}, processes[who]["ready"]) for who in heard if heard[who]
@@ -180,6 +190,15 @@ class CellMetrics(Collector):
             "dwell_silences": [({}, status.get("silences"))],
             "dwell_migrations": [({"reason": one}, moves.get(one)) for one in MOVED_BY],
             "dwell_windows": [({}, status.get("windows"))],
+            "dwell_stage_inputs": [
+                ({**_stage(name), "outcome": end}, count)
+                for name, one in stages.items()
+                for end, count in one["inputs_total"].items()
+            ],
+            "dwell_flow_bytes": [
+                (dict(zip(("source", "target"), name.split("->"), strict=True)), one["bytes_total"])
+                for name, one in flows.items()
+            ],
         }
 
     def _certificates(self) -> Samples:
@@ -202,3 +221,9 @@ class CellMetrics(Collector):
                     exemplar = {"run": str(cycle.run), "cycle": str(cycle.number)}
                     of_cell = self._latency.labels(self._problem.name)
                     of_cell.observe(cycle.latency_ns / 1e9, exemplar)
+
+
+def _stage(name: str) -> dict[str, str]:
+    """Return the labels of ``TASK@NODE``."""
+    task, _, node = name.partition("@")
+    return {"task": task, "node": node}

@@ -19,6 +19,7 @@ MOST_CYCLES = 40_000
 SHOWN = (
     *("health", "headline", "mode", "fallback", "moving_to", "proving", "pinned", "drained"),
     *("migrations", "guard_moves", "unproven", "bound_ms", "silences", "release_ratio"),
+    *("stages", "flows"),
 )
 
 

@@ -15,9 +15,10 @@ from dwell.errors import LiveError
 from dwell.live.continuity import SetbackDetector
 from dwell.live.failures import start_thread
 from dwell.live.keys import TWICE
-from dwell.live.messages import Carried, Load, encode
+from dwell.live.messages import Carried, Load, StageCounts, encode
 from dwell.live.relay_batch import MOST_MESSAGES, RelayBatch
 from dwell.live.role import Pulse, RolePlace
+from dwell.live.stage_counts import REPORT_NS
 from dwell.live.supervision import Supervisor
 from dwell.live.transport.abandoned import OUT_OF_FILES
 from dwell.live.transport.transport import Arrival
@@ -94,6 +95,8 @@ class Agent:
     ----------
     busy_ns : callable
         Returns the core-nanoseconds that the node has been busy so far.
+    stages : callable, optional
+        Returns the counts of the node's workers.
     """
 
     def __init__(
@@ -102,8 +105,11 @@ class Agent:
         supervisor: Supervisor,
         busy_ns: Callable[[], int],
         accelerator: Gauge | None = None,
+        stages: Callable[[], Iterable[StageCounts]] = tuple,
     ) -> None:
         self.place, self.supervisor = place, supervisor
+        self._read_stages = stages
+        self._stages: tuple[StageCounts, ...] = ()
         self._busy_ns, self._accelerator = busy_ns, accelerator
         self.cpu_clock: Callable[[], int] = time.process_time_ns
         # No guard waits for it: it carries nothing that a cycle needs.
@@ -113,6 +119,7 @@ class Agent:
         self._chores: dict[Callable[[int], None], int] = {
             lambda _: supervisor.step(): LOOK_NS,
             lambda _: supervisor.tend(): HOUSEKEEPING_NS,
+            self._count: REPORT_NS,
             self._report: LOAD_NS,
         }
         self._due_ns = dict.fromkeys(self._chores, 0)
@@ -197,6 +204,10 @@ class Agent:
     def _put(self, key: str, messages: list[tuple[str, bytes]]) -> None:
         self.place.transport.put(key, encode(Carried(tuple(messages))))
 
+    def _count(self, _: int) -> None:
+        """Read what the next report of the load says of stages."""
+        self._stages = tuple(self._read_stages())
+
     def _report(self, now_ns: int) -> None:
         place = self.place
         processes = {who: round(s * 1e9) for who, s in self.supervisor.cpu_seconds().items()}
@@ -210,5 +221,6 @@ class Agent:
         used = -1.0 if self._accelerator is None else self._accelerator.value()
         spent = busy_ns, self._spent["own"], self._spent["shadow"]
         each = *processes.items(), (place.who, self.cpu_clock())
-        load = Load(place.node, place.life, now_ns, *spent, used, each)
+        load = Load(place.node, place.life, now_ns, *spent, used, each, self._stages)
+        self._stages = ()
         place.put_twice(place.keys.load(place.node), load)

@@ -218,7 +218,7 @@ class ControlledCell:
                     if guess or self._goes_on(done.stamp, who, now_ns, alone=True):
                         windows.completed(done, now_ns)
                 case "load" if windows is not None:
-                    windows.loaded(self.place.load(sample))
+                    windows.loaded(self.place.load(sample), now_ns)
                 case "accepted":
                     answer = self.place.read(sample, Accepted, lambda _: self.place.stamper[0])
                     self._answered(answer, now_ns)
@@ -755,6 +755,8 @@ class ControlledCell:
             "moves": dict(self.moves),
             "disbelieved": self.continuity.leaps,
             "window": {**self._window, "age_ms": age_ms} if self._window else {},
+            "stages": {},
+            "flows": {},
             **(self.windows.status() if self.windows is not None else {}),
             **(self.windows.symptoms(now_ns) if self.windows is not None else {}),
             "processes": self._processes(now_ns),

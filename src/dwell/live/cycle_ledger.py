@@ -612,12 +612,12 @@ class Ledger:
             if cycle.shifts[hop.node].bound_ns >= UNBOUNDED_NS:
                 continue
             shift_ns = ready_ns - hop.arrived_ns
-            if hop.ended_ns != UNKNOWN:
+            if hop.ended_ns != UNKNOWN and not hop.warmup:
                 known["start_ns"][row, column] = max(hop.started_ns + shift_ns, 0)
                 known["end_ns"][row, column] = max(hop.ended_ns + shift_ns, 0)
                 known["work_ns"][row, column] = self._work_ns(hop)
             # Where a shadow stops, its last messages arrive for a job that never runs.
-            if hop.ended_ns != UNKNOWN or hop.task not in self.sinks:
+            if not hop.warmup and (hop.ended_ns != UNKNOWN or hop.task not in self.sinks):
                 known["ready_ns"][row, column] = max(ready_ns, 0)
             for source, arrived_ns in hop.inputs:
                 flow = self._flows.get((source, hop.task))
@@ -639,7 +639,7 @@ class Ledger:
         """Return source and target of the first message that is not known to have arrived.
 
         Only those to other nodes count, and an image before all others: beats, which small messages
-        share their lane with, say nothing of it.
+        share their lane with, say nothing of it. A task whose inputs were replaced sends nothing.
 
         Parameters
         ----------
@@ -654,11 +654,13 @@ class Ledger:
             if nodes[hop.task] == hop.node
             for source, _ in hop.inputs
         }
-        missing = [
-            flow
-            for flow in self._forward
-            if nodes[flow.source] != nodes[flow.target] and (flow.source, flow.target) not in there
-        ]
+        idle = {hop.task for hop in hops if hop.ended_ns == UNKNOWN and nodes[hop.task] == hop.node}
+        missing = []
+        for one in self._forward:
+            if one.source in idle:
+                idle.add(one.target)
+            elif nodes[one.source] != nodes[one.target] and (one.source, one.target) not in there:
+                missing.append(one)
         images = (flow for flow in missing if lane_of(flow.payload_bytes) == "images")
         flow = next(images, None) or next(iter(missing), None)
         if flow is None:

@@ -133,8 +133,11 @@ def _window_was_due(problem: Problem, status: Mapping[str, Any]) -> bool:
 def _no_cycle(status: Mapping[str, Any]) -> str | None:
     if not status["window"] or status["done_cycles"] or not status["heard_cycles"]:
         return None
-    notes = [one["note"] for one in status["processes"].values() if one["heard"] and one["note"]]
-    return f"no cycle of the last window was completed{_because(notes[:1])}"
+    heard = [(who, one) for who, one in status["processes"].items() if one["heard"] and one["note"]]
+    # First those that cannot work; an agent's note is about its node.
+    heard.sort(key=lambda item: (item[1]["ready"], item[0].startswith("agent@")))
+    notes = [one["note"] for _, one in heard[:1]]
+    return f"no cycle of the last window was completed{_because(notes)}"
 
 
 def _symptoms(
@@ -144,21 +147,21 @@ def _symptoms(
     sinks = [role for role in members if role.kind == "sink"]
     patience_ms = (problem.controller.guard_cycles + 1) * problem.pipeline.period_ms
     limit_ms = max(patience_ms, problem.max_age_ms)
+    slow = list(_slow(problem, status))
     for role in sinks:
         sink = status["sinks"][role.task]
         age_ms = status["begun_ms"] if sink["applied_age_ms"] is None else sink["applied_age_ms"]
         if _heard(status, role) and age_ms > limit_ms:
-            why = _notes(status, [role.who])
             # By its last outcome, the gate lets no command through.
-            if sink["outcome"] == STALE:
-                oldest = f"max_age_ms ({problem.max_age_ms:g})"
-                why.insert(0, f"by the clocks, commands are older than {oldest} when they come")
+            late = [*slow, _stale(problem, sink["stale_ms"])] if sink["outcome"] == STALE else []
+            why = [*late, *_notes(status, [role.who])]
             yield f"{role.who} has applied nothing since {_time(age_ms)}{_because(why)}"
     recent = status["recent"]
     rates = recent["violation_rates"]
     placed = problem.candidates[status["placement"]].items()
     names = [*(f"{task}@{node}" for task, node in placed), *(role.who for role in sinks)]
-    why = [*_unreached(problem, status, recent["unreached"]), *_notes(status, names)]
+    unreached = [] if slow else _unreached(problem, status, recent["unreached"])
+    why = [*slow, *unreached, *_notes(status, names)]
     yield from _uneven(problem, status, why)
     if problem.live.degraded_by(rates):
         rate = sum(rates) / len(rates)
@@ -172,6 +175,28 @@ def _symptoms(
             *_notes(status, [f"{task}@{node}.shadow" for task, node in placed]),
         ]
         yield f"the last {found['shadows']} shadows through {name} have failed{_because(why)}"
+
+
+def _slow(problem: Problem, status: Mapping[str, Any]) -> Iterator[str]:
+    """Yield which stages take longer than a period, and what this costs."""
+    for one in status["slow"]:
+        lost = f": {one['replaced']} of {one['inputs']} inputs were replaced"
+        takes = f"{one['stage']} takes {one['exec_ms']:.0f} ms of {problem.pipeline.period_ms:.0f}"
+        yield f"{takes}{lost if one['replaced'] else ''}"
+
+
+def _stale(problem: Problem, age_ms: float | None) -> str:
+    """Say whether commands are old, or only the clocks say so.
+
+    Parameters
+    ----------
+    age_ms : float or None
+        Age of the last stale command by the controller's clock alone, if known.
+    """
+    limit = f"max_age_ms ({problem.max_age_ms:g})"
+    if age_ms is None or age_ms <= problem.max_age_ms:
+        return f"by the clocks, commands are older than {limit} when they come"
+    return f"commands are {age_ms:.0f} ms old when they come, more than {limit}"
 
 
 def _uneven(problem: Problem, status: Mapping[str, Any], why: list[str]) -> Iterator[str]:

@@ -33,6 +33,7 @@ from dwell.live.loads import ProcessLoads
 from dwell.live.messages import Completion, Load, Stamp, Stamped
 from dwell.live.offsets import UNBOUNDED_NS, Offsets
 from dwell.live.run_rows import LiveWindow, Resume, RunRows, sends_shadows
+from dwell.live.stage_counts import StageTable
 from dwell.live.symptoms import Symptoms
 from dwell.model import Problem
 from dwell.model.window_close import window_close_ns
@@ -108,6 +109,7 @@ class LiveWindows:
         self._ledger = Ledger(problem, offsets)
         self._symptoms = Symptoms(problem, self._ledger)
         self._processes = ProcessLoads()
+        self._stages = StageTable(problem)
         self._keeps_jobs = resume.jobs
         self._size = problem.window_cycles
         self._period_ns = problem.pipeline.period_ns
@@ -192,9 +194,17 @@ class LiveWindows:
                     self._ledger.settle(cycle)
                     self.record.touch(cycle)
 
-    def loaded(self, load: Load) -> None:
-        """A node's agent has read its counters."""
+    def loaded(self, load: Load, at_ns: int = 0) -> None:
+        """A node's agent has read its counters.
+
+        Parameters
+        ----------
+        at_ns : int, optional
+            When this was heard, on the controller's clock.
+        """
         if load.node in self._ledger.loads:
+            if self._newest is not None:
+                self._stages.take(load, self._newest[0].key, at_ns)
             self._ledger.loads[load.node].report(load)
             if self._keeps_jobs:
                 self._processes.report(load.node, load.at_ns, load.processes)
@@ -571,7 +581,25 @@ class LiveWindows:
 
     def symptoms(self, now_ns: int) -> dict[str, object]:
         """Return what the cycles say of the cell's health, as plain values (see `Symptoms`)."""
-        return self._symptoms.status(list(reversed(self._by_key.values())), now_ns)
+        found = self._symptoms.status(list(reversed(self._by_key.values())), now_ns)
+        if self._newest is None:
+            return {**found, "stages": {}, "flows": {}, "slow": [], "counted_cycles": None}
+        newest = self._newest[0]
+        slow = self._stages.slow(self.problem.candidates[newest.placement], newest.key)
+        recent = found["recent"]
+        if (ways := recent["unreached"]) is not None:
+            source, target = ways[0], ways[1].partition("@")[0]
+            if self._stages.withholds(source, target, newest.key):
+                recent["unreached"] = None
+        stages = self._stages.status(newest.key, now_ns, partial(self._span_ns, newest.run))
+        return {**found, **stages, "slow": list(slow)}
+
+    def _span_ns(self, run: int, begin: int, end: int) -> int:
+        """Time between the releases of two cycles; by the period where one is not known."""
+        first, last = (self._by_key.get((run, number)) for number in (begin, end))
+        if first is None or last is None or last.at_ns <= first.at_ns:
+            return (end - begin) * self._period_ns
+        return last.at_ns - first.at_ns
 
     def status(self) -> dict[str, object]:
         """Return how the windows are, as plain values."""

@@ -113,6 +113,8 @@ class Hop(_Array, frozen=True):
         those of no such group; -1 where that is not known.
     group_ns : tuple of int
         CPU time that the group had taken when the job started, and when the stage returned.
+    warmup : bool
+        Whether its worker had not completed its `warmup_jobs` yet.
     """
 
     task: Name
@@ -126,6 +128,7 @@ class Hop(_Array, frozen=True):
     others_ns: Spent = -1
     outside_ns: Spent = -1
     group_ns: tuple[Spent, Spent] = (-1, -1)
+    warmup: bool = False
 
 
 class Header(_Array, frozen=True):
@@ -321,6 +324,57 @@ class Answer(_Array, frozen=True):
     status: dict[str, Any]
 
 
+class InputCounts(_Array, frozen=True):
+    """Inputs of a worker from one ``TASK@NODE``, by outcome."""
+
+    source: Name
+    taken: Count
+    replaced: Count
+    dropped: Count
+    waiting: Count
+
+
+class OutputCounts(_Array, frozen=True):
+    """Outputs of a worker to one ``TASK@NODE``.
+
+    Parameters
+    ----------
+    total_bytes : int
+        Payloads of all blocks.
+    """
+
+    target: Name
+    sent: Count
+    payload_bytes: Count
+    total_bytes: Count
+
+
+class StageCounts(_Array, frozen=True):
+    """Jobs and messages of a worker in one block of cycles (see `dwell.live.stage_counts`).
+
+    Parameters
+    ----------
+    median_ns, p95_ns : int
+        Time of a job from start to end; 0 without jobs.
+    replaced, dropped : int
+        Cycles of which an input was replaced, or dropped.
+    totals : tuple of int
+        Inputs of all blocks that were taken, replaced and dropped.
+    """
+
+    who: Name
+    run: Count
+    block: Count
+    jobs: Count
+    median_ns: Count
+    p95_ns: Count
+    replaced: Count
+    dropped: Count
+    inputs: Annotated[tuple[InputCounts, ...], msgspec.Meta(max_length=256)]
+    outputs: Annotated[tuple[OutputCounts, ...], msgspec.Meta(max_length=256)]
+    totals: tuple[Count, Count, Count]
+
+
 class Load(_Array, frozen=True):
     """Work of a node's CPU since its agent began to count.
 
@@ -336,6 +390,8 @@ class Load(_Array, frozen=True):
         Utilisation of the node's accelerators where a hook measures it; -1 otherwise.
     processes : tuple of (str, int)
         CPU time of each of the cell's processes there, the agent's included, since it was started.
+    stages : tuple of StageCounts
+        Once a second, the last two blocks of each worker; empty between.
     """
 
     node: Name
@@ -346,6 +402,7 @@ class Load(_Array, frozen=True):
     shadow_ns: Count
     accelerator: Annotated[float, msgspec.Meta(ge=-1.0, le=1e9)] = -1.0
     processes: Annotated[tuple[tuple[Name, Count], ...], msgspec.Meta(max_length=1_000)] = ()
+    stages: Annotated[tuple[StageCounts, ...], msgspec.Meta(max_length=1_000)] = ()
 
 
 class Snapshot(_Array, frozen=True):

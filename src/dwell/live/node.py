@@ -22,6 +22,7 @@ from dwell.live.launcher import ForkServer
 from dwell.live.log import Log
 from dwell.live.recording import RunRecorder
 from dwell.live.security import Security
+from dwell.live.stage_counts import read_books
 from dwell.live.state_files import make_folder
 from dwell.live.supervision import Supervisor
 from dwell.live.transport.orphans import remove_orphans
@@ -95,7 +96,8 @@ def run_agent(
                 supervisor.keep(role.who, words(role.who))
         place = security.place(who, node, transport, Log(say))
         gauge = None if accelerator is None else Gauge(accelerator)
-        agent = Agent(place, supervisor, _busy_clock(problem, node, say), gauge)
+        stages = partial(read_books, problem, wiring.on(node), folder)
+        agent = Agent(place, supervisor, _busy_clock(problem, node, say), gauge, stages)
         clock, complain = platform.clock(problem, node), place.complain
         hosted = Hosted(agent, transport, clock, stopped=stopped, complain=complain)
         keep_collections_short()

@@ -29,8 +29,16 @@ from dwell.live.role import Pulse, RoleLogic, RolePlace
 from dwell.live.security import Security
 from dwell.live.sink import Rest, Sink
 from dwell.live.stage import CellActuator, load_actuator, load_stage
+from dwell.live.stage_counts import StageBook, book_path
 from dwell.live.stamper import Stamper
-from dwell.live.state_files import BookFile, HighestFile, InFlight, boot_id, make_folder
+from dwell.live.state_files import (
+    BookFile,
+    HighestFile,
+    InFlight,
+    boot_id,
+    kept_memory,
+    make_folder,
+)
 from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import Role as Named
 from dwell.live.wiring import wire
@@ -168,12 +176,14 @@ def _work(
         broken = False, f"{role.who}: {error}"
         _host(_Broken(place, lambda: broken), place, stopped, clock)
         return
+    memory = partial(kept_memory, book_path(folder, role.who))
     worker = Worker(
         place,
         role.task,
         stage,
         shadow=role.kind == "shadow",
         stands_by=f"{role.task}@{role.node}" if role.kind == "standby" else "",
+        book=StageBook(problem, role.task, role.node, memory),
     )
     if group is not None:
         worker.group_clock = group.counts

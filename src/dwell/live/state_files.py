@@ -112,6 +112,14 @@ def _required(path: Path, size: int) -> mmap.mmap:
         raise LiveError(f"{path}: {why}") from None
 
 
+def kept_memory(path: Path, size: int) -> mmap.mmap | bytearray:
+    """Map a file for counts; memory of the process's own where the disk has no room."""
+    try:
+        return _mapped(path, size)
+    except OSError:
+        return bytearray(size)
+
+
 class _Slots:
     """Two slots of mapped memory, written in turn.
 

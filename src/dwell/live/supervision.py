@@ -38,7 +38,10 @@ POISONOUS = 2
 #: A process has warmed up after this time; it is reported when it has gained this much since, and
 #: has more than twice what it had then.
 WARM_S, GROWTH_BYTES = 30.0, 128 << 20
-#: How long it is told that a process has died for want of memory, or what has been put aside.
+#: Memory above its largest so far from which on a process still grows.
+GROWS_BYTES = 1 << 20
+#: Time for which notes repeat that a process has died for want of memory, that a message has been
+#: put aside, or, since the last growth, that memory grows.
 TOLD_S = 60.0
 #: An agent is not ready while a process of its node has died so often, one start after another.
 MOST_TRIES = 10
@@ -75,6 +78,9 @@ class SupervisedProcess:
     has_bytes: int = 0
     watched: psutil.Process | None = None
     warm_bytes: int | None = None
+    #: Its largest memory so far, the instant of that, and the note about its growth.
+    peak_bytes: int = 0
+    peak_s: float = -math.inf
     growth: str = ""
 
     @property
@@ -242,7 +248,7 @@ class Supervisor:
         except OSError as error:
             self._died(child, f"could not be started ({error.strerror})")
             return
-        child.warm_bytes, child.growth = None, ""
+        child.warm_bytes, child.peak_bytes, child.growth = None, 0, ""
         self._write_mark(child)
 
     def _write_mark(self, child: SupervisedProcess) -> None:
@@ -286,7 +292,10 @@ class Supervisor:
             return
         # Without what it shares with others: the payloads in shared memory.
         child.has_bytes = has_bytes = memory.rss - memory.shared
-        if time.monotonic() - child.started_s < self._warm_s:
+        now_s = time.monotonic()
+        if has_bytes > child.peak_bytes + GROWS_BYTES:
+            child.peak_bytes, child.peak_s = has_bytes, now_s
+        if now_s - child.started_s < self._warm_s:
             return
         before = child.warm_bytes
         if before is None:
@@ -326,8 +335,8 @@ class Supervisor:
         notes = [self._lost] if self._lost_s > since_s else []
         notes += [child.note for child in ailing]
         notes += [child.told for child in self.children if child.told_s > since_s]
-        notes += [child.growth for child in self.children if child.growth]
-        return "; ".join(dict.fromkeys(notes))[:2000]
+        notes += [child.growth for child in self.children if child.peak_s > since_s]
+        return "; ".join(dict.fromkeys(filter(None, notes)))[:2000]
 
     def stop(
         self, patience_s: float = STOP_S, *, hurried: threading.Event | None = None

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dwell.live.cycle_ledger import SHADOW, Ledger, LiveCycle
-from dwell.live.messages import ACTUATED, Completion
+from dwell.live.messages import ACTUATED, STALE, Completion
 from dwell.live.run_rows import LiveWindow
 from dwell.model import Problem
 from dwell.model.live import RECENT_WINDOWS
@@ -98,7 +98,8 @@ class Symptoms:
             per period, over the time of three windows; None before the first has passed.
             ``recent``: V_D and `_commands` of the last windows, and the message that most of their
             lost cycles lack. ``sinks``: age of
-            the last command that was applied, or None, and what came of the last one. ``failing``:
+            the last command that was applied, or None, what came of the last one, and the time
+            from stamp to completion of the last stale one, as both came here, or None. ``failing``:
             by candidate, how many of its last shadows failed in a row, at most g + 1, and the
             message that the last one lacks. Messages are source and target, as ``task@node``.
         """
@@ -114,7 +115,9 @@ class Symptoms:
                 **self._commands(),
                 "unreached": self._mostly_unreached(),
             },
-            "sinks": {sink: self._sink(sink, now_ns) for sink in sorted(self._ledger.sinks)},
+            "sinks": {
+                sink: self._sink(sink, newest, now_ns) for sink in sorted(self._ledger.sinks)
+            },
             "failing": dict(self._failing(newest)),
         }
 
@@ -150,10 +153,19 @@ class Symptoms:
             found["cycles"].append((first.number, cycles[-1].number))
         return found
 
-    def _sink(self, sink: str, now_ns: int) -> dict[str, Any]:
+    def _sink(self, sink: str, newest: Sequence[LiveCycle], now_ns: int) -> dict[str, Any]:
         at_ns = self._applied_ns.get(sink)
         age_ms = None if at_ns is None else round((now_ns - at_ns) / 1e6, 1)
-        return {"applied_age_ms": age_ms, "outcome": self._outcomes.get(sink)}
+        stale = (
+            round(cycle.interval_ns / 1e6, 1)
+            for cycle in newest
+            if cycle.interval_ns is not None
+            and sink in cycle.reports
+            and cycle.reports[sink].outcome == STALE
+        )
+        outcome = self._outcomes.get(sink)
+        stale_ms = next(stale, None) if outcome == STALE else None
+        return {"applied_age_ms": age_ms, "outcome": outcome, "stale_ms": stale_ms}
 
     def _mostly_unreached(self) -> tuple[str, str] | None:
         lost = (

@@ -27,6 +27,7 @@ from dwell.live.payloads import read_payload, write_payload
 from dwell.live.role import BeatState, Pulse, RolePlace
 from dwell.live.routing import STAMPER, Routes
 from dwell.live.stage import CellStage, Message
+from dwell.live.stage_counts import DROPPED, REPLACED, TAKEN, StageBook
 from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import SPARE, lane_of, longest_bytes
 from dwell.model.instants import EVIDENCE_NS, NEVER_NS
@@ -68,6 +69,11 @@ class Job:
         """Run and cycle: what later jobs have more of."""
         return self.header.stamp.key
 
+    @property
+    def headers(self) -> Iterable[Header]:
+        """Headers of the inputs."""
+        return (header for header, _, _ in self.inputs.values())
+
     def hops(self) -> tuple[Hop, ...]:
         """All jobs behind it, each once."""
         hops = (hop for header, _, _ in self.inputs.values() for hop in header.hops)
@@ -101,9 +107,16 @@ class Chore:
 
 @dataclass(slots=True)
 class _Joins:
-    """Inputs of cycles that wait for the rest; a later complete cycle evicts the earlier ones."""
+    """Inputs of cycles that wait for the rest; a later complete cycle evicts the earlier ones.
+
+    Parameters
+    ----------
+    drop : callable
+        Takes the headers of inputs that come too late, or are evicted.
+    """
 
     sources: frozenset[str]
+    drop: Callable[[Iterable[Header]], None]
     waiting: dict[tuple[int, int], Inputs] = field(default_factory=dict)
     newest: tuple[int, int] = (-1, -1)
 
@@ -111,16 +124,22 @@ class _Joins:
         """Take an input; returns the complete set that it completes."""
         cycle = header.stamp.key
         if cycle <= self.newest or header.source not in self.sources:
+            self.drop([header])
             return None
         inputs = self.waiting.setdefault(cycle, {})
         inputs.setdefault(header.source, (header, payload, at_ns))
         if len(inputs) < len(self.sources):
             if len(self.waiting) > MAX_JOINS:
-                del self.waiting[min(self.waiting)]
+                self._evict(min(self.waiting))
             return None
         self.newest = cycle
-        self.waiting = {other: kept for other, kept in self.waiting.items() if other > cycle}
+        del self.waiting[cycle]
+        for other in [other for other in self.waiting if other < cycle]:
+            self._evict(other)
         return inputs
+
+    def _evict(self, cycle: tuple[int, int]) -> None:
+        self.drop(header for header, _, _ in self.waiting.pop(cycle).values())
 
 
 class _Source:
@@ -193,6 +212,8 @@ class Worker:
     ----------
     stands_by : str
         Process that it stands by for; empty for none.
+    book : StageBook, optional
+        Counts its jobs and messages, those of shadows excluded.
     """
 
     def __init__(
@@ -203,6 +224,7 @@ class Worker:
         *,
         shadow: bool = False,
         stands_by: str = "",
+        book: StageBook | None = None,
     ) -> None:
         self.place, self.task, self.stage = place, task, stage
         self.shadow, self.stands_by = shadow, stands_by
@@ -223,7 +245,13 @@ class Worker:
         self._framed_ns: int | None = None
         self.is_sink = not self._output_bytes
         self._depth = problem.pipeline.tasks[task].depth
-        self._joins = {MAIN: _Joins(sources), SHADOW: _Joins(sources)}
+        self.book = book or StageBook(problem, task, place.node)
+        self.book.begin()
+        self._warmup = problem.pipeline.tasks[task].warmup_jobs
+        self._joins = {
+            MAIN: _Joins(sources, lambda headers: self.book.ended(headers, DROPPED)),
+            SHADOW: _Joins(sources, lambda _: None),
+        }
         #: What is read at a job's start and after the stage was called; a stage that is said to use
         #: several threads is charged with all that its process does meanwhile.
         alone = problem.pipeline.tasks[task].on[place.node].threads == 1
@@ -316,11 +344,14 @@ class Worker:
         if header.source == STAMPER and self._source is not None:
             self._source.stamped(header, now_ns)
             return
+        if kind == MAIN and not self.stands_by:
+            self.book.arrived(header)
         declared = self._input_bytes.get(header.source)
         longest = 0 if declared is None else longest_bytes(declared)
         if len(sample.payload) > longest:
             what = f"{len(sample.payload)} bytes from {header.source}; at most {longest} are taken"
             self.place.complain(LiveError(f"{self.task} on {self.place.node}: {what}"))
+            self._joins[kind].drop([header])
             return
         complete = self._joins[kind].add(header, sample.payload, now_ns)
         if complete is None:
@@ -332,6 +363,7 @@ class Worker:
             # A shadow ends where the sink begins.
             self._end(job, "shadow")
         elif self._is_forked(job):
+            self.book.ended(job.headers, TAKEN)
             self._forked.append(job)
             if self._follows:
                 self._replay.append(job)
@@ -343,13 +375,16 @@ class Worker:
     def _replace(self, job: Job) -> None:
         """A later cycle has taken a job's place."""
         self.replaced += 1
+        if not job.shadow:
+            self.book.ended(job.headers, REPLACED)
         self._end(job, "shadow" if job.shadow else "replaced")
 
     def _end(self, job: Job, outcome: str) -> None:
         """Report a job that is here and will not run, with all that is known of its cycle."""
         place, at_ns = self.place, job.arrived_ns
         inputs = tuple((source, at_ns) for source, (_, _, at_ns) in job.inputs.items())
-        here = Hop(self.task, place.node, at_ns, UNKNOWN, UNKNOWN, inputs)
+        times = at_ns, UNKNOWN, UNKNOWN
+        here = Hop(self.task, place.node, *times, inputs, warmup=self.warms_up)
         hops = (*job.hops(), here)
         ended = Completion(job.header.stamp, self.task, at_ns, outcome, hops, place.node)
         place.put_twice(place.keys.ended(), ended)
@@ -533,6 +568,11 @@ class Worker:
             beat and beat.ready and detector.fresh(self.stands_by, self._now_ns, patience_ns)
         )
 
+    @property
+    def warms_up(self) -> bool:
+        """Whether its jobs are the first ones, which say nothing of the others."""
+        return self._warmup > 0
+
     def rest_s(self, now_ns: int) -> float:
         """Seconds after which there may be something to do without any message."""
         # A standby has to notice silence.
@@ -580,6 +620,8 @@ class Worker:
     def _taken(self, job: Job, now_ns: int) -> Job:
         self.busy_since_ns = now_ns
         self._busy_cycle = job.header.stamp.cycle
+        if not job.shadow:
+            self.book.ended(job.headers, TAKEN)
         return job
 
     def retry(self, shadow: bool, inputs: list[tuple[Header, bytes]], now_ns: int) -> None:
@@ -632,6 +674,10 @@ class Worker:
         self.busy_since_ns = None
         self.state_at = max(self.state_at, job.order)
         place, stamp = self.place, job.header.stamp
+        if warmup := self.warms_up:
+            self._warmup -= 1
+        elif not job.shadow:
+            self.book.ran(stamp, ended_ns - started_ns)
         runs_here = self.routes.runs(self.task, place.node, stamp)
         if runs_here and self._stateful:
             self._worked_at = max(self._worked_at, job.order)
@@ -654,7 +700,7 @@ class Worker:
         before, cpu_ns, after = self._counted
         spent = cpu_ns, *after.since(before)
         group_ns = before.group_ns, after.group_ns
-        hop = Hop(self.task, place.node, *times, inputs, state_age, *spent, group_ns)
+        hop = Hop(self.task, place.node, *times, inputs, state_age, *spent, group_ns, warmup)
         seal, hops = job.header.seal, (*job.hops(), hop)
         header = Header(stamp, self.task, place.node, kind, hops, job.shadow, seal)
         head = encode(header)
@@ -675,6 +721,8 @@ class Worker:
                     continue
                 key = place.keys.inputs(target, node, to)
                 place.transport.put(key, data, head, lane=lane_of(declared))
+                if to == MAIN:
+                    self.book.sent(stamp, f"{target}@{node}", len(data))
             self._plan_checkpoint(job, ended_ns)
 
     def framed(self, now_ns: int) -> None:
@@ -708,7 +756,7 @@ class Worker:
         count = self._failed_in_a_row
         recent = self._now_ns < self._failed_ns + EVIDENCE_NS
         if recent and count >= self.place.problem.controller.failures_in_a_row:
-            return False, f"{self.trouble} ({count} calls in a row have failed)"
+            return False, f"{self.trouble}, {count} calls in a row"
         if self.triggers and self._framed_ns is None:
             self._framed_ns = self._now_ns
         if self._framed_ns is not None and self._now_ns - self._framed_ns > limit_ns:

@@ -95,6 +95,12 @@ class Task:
     run: str | None = key(
         "Class or function of a live worker, as `package.module:Name`.", default=None
     )
+    warmup_jobs: int = key(
+        "First jobs of a live worker that do not count in times of stages and in estimators.",
+        Bound(0, MAX_COUNT, whole=True),
+        default=0,
+        is_rare=True,
+    )
 
     def __post_init__(self) -> None:
         if self.run is not None:

@@ -65,6 +65,7 @@ class CellView {
     this.decided(state);
     panel.health(this.root, state, this.page.stale);
     panel.facts(this.root, this.cell, state);
+    panel.stages(this.root, state);
     panel.heard(this.root, state);
     this.charts.read(state);
   }

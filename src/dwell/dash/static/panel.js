@@ -152,6 +152,24 @@ export const events = (root, cell, view, page) => {
   );
 };
 
+const END_WORDS = ["taken", "replaced", "dropped", "lost"];
+
+/** Show times of stages and counts of flows in the last window. */
+export const stages = (root, state) => {
+  const part = root.querySelector(".stages");
+  const times = Object.entries(state.stages ?? {});
+  part.hidden = !times.length;
+  const key = JSON.stringify([state.stages, state.flows]);
+  if (part.hidden || part.dataset.key === key) return;
+  part.dataset.key = key;
+  const rows = (body, lines) =>
+    body.replaceChildren(...lines.map(([name, ...texts]) => make("tr", {}, make("th", { scope: "row", text: name }), ...cells(texts))));
+  const [stage, flow] = part.querySelectorAll("tbody");
+  rows(stage, times.map(([name, one]) => [name, number(one.exec_median_ms, 1), number(one.exec_p95_ms, 1), count(one.jobs), count(one.replaced), count(one.dropped)]));
+  const flows = Object.entries(state.flows ?? {});
+  rows(flow, flows.map(([name, one]) => [name, count(one.sent), ...END_WORDS.map((end) => count(one[end])), count(one.in_flight), number(one.bytes_per_s / 1e3, 1)]));
+};
+
 export const heard = (root, state) => {
   const part = root.querySelector(".heard");
   part.hidden = !state.processes;
