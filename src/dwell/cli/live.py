@@ -396,7 +396,7 @@ def units(
     problem = load_without_traces(cell)
     files = write_units(problem, node, cell, out, user=user, keys=keys, insecure=insecure)
     copied = " ".join(shlex.quote(str(file)) for file in files)
-    names = " ".join(file.stem for file in files)
+    names = " ".join(shlex.quote(file.stem) for file in files)
     typer.echo(
         f"sudo cp {copied} /etc/systemd/system/\n"
         "sudo systemctl daemon-reload\n"
