@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import shutil
+import socket
 import subprocess
 from pathlib import Path
 
@@ -12,6 +13,8 @@ import pytest
 
 import dwell
 from dwell.cli.units import escaped_name, unit_texts, verify
+from dwell.live.wiring import wire
+from tests.cli.live_cell import PATIENCE_S, RealCell
 from tests.cli.small_cell import ROOT, SMALL, assert_refused, call
 
 CELL = ROOT / "examples" / "live" / "cell.yaml"
@@ -113,3 +116,29 @@ def test_the_manual_shows_these_units() -> None:
     assert shown == [made["R1"][agent_unit("R1")], made["E"][CONTROLLER_UNIT]]
     assert f"/{agent_unit('R1')}`" in page
     assert f"/{CONTROLLER_UNIT}`" in page
+
+
+def test_agents_and_controllers_report_to_systemd(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(tmp_path / "notify"))
+        systemd.settimeout(PATIENCE_S)
+        monkeypatch.setenv("NOTIFY_SOCKET", systemd.getsockname())
+        cell = RealCell(tmp_path)
+        try:
+            for who, name, start in (
+                ("agent@R1", "agent-R1", lambda: cell.agent("R1")),
+                ("controller@E", "controller", cell.controller),
+            ):
+                start()
+                assert systemd.recv(100) == b"READY=1"
+                end = wire(cell.problem).entry(who).listen["control"]
+                socket.create_connection((end.address, end.port), PATIENCE_S).close()
+                assert systemd.recv(100) == b"WATCHDOG=1"
+                assert cell.end(name) == 0
+                while (report := systemd.recv(100)) == b"WATCHDOG=1":
+                    pass
+                assert report == b"STOPPING=1"
+        finally:
+            cell.close()

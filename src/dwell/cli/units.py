@@ -21,10 +21,13 @@ MOST_FILES = 65_536
 UNIT = """\
 [Unit]
 Description={description}
+# It is started again for ever.
+StartLimitIntervalSec=0
 Wants=network-online.target{beside}
 After=network-online.target{beside}
 
 [Service]
+Type=notify
 User={user}
 StateDirectory=dwell
 {environment}ExecStart={command}
@@ -36,6 +39,8 @@ WantedBy=multi-user.target
 """
 #: Settings of each service beside those that both have.
 AGENT = f"""\
+# An agent that hangs is replaced; its processes go on.
+WatchdogSec=30
 # The agent ends its processes itself. Should it die alone, they work on, and the next agent takes
 # them over: systemd must not end them.
 KillMode=process
@@ -53,6 +58,7 @@ OOMPolicy=continue
 # CPUAffinity=2-5
 """
 CONTROLLER = f"""\
+WatchdogSec=60
 TimeoutStopSec=60
 LimitNOFILE={MOST_FILES}
 """

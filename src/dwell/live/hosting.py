@@ -162,17 +162,20 @@ class Hosted:
         self.hurry.set()
 
 
-def take_turns(all_hosted: Sequence[Hosted]) -> None:
+def take_turns(all_hosted: Sequence[Hosted], each_turn: Callable[[], None] = lambda: None) -> None:
     """Wake roles in this thread, always the one that is due first, until they are told to stop.
 
     Parameters
     ----------
     all_hosted : sequence of Hosted
         With the same `stopped` and the same `hurry`.
+    each_turn : callable, optional
+        Called before each role that is woken, and several times a second.
     """
     stopped, hurry = all_hosted[0].stopped, all_hosted[0].hurry
     try:
         while not stopped.is_set():
+            each_turn()
             first = min(all_hosted, key=Hosted.rest_ns)
             rest_ns = first.rest_ns()
             if rest_ns > 0:

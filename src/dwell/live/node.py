@@ -22,6 +22,7 @@ from dwell.live.launcher import ForkServer
 from dwell.live.log import Log
 from dwell.live.recording import RunRecorder
 from dwell.live.security import Security
+from dwell.live.service import Service
 from dwell.live.state_files import make_folder
 from dwell.live.supervision import Supervisor
 from dwell.live.transport.orphans import remove_orphans
@@ -83,6 +84,9 @@ def run_agent(
         say(unused)
     wiring = wire(problem)
     who = f"agent@{node}"
+    # Without the variables of systemd, which the processes must not have.
+    environment = dict(os.environ if environment is None else environment)
+    service = Service(who, environment)
     security = Security.of(problem, wiring.entry(who).role, environment)
     security.remember(make_folder(folder))
     security.remind(say, stopped)
@@ -99,8 +103,10 @@ def run_agent(
         clock, complain = platform.clock(problem, node), place.complain
         hosted = Hosted(agent, transport, clock, stopped=stopped, complain=complain)
         keep_collections_short()
-        hosted.run()
+        service.ready()
+        take_turns([hosted], service.step)
     finally:
+        service.stopping()
         failed = supervisor.stop(hurried=hurried)
         transport.close()
         # Those that have been killed could not remove theirs.
@@ -189,6 +195,8 @@ def run_controller(
     # No message waits for long while a window closes.
     sys.setswitchinterval(0.0005)
     recorders = []
+    environment = dict(os.environ if environment is None else environment)
+    service = Service(f"controller@{problems[0].controller_node}", environment)
     with ExitStack() as stack:
         hosted, hurry = [], threading.Event()
         for problem in problems:
@@ -213,9 +221,11 @@ def run_controller(
             )
             recorders.append((recorder, cell))
         keep_collections_short()
+        service.ready()
         try:
-            take_turns(hosted)
+            take_turns(hosted, service.step)
         finally:
+            service.stopping()
             folders = [_finished(recorder, cell) for recorder, cell in recorders]
         return [folder for folder in folders if folder is not None]
 

@@ -259,7 +259,7 @@ class Supervisor:
         if self.children and not self.folder.is_dir():
             self._make_folder()
         for child in self.children:
-            if _shorten(child.file("log"), self._log_bytes):
+            if shorten_log(child.file("log"), self._log_bytes):
                 child.log_begins = 0
             if child.process is not None and not child.file("pid").exists():
                 self._write_mark(child)  # there was no room for it
@@ -451,7 +451,7 @@ def _oom_kills() -> int:
         return 0
 
 
-def _shorten(path: Path, longest: int) -> bool:
+def shorten_log(path: Path, longest: int) -> bool:
     """Begin a log anew that is too long; its process goes on appending to the same file."""
     try:
         if path.stat().st_size <= longest:
