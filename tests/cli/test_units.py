@@ -127,11 +127,11 @@ def test_agents_and_controllers_report_to_systemd(
         monkeypatch.setenv("NOTIFY_SOCKET", systemd.getsockname())
         cell = RealCell(tmp_path)
         try:
-            for who, name, start in (
-                ("agent@R1", "agent-R1", lambda: cell.agent("R1")),
-                ("controller@E", "controller", cell.controller),
-            ):
-                start()
+            for who, name in (("agent@R1", "agent-R1"), ("controller@E", "controller")):
+                if name == "controller":
+                    cell.controller()
+                else:
+                    cell.agent("R1")
                 assert systemd.recv(100) == b"READY=1"
                 end = wire(cell.problem).entry(who).listen["control"]
                 socket.create_connection((end.address, end.port), PATIENCE_S).close()

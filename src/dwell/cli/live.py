@@ -21,10 +21,13 @@ from dwell.cli.options import (
     Insecure,
     Json,
     Keys,
+    LogFormat,
+    Logs,
     Node,
     Policy,
     Seed,
     argument,
+    begin_log,
     flag,
     option,
     require_held,
@@ -82,11 +85,13 @@ def agent(
     ] = None,
     keys: Keys = None,
     insecure: Insecure = False,
+    log_format: Logs = LogFormat.TEXT,
     owner: Owner = None,
 ) -> None:
     """Run a node of a live cell: its workers, and on the right nodes stamper and sinks."""
     from dwell.live import node_command
 
+    begin_log(log_format, f"agent@{node}")
     with _bad_parameters():
         node_command.agent(
             node,
@@ -119,11 +124,13 @@ def controller(
     cpus: Cpus = None,
     keys: Keys = None,
     insecure: Insecure = False,
+    log_format: Logs = LogFormat.TEXT,
     owner: Owner = None,
 ) -> None:
     """Decide where the stages of live cells run."""
     from dwell.live import node_command
 
+    begin_log(log_format, "controller")
     with _bad_parameters():
         node_command.controller(
             cell,
