@@ -19,7 +19,8 @@ from dwell.live.security import INSECURE, Security
 from dwell.live.transport.transport import Arrival
 from dwell.live.transport.zenoh import ZenohSettings, ZenohTransport
 from dwell.live.trust import KEYS
-from dwell.live.trust.authority import Authority, _general_name, _pem
+from dwell.live.trust.authority import Authority, _general_name
+from dwell.live.trust.request import private_pem
 from dwell.live.trust.roster import Subject, write_private
 from dwell.live.wiring import Locator, Role, WiringEntry, wire
 from dwell.model import Endpoint, Host, Problem
@@ -153,8 +154,8 @@ def expired(authority: Authority, folder: Path, seconds: float = -60.0) -> Path:
     public = key.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw)
     ends = datetime.now(UTC) + timedelta(seconds=seconds)
     subject = Subject("R2", "node", 1, 77, base64.b64encode(public).decode(), "2020-01-01")
-    made = authority._certificate(subject, key, [_general_name("127.0.0.1")], ends)
-    write_private(folder / "key.pem", _pem(key))
+    made = authority._certificate(subject, key.public_key(), [_general_name("127.0.0.1")], ends)
+    write_private(folder / "key.pem", private_pem(key))
     write_private(folder / "cert.pem", made.public_bytes(Encoding.PEM))
     write_private(folder / "ca.pem", authority.certificate.public_bytes(Encoding.PEM))
     return folder

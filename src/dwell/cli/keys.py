@@ -18,6 +18,11 @@ if TYPE_CHECKING:
 
 Folder = Annotated[Path, argument("FOLDER", "Folder of the authority.")]
 Name = Annotated[str, argument("NAME", "Node of the cell, or another subject.")]
+SubjectRole = Annotated[
+    str | None,
+    typer.Option(help="node, controller, operator or observer; the one it had if not given."),
+]
+Addresses = Annotated[list[str] | None, option("HOST", "Where it is reached; may be repeated.")]
 Days = Annotated[int, typer.Option(help="How long certificates hold.")]
 
 keys = typer.Typer(
@@ -64,13 +69,8 @@ def _addresses(problem: Problem, node: str) -> list[str]:
 def issue(
     folder: Folder,
     name: Name,
-    role: Annotated[
-        str | None,
-        typer.Option(help="node, controller, operator or observer; the one it had if not given."),
-    ] = None,
-    address: Annotated[
-        list[str] | None, option("HOST", "Where it is reached; may be repeated.")
-    ] = None,
+    role: SubjectRole = None,
+    address: Addresses = None,
     days: Days = 365,
     as_json: Json = False,
 ) -> None:
@@ -80,6 +80,45 @@ def issue(
     authority = Authority.open(folder)
     authority.issue(name, role, address, days=days)
     _show_changed(authority.roster, as_json=as_json)
+
+
+@keys.command()
+def request(
+    node: Annotated[
+        list[str], argument("NODE", "Node of the cell, or another subject; may be repeated.")
+    ],
+    out: Annotated[Path, option("FOLDER", "Where keyrings and requests go.")] = Path("keys"),
+) -> None:
+    """Make a key here, and a request for its certificate: no private key travels."""
+    from dwell.live.trust.request import request_certificate
+
+    made = [request_certificate(out, name) for name in node]
+    names = " ".join(path.name for path in made)
+    typer.echo(
+        f"{' '.join(map(str, made))}\n\nTake the requests to the folder of the authority: "
+        f"dwell keys sign {names}\nTake cert.pem, ca.pem and roster.json from there back into "
+        f"{', '.join(str(out / name) for name in node)}."
+    )
+
+
+@keys.command()
+def sign(
+    request: Annotated[
+        list[Path], argument("REQUEST", "What dwell keys request has made; may be repeated.")
+    ],
+    authority: Annotated[Path, option("FOLDER", "Folder of the authority.")] = Path("keys"),
+    role: SubjectRole = None,
+    address: Addresses = None,
+    days: Days = 365,
+    as_json: Json = False,
+) -> None:
+    """Issue the certificates that requests are for."""
+    from dwell.live.trust.authority import Authority
+
+    opened = Authority.open(authority)
+    for path in request:
+        opened.sign(path, role, address, days=days)
+    _show_changed(opened.roster, as_json=as_json)
 
 
 @keys.command()

@@ -233,7 +233,7 @@ def _tls(problem: Problem, keyring: Keyring) -> dict[str, object]:
     from dwell.live.permissions import subjects
     from dwell.live.trust.acl import access_control
 
-    certificate, key = str(keyring.folder / "cert.pem"), str(keyring.folder / "key.pem")
+    certificate, key = str(keyring.folder / "cert.pem"), str(keyring.key_file)
     tls = "transport/link/tls"
     may_put = subjects(problem, keyring.roster)
     return {

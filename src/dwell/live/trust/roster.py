@@ -28,6 +28,15 @@ MAX_BYTES = 1 << 20
 DOMAIN = b"dwell roster 1\0"
 
 
+def require_name(name: object) -> None:
+    """Raise a TrustError unless a subject can have a name."""
+    if not isinstance(name, str) or not NAME.fullmatch(name):
+        raise TrustError(
+            f"{name!r} is no name of a subject; write letters, digits, - and _, "
+            "beginning with a letter, 48 at most"
+        )
+
+
 @dataclass(frozen=True, slots=True)
 class Subject:
     """A holder of a certificate.
@@ -53,11 +62,7 @@ class Subject:
     expires: str
 
     def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not NAME.fullmatch(self.name):
-            raise TrustError(
-                f"{self.name!r} is no name of a subject; write letters, digits, - and _, "
-                "beginning with a letter, 48 at most"
-            )
+        require_name(self.name)
         if self.role not in ROLES:
             raise TrustError(f"{self.name}: no role {self.role!r}; there are {', '.join(ROLES)}")
         if type(self.generation) is not int or self.generation < 1:
