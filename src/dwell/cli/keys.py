@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from datetime import UTC, date, datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +13,7 @@ from dwell.cli.options import Json, argument, option
 from dwell.cli.output import aligned, print_json
 
 if TYPE_CHECKING:
-    from dwell.live.trust.roster import Roster
+    from dwell.live.trust.roster import Roster, Subject
     from dwell.model import Problem
 
 Folder = Annotated[Path, argument("FOLDER", "Folder of the authority.")]
@@ -74,7 +74,7 @@ def issue(
     days: Days = 365,
     as_json: Json = False,
 ) -> None:
-    """Issue a certificate with a new key; the one that the subject had is revoked."""
+    """Issue a certificate with a new key; those before hold until they end."""
     from dwell.live.trust.authority import Authority
 
     authority = Authority.open(folder)
@@ -123,7 +123,7 @@ def sign(
 
 @keys.command()
 def revoke(folder: Folder, name: Name, as_json: Json = False) -> None:
-    """Take a subject's certificate back."""
+    """Take a subject's certificates back."""
     from dwell.live.trust.authority import Authority
 
     authority = Authority.open(folder)
@@ -144,7 +144,7 @@ def show(
         _show(Authority.open(folder).roster, as_json=as_json)
         return
     keyring = Keyring.open(folder)
-    _show(keyring.roster, own=keyring.own.name, as_json=as_json)
+    _show(keyring.roster, own=keyring.own, as_json=as_json)
 
 
 def _show_changed(roster: Roster, *, as_json: bool) -> None:
@@ -156,7 +156,7 @@ def _show_changed(roster: Roster, *, as_json: bool) -> None:
         )
 
 
-def _show(roster: Roster, *, own: str = "", as_json: bool) -> None:
+def _show(roster: Roster, *, own: Subject | None = None, as_json: bool) -> None:
     today = datetime.now(UTC).date()
     if as_json:
         print_json(
@@ -167,8 +167,8 @@ def _show(roster: Roster, *, own: str = "", as_json: bool) -> None:
                     subject.name: {
                         "role": subject.role,
                         "generation": subject.generation,
-                        "expires": subject.expires,
-                        "days": _days(subject.expires, today),
+                        "expires": subject.ends.date().isoformat(),
+                        "days": (subject.ends.date() - today).days,
                     }
                     for subject in roster.subjects.values()
                 },
@@ -181,18 +181,14 @@ def _show(roster: Roster, *, own: str = "", as_json: bool) -> None:
             subject.name,
             subject.role,
             str(subject.generation),
-            subject.expires,
-            _remark(_days(subject.expires, today)),
-            "this keyring" if subject.name == own else "",
+            subject.ends.date().isoformat(),
+            _remark((subject.ends.date() - today).days),
+            "this keyring" if subject == own else "",
         )
-        for subject in roster.subjects.values()
+        for subject in roster.certificates
     ]
     typer.echo(f"cell {roster.cell}, roster {roster.number}, {len(roster.revoked)} revoked\n")
     typer.echo(aligned(("subject", "role", "generation", "ends", "", ""), rows))
-
-
-def _days(expires: str, today: date) -> int:
-    return (date.fromisoformat(expires) - today).days
 
 
 def _remark(days: int) -> str:

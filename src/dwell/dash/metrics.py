@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterable, Iterator, Mapping
-from datetime import UTC, datetime
 from typing import Any, Literal, TypeAlias, get_args
 
 from prometheus_client import Histogram, Metric
@@ -49,8 +48,8 @@ SENTENCES: Mapping[Kind, Mapping[str, str]] = {
         "unproven.",
         "dwell_process_heard": "Whether the controller hears a process of the cell.",
         "dwell_process_ready": "Whether a process that is heard can do its work.",
-        "dwell_certificate_expiry_timestamp_seconds": "Beginning of the day on which a certificate "
-        "ends.",
+        "dwell_certificate_expiry_timestamp_seconds": "Instant at which a subject's newest "
+        "certificate ends.",
     },
     "info": {
         "dwell_placement": "Placement of the newest cycle.",
@@ -185,8 +184,7 @@ class CellMetrics(Collector):
     def _certificates(self) -> Samples:
         keyring = self._observer.security.keyring
         for subject in () if keyring is None else keyring.roster.subjects.values():
-            ends = datetime.fromisoformat(subject.expires).replace(tzinfo=UTC)
-            yield {"subject": subject.name}, ends.timestamp()
+            yield {"subject": subject.name}, subject.ends.timestamp()
 
     def _keep_up(self) -> None:
         while not self._stopped.wait(EVERY_S):

@@ -176,7 +176,7 @@ def test_a_signature_is_for_one_cell(
     seals["R1"].require("order", CONTROLLER, sealed)
     other = issue(tmp_path / "keys", "another")["R1"]
     own = seals["R1"]._keyring.roster.subjects
-    other._keys = {name: subject.key for name, subject in own.items()}
+    other._keys = {name: [subject.key] for name, subject in own.items()}
     with pytest.raises(TrustError, match="order: not signed by controller"):
         other.require("order", CONTROLLER, sealed)
 

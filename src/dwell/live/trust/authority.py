@@ -124,7 +124,7 @@ class Authority:
         *,
         days: int = DAYS,
     ) -> Path:
-        """Issue a certificate with a new key; one that the subject had is revoked.
+        """Issue a certificate with a new key; those before hold until they end.
 
         Parameters
         ----------
@@ -201,7 +201,8 @@ class Authority:
         expires = min(_now() + timedelta(days=days), self.certificate.not_valid_after_utc)
         encoded = base64.b64encode(public).decode()
         played = cast("Role", role or (before.role if before else None))
-        subject = Subject(name, played, generation, serial, encoded, expires.date().isoformat())
+        instants = _now().isoformat(), expires.isoformat()
+        subject = Subject(name, played, generation, serial, encoded, *instants)
         names = self._names(name) if addresses is None else map(_general_name, addresses)
         certificate = self._certificate(subject, key, list(dict.fromkeys(names)), expires)
         folder = self.folder / name
@@ -212,13 +213,13 @@ class Authority:
             write_private(folder / "key.pem", private_pem(secret))
         write_private(folder / "cert.pem", certificate.public_bytes(Encoding.PEM))
         write_private(folder / "ca.pem", self.certificate.public_bytes(Encoding.PEM))
-        revoked = (*roster.revoked, before.serial) if before is not None else roster.revoked
         subjects = {**roster.subjects, name: subject}
-        self._publish(replace(roster, subjects=subjects, revoked=revoked))
+        earlier = [one for one in (*roster.earlier, before) if one and one.ends > _now()]
+        self._publish(replace(roster, subjects=subjects, earlier=tuple(earlier)))
         return folder
 
     def revoke(self, name: str) -> None:
-        """Take a subject's certificate back; hosts know once they have the new roster.
+        """Take a subject's certificates back; hosts know once they have the new roster.
 
         Raises
         ------
@@ -226,12 +227,13 @@ class Authority:
             If there is no such subject.
         """
         roster = self.roster
-        subject = roster.subjects.get(name)
-        if subject is None:
+        if name not in roster.subjects:
             known = ", ".join(roster.subjects) or "nobody"
             raise TrustError(f"no subject {name!r} in {self.folder}; there is {known}")
         rest = {one: its for one, its in roster.subjects.items() if one != name}
-        self._publish(replace(roster, subjects=rest, revoked=(*roster.revoked, subject.serial)))
+        earlier = tuple(one for one in roster.earlier if one.name != name)
+        revoked = (*roster.revoked, *(one.serial for one in roster.of(name)))
+        self._publish(replace(roster, subjects=rest, revoked=revoked, earlier=earlier))
 
     def _last(self, name: str) -> x509.Certificate | None:
         """Return the newest certificate that a subject's folder has."""

@@ -68,13 +68,14 @@ class Keyring:
         if key.public_key() != certificate.public_key():
             raise TrustError(f"{folder}: {path.name} does not belong to cert.pem")
         common = str(certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
-        own = roster.subjects.get(common.rpartition(".")[0])
-        if certificate.serial_number in roster.revoked or own is None:
+        known = roster.of(common.rpartition(".")[0])
+        if certificate.serial_number in roster.revoked or not known:
             raise TrustError(f"{folder}: the certificate of {common} has been revoked")
-        if own.serial != certificate.serial_number:
+        own = next((one for one in known if one.serial == certificate.serial_number), None)
+        if own is None:
             raise TrustError(
-                f"{folder}: cert.pem is that of {common}, roster.json has {own.common_name}; "
-                "take both from the authority's folder anew"
+                f"{folder}: cert.pem is that of {common}, roster.json has {known[0].common_name}; "
+                "take both from the authority's folder again"
             )
         expires = certificate.not_valid_after_utc
         if expires <= datetime.now(UTC):
