@@ -187,7 +187,7 @@ def status(
         typer.echo(f"error: {answer['headline']} {running_elsewhere(problem)}".rstrip(), err=True)
     else:
         typer.echo("\n".join(status_lines(answer)))
-    if absent or (check and answer["headline"]):
+    if absent or (check and answer["health"] != "ok"):
         raise typer.Exit(ExitCode.FAILED)
 
 

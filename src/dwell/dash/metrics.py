@@ -19,6 +19,7 @@ from dwell.dash.observer import OUTCOMES, Observer
 from dwell.live.controlled_cell import MOVED_BY
 from dwell.live.failures import start_thread
 from dwell.live.health import Health
+from dwell.live.keys import CONTROLLER
 from dwell.live.wiring import roles
 
 Kind: TypeAlias = Literal["counter", "gauge", "info"]
@@ -48,6 +49,8 @@ SENTENCES: Mapping[Kind, Mapping[str, str]] = {
         "unproven.",
         "dwell_process_heard": "Whether the controller hears a process of the cell.",
         "dwell_process_ready": "Whether a process that is heard can do its work.",
+        "dwell_certificate_days": "Days until the certificate ends that a node or the controller "
+        "uses; negative afterwards.",
         "dwell_certificate_expiry_timestamp_seconds": "Instant at which a subject's newest "
         "certificate ends.",
     },
@@ -165,6 +168,11 @@ class CellMetrics(Collector):
             "dwell_process_heard": [({"process": who}, heard[who]) for who in heard if status],
             "dwell_process_ready": [
                 ({"process": who}, processes[who]["ready"]) for who in heard if heard[who]
+            ],
+            "dwell_certificate_days": [
+                ({"subject": name}, certificate["days"])
+                for name, certificate in (status.get("certificates") or {}).items()
+                if name in (*problem.fabric.nodes, CONTROLLER)
             ],
             "dwell_certificate_expiry_timestamp_seconds": self._certificates(),
             "dwell_placement": [({"placement": placement}, 1)] if placed else [],

@@ -221,6 +221,9 @@ class Beat(_Array, frozen=True):
         Digest of the cell file, so that different files are noticed.
     note : str
         Why it is not ready, or the last failure.
+    generation, roster : int
+        Generation of the certificate that the process uses, and number of its roster; 0 without
+        keys.
     """
 
     who: Name
@@ -234,6 +237,8 @@ class Beat(_Array, frozen=True):
     cell: Annotated[str, msgspec.Meta(max_length=64)] = ""
     note: Words = ""
     version: Annotated[str, msgspec.Meta(max_length=64)] = ""
+    generation: Count = 0
+    roster: Count = 0
 
 
 class Order(_Array, frozen=True):

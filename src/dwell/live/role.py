@@ -446,9 +446,11 @@ class Pulse:
     def _put(self, now_ns: int, ready: bool, note: str, heard: tuple[Heard, ...]) -> None:
         place = self.place
         term, placement = self._holds() if self._holds is not None else (0, "")
+        keyring = None if place.seals is None else place.seals.keyring
+        keys = (0, 0) if keyring is None else (keyring.own.generation, keyring.roster.number)
         beat = Beat(
             *(place.who, place.node, place.life, now_ns, ready, heard, term, placement),
-            *(self._digest, printable(note)[:2000], __version__),
+            *(self._digest, printable(note)[:2000], __version__, *keys),
         )
         place.put_twice(self._key, beat)
 

@@ -22,7 +22,7 @@ class Seals:
     """Signs a process's messages, and checks those of others."""
 
     def __init__(self, keyring: Keyring) -> None:
-        self._keyring = keyring
+        self.keyring = keyring
         self._domain = f"dwell message 1 {keyring.roster.cell} "
         self._keys: dict[str, list[Ed25519PublicKey]] = {}
         self._good: dict[tuple[str, str, bytes], None] = {}
@@ -35,7 +35,7 @@ class Seals:
         word : str
             Kind of the message, by the first word of its key.
         """
-        return self._keyring.sign(self._of(word), data) + data
+        return self.keyring.sign(self._of(word), data) + data
 
     def require(self, word: str, name: str, sealed: bytes) -> None:
         """Raise a TrustError unless a subject has sealed a message.
@@ -56,7 +56,7 @@ class Seals:
 
     def _verifies(self, word: str, name: str, sealed: bytes) -> bool:
         if name not in self._keys:
-            self._keys[name] = [subject.key for subject in self._keyring.roster.of(name)]
+            self._keys[name] = [subject.key for subject in self.keyring.roster.of(name)]
         signature, data = sealed[:SIGNATURE_BYTES], sealed[SIGNATURE_BYTES:]
         return any(
             _is_signed(key, signature, self._of(word) + b"\0" + data) for key in self._keys[name]
