@@ -213,7 +213,7 @@ def test_promtool_finds_nothing_to_complain_of(cell: StandIn) -> None:
     done = subprocess.run(
         [promtool, "check", "metrics"], input=page, check=False, capture_output=True
     )
-    # Days are what people count certificates in; the timestamp beside them has seconds.
+    # Days are what people count certificates in; the other metric has seconds.
     lines = [line for line in done.stderr.splitlines() if b"dwell_certificate_days" not in line]
     assert (done.stdout, lines) == (b"", [])
 

@@ -87,7 +87,7 @@ def test_a_loop_that_hangs_gives_no_sign_of_life(
     monkeypatch.setattr("dwell.live.service.STEP_S", 0.0)
     role, service = Hanging(), Service("agent@R1", {"NOTIFY_SOCKET": systemd.getsockname()})
     hosted = Hosted(role, Network().transport("agent@R1", "R1"))
-    turns = threading.Thread(target=take_turns, args=([hosted], service.step), daemon=True)
+    turns = threading.Thread(target=take_turns, args=([hosted], [service.step]), daemon=True)
     turns.start()
     assert role.hangs.wait(PATIENCE_S)
     assert [systemd.recv(100) for _ in range(2)] == [b"WATCHDOG=1"] * 2

@@ -51,13 +51,14 @@ def key_file(folder: Path, public: object) -> Path:
     leaves the key of the present one in place.
     """
     if isinstance(public, Ed25519PublicKey):
-        own = _own_file(folder, public)
+        own = own_key_file(folder, public)
         if own.exists():
             return own
     return folder / "key.pem"
 
 
-def _own_file(folder: Path, public: Ed25519PublicKey) -> Path:
+def own_key_file(folder: Path, public: Ed25519PublicKey) -> Path:
+    """Return the file of a keyring that is for one key alone, by its public half."""
     digits = public.public_bytes(Encoding.Raw, PublicFormat.Raw).hex()
     return folder / f"key-{digits[:16]}.pem"
 
@@ -83,7 +84,7 @@ def request_certificate(out: Path, name: str) -> Path:
     require_name(name)
     key = Ed25519PrivateKey.generate()
     make_private_folder(out / name)
-    write_private(_own_file(out / name, key.public_key()), private_pem(key))
+    write_private(own_key_file(out / name, key.public_key()), private_pem(key))
     builder = x509.CertificateSigningRequestBuilder().subject_name(common_name(name))
     path = out / f"{name}.csr"
     write_private(path, builder.sign(key, None).public_bytes(Encoding.PEM))
