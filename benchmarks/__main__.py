@@ -24,6 +24,7 @@ BENCHMARKS = {
     "pricing": ("pricing", "measure"),
     "regimes": ("regimes", "measure"),
     "sooner": ("sooner", "measure"),
+    "passing": ("passing_faults", "measure"),
     "errors": ("stated_errors", "measure"),
     "clairvoyant": ("clairvoyant", "measure"),
     "fleet": ("fleet", "measure"),

@@ -17,6 +17,21 @@ def random_cell(number: int) -> Problem:
     return from_document(_document(number))
 
 
+def passing_faults(number: int) -> Problem:
+    """Return the cell with the default settings; each fault holds once, for 30 of 120 s."""
+    document = _document(number)
+    del document["controller"]
+    steady = document["scenarios"].values()
+    document["scenarios"] = {
+        "passing": [
+            {**fault, "at_s": 60 + 120 * place, "for_s": 30}
+            for place, faults in enumerate(steady)
+            for fault in faults
+        ]
+    }
+    return from_document(document)
+
+
 def _document(number: int) -> Document:
     rng = random.Random(50_000 + number)
     period_ms = rng.choice([33.3, 50, 100])
