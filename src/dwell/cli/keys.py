@@ -151,8 +151,8 @@ def _show_changed(roster: Roster, *, as_json: bool) -> None:
     _show(roster, as_json=as_json)
     if not as_json:
         typer.echo(
-            f"\nTake roster.json (number {roster.number}) to every host, and start its processes "
-            "again:\nuntil then it goes by the one that it has."
+            f"\nTake roster.json (number {roster.number}) to every host: its agent uses it within "
+            "a minute."
         )
 
 

@@ -769,7 +769,7 @@ class ControlledCell:
         if self.place.seals is None:
             return {}
         keyring, silent_ns = self.place.seals.keyring, silent_after_ns(self.place.problem)
-        # Of a node the oldest that a process uses, of those that are heard if there are any.
+        # The oldest that a process of the node uses; processes that are heard come first.
         used = {CONTROLLER: (False, keyring.own.generation)}
         for _, beat, age_ns in self.pulse.detector.everybody(now_ns):
             found = age_ns > silent_ns, beat.generation
