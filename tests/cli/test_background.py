@@ -17,9 +17,9 @@ import yaml
 from dwell.live.local_addresses import taken_ports
 from dwell.live.supervision import survivor
 from dwell.live.wiring import wire
-from tests.cli.live_cell import PATIENCE_S, RealCell, invoke
+from tests.cli.live_cell import RealCell, invoke
 from tests.cli.small_cell import environment
-from tests.waiting import wait_until
+from tests.waiting import PATIENCE_S, wait_until
 
 #: An address for documentation (RFC 5737), which no computer has.
 AWAY = "192.0.2.7"

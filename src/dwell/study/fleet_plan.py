@@ -1,37 +1,44 @@
-"""Plan: where the cells of a fleet are best placed, by the table of loads, and played.
+"""Plan: good placements of a fleet, by the table of loads first, then as played.
 
-Of the table's Φ the least is found over one shared resource by dynamic programming: of every load
-that it may have, cell after cell takes the candidates by which the sum of costs at that load is
-least and the work no more than it (a knapsack). With several it is a mixed-integer program.
+The search begins at the placements with the least Φ of the table: a knapsack over one shared
+resource, a mixed-integer program over several. Moves of one cell and of two go on from there as
+long as one makes the played Φ better. Small fleets begin again from places nearby.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from dwell.control.ledger import Loads
-from dwell.estimators.fleet_prices import CellTerms, FleetPrice, FleetPrices, PricedCell
+from dwell.control.fleet_rank import FleetRank
+from dwell.control.knapsack import cheapest
+from dwell.control.loads import Loads
+from dwell.control.neighbours import Neighbours, Rank, descend
+from dwell.estimators.fleet_prices import CellTerms, FleetPrice, FleetPrices
 from dwell.estimators.load_table import load_table
-from dwell.estimators.prices import prices_of
+from dwell.estimators.prices import SEED, prices_of
 from dwell.model.fleet import Fleet
 from dwell.model.progress import Progress
 from dwell.model.qos import QoS
 from dwell.record import FleetRun
-from dwell.sim.fleet import phased
+from dwell.sim.fleet import phased, priced_cells, tabled_cells
 
-#: Levels of the load of a shared resource: of the only one, of each of several.
-LEVELS, LEVELS_OF_SEVERAL = 400, 40
+#: Levels of the load of each of several shared resources.
+LEVELS_OF_SEVERAL = 40
+#: Cells that the search may play in all, which bounds its time for large fleets.
+CELLS_PLAYED = 20_000
+#: Fleets whose search took fewer plays begin again, with as many cells elsewhere.
+ENOUGH_PLAYS, ELSEWHERE = 200, 4
 #: Cycles that a plan is played for, of all cells together, and most of a cell.
 CYCLES, MOST = 1_000_000, 15_000
 
 
 @dataclass(frozen=True, slots=True)
 class FleetPlan:
-    """Where the cells of a fleet are best placed.
+    """Placements of a fleet with the best played price that was found.
 
     Parameters
     ----------
@@ -60,6 +67,10 @@ class FleetPlan:
         """What each cell comes to."""
         priced = map(self.played.qos, range(len(self.placements)))
         return {name: qos for name, qos in zip(self.placements, priced, strict=True) if qos}
+
+    def above(self, limit: float) -> list[str]:
+        """Return the cells that miss a larger share of their deadlines than a limit."""
+        return [name for name, qos in self.cells.items() if qos.violation_rate > limit]
 
     def regret(self, run: FleetRun) -> float:
         """How far Φ of a run, by what its windows show, is above that of the plan: a share of it.
@@ -104,7 +115,7 @@ def phi_of(run: FleetRun) -> float:
 
 
 def plan_fleet(fleet: Fleet, *, seed: int = 1, progress: Progress | None = None) -> FleetPlan:
-    """Find where the cells of a fleet are best placed while their scenarios go on.
+    """Find good placements of a fleet while its scenarios go on, by its objective.
 
     Parameters
     ----------
@@ -114,11 +125,10 @@ def plan_fleet(fleet: Fleet, *, seed: int = 1, progress: Progress | None = None)
         Told how many of how many levels of the table have been played.
     """
     cells = [
-        PricedCell(cell.name, problem, cell.streams, cell.entry.scenario)
-        for cell, problem in zip(fleet.cells, phased(fleet, seed), strict=True)
+        replace(one, scenario=cell.entry.scenario)
+        for cell, one in zip(fleet.cells, priced_cells(fleet, phased(fleet, seed)), strict=True)
     ]
-    undisturbed = [replace(cell, scenario="baseline") for cell in cells]
-    table = load_table(undisturbed, fleet.shared, progress)
+    table = load_table(tabled_cells(fleet, seed), fleet.shared, progress)
     loads = Loads(table)
     alone = [
         {
@@ -127,13 +137,46 @@ def plan_fleet(fleet: Fleet, *, seed: int = 1, progress: Progress | None = None)
         }
         for cell in cells
     ]
-    best = best_placements(loads, alone)
+    prices = FleetPrices(cells, fleet.shared, disturbances=fleet.disturbances)
+    best = _as_played(prices, FleetRank(fleet.objective, cells), loads, alone)
     cycles = min(CYCLES, MOST * len(cells))
     prices = FleetPrices(cells, fleet.shared, cycles, fleet.disturbances)
     played = prices.price(tuple(best))
     names = [cell.name for cell in cells]
     phi = sum(loads.costs(best, alone)) / len(cells)
     return FleetPlan(dict(zip(names, best, strict=True)), phi, played)
+
+
+def _as_played(
+    prices: FleetPrices, rank: FleetRank, loads: Loads, alone: Sequence[Mapping[str, float]]
+) -> tuple[str, ...]:
+    """Return the best placements of those that were played, from the table's best on."""
+    played: dict[tuple[str, ...], FleetPrice] = {}
+    most = max(CELLS_PLAYED // len(alone), 1)
+
+    def ranked(placements: tuple[str, ...]) -> Rank | None:
+        if placements not in played:
+            if len(played) >= most:
+                return None
+            played[placements] = prices.price(placements)
+        return rank.of([*played[placements].costs, played[placements].shared])
+
+    near = Neighbours(prices.cells, loads)
+
+    def neighbours(placements: tuple[str, ...]) -> Iterable[tuple[str, ...]]:
+        return near.of(placements, alone, played[placements].costs)
+
+    best = descend(tuple(best_placements(loads, alone)), neighbours, ranked)
+    rng = np.random.Generator(np.random.SFC64(SEED))
+    for _ in range(ENOUGH_PLAYS):
+        if len(played) >= min(ENOUGH_PLAYS, most):
+            break
+        start = list(best)
+        for i in rng.permutation(len(start))[:ELSEWHERE].tolist():
+            start[i] = list(alone[i])[int(rng.integers(len(alone[i])))]
+        descend(tuple(start), neighbours, ranked)
+        best = min(played, key=lambda one: ranked(one) or ())
+    return best
 
 
 def best_placements(loads: Loads, alone: Sequence[Mapping[str, float]]) -> list[str]:
@@ -146,50 +189,7 @@ def best_placements(loads: Loads, alone: Sequence[Mapping[str, float]]) -> list[
     """
     if len(loads.resources) > 1:
         return _by_program(loads, alone)
-    most = max(map(loads.most, loads.resources), default=0.0)
-    levels = np.linspace(0.0, most, LEVELS + 1) if most else np.zeros(1)
-    step = levels[1] if most else 1.0
-    units = [
-        {name: round(loads.work(i, name) / step) for name in costs} for i, costs in enumerate(alone)
-    ]
-    found = (
-        _at_level(loads, alone, units, last, load) for last, load in enumerate(levels.tolist())
-    )
-    return min(
-        (one for one in found if one is not None), key=lambda one: sum(loads.costs(one, alone))
-    )
-
-
-def _at_level(
-    loads: Loads,
-    alone: Sequence[Mapping[str, float]],
-    units: Sequence[Mapping[str, int]],
-    last: int,
-    load: float,
-) -> list[str] | None:
-    """Least sum of costs at a load, with no more than `last` units of work; a knapsack."""
-    #: By work that is asked so far, the least sum of the cells before.
-    least = np.zeros(last + 1)
-    chosen = []
-    for i, costs in enumerate(alone):
-        rows = []
-        for name in costs:
-            row, work = np.full(last + 1, np.inf), units[i][name]
-            if work <= last:
-                row[work:] = least[: last + 1 - work] + costs[name]
-                row[work:] += loads.wait(i, name, load)
-            rows.append(row)
-        chosen.append(np.argmin(rows, axis=0))
-        least = np.min(rows, axis=0)
-    left = last
-    if not np.isfinite(least[left]):
-        return None
-    names = []
-    for i in reversed(range(len(alone))):
-        name = list(alone[i])[chosen[i][left]]
-        left -= units[i][name]
-        names.append(name)
-    return names[::-1]
+    return [*cheapest(loads, alone, [min(costs, key=costs.__getitem__) for costs in alone])]
 
 
 def _by_program(loads: Loads, alone: Sequence[Mapping[str, float]]) -> list[str]:

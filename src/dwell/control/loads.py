@@ -1,0 +1,144 @@
+"""Loads: costs of a fleet's cells at any placements, by a table of loads."""
+
+from __future__ import annotations
+
+import bisect
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from dwell.cost import price
+from dwell.estimators.fleet_prices import CellTerms
+from dwell.estimators.load_table import LoadTable
+
+
+class AtLoad(NamedTuple):
+    """What placements come to on shared resources.
+
+    Parameters
+    ----------
+    loads : mapping of str to float
+        Cores, or places, that are kept busy, by resource.
+    waiting : mapping of (kind, candidate) to int
+        How many cells there are of each that has work there.
+    """
+
+    loads: Mapping[str, float]
+    waiting: Mapping[tuple[int, str], int]
+
+
+class Loads:
+    """Costs of a fleet's cells at any placements, as a table of loads has them."""
+
+    def __init__(self, table: LoadTable) -> None:
+        self._kinds, self._work = table.kinds, table.work
+        #: Loads and what J is more there, by kind and candidate.
+        self._waits: dict[tuple[int, str], tuple[list[float], list[float]]] = {}
+        for group, column in table.columns.items():
+            objective = table.cells[group[0]].problem.objective
+            l95_ms, rate, nothing = column.l95_ms, column.violation_rate, np.zeros(1)
+            j = price(l95_ms, rate, nothing, nothing, 0.0, 0.0, objective)
+            self._waits[group] = column.level.tolist(), (j - j[0]).tolist()
+        terms = [CellTerms(cell.problem, table.shared).of_one() for cell in table.cells]
+        #: What a busy core, or place, of each shared resource costs the fleet.
+        self._of_one = {
+            name: sum(one.get(name, 0.0) for one in terms) / len(terms)
+            for name in dict.fromkeys(name for work in self._work for name, _ in work.values())
+        }
+
+        self._filling = {
+            name: [group for group in self._waits if self.resource(*group) == name]
+            for name in self._of_one
+        }
+
+    def __repr__(self) -> str:
+        return f"<Loads of {len(self._kinds)} cells on {', '.join(self.resources) or 'nothing'}>"
+
+    @property
+    def resources(self) -> tuple[str, ...]:
+        """Resources of shared nodes that any candidate fills most."""
+        return tuple(self._of_one)
+
+    def most(self, resource: str) -> float:
+        """Work that all cells together may have for a resource: cores, or places."""
+        return sum(
+            max((work for where, work in of.values() if where == resource), default=0.0)
+            for of in self._work
+        )
+
+    def group(self, index: int, name: str) -> tuple[int, str]:
+        """Cells that wait alike: the kind of a cell, and a candidate."""
+        return self._kinds[index], name
+
+    def resource(self, index: int, name: str) -> str | None:
+        """Shared resource that a cell's candidate fills most."""
+        return self._work[index].get(name, (None, 0.0))[0]
+
+    def work(self, index: int, name: str) -> float:
+        """How much of it."""
+        return self._work[index].get(name, (None, 0.0))[1]
+
+    def wait(self, index: int, name: str, load: float) -> float:
+        """What J of a cell's candidate grows by at a load of its shared resource."""
+        of = self._waits.get(self.group(index, name))
+        return 0.0 if of is None else _between(load, *of)
+
+    def at(self, placements: Sequence[str]) -> AtLoad:
+        """Add up what placements come to."""
+        loads, waiting = dict.fromkeys(self._of_one, 0.0), Counter[tuple[int, str]]()
+        for i, name in enumerate(placements):
+            if name in self._work[i]:
+                resource, work = self._work[i][name]
+                loads[resource] += work
+                waiting[self.group(i, name)] += 1
+        return AtLoad(loads, waiting)
+
+    def rise(self, at: AtLoad, index: int, here: str, there: str) -> float:
+        """What Φ rises by, but for J alone, where a cell goes from one candidate to another."""
+        loads = dict(at.loads)
+        for name, sign in ((here, -1.0), (there, 1.0)):
+            if name in self._work[index]:
+                resource, work = self._work[index][name]
+                loads[resource] += sign * work
+        of_here, of_there = self.group(index, here), self.group(index, there)
+        rise = 0.0
+        for resource, load in loads.items():
+            before = at.loads[resource]
+            rise += self._of_one[resource] * (load - before)
+            for group in self._filling[resource]:
+                count = at.waiting[group]
+                if group == of_here:
+                    rise -= _between(before, *self._waits[group])
+                    count -= 1
+                elif group == of_there:
+                    rise += _between(load, *self._waits[group])
+                if count and load != before:
+                    waits = self._waits[group]
+                    rise += count * (_between(load, *waits) - _between(before, *waits))
+        return rise
+
+    def costs(self, placements: Sequence[str], alone: Sequence[Mapping[str, float]]) -> list[float]:
+        """J of every cell, without switching; then what shared resources cost.
+
+        Parameters
+        ----------
+        alone : sequence of mapping of str to float
+            J of every candidate of each cell where no other is there.
+        """
+        loads = self.at(placements).loads
+        costs = [
+            mine[name] + self.wait(i, name, loads.get(self.resource(i, name) or "", 0.0))
+            for i, (name, mine) in enumerate(zip(placements, alone, strict=True))
+        ]
+        return [*costs, sum(self._of_one[one] * load for one, load in loads.items())]
+
+
+def _between(x: float, xs: Sequence[float], ys: Sequence[float]) -> float:
+    """Interpolate; beyond an end it is as there."""
+    i = bisect.bisect_right(xs, x)
+    if i == 0 or i == len(xs):
+        return ys[max(i - 1, 0)]
+    x0, x1, y0, y1 = xs[i - 1], xs[i], ys[i - 1], ys[i]
+    return y0 + (y1 - y0) * (x - x0) / (x1 - x0)

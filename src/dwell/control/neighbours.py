@@ -1,0 +1,182 @@
+"""Neighbours: placements of a fleet that differ in one cell or two, most promising first."""
+
+from __future__ import annotations
+
+import itertools
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import NamedTuple, TypeAlias
+
+from dwell.control.loads import AtLoad, Loads
+from dwell.estimators.fleet_prices import PricedCell
+
+#: Value of placements; the smaller one is better.
+Rank: TypeAlias = "tuple[float, ...]"
+
+#: Moves of each kind that are combined in pairs.
+PAIRED = 16
+
+
+class _Move(NamedTuple):
+    """A cell takes another candidate.
+
+    Parameters
+    ----------
+    rise : float
+        Predicted change of Φ.
+    own : float
+        Least change of the cell's own cost, if it meets no other cell.
+    cell, name : int, str
+    joins : int
+        Change of the number of cells on shared nodes.
+    at : AtLoad
+        Loads after it.
+    """
+
+    rise: float
+    own: float
+    cell: int
+    name: str
+    joins: int
+    at: AtLoad
+
+
+class Neighbours:
+    """Predicts Φ of placements near others that were played.
+
+    The table of loads does not know which cells meet. Two corrections do: the difference between
+    played and tabulated costs leaves with the cell that has it, and a cell that joins others of
+    its period waits in proportion to how near their phases are.
+    """
+
+    def __init__(self, cells: Sequence[PricedCell], loads: Loads) -> None:
+        self._loads = loads
+        self._nearness = [[_nearness(one, other) for other in cells] for one in cells]
+
+    def of(
+        self,
+        placements: Sequence[str],
+        costs: Sequence[Mapping[str, float]],
+        played: Sequence[float],
+    ) -> Iterator[tuple[str, ...]]:
+        """Yield moves of one cell and of two, in turn with more, as many and fewer on shared nodes.
+
+        Moves that cannot pay, even if no cell waited any more, are left out.
+
+        Parameters
+        ----------
+        costs : sequence of mapping of str to float
+            By cell, cost of each candidate that it may take, without any other cell.
+        played : sequence of float
+            Cost of each cell at these placements, as played.
+        """
+        loads, at = self._loads, self._loads.at(placements)
+        rest = [
+            cost - known
+            for cost, known in zip(played, loads.costs(placements, costs), strict=False)
+        ]
+        moves = [
+            self._moved(placements, at, costs, i, name, played[i], rest[i])
+            for i, of in enumerate(costs)
+            for name in of
+            if name != placements[i]
+        ]
+        by_kind: defaultdict[int, list[tuple[float, tuple[str, ...]]]] = defaultdict(list)
+        best: defaultdict[int, list[_Move]] = defaultdict(list)
+        # A cell that leaves a shared node relieves the others by no more than they wait.
+        relief = sum(
+            max(cost - costs[i][name], 0.0)
+            for i, (cost, name) in enumerate(zip(played, placements, strict=True))
+            if loads.resource(i, name) is not None
+        )
+
+        def may_pay(*moved: _Move) -> bool:
+            leaves = any(loads.resource(one.cell, placements[one.cell]) for one in moved)
+            return sum(one.own for one in moved) < (relief if leaves else 0.0)
+
+        for move in sorted(moves, key=lambda move: move.rise):
+            if may_pay(move):
+                by_kind[move.joins].append((move.rise, _with(placements, move)))
+            best[move.joins].append(move)
+        few = [move for some in best.values() for move in some[:PAIRED]]
+        for one, other in itertools.combinations(few, 2):
+            if one.cell != other.cell and may_pay(one, other):
+                rise = self._of_two(placements, at, one, other)
+                joins = max(-1, min(one.joins + other.joins, 1))
+                by_kind[joins].append((rise, _with(placements, one, other)))
+        kinds = sorted(map(sorted, by_kind.values()))
+        for turn in itertools.zip_longest(*kinds):
+            yield from (found[1] for found in turn if found is not None)
+
+    def _moved(
+        self,
+        placements: Sequence[str],
+        at: AtLoad,
+        costs: Sequence[Mapping[str, float]],
+        i: int,
+        name: str,
+        played: float,
+        rest: float,
+    ) -> _Move:
+        loads, here = self._loads, placements[i]
+        rise = costs[i][name] - costs[i][here] + loads.rise(at, i, here, name) - rest
+        after = loads.at(_one(placements, i, name))
+        resource = loads.resource(i, name)
+        if resource is not None:
+            near = [
+                self._nearness[i][j]
+                for j, other in enumerate(placements)
+                if j != i and loads.resource(j, other) == resource
+            ]
+            wait = loads.wait(i, name, after.loads[resource])
+            rise += wait * sum(near) / max(len(near), 1)
+        joins = (resource is not None) - (loads.resource(i, here) is not None)
+        return _Move(rise, costs[i][name] - played, i, name, joins, after)
+
+    def _of_two(self, placements: Sequence[str], at: AtLoad, one: _Move, other: _Move) -> float:
+        """Predicted change of Φ for two moves: what they change together differs by the load."""
+        loads, here = self._loads, placements[other.cell]
+        alone = loads.rise(at, other.cell, here, other.name)
+        together = loads.rise(one.at, other.cell, here, other.name)
+        return one.rise + other.rise + together - alone
+
+
+def descend(
+    start: tuple[str, ...],
+    neighbours: Callable[[tuple[str, ...]], Iterable[tuple[str, ...]]],
+    rank: Callable[[tuple[str, ...]], Rank | None],
+) -> tuple[str, ...]:
+    """Take the first neighbour that is better until none is, or none can be ranked any more."""
+    best, least = start, rank(start)
+    if least is None:
+        return best
+    while True:
+        for one in neighbours(best):
+            found = rank(one)
+            if found is None:
+                return best
+            if found < least:
+                best, least = one, found
+                break
+        else:
+            return best
+
+
+def _one(placements: Sequence[str], i: int, name: str) -> list[str]:
+    return [*placements[:i], name, *placements[i + 1 :]]
+
+
+def _with(placements: Sequence[str], *moves: _Move) -> tuple[str, ...]:
+    found = list(placements)
+    for move in moves:
+        found[move.cell] = move.name
+    return tuple(found)
+
+
+def _nearness(one: PricedCell, other: PricedCell) -> float:
+    """Return 1 for equal phases, -1 for opposite ones, 0 for other periods."""
+    a, b = one.problem.pipeline, other.problem.pipeline
+    if a.period_ms != b.period_ms:
+        return 0.0
+    apart = abs(a.first_release_ms - b.first_release_ms) % a.period_ms / a.period_ms
+    return 1.0 - 4.0 * min(apart, 1.0 - apart)
