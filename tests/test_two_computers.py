@@ -24,11 +24,11 @@ PATIENCE_S = 120.0
 #: Stands for scp, as both computers have their files on this one.
 SCP = """\
 #!{python}
-import shutil, subprocess, sys
-*sources, target = sys.argv[2:]
-host, _, folder = target.partition(":")
-assert (sys.argv[1], host) == ("-r", "edge")
-subprocess.run(["cp", "-r", *sources, f"{edge}/{{folder}}"], check=True)
+import subprocess, sys
+assert sys.argv[1] == "-r"
+places = [place.replace("edge:", "{edge}/", 1) for place in sys.argv[2:]]
+assert places != sys.argv[2:]
+subprocess.run(["cp", "-r", *places], check=True)
 """
 
 
@@ -141,8 +141,8 @@ def steps() -> Iterator[tuple[tuple[str, ...], str]]:
             yield places[place], line
 
 
-def test_the_quickstart_has_ten_commands() -> None:
-    assert len(list(steps())) == 10
+def test_the_quickstart_has_thirteen_commands() -> None:
+    assert len(list(steps())) == 13
 
 
 def assert_whole(line: str, computer: Computer) -> None:
@@ -167,6 +167,13 @@ def test_the_quickstart_works(computers: dict[str, Computer]) -> None:
             if "live status" in line:
                 assert told.startswith("follower")
                 assert_whole(line, computers["robot"])
+        # No private key has left the computer where it was made.
+        keys = {
+            name: {path.read_bytes() for path in computer.home.rglob("*key*.pem")}
+            for name, computer in computers.items()
+        }
+        assert len(keys["edge"]) == 2
+        assert keys["edge"].isdisjoint(keys["robot"])
     finally:
         for computer in computers.values():
             computer.run("! test -f follower/cell.yaml || dwell live down follower/cell.yaml")

@@ -58,9 +58,28 @@ def test_revoke_and_issue(folder: Path) -> None:
     assert listed(folder)["eve"]["role"] == "observer"
 
 
+def test_keys_are_requested_and_signed(folder: Path, tmp_path: Path) -> None:
+    code, printed = run("request", "R1", "controller", "--out", tmp_path / "host")
+    assert code == 0
+    assert "dwell keys sign R1.csr controller.csr" in printed
+    requests = sorted((tmp_path / "host").glob("*.csr"))
+    code, printed = run("sign", *requests, "--authority", folder)
+    assert code == 0
+    assert {name: listed(folder)[name]["generation"] for name in ("R1", "controller", "E")} == {
+        "R1": 2,
+        "controller": 2,
+        "E": 1,
+    }
+    assert run("request", "eve", "--out", tmp_path / "host")[0] == 0
+    words = ("sign", tmp_path / "host" / "eve.csr", "--authority", folder)
+    assert "say its role" in run(*words)[1]
+    assert run(*words, "--role", "observer", "--days", "3")[0] == 0
+    assert listed(folder)["eve"]["days"] == 3
+
+
 def test_mistakes(folder: Path, tmp_path: Path) -> None:
     for words, said in {
-        ("show", tmp_path / "none"): "key.pem: cannot be read",
+        ("show", tmp_path / "none"): "ca.pem: cannot be read",
         ("revoke", folder, "R7"): "no subject 'R7'",
         ("issue", folder, "x y", "--role", "node"): "no name of a subject",
         ("issue", folder, "x", "--role", "king"): "no role 'king'",

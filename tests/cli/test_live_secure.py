@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -264,13 +265,45 @@ def test_bare_connections_end_nothing_and_keep_nobody_out_once_they_have_gone(
     assert all(process.poll() is None for process in cell.processes.values())
 
 
+def test_certificates_are_renewed_while_the_cell_runs(cell: SecureCell) -> None:
+    """A host with a new certificate gets its files first, the others theirs one by one."""
+    assert cell.as_("operator", *PIN)[0] == 0
+    before = cell.until(lambda status: status["health"] == "ok" and status["placement"] == "SO")
+    processes = dict(cell.processes)
+    pids = {who: cell.pid(who) for who in ("stamper@R1", "camera@R1", "sink.control@R2")}
+    requested = ("R1", "controller")
+    assert invoke("keys", "request", *requested, "--out", cell.host)[0] == 0
+    requests = [cell.host / f"{name}.csr" for name in requested]
+    code, _, error = invoke("keys", "sign", *requests, "--authority", cell.keys, "--days", "700")
+    assert code == 0, error
+    for name in ("R1", "R2", "controller", "operator", "E"):
+        shutil.copytree(cell.keys / name, cell.host / name, dirs_exist_ok=True)
+        time.sleep(1)
+
+    def renewed(status: dict[str, Any]) -> bool:
+        certificates = status["certificates"]
+        return all(certificates[name]["days"] > 600 for name in requested)
+
+    after = cell.until(renewed)
+    assert all(cell.pid(who) != pid for who, pid in pids.items())
+    assert cell.processes == processes
+    assert all(process.poll() is None for process in processes.values())
+    assert after["certificates"]["E"] == before["certificates"]["E"] | {
+        "days": after["certificates"]["E"]["days"]
+    }
+    found = cell.until(lambda status: status["health"] == "ok")
+    # Neither the run nor what operators wanted is forgotten.
+    assert (found["run"], found["pinned"]) == (before["run"], "SO")
+    cell.until(lambda status: status["window"]["number"] > found["window"]["number"])
+
+
 def test_the_run_is_a_run_and_no_log_has_a_secret(cell: SecureCell) -> None:
     assert cell.end("controller") == 0
     (folder,) = (cell.folder / "runs").iterdir()
     assert dwell.open_run(folder).windows.height > 2
     logs = cell.logs
     assert "PRIVATE KEY" not in logs
-    for path in cell.host.glob("*/key.pem"):
+    for path in cell.host.glob("*/key*.pem"):
         secret = path.read_text().splitlines()[1]
         assert secret[-20:] not in logs
     assert "Traceback" not in logs

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -9,7 +10,9 @@ from pathlib import Path
 import pytest
 
 import dwell
-from tests.cli.small_cell import CANONICAL, environment, interrupt_at_first_sign
+from tests.cli.small_cell import CANONICAL, ROOT, environment, interrupt_at_first_sign
+
+CELL = ROOT / "examples" / "live" / "cell.yaml"
 
 # Not pydantic: Typer itself may read arguments with it.
 HEAVY = ("polars", "numpy", "matplotlib", "rich", "yaml", "zenoh")
@@ -48,6 +51,24 @@ def test_nothing_heavy_is_imported_before_it_is_needed(code: str) -> None:
         check=True,
     )
     assert result.stdout.splitlines()[-1] == "[]"
+
+
+@pytest.mark.parametrize(
+    ("words", "who", "refused"),
+    [
+        (("agent", "--node", "R9", "--cell", CELL), "agent@R9", "no node 'R9'"),
+        (("controller", "--cell", "none.yaml"), "controller", "none.yaml"),
+        (("dash", "none.yaml"), "dash", "none.yaml"),
+    ],
+)
+def test_an_error_that_ends_a_command_is_json_where_its_log_is(
+    words: tuple[str | Path, ...], who: str, refused: str, tmp_path: Path
+) -> None:
+    result = call(*words, "--log-format", "json", folder=tmp_path)
+    assert result.returncode != 0
+    last = json.loads(result.stderr.splitlines()[-1])
+    assert last["process"] == who
+    assert refused in last["message"]
 
 
 def test_results_go_to_stdout(tmp_path: Path) -> None:

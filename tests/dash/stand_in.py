@@ -123,6 +123,7 @@ class StandIn:
                 "utilisation": {"R1": 0.5, "R2": 0.25, "E": None},
             },
             "processes": {who: {"heard": True, "ready": True, "note": ""} for who in members},
+            "certificates": {"R1": {"expires": "2030-01-01", "days": 3.5, "soon": True}},
         }
 
 

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import re
+import time
 from collections.abc import Mapping
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from dwell.live.health import diagnose, silent_after_ns, window_late_ns
 from dwell.live.stage import Message
+from dwell.live.trust.authority import Authority
+from dwell.live.trust.keyring import Keyring
+from dwell.live.trust.signing import Seals
 from dwell.live.wiring import roles
 from dwell.model import Problem
 from tests.live.memory_transport import Clock
@@ -525,3 +531,96 @@ def test_a_note_about_memory_hides_no_other(problem: Problem) -> None:
     first = headline.partition(";")[0]
     assert re.search(r"returned a NoneType, not a Message, \d+ calls in a row", first)
     assert grown not in headline
+
+
+# ----------------------------------------------------------------------- certificates
+
+
+class Issued:
+    """A cell with keys; the certificates of some subjects end at other times than the rest."""
+
+    def __init__(self, problem: Problem, folder: Path, patch: pytest.MonkeyPatch) -> None:
+        self.problem, self._patch = problem, patch
+        self.authority = Authority.create(folder, problem.name)
+        for name in (*problem.fabric.nodes, "controller"):
+            self.issue(name)
+
+    def issue(self, name: str, **left: float) -> None:
+        """Issue a certificate of a year, of which some time is left."""
+        if left:
+            begun = datetime.now(UTC) - timedelta(days=365) + timedelta(**left)
+            self._patch.setattr("dwell.live.trust.authority._now", lambda: begun)
+        role = "controller" if name == "controller" else "node"
+        self.authority.issue(name, role)
+        self._patch.undo()
+
+    @property
+    def seals(self) -> dict[str, Seals]:
+        names = self.authority.roster.subjects
+        return {name: Seals(Keyring.open(self.authority.folder / name)) for name in names}
+
+
+@pytest.fixture
+def issued(problem: Problem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Issued:
+    return Issued(problem, tmp_path / "keys", monkeypatch)
+
+
+@pytest.mark.parametrize(
+    ("left", "health", "headline"),
+    [
+        ({"days": 20}, "ok", None),
+        ({"days": 3, "hours": 1}, "ok", "R2's certificate ends in 3 days"),
+        ({"hours": 5, "minutes": 1}, "ok", "R2's certificate ends in 5 h"),
+        ({"minutes": 30.2}, "degraded", "R2's certificate ends in 30 min"),
+    ],
+)
+def test_the_end_of_a_certificate_is_announced(
+    issued: Issued, left: dict[str, float], health: str, headline: str | None
+) -> None:
+    issued.issue("R2", **left)
+    found = running(issued.problem, seals=issued.seals).status
+    assert (found["health"], found["headline"]) == (health, headline)
+    assert found["certificates"]["R2"]["days"] == pytest.approx(
+        timedelta(**left).total_seconds() / 86_400, abs=0.01
+    )
+
+
+def test_a_certificate_that_has_ended_is_named_also_where_its_node_is_silent(
+    issued: Issued,
+) -> None:
+    issued.issue("R2", seconds=3)
+    world = running(issued.problem, seals=issued.seals)
+    time.sleep(3.5)
+    for role in roles(world.problem):
+        if role.node == "R2":
+            world.kill(role.who)
+    world.run(silence_ms(world) + 1_000)
+    found = world.status
+    assert found["health"] in ("degraded", "stalled")
+    assert "R2's certificate ended " in found["headline"]
+    assert "nothing is heard of R2" in found["headline"]
+
+
+def test_the_certificate_that_is_in_use_counts(issued: Issued) -> None:
+    """A newer one of the same node, which it has not taken yet, changes nothing."""
+    issued.issue("R2", days=2.1)
+    before = issued.seals
+    issued.issue("R2")
+    new = issued.seals
+    used = {**new, "R2": Seals(replace(before["R2"].keyring, roster=new["R2"].keyring.roster))}
+    world = running(issued.problem, seals=used)
+    assert world.status["headline"] == "R2's certificate ends in 2 days"
+    world.seals = new
+    for role in roles(world.problem):
+        if role.node == "R2":
+            world.kill(role.who)
+            world.start(role.who)
+    world.run(2_000)
+    assert world.status["headline"] is None
+
+
+def test_certificates_that_end_together_are_one_warning(issued: Issued) -> None:
+    for name in ("R1", "E", "R2", "controller"):
+        issued.issue(name, days=3.1)
+    found = running(issued.problem, seals=issued.seals).status
+    assert found["headline"] == "R1's, E's, R2's, controller's certificate ends in 3 days"

@@ -19,11 +19,13 @@ from dwell.live.security import INSECURE, Security
 from dwell.live.transport.transport import Arrival
 from dwell.live.transport.zenoh import ZenohSettings, ZenohTransport
 from dwell.live.trust import KEYS
-from dwell.live.trust.authority import Authority, _general_name, _pem
+from dwell.live.trust.authority import Authority, _general_name
+from dwell.live.trust.request import private_pem
 from dwell.live.trust.roster import Subject, write_private
 from dwell.live.wiring import Locator, Role, WiringEntry, wire
 from dwell.model import Endpoint, Host, Problem
 from tests.live.test_wiring import cell, housed
+from tests.live.trust.rosters import LIFE
 from tests.ports import free_ports
 from tests.waiting import PATIENCE_S
 
@@ -152,9 +154,9 @@ def expired(authority: Authority, folder: Path, seconds: float = -60.0) -> Path:
     key = Ed25519PrivateKey.generate()
     public = key.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw)
     ends = datetime.now(UTC) + timedelta(seconds=seconds)
-    subject = Subject("R2", "node", 1, 77, base64.b64encode(public).decode(), "2020-01-01")
-    made = authority._certificate(subject, key, [_general_name("127.0.0.1")], ends)
-    write_private(folder / "key.pem", _pem(key))
+    subject = Subject("R2", "node", 1, 77, base64.b64encode(public).decode(), *LIFE)
+    made = authority._certificate(subject, key.public_key(), [_general_name("127.0.0.1")], ends)
+    write_private(folder / "key.pem", private_pem(key))
     write_private(folder / "cert.pem", made.public_bytes(Encoding.PEM))
     write_private(folder / "ca.pem", authority.certificate.public_bytes(Encoding.PEM))
     return folder
@@ -247,7 +249,8 @@ def test_who_is_revoked_is_not_heard(problem: Problem, tmp_path: Path) -> None:
     key = Keys(problem.name).load("R2")
     old = tmp_path / "old"
     shutil.copytree(authority.folder / "R2", old)
-    authority.issue("R2")
+    authority.revoke("R2")
+    authority.issue("R2", "node", ["127.0.0.1"])
     write_private(old / "roster.json", (authority.folder / "R2" / "roster.json").read_bytes())
     with pytest.raises(TrustError, match=r"the certificate of R2\.1 has been revoked"):
         security(problem, old, "agent@R2")

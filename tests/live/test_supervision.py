@@ -495,3 +495,58 @@ def test_a_process_marks_itself_and_is_there_once(tmp_path: Path, said: list[str
     finally:
         first.kill()
         first.wait()
+
+
+# ---------------------------------------------------------------------- one after another
+
+#: Ends in order, and is ready after a while.
+READY = """
+import signal, sys, time
+from pathlib import Path
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+time.sleep(0.05)
+Path(sys.argv[1]).touch()
+time.sleep(1000)
+"""
+
+
+def keep_ready(supervisor: Supervisor, who: str, code: str = READY) -> SupervisedProcess:
+    mark = supervisor.folder / f"{who}.ready"
+    return supervisor.keep(who, [sys.executable, "-c", code, str(mark)])
+
+
+def test_processes_are_restarted_one_after_another_and_the_first_last(
+    supervisor: Supervisor,
+) -> None:
+    children = [keep_ready(supervisor, who) for who in ("stamper@E", "plan@E", "act@E")]
+    until(supervisor, lambda: all(child.file("ready").exists() for child in children))
+    before = [child.pid for child in children]
+    supervisor.restart_in_turn()
+    order: list[str] = []
+    while supervisor.restarting or not order:
+        supervisor.step()
+        away = [child.who for child in children if not child.file("ready").exists()]
+        assert len(away) <= 1
+        order += [who for who in away if who not in order]
+        time.sleep(0.005)
+    assert order == ["act@E", "plan@E", "stamper@E"]
+    assert all(child.pid != pid for child, pid in zip(children, before, strict=True))
+    assert [child.starts for child in children] == [2, 2, 2]
+    # An end that was asked for is no trouble.
+    assert (supervisor.notes(), supervisor.stuck()) == ("", False)
+
+
+def test_a_process_that_does_not_end_or_is_never_ready_delays_the_next_for_a_while_only(
+    supervisor: Supervisor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(supervision, "STOP_S", 0.2)
+    monkeypatch.setattr(supervision, "TURN_S", 1.0)
+    deaf = READY.replace("lambda *_: sys.exit(0)", "signal.SIG_IGN")
+    never = READY.replace("Path(sys.argv[1]).touch()", "pass")
+    codes = {"last@E": READY, "never@E": never, "deaf@E": deaf}
+    children = [keep_ready(supervisor, who, code) for who, code in codes.items()]
+    until(supervisor, lambda: all(child.starts for child in children))
+    until(supervisor, lambda: children[0].file("ready").exists())
+    supervisor.restart_in_turn()
+    until(supervisor, lambda: not supervisor.restarting)
+    assert [child.starts for child in children] == [2, 2, 2]

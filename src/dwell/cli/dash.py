@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dwell.cli.options import Insecure, Keys, argument, flag, option
+from dwell.cli.options import (
+    Insecure,
+    Keys,
+    LogFormat,
+    Logs,
+    argument,
+    begin_log,
+    flag,
+    option,
+)
 
 if TYPE_CHECKING:
     from dwell.dash.server import Dash
@@ -53,12 +62,14 @@ def dash(
     ] = None,
     keys: Keys = None,
     insecure: Insecure = False,
+    log_format: Logs = LogFormat.TEXT,
 ) -> None:
     """Show a live cell, or recorded runs, on a page in the browser of this computer."""
     from dwell.dash.pages import live_page, recorded_page
     from dwell.live.log import say
     from dwell.record import is_fleet
 
+    begin_log(log_format, "dash")
     kept = None if token is None else _kept(token)
     where = shown or CELL
     if where.is_dir():

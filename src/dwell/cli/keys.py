@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from datetime import UTC, date, datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,11 +13,16 @@ from dwell.cli.options import Json, argument, option
 from dwell.cli.output import aligned, print_json
 
 if TYPE_CHECKING:
-    from dwell.live.trust.roster import Roster
+    from dwell.live.trust.roster import Roster, Subject
     from dwell.model import Problem
 
 Folder = Annotated[Path, argument("FOLDER", "Folder of the authority.")]
 Name = Annotated[str, argument("NAME", "Node of the cell, or another subject.")]
+SubjectRole = Annotated[
+    str | None,
+    typer.Option(help="node, controller, operator or observer; the one it had if not given."),
+]
+Addresses = Annotated[list[str] | None, option("HOST", "Where it is reached; may be repeated.")]
 Days = Annotated[int, typer.Option(help="How long certificates hold.")]
 
 keys = typer.Typer(
@@ -64,17 +69,12 @@ def _addresses(problem: Problem, node: str) -> list[str]:
 def issue(
     folder: Folder,
     name: Name,
-    role: Annotated[
-        str | None,
-        typer.Option(help="node, controller, operator or observer; the one it had if not given."),
-    ] = None,
-    address: Annotated[
-        list[str] | None, option("HOST", "Where it is reached; may be repeated.")
-    ] = None,
+    role: SubjectRole = None,
+    address: Addresses = None,
     days: Days = 365,
     as_json: Json = False,
 ) -> None:
-    """Issue a certificate with a new key; the one that the subject had is revoked."""
+    """Issue a certificate with a new key; those before hold until they end."""
     from dwell.live.trust.authority import Authority
 
     authority = Authority.open(folder)
@@ -83,8 +83,47 @@ def issue(
 
 
 @keys.command()
+def request(
+    node: Annotated[
+        list[str], argument("NODE", "Node of the cell, or another subject; may be repeated.")
+    ],
+    out: Annotated[Path, option("FOLDER", "Where keyrings and requests go.")] = Path("keys"),
+) -> None:
+    """Make a key here, and a request for its certificate: no private key travels."""
+    from dwell.live.trust.request import request_certificate
+
+    made = [request_certificate(out, name) for name in node]
+    names = " ".join(path.name for path in made)
+    typer.echo(
+        f"{' '.join(map(str, made))}\n\nTake the requests to the folder of the authority: "
+        f"dwell keys sign {names}\nTake cert.pem, ca.pem and roster.json from there back into "
+        f"{', '.join(str(out / name) for name in node)}."
+    )
+
+
+@keys.command()
+def sign(
+    request: Annotated[
+        list[Path], argument("REQUEST", "What dwell keys request has made; may be repeated.")
+    ],
+    authority: Annotated[Path, option("FOLDER", "Folder of the authority.")] = Path("keys"),
+    role: SubjectRole = None,
+    address: Addresses = None,
+    days: Days = 365,
+    as_json: Json = False,
+) -> None:
+    """Issue the certificates that requests are for."""
+    from dwell.live.trust.authority import Authority
+
+    opened = Authority.open(authority)
+    for path in request:
+        opened.sign(path, role, address, days=days)
+    _show_changed(opened.roster, as_json=as_json)
+
+
+@keys.command()
 def revoke(folder: Folder, name: Name, as_json: Json = False) -> None:
-    """Take a subject's certificate back."""
+    """Take a subject's certificates back."""
     from dwell.live.trust.authority import Authority
 
     authority = Authority.open(folder)
@@ -105,19 +144,19 @@ def show(
         _show(Authority.open(folder).roster, as_json=as_json)
         return
     keyring = Keyring.open(folder)
-    _show(keyring.roster, own=keyring.own.name, as_json=as_json)
+    _show(keyring.roster, own=keyring.own, as_json=as_json)
 
 
 def _show_changed(roster: Roster, *, as_json: bool) -> None:
     _show(roster, as_json=as_json)
     if not as_json:
         typer.echo(
-            f"\nTake roster.json (number {roster.number}) to every host, and start its processes "
-            "again:\nuntil then it goes by the one that it has."
+            f"\nTake roster.json (number {roster.number}) to every host: its agent uses it within "
+            "a minute."
         )
 
 
-def _show(roster: Roster, *, own: str = "", as_json: bool) -> None:
+def _show(roster: Roster, *, own: Subject | None = None, as_json: bool) -> None:
     today = datetime.now(UTC).date()
     if as_json:
         print_json(
@@ -128,8 +167,8 @@ def _show(roster: Roster, *, own: str = "", as_json: bool) -> None:
                     subject.name: {
                         "role": subject.role,
                         "generation": subject.generation,
-                        "expires": subject.expires,
-                        "days": _days(subject.expires, today),
+                        "expires": subject.ends.date().isoformat(),
+                        "days": (subject.ends.date() - today).days,
                     }
                     for subject in roster.subjects.values()
                 },
@@ -142,18 +181,14 @@ def _show(roster: Roster, *, own: str = "", as_json: bool) -> None:
             subject.name,
             subject.role,
             str(subject.generation),
-            subject.expires,
-            _remark(_days(subject.expires, today)),
-            "this keyring" if subject.name == own else "",
+            subject.ends.date().isoformat(),
+            _remark((subject.ends.date() - today).days),
+            "this keyring" if subject == own else "",
         )
-        for subject in roster.subjects.values()
+        for subject in roster.certificates
     ]
     typer.echo(f"cell {roster.cell}, roster {roster.number}, {len(roster.revoked)} revoked\n")
     typer.echo(aligned(("subject", "role", "generation", "ends", "", ""), rows))
-
-
-def _days(expires: str, today: date) -> int:
-    return (date.fromisoformat(expires) - today).days
 
 
 def _remark(days: int) -> str:

@@ -21,10 +21,13 @@ from dwell.cli.options import (
     Insecure,
     Json,
     Keys,
+    LogFormat,
+    Logs,
     Node,
     Policy,
     Seed,
     argument,
+    begin_log,
     flag,
     option,
     require_held,
@@ -82,11 +85,13 @@ def agent(
     ] = None,
     keys: Keys = None,
     insecure: Insecure = False,
+    log_format: Logs = LogFormat.TEXT,
     owner: Owner = None,
 ) -> None:
     """Run a node of a live cell: its workers, and on the right nodes stamper and sinks."""
     from dwell.live import node_command
 
+    begin_log(log_format, f"agent@{node}")
     with _bad_parameters():
         node_command.agent(
             node,
@@ -119,11 +124,13 @@ def controller(
     cpus: Cpus = None,
     keys: Keys = None,
     insecure: Insecure = False,
+    log_format: Logs = LogFormat.TEXT,
     owner: Owner = None,
 ) -> None:
     """Decide where the stages of live cells run."""
     from dwell.live import node_command
 
+    begin_log(log_format, "controller")
     with _bad_parameters():
         node_command.controller(
             cell,
@@ -183,7 +190,7 @@ def status(
         typer.echo(f"error: {answer['headline']} {running_elsewhere(problem)}".rstrip(), err=True)
     else:
         typer.echo("\n".join(status_lines(answer, stages=stages)))
-    if absent or (check and answer["headline"]):
+    if absent or (check and answer["health"] != "ok"):
         raise typer.Exit(ExitCode.FAILED)
 
 
@@ -399,7 +406,7 @@ def units(
     problem = load_without_traces(cell)
     files = write_units(problem, node, cell, out, user=user, keys=keys, insecure=insecure)
     copied = " ".join(shlex.quote(str(file)) for file in files)
-    names = " ".join(file.stem for file in files)
+    names = " ".join(shlex.quote(file.stem) for file in files)
     typer.echo(
         f"sudo cp {copied} /etc/systemd/system/\n"
         "sudo systemctl daemon-reload\n"

@@ -328,7 +328,7 @@ class Screen:
         if state.silent_s:
             remark.append(f"no answer from the controller for {state.silent_s:.0f} s", "bold red")
         elif status.get("headline"):
-            remark.append(status["headline"], "bold red")
+            remark.append(status["headline"], "bold" if status["health"] == "ok" else "bold red")
         elif status.get("fallback"):
             proving = status.get("proving")
             progress = f"; {proof(proving)}" if proving else ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -122,10 +123,31 @@ Insecure = Annotated[
         envvar="DWELL_INSECURE",
     ),
 ]
+
+
+class LogFormat(StrEnum):
+    """Forms of the log on stderr."""
+
+    TEXT = "text"
+    JSON = "json"
+
+
+Logs = Annotated[
+    LogFormat,
+    typer.Option("--log-format", help="Form of the log on stderr: lines of text, or of JSON."),
+]
 TestbedName = Annotated[
     str, typer.Option("--name", help="Of the testbed, among others on this machine.")
 ]
 Json = Annotated[bool, flag("--json", "Print JSON on stdout.")]
+
+
+def begin_log(log_format: LogFormat, who: str) -> None:
+    """Have a process print its log in a form."""
+    if log_format is LogFormat.JSON:
+        from dwell.live.log import log_as_json
+
+        log_as_json(who)
 
 
 def require_one_length(windows: int | None, seconds: float | None) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import getpass
+import re
 import shutil
 import subprocess
 import sys
@@ -20,10 +21,13 @@ MOST_FILES = 65_536
 UNIT = """\
 [Unit]
 Description={description}
+# It is started again for ever.
+StartLimitIntervalSec=0
 Wants=network-online.target{beside}
 After=network-online.target{beside}
 
 [Service]
+Type=notify
 User={user}
 StateDirectory=dwell
 {environment}ExecStart={command}
@@ -35,6 +39,8 @@ WantedBy=multi-user.target
 """
 #: Settings of each service beside those that both have.
 AGENT = f"""\
+# An agent that hangs is replaced; its processes go on.
+WatchdogSec=30
 # The agent ends its processes itself. Should it die alone, they work on, and the next agent takes
 # them over: systemd must not end them.
 KillMode=process
@@ -52,6 +58,7 @@ OOMPolicy=continue
 # CPUAffinity=2-5
 """
 CONTROLLER = f"""\
+WatchdogSec=60
 TimeoutStopSec=60
 LimitNOFILE={MOST_FILES}
 """
@@ -59,6 +66,8 @@ LimitNOFILE={MOST_FILES}
 STATE = "${STATE_DIRECTORY}"
 #: Signs that end a word, or mean something in one.
 SPECIAL = frozenset(" \t\"'\\;")
+#: Signs that the name of a unit has as they are.
+PLAIN_SIGN = re.compile("[A-Za-z0-9:_.]")
 
 
 def unit_texts(
@@ -107,12 +116,26 @@ def unit_texts(
     state = f"{STATE}/{problem.name}/{node}"
     agent = ("agent", "--node", node, "--cell", str(cell), "--state", state)
     called = f"Dwell agent of node {node} of cell {problem.name}"
-    units = {"dwell-agent.service": unit(called, agent, AGENT, beside=" time-sync.target")}
+    name = f"dwell-agent@{escaped_name(problem.name)}-{escaped_name(node)}.service"
+    units = {name: unit(called, agent, AGENT, beside=" time-sync.target")}
     if node == problem.controller_node:
         controller = ("controller", "--cell", str(cell), "--out", f"{STATE}/runs")
         called = f"Dwell controller of cell {problem.name}"
-        units["dwell-controller.service"] = unit(called, controller, CONTROLLER)
+        name = f"dwell-controller@{escaped_name(problem.name)}.service"
+        units[name] = unit(called, controller, CONTROLLER)
     return units
+
+
+def escaped_name(name: str) -> str:
+    """Return a name as part of the name of a unit, as systemd-escape(1) writes it."""
+    return "".join(
+        sign if PLAIN_SIGN.fullmatch(sign) and (sign, i) != (".", 0) else _hexadecimal(sign)
+        for i, sign in enumerate(name)
+    )
+
+
+def _hexadecimal(sign: str) -> str:
+    return "".join(f"\\x{byte:02x}" for byte in sign.encode())
 
 
 def _escaped(text: str) -> str:

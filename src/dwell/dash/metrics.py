@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterable, Iterator, Mapping
-from datetime import UTC, datetime
 from typing import Any, Literal, TypeAlias, get_args
 
 from prometheus_client import Histogram, Metric
@@ -20,6 +19,7 @@ from dwell.dash.observer import OUTCOMES, Observer
 from dwell.live.controlled_cell import MOVED_BY
 from dwell.live.failures import start_thread
 from dwell.live.health import Health
+from dwell.live.keys import CONTROLLER
 from dwell.live.wiring import roles
 
 Kind: TypeAlias = Literal["counter", "gauge", "info", "summary"]
@@ -49,8 +49,10 @@ SENTENCES: Mapping[Kind, Mapping[str, str]] = {
         "unproven.",
         "dwell_process_heard": "Whether the controller hears a process of the cell.",
         "dwell_process_ready": "Whether a process that is heard can do its work.",
-        "dwell_certificate_expiry_timestamp_seconds": "Beginning of the day on which a certificate "
-        "ends.",
+        "dwell_certificate_days": "Days until the certificate ends that a node or the controller "
+        "uses; negative afterwards.",
+        "dwell_certificate_expiry_timestamp_seconds": "Instant at which a subject's newest "
+        "certificate ends.",
     },
     "summary": {
         "dwell_stage_seconds": "Time of a stage's jobs from start to end in the last window.",
@@ -177,6 +179,11 @@ class CellMetrics(Collector):
             "dwell_process_ready": [
                 ({"process": who}, processes[who]["ready"]) for who in heard if heard[who]
             ],
+            "dwell_certificate_days": [
+                ({"subject": name}, certificate["days"])
+                for name, certificate in (status.get("certificates") or {}).items()
+                if name in (*problem.fabric.nodes, CONTROLLER)
+            ],
             "dwell_certificate_expiry_timestamp_seconds": self._certificates(),
             "dwell_placement": [({"placement": placement}, 1)] if placed else [],
             "dwell_task_placement": [
@@ -204,8 +211,7 @@ class CellMetrics(Collector):
     def _certificates(self) -> Samples:
         keyring = self._observer.security.keyring
         for subject in () if keyring is None else keyring.roster.subjects.values():
-            ends = datetime.fromisoformat(subject.expires).replace(tzinfo=UTC)
-            yield {"subject": subject.name}, ends.timestamp()
+            yield {"subject": subject.name}, subject.ends.timestamp()
 
     def _keep_up(self) -> None:
         while not self._stopped.wait(EVERY_S):

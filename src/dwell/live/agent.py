@@ -22,6 +22,7 @@ from dwell.live.stage_counts import REPORT_NS
 from dwell.live.supervision import Supervisor
 from dwell.live.transport.abandoned import OUT_OF_FILES
 from dwell.live.transport.transport import Arrival
+from dwell.live.wiring import roles
 from dwell.model.instants import NEVER_NS
 
 #: Time between two looks at the processes, and between two reports of what the CPU does.
@@ -113,7 +114,13 @@ class Agent:
         self._busy_ns, self._accelerator = busy_ns, accelerator
         self.cpu_clock: Callable[[], int] = time.process_time_ns
         # No guard waits for it: it carries nothing that a cycle needs.
-        self.pulse = Pulse(place, self._state, every=AGENT_BEAT)
+        hears = [place.stamper]
+        if place.seals is not None:
+            # They say which roster they use.
+            hears += [
+                (role.node, role.who) for role in roles(place.problem) if role.kind == "agent"
+            ]
+        self.pulse = Pulse(place, self._state, hears=hears, every=AGENT_BEAT)
         self._relays = place.node == place.problem.relay_node
         # What is done again and again, every so often; and when each is due.
         self._chores: dict[Callable[[int], None], int] = {

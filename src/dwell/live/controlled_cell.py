@@ -9,6 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from typing import Any, Literal, Protocol, TypeAlias
 
 from dwell.control import Controller, Proposal
@@ -16,6 +17,7 @@ from dwell.errors import LiveError
 from dwell.live.agent import AGENT_BEAT
 from dwell.live.continuity import Continuity, SetbackDetector
 from dwell.live.health import PATIENCE_NS, diagnose, silent_after_ns
+from dwell.live.keys import CONTROLLER
 from dwell.live.live_windows import LiveWindows
 from dwell.live.messages import (
     OTHER,
@@ -760,6 +762,7 @@ class ControlledCell:
             **(self.windows.status() if self.windows is not None else {}),
             **(self.windows.symptoms(now_ns) if self.windows is not None else {}),
             "processes": self._processes(now_ns),
+            "certificates": self._certificates(now_ns),
             **self._missing(now_ns),
             "complaints": dict(list(self.place.complaints.items())[-10:]),
             "record": self._recorder.trouble or None,
@@ -788,6 +791,28 @@ class ControlledCell:
             }
             for who, beat, age_ns in self.pulse.detector.everybody(now_ns)
         }
+
+    def _certificates(self, now_ns: int) -> dict[str, dict[str, Any]]:
+        """Return until when the certificates hold that the nodes and this controller use."""
+        if self.place.seals is None:
+            return {}
+        keyring, silent_ns = self.place.seals.keyring, silent_after_ns(self.place.problem)
+        # The oldest that a process of the node uses; processes that are heard come first.
+        used = {CONTROLLER: (False, keyring.own.generation)}
+        for _, beat, age_ns in self.pulse.detector.everybody(now_ns):
+            found = age_ns > silent_ns, beat.generation
+            used[beat.node] = min(used.get(beat.node, found), found)
+        now, certificates = datetime.now(UTC), {}
+        for name in (*self.place.problem.fabric.nodes, CONTROLLER):
+            known = {one.generation: one for one in reversed(keyring.roster.of(name))}
+            newest = max(known, default=0)
+            if one := known.get(used.get(name, (True, newest))[1], known.get(newest)):
+                certificates[name] = {
+                    "expires": one.expires,
+                    "days": round((one.ends - now).total_seconds() / 86_400, 6),
+                    "soon": now >= one.warns_from,
+                }
+        return certificates
 
     def _missing(self, now_ns: int) -> dict[str, Any]:
         """Return who is not heard: those that differ, with why, and those that say nothing."""

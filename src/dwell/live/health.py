@@ -3,9 +3,11 @@
 ============  ====================================================================================
 ``health``    what it means
 ============  ====================================================================================
-``ok``        all processes are heard and ready, windows close, and cycles are completed
+``ok``        all processes are heard and ready, windows close, and cycles are completed; the
+              headline may warn of certificates that end
 ``degraded``  windows close, but a process is silent, not ready, or has another cell file or
-              version, too many cycles miss, a sink applies nothing, or a candidate's shadows fail
+              version, too many cycles miss, a sink applies nothing, a candidate's shadows fail, or
+              a certificate has ended or does so within an hour
 ``stalled``   no window has closed for too long, or no cycle of the last one was completed
 ``silent``    the controller hears no process of the cell
 ``absent``    no controller answers; only who asks can tell (`dwell.live.operator_client`)
@@ -33,6 +35,8 @@ LEAST_NS = 1_000_000_000
 PATIENCE_NS = 2_000_000_000
 #: Faults of single processes that the headline names.
 NAMED = 3
+#: Time before a certificate's end from which a cell is degraded.
+LAST_MS = 3_600e3
 #: Number of the last windows with a silence or too few commands that degrades a cell.
 BAD_WINDOWS = 2
 
@@ -68,16 +72,17 @@ def diagnose(problem: Problem, status: Mapping[str, Any]) -> tuple[Health, str |
     -------
     str
     str or None
-        None where nothing is.
+        None where nothing is wrong, and no certificate ends soon.
     """
     members = [
         role
         for role in roles(problem)
         if role.kind != "controller" and role.who not in status["strangers"]
     ]
+    ended, ending = _certificates(status)
     deaf = _hears_nobody(problem, status, members)
     stalled = _no_window(problem, status) or _no_cycle(status)
-    faults = [] if deaf else list(_faults(status, members))
+    faults = [*ended, *([] if deaf else _faults(status, members))]
     faults += [
         why
         for who, why in status["strangers"].items()
@@ -92,8 +97,25 @@ def diagnose(problem: Problem, status: Mapping[str, Any]) -> tuple[Health, str |
     if more > 0:
         found.append(f"and {more} more")
     if not found:
-        return "ok", None
+        return "ok", "; ".join(ending) or None
+    found += ending
     return "silent" if deaf else "stalled" if stalled else "degraded", "; ".join(found)
+
+
+def _certificates(status: Mapping[str, Any]) -> tuple[list[str], list[str]]:
+    """Return which certificates have ended or do so within `LAST_MS`, and which end soon."""
+    named: tuple[dict[str, list[str]], dict[str, list[str]]] = {}, {}
+    for name, certificate in status["certificates"].items():
+        left_ms = certificate["days"] * 86_400e3
+        if left_ms >= LAST_MS and not certificate["soon"]:
+            continue
+        when = f"ended {_time(-left_ms)} ago" if left_ms <= 0 else f"ends in {_time(left_ms)}"
+        named[left_ms >= LAST_MS].setdefault(when, []).append(name)
+    ended, ending = (
+        ["'s, ".join(names) + f"'s certificate {when}" for when, names in of.items()]
+        for of in named
+    )
+    return ended, ending
 
 
 def _hears_nobody(
@@ -282,4 +304,6 @@ def _time(ms: float) -> str:
         return f"{seconds:.1f} s"
     if seconds < 120:
         return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7_200 else f"{seconds / 3_600:.0f} h"
+    if seconds < 7_200:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3_600:.0f} h" if seconds < 172_800 else f"{seconds / 86_400:.0f} days"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from dwell.errors import LiveError, describe_raised
 from dwell.live.continuity import SetbackDetector
@@ -106,7 +106,11 @@ class Hosted:
         self.news = threading.Semaphore(0)
         self._due_ns = 0
         self._setback = SetbackDetector()
-        for key in role.subscriptions():
+        self.hear_through(transport)
+
+    def hear_through(self, transport: Transport) -> None:
+        """Have the role get what a transport brings."""
+        for key in self.role.subscriptions():
             transport.subscribe(key, self._receive)
 
     def _receive(self, sample: Arrival) -> None:
@@ -162,17 +166,21 @@ class Hosted:
         self.hurry.set()
 
 
-def take_turns(all_hosted: Sequence[Hosted]) -> None:
+def take_turns(all_hosted: Sequence[Hosted], each_turn: Iterable[Callable[[], None]] = ()) -> None:
     """Wake roles in this thread, always the one that is due first, until they are told to stop.
 
     Parameters
     ----------
     all_hosted : sequence of Hosted
         With the same `stopped` and the same `hurry`.
+    each_turn : iterable of callable, optional
+        Called before each role that is woken, and several times a second.
     """
     stopped, hurry = all_hosted[0].stopped, all_hosted[0].hurry
     try:
         while not stopped.is_set():
+            for step in each_turn:
+                step()
             first = min(all_hosted, key=Hosted.rest_ns)
             rest_ns = first.rest_ns()
             if rest_ns > 0:
@@ -192,6 +200,7 @@ def work(
     note: Callable[[Job | None], None] = lambda job: None,
     clock: Clock = time.monotonic_ns,
     begin: Callable[[], None] = lambda: None,
+    ready: Callable[[], None] = lambda: None,
 ) -> None:
     """Run a worker's jobs in this thread until it is told to stop.
 
@@ -201,6 +210,8 @@ def work(
         Told what job begins, and None when it is over.
     begin : callable, optional
         Called before the stage is started, when the thread of the beats runs.
+    ready : callable, optional
+        Called when the stage has started.
     """
     complain = worker.place.complain
     hosted = Hosted(worker, transport, clock, heard=lambda: worker.has_work, complain=complain)
@@ -211,6 +222,7 @@ def work(
     with hosted.lock:
         worker.started = True
         worker.pulse.send(clock())
+    ready()
     keep_collections_short()
     if worker.triggers:
         start_thread("frames", _frames, worker, hosted, stopped)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import io
+import json
 import sys
 import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from datetime import UTC, datetime
 
 
 def printable(text: str, keep: str = "") -> str:
@@ -44,6 +46,40 @@ def escape_output() -> None:
             before.flush()
         raw = io.FileIO(before.fileno(), "wb", closefd=False)
         setattr(sys, name, _Escaping(raw, encoding="utf-8", write_through=True))
+
+
+class _Unfinished(threading.local):
+    """What a thread has written of its line."""
+
+    text = ""
+
+
+class _JsonLines(io.TextIOWrapper):
+    """Writes each line as a JSON document with its time, level and process."""
+
+    def __init__(self, raw: io.FileIO, who: str) -> None:
+        super().__init__(raw, encoding="utf-8", write_through=True)
+        self._who, self._unfinished = who, _Unfinished()
+
+    def write(self, text: str) -> int:
+        *lines, self._unfinished.text = (self._unfinished.text + text).split("\n")
+        for line in filter(str.strip, lines):
+            level, _, rest = line.partition(": ")
+            known = level.lower() in ("warning", "error")
+            document = {
+                "time": datetime.now(UTC).isoformat(timespec="milliseconds"),
+                "level": level.lower() if known else "info",
+                "process": self._who,
+                "message": printable(rest if known else line, keep="\t"),
+            }
+            super().write(f"{json.dumps(document)}\n")
+        return len(text)
+
+
+def log_as_json(who: str) -> None:
+    """Have all that this process prints on stderr from now on be JSON, one document per line."""
+    sys.stderr.flush()
+    sys.stderr = _JsonLines(io.FileIO(sys.stderr.fileno(), "wb", closefd=False), who)
 
 
 def say(line: str) -> None:

@@ -228,6 +228,9 @@ class Beat(_Array, frozen=True):
         Run of the last command that a sink let through; 0 from other processes.
     moving : bool
         Whether a worker writes or reads a state that an order asked for.
+    generation, roster : int
+        Generation of the certificate that the process uses, and number of its roster; 0 without
+        keys.
     """
 
     who: Name
@@ -243,6 +246,8 @@ class Beat(_Array, frozen=True):
     version: Annotated[str, msgspec.Meta(max_length=64)] = ""
     run: Count = 0
     moving: bool = False
+    generation: Count = 0
+    roster: Count = 0
 
 
 class Order(_Array, frozen=True):

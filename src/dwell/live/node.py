@@ -9,8 +9,10 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from dwell.control import Controller
 from dwell.errors import KernelError, LiveError
@@ -21,13 +23,20 @@ from dwell.live.hosting import PLAIN, Hosted, Platform, keep_collections_short, 
 from dwell.live.launcher import ForkServer
 from dwell.live.log import Log
 from dwell.live.recording import RunRecorder
+from dwell.live.role import RolePlace
 from dwell.live.security import Security
+from dwell.live.service import Service
 from dwell.live.stage_counts import read_books
 from dwell.live.state_files import make_folder
 from dwell.live.supervision import Supervisor
 from dwell.live.transport.orphans import remove_orphans
+from dwell.live.transport.transport import Transport
+from dwell.live.trust import KEYS
 from dwell.live.wiring import wire
 from dwell.model import Problem, QoS
+
+if TYPE_CHECKING:
+    from dwell.live.trust.keyring import Keyring
 
 #: Why a folder cannot be made that somebody has to put right; anything else is tried again.
 MISTAKEN = frozenset({errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP})
@@ -84,27 +93,49 @@ def run_agent(
         say(unused)
     wiring = wire(problem)
     who = f"agent@{node}"
+    # Without the variables of systemd, which the processes must not have.
+    environment = dict(os.environ if environment is None else environment)
+    service = Service(who, environment)
     security = Security.of(problem, wiring.entry(who).role, environment)
     security.remember(make_folder(folder))
     security.remind(say, stopped)
+    source = security.keyring
+    if source is not None:
+        from dwell.live.key_renewal import installed
+
+        environment[KEYS] = str(folder / "keys")
+        security = replace(security, keyring=installed(source, folder / "keys"))
     transport = platform.transport(security, who, node)
+    place = security.place(who, node, transport, Log(say))
     launcher = ForkServer(program, environment)
     supervisor = Supervisor(make_folder(folder), say, launcher)
     try:
         for role in wiring.on(node):
             if role.kind not in ("agent", "controller"):
                 supervisor.keep(role.who, words(role.who))
-        place = security.place(who, node, transport, Log(say))
         gauge = None if accelerator is None else Gauge(accelerator)
         stages = partial(read_books, problem, wiring.on(node), folder)
         agent = Agent(place, supervisor, _busy_clock(problem, node, say), gauge, stages)
         clock, complain = platform.clock(problem, node), place.complain
         hosted = Hosted(agent, transport, clock, stopped=stopped, complain=complain)
+        each_turn = [service.step]
+        if source is not None:
+            from dwell.live.key_renewal import KeyRenewal
+
+            connect = partial(_connected, platform, security, who, folder)
+            renewal = KeyRenewal(
+                *(source.folder, hosted, agent.pulse, connect),
+                copy=folder / "keys",
+                supervisor=supervisor,
+            )
+            each_turn.append(renewal.step)
         keep_collections_short()
-        hosted.run()
+        service.ready()
+        take_turns([hosted], each_turn)
     finally:
+        service.stopping()
         failed = supervisor.stop(hurried=hurried)
-        transport.close()
+        place.transport.close()
         # Those that have been killed could not remove theirs.
         remove_orphans()
     moving = [f"{who} {why}" for who, why in failed.items() if who.startswith("sink.")]
@@ -191,16 +222,18 @@ def run_controller(
     # No message waits for long while a window closes.
     sys.setswitchinterval(0.0005)
     recorders = []
+    environment = dict(os.environ if environment is None else environment)
+    service = Service(f"controller@{problems[0].controller_node}", environment)
     with ExitStack() as stack:
-        hosted, hurry = [], threading.Event()
+        hosted, hurry, each_turn = [], threading.Event(), [service.step]
         for problem in problems:
             node = problem.controller_node
             role = wire(problem).entry(f"controller@{node}").role
             security = Security.of(problem, role, environment)
             security.remind(say, stopped)
             transport = platform.transport(security, f"controller@{node}", node)
-            stack.callback(transport.close)
             place = security.place(f"controller@{node}", node, transport, Log(say))
+            stack.callback(_close, place)
             controller = _controller(problem, policy, say)
             recorder = RunRecorder(out, problem, controller, say, jobs=jobs)
             clock = platform.clock(problem, node)
@@ -213,13 +246,35 @@ def run_controller(
                     complain=place.complain,
                 )
             )
+            if security.keyring is not None:
+                from dwell.live.key_renewal import KeyRenewal
+
+                connect = partial(_connected, platform, security, place.who, None)
+                folder = security.keyring.folder
+                each_turn.append(KeyRenewal(folder, hosted[-1], cell.pulse, connect).step)
             recorders.append((recorder, cell))
         keep_collections_short()
+        service.ready()
         try:
-            take_turns(hosted)
+            take_turns(hosted, each_turn)
         finally:
+            service.stopping()
             folders = [_finished(recorder, cell) for recorder, cell in recorders]
         return [folder for folder in folders if folder is not None]
+
+
+def _close(place: RolePlace) -> None:
+    place.transport.close()
+
+
+def _connected(
+    platform: Platform, security: Security, who: str, state: Path | None, keyring: Keyring
+) -> Transport:
+    """Open the sessions of a process with newer keys, whose roster a state folder remembers."""
+    renewed = replace(security, keyring=keyring)
+    if state is not None:
+        renewed.remember(state)
+    return platform.transport(renewed, who, who.partition("@")[2])
 
 
 def _controller(problem: Problem, policy: str | None, say: Callable[[str], None]) -> Controller:

@@ -7,12 +7,13 @@ import queue
 import time
 import uuid
 from collections.abc import Mapping
+from datetime import UTC, datetime
 from typing import Any
 
 import msgspec
 
 from dwell.errors import LiveError, TrustError
-from dwell.live.keys import Keys
+from dwell.live.keys import CONTROLLER, Keys
 from dwell.live.local_addresses import running_elsewhere
 from dwell.live.log import printable
 from dwell.live.messages import Answer, Ask, decode, encode
@@ -155,8 +156,15 @@ class OperatorClient:
             since = f" since {time.monotonic() - self._answered_s:.0f} s"
         return (
             f"no controller of cell {self.problem.name!r} answers{since}; is `dwell controller` "
-            f"running on {self.problem.controller_node}?"
+            f"running on {self.problem.controller_node}?{self._ended()}"
         )
+
+    def _ended(self) -> str:
+        """Return that the controller's certificate has ended, by the roster; nothing otherwise."""
+        keyring = self._security.keyring
+        known = [] if keyring is None else keyring.roster.of(CONTROLLER)[:1]
+        ends = [one.ends for one in known if one.ends < datetime.now(UTC)]
+        return "".join(f" its certificate ended on {end:%Y-%m-%d %H:%M} UTC" for end in ends)
 
 
 def _shown(value: Any) -> Any:

@@ -455,9 +455,11 @@ class Pulse:
     def _put(self, now_ns: int, ready: bool, note: str, heard: tuple[Heard, ...]) -> None:
         place = self.place
         term, placement, run, moving = self._holds()
+        keyring = None if place.seals is None else place.seals.keyring
+        keys = (0, 0) if keyring is None else (keyring.own.generation, keyring.roster.number)
         beat = Beat(
             *(place.who, place.node, place.life, now_ns, ready, heard, term, placement),
-            *(self._digest, printable(note)[:2000], __version__, run, moving),
+            *(self._digest, printable(note)[:2000], __version__, run, moving, *keys),
         )
         place.put_twice(self._key, beat)
 

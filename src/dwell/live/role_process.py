@@ -98,6 +98,7 @@ def _run(
     if role.kind not in ("stamper", "sink"):
         _work(role, place, folder, stopped, clock, group)
         return True
+    (folder / f"{role.who}.ready").touch()
     if role.kind == "stamper":
         book = BookFile(folder / f"{role.who}.book")
         stamper = Stamper(place, book, time.time_ns(), clock(), boot_id())
@@ -204,6 +205,7 @@ def _work(
         note=note,
         clock=clock,
         begin=partial(take_lowest_class, role.who, _print) if worker.shadow else lambda: None,
+        ready=(folder / f"{role.who}.ready").touch,
     )
 
 

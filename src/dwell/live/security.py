@@ -5,6 +5,7 @@ Both settings come from the environment, so that an agent's processes have them 
 
 from __future__ import annotations
 
+import base64
 import ipaddress
 import os
 import threading
@@ -233,16 +234,20 @@ def _tls(problem: Problem, keyring: Keyring) -> dict[str, object]:
     from dwell.live.permissions import subjects
     from dwell.live.trust.acl import access_control
 
-    certificate, key = str(keyring.folder / "cert.pem"), str(keyring.folder / "key.pem")
+    # Zenoh reads files at every connection, when newer ones may be there.
+    authority, certificate, key = (
+        base64.b64encode(path.read_bytes()).decode()
+        for path in (keyring.folder / "ca.pem", keyring.folder / "cert.pem", keyring.key_file)
+    )
     tls = "transport/link/tls"
     may_put = subjects(problem, keyring.roster)
     return {
         "transport/link/protocols": ["tls"],
-        f"{tls}/root_ca_certificate": str(keyring.folder / "ca.pem"),
-        f"{tls}/listen_certificate": certificate,
-        f"{tls}/listen_private_key": key,
-        f"{tls}/connect_certificate": certificate,
-        f"{tls}/connect_private_key": key,
+        f"{tls}/root_ca_certificate_base64": authority,
+        f"{tls}/listen_certificate_base64": certificate,
+        f"{tls}/listen_private_key_base64": key,
+        f"{tls}/connect_certificate_base64": certificate,
+        f"{tls}/connect_private_key_base64": key,
         f"{tls}/enable_mtls": True,
         f"{tls}/verify_name_on_connect": True,
         f"{tls}/close_link_on_expiration": True,

@@ -29,6 +29,8 @@ from dwell.live.state_files import InFlight, make_folder, open_own
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.05, 5.0
 #: Time in which processes end by themselves when told to: an actuator may take two seconds of it.
 STOP_S = 3.5
+#: Time after which the next process is restarted, whether the one before it is ready or not.
+TURN_S = 30.0
 #: Time between two looks whether they have, or whether they shall end at once.
 LOOK_S = 0.1
 #: A process that lived so long has recovered.
@@ -97,8 +99,8 @@ class SupervisedProcess:
     def file(self, kind: str) -> Path:
         """Return a file of its: its output (`log`), inputs of its present job (`inflight`), ...
 
-        ``pid`` tells the next agent of a process that outlives this one, and what is in ``again``
-        is worked on first by a worker that is started.
+        ``pid`` tells the next agent of a process that outlives this one, what is in ``again`` is
+        worked on first by a worker that is started, and ``ready`` is there once it can work.
         """
         return self.folder / f"{self.who}.{kind}"
 
@@ -134,6 +136,10 @@ class Supervisor:
         self._say = say
         self._oom_kills = _oom_kills()
         self._launcher = launcher
+        # Processes that are to be restarted, the next one last; who is, since when, and after how
+        # many starts.
+        self._turns: list[SupervisedProcess] = []
+        self._turn: tuple[SupervisedProcess, float, int] | None = None
         # What has become of the folder, if it was removed, and when.
         self._lost, self._lost_s = "", -math.inf
 
@@ -173,6 +179,40 @@ class Supervisor:
                 continue
             if ready and time.monotonic() >= child.next_s and not self._adopts(child):
                 self._start(child)
+
+        self._take_turn()
+
+    @property
+    def restarting(self) -> bool:
+        """Whether processes are being restarted in turn."""
+        return self._turn is not None or bool(self._turns)
+
+    def restart_in_turn(self) -> None:
+        """Have every process end and start again, each when the one before it is ready.
+
+        Those that were kept last are the first: workers before sinks, and the stamper at the end.
+        """
+        self._turns = list(self.children)
+
+    def _take_turn(self) -> None:
+        now_s = time.monotonic()
+        if self._turn is not None:
+            child, since_s, starts = self._turn
+            if child.starts == starts and child.pid is not None and now_s > since_s + STOP_S:
+                with suppress(ProcessLookupError):
+                    os.kill(child.pid, signal.SIGKILL)
+            ready = child.starts > starts and child.file("ready").exists()
+            if not ready and now_s < since_s + TURN_S:
+                return
+            self._turn = None
+        if self._turns:
+            child = self._turns.pop()
+            self._turn = child, now_s, child.starts
+            child.failures = 0
+            self._say(f"{child.who}: is restarted")
+            if child.pid is not None:
+                with suppress(ProcessLookupError):
+                    os.kill(child.pid, signal.SIGTERM)
 
     def _alive(self, child: SupervisedProcess) -> bool:
         if child.process is None:
@@ -240,6 +280,8 @@ class Supervisor:
         """Start a process; a disk that is full must not end the agent, and with it the node."""
         child.starts += 1
         child.started_s = time.monotonic()
+        with suppress(OSError):
+            child.file("ready").unlink(missing_ok=True)
         try:
             with open(child.file("log"), "ab", opener=open_own) as log:
                 child.log_begins = log.tell()
@@ -265,7 +307,7 @@ class Supervisor:
         if self.children and not self.folder.is_dir():
             self._make_folder()
         for child in self.children:
-            if _shorten(child.file("log"), self._log_bytes):
+            if shorten_log(child.file("log"), self._log_bytes):
                 child.log_begins = 0
             if child.process is not None and not child.file("pid").exists():
                 self._write_mark(child)  # there was no room for it
@@ -460,7 +502,7 @@ def _oom_kills() -> int:
         return 0
 
 
-def _shorten(path: Path, longest: int) -> bool:
+def shorten_log(path: Path, longest: int) -> bool:
     """Begin a log anew that is too long; its process goes on appending to the same file."""
     try:
         if path.stat().st_size <= longest:

@@ -22,7 +22,7 @@ from tests.cells.generated import random_problem
 from tests.cells.once import with_windows
 from tests.live.memory_transport import MemoryTransport, matcher
 from tests.live.small_world import Alternating, Counting, World, stateful
-from tests.live.trust.rosters import roster_of
+from tests.live.trust.rosters import LIFE, roster_of
 
 NOBODY = "nobody.1"
 
@@ -165,8 +165,8 @@ def test_a_name_alone_gives_no_role(problem: Problem) -> None:
     keys = Keys(problem.name)
     roster = roster_of(problem)
     changed = {
-        "E": Subject("E", "observer", 1, 1, "", "2030-01-01"),
-        CONTROLLER: Subject(CONTROLLER, "node", 1, 2, "", "2030-01-01"),
+        "E": Subject("E", "observer", 1, 1, "", *LIFE),
+        CONTROLLER: Subject(CONTROLLER, "node", 1, 2, "", *LIFE),
     }
     wall = wall_of(problem, Roster(problem.name, 1, {**roster.subjects, **changed}))
     assert not wall.lets("E.1", keys.load("E"))

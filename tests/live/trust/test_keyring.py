@@ -10,8 +10,10 @@ import pytest
 from cryptography.exceptions import InvalidSignature
 
 from dwell.errors import TrustError
+from dwell.live.trust.acl import access_control
 from dwell.live.trust.authority import Authority
 from dwell.live.trust.keyring import Keyring
+from dwell.live.trust.signing import Seals
 
 DOMAIN = b"test"
 
@@ -60,18 +62,42 @@ def test_a_key_that_others_may_use_is_refused(authority: Authority) -> None:
         keyring(authority)
 
 
-def test_one_issued_anew_revokes_the_one_before(authority: Authority, tmp_path: Path) -> None:
+def test_the_certificate_before_holds_until_it_ends(
+    authority: Authority, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     before = keyring(authority)
     old = shutil.copytree(authority.folder / "R1", tmp_path / "old")
-    Authority.open(authority.folder).issue("R1", "node", ["127.0.0.1"])
-    found = keyring(authority)
-    assert found.own.common_name == "R1.2"
-    assert len(found.roster.revoked) == 1
-    assert verifies(found, "R1", DOMAIN, b"data", found.sign(DOMAIN, b"data"))
-    assert not verifies(found, "R1", DOMAIN, b"data", before.sign(DOMAIN, b"data"))
+    Authority.open(authority.folder).issue("R1")
     shutil.copy(authority.folder / "R1" / "roster.json", old / "roster.json")
-    with pytest.raises(TrustError, match=r"the certificate of R1\.1 has been revoked"):
-        Keyring.open(old)
+    found, kept = keyring(authority), Keyring.open(old)
+    assert (found.own.common_name, kept.own.common_name) == ("R1.2", "R1.1")
+    assert (found.roster, found.roster.revoked) == (kept.roster, ())
+    # Whichever of them R1 uses, others believe it.
+    seals = Seals(keyring(authority, "controller"))
+    for own in (before, found):
+        seals.require("beat", "R1", Seals(own).seal("beat", b"data"))
+    everybody = access_control(found.roster, "dwell/cell", {"dwell/cell/load/R1": ["R1"]})
+    assert {"R1.1", "R1.2"} == set(everybody["policies"][1]["subjects"])
+    # Those that have ended are not listed any more.
+    later = datetime.now(UTC) + timedelta(days=400)
+    monkeypatch.setattr("dwell.live.trust.authority._now", lambda: later)
+    Authority.open(authority.folder).issue("R1", days=3_000)
+    assert [one.generation for one in Authority.open(authority.folder).roster.of("R1")] == [3]
+
+
+def test_all_certificates_of_a_name_are_revoked_together(
+    authority: Authority, tmp_path: Path
+) -> None:
+    old = shutil.copytree(authority.folder / "R1", tmp_path / "old")
+    authority.issue("R1")
+    authority.revoke("R1")
+    assert "R1" not in {one.name for one in authority.roster.certificates}
+    for folder in (old, authority.folder / "R1"):
+        shutil.copy(authority.folder / "controller" / "roster.json", folder)
+        with pytest.raises(TrustError, match=r"the certificate of R1\.\d has been revoked"):
+            Keyring.open(folder)
+    authority.issue("R1", "node")
+    assert [one.generation for one in authority.roster.of("R1")] == [3]
 
 
 def test_the_revoked_are_no_subjects(authority: Authority) -> None:

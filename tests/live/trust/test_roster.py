@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from dwell.errors import TrustError
 from dwell.live.trust.authority import Authority
 from dwell.live.trust.roster import ROLES, Roster, Subject
+from tests.live.trust.rosters import LIFE
 
 
 @given(where=st.floats(0, 1, exclude_max=True), change=st.integers(1, 255))
@@ -43,8 +45,20 @@ def test_no_changed_roster_is_accepted(
 )
 def test_subjects_are_valid_or_refused(name: str, role: str, generation: int, serial: int) -> None:
     try:
-        subject = Subject(name, role, generation, serial, "", "")  # type: ignore[arg-type]
+        subject = Subject(name, role, generation, serial, "", *LIFE)  # type: ignore[arg-type]
     except TrustError:
         return
     assert os.sep not in subject.common_name
     assert subject.common_name.count(".") == 1
+
+
+@pytest.mark.parametrize(
+    ("days", "warned_days"), [(3_650, 14), (365, 14), (42, 14), (30, 10), (3, 1)]
+)
+def test_an_end_is_warned_of_two_weeks_or_a_third_of_the_life_before(
+    tmp_path: Path, days: int, warned_days: int
+) -> None:
+    authority = Authority.create(tmp_path / "keys", "cell", days=days)
+    authority.issue("R1", "node", days=days)
+    subject = authority.roster.subjects["R1"]
+    assert (subject.ends - subject.warns_from).total_seconds() == warned_days * 86_400

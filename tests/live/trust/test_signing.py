@@ -205,8 +205,8 @@ def test_a_signature_is_for_one_cell(
     sealed = seals[CONTROLLER].seal("order", b"data")
     seals["R1"].require("order", CONTROLLER, sealed)
     other = issue(tmp_path / "keys", "another")["R1"]
-    own = seals["R1"]._keyring.roster.subjects
-    other._keys = {name: subject.key for name, subject in own.items()}
+    own = seals["R1"].keyring.roster.subjects
+    other._keys = {name: [subject.key] for name, subject in own.items()}
     with pytest.raises(TrustError, match="order: not signed by controller"):
         other.require("order", CONTROLLER, sealed)
 
@@ -463,11 +463,11 @@ def test_copies_cost_no_second_look(
     verifies = Seals._verifies
 
     def count(self: Seals, word: str, name: str, sealed: bytes) -> bool:
-        found.append((self._keyring.own.name, word))
+        found.append((self.keyring.own.name, word))
         return verifies(self, word, name, sealed)
 
     monkeypatch.setattr(Seals, "_verifies", count)
-    fresh = {name: Seals(one._keyring) for name, one in seals.items()}
+    fresh = {name: Seals(one.keyring) for name, one in seals.items()}
     world = World(problem, policy="LOC", seals=fresh)
     world.run(2_000)
     cycles = len(world.cycles)
@@ -478,7 +478,7 @@ def test_copies_cost_no_second_look(
 
 
 def test_what_is_remembered_is_bounded(seals: dict[str, Seals]) -> None:
-    fresh = Seals(seals["R1"]._keyring)
+    fresh = Seals(seals["R1"].keyring)
     for number in range(signing.REMEMBERED + 50):
         fresh.require("done", "R2", seals["R2"].seal("done", str(number).encode()))
     assert len(fresh._good) == signing.REMEMBERED

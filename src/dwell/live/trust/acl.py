@@ -37,14 +37,15 @@ def access_control(
         _rule("send", [below], ["put"], ["egress"]),
     ]
     policies: list[dict[str, Any]] = []
-    everybody = [subject.common_name for subject in roster.subjects.values()]
+    everybody = [subject.common_name for subject in roster.certificates]
     if everybody:
         policies.append({"rules": ["hear", "send"], "subjects": everybody})
     # Keys of the same senders share a rule.
     together: dict[frozenset[str], list[str]] = {}
     for expression, names in may_put.items():
-        known = (name for name in names if name in roster.subjects)
-        senders = frozenset(roster.subjects[name].common_name for name in known)
+        allowed = frozenset(names)
+        known = (subject for subject in roster.certificates if subject.name in allowed)
+        senders = frozenset(subject.common_name for subject in known)
         if senders:
             together.setdefault(senders, []).append(expression)
     for number, (senders, expressions) in enumerate(together.items()):

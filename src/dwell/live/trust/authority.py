@@ -11,17 +11,21 @@ from pathlib import Path
 from typing import cast
 
 from cryptography import x509
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 from cryptography.hazmat.primitives.serialization import (
     Encoding,
-    NoEncryption,
-    PrivateFormat,
     PublicFormat,
     load_pem_private_key,
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from dwell.errors import TrustError
+from dwell.live.trust.request import (
+    common_name,
+    make_private_folder,
+    private_pem,
+    read_request,
+)
 from dwell.live.trust.roster import ROLES, Role, Roster, Subject, write_private
 
 #: Folder of the authority's own key, which stays where the others are issued.
@@ -59,9 +63,9 @@ class Authority:
         _require_days(days)
         if (folder / AUTHORITY).exists():
             raise TrustError(f"{folder}: has an authority already; keys are never replaced by it")
-        _make(folder / AUTHORITY)
+        make_private_folder(folder / AUTHORITY)
         key = Ed25519PrivateKey.generate()
-        name = _name(f"dwell authority of {cell}"[:64])
+        name = common_name(f"dwell authority of {cell}"[:64])
         usage = x509.KeyUsage(
             digital_signature=True,
             content_commitment=False,
@@ -74,14 +78,14 @@ class Authority:
             decipher_only=False,
         )
         certificate = (
-            _builder(name, name, key, _now() + timedelta(days=10 * days))
+            _builder(name, name, key.public_key(), _now() + timedelta(days=10 * days))
             .serial_number(x509.random_serial_number())
             .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
             .add_extension(usage, critical=True)
             .sign(key, None)
         )
         made = cls(folder, key, certificate, Roster(cell, 1, {}))
-        write_private(folder / AUTHORITY / "key.pem", _pem(key))
+        write_private(folder / AUTHORITY / "key.pem", private_pem(key))
         write_private(folder / AUTHORITY / "ca.pem", certificate.public_bytes(Encoding.PEM))
         made._publish(made.roster)
         return made
@@ -120,7 +124,7 @@ class Authority:
         *,
         days: int = DAYS,
     ) -> Path:
-        """Issue a certificate with a new key; one that the subject had is revoked.
+        """Issue a certificate with a new key; those before hold until they end.
 
         Parameters
         ----------
@@ -141,6 +145,48 @@ class Authority:
         TrustError
             If the name or role or time is not valid, or it cannot be written.
         """
+        key = Ed25519PrivateKey.generate()
+        return self._certify(name, key.public_key(), role, addresses, days, secret=key)
+
+    def sign(
+        self,
+        request: Path,
+        role: str | None = None,
+        addresses: Collection[str] | None = None,
+        *,
+        days: int = DAYS,
+    ) -> Path:
+        """Issue a certificate for a key that was made elsewhere; the rest as for `issue`.
+
+        Parameters
+        ----------
+        request : Path
+            File that `dwell.live.trust.request.request_certificate` has written.
+
+        Returns
+        -------
+        Path
+            Folder of its keyring, which lacks the private key.
+
+        Raises
+        ------
+        TrustError
+            As `issue`, or if the request is none.
+        """
+        name, key = read_request(request)
+        return self._certify(name, key, role, addresses, days)
+
+    def _certify(
+        self,
+        name: str,
+        key: Ed25519PublicKey,
+        role: str | None,
+        addresses: Collection[str] | None,
+        days: int,
+        *,
+        secret: Ed25519PrivateKey | None = None,
+    ) -> Path:
+        """Issue a certificate for a key; return the folder of the subject's keyring."""
         _require_days(days)
         roster, before = self.roster, self.roster.subjects.get(name)
         if name == AUTHORITY:
@@ -149,28 +195,31 @@ class Authority:
             raise TrustError(f"{name} is new; say its role, {', '.join(ROLES)}")
         if before is not None and role not in (None, before.role):
             raise TrustError(f"{name} has the role {before.role}; revoke it to make it {role}")
-        key = Ed25519PrivateKey.generate()
         serial = x509.random_serial_number()
         generation = 1 + max(before.generation if before else 0, self._last_generation(name))
-        public = key.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw)
+        public = key.public_bytes(Encoding.Raw, PublicFormat.Raw)
         expires = min(_now() + timedelta(days=days), self.certificate.not_valid_after_utc)
         encoded = base64.b64encode(public).decode()
         played = cast("Role", role or (before.role if before else None))
-        subject = Subject(name, played, generation, serial, encoded, expires.date().isoformat())
+        instants = _now().isoformat(), expires.isoformat()
+        subject = Subject(name, played, generation, serial, encoded, *instants)
         names = self._names(name) if addresses is None else map(_general_name, addresses)
         certificate = self._certificate(subject, key, list(dict.fromkeys(names)), expires)
         folder = self.folder / name
-        _make(folder)
-        write_private(folder / "key.pem", _pem(key))
+        make_private_folder(folder)
+        if secret is None:
+            (folder / "key.pem").unlink(missing_ok=True)
+        else:
+            write_private(folder / "key.pem", private_pem(secret))
         write_private(folder / "cert.pem", certificate.public_bytes(Encoding.PEM))
         write_private(folder / "ca.pem", self.certificate.public_bytes(Encoding.PEM))
-        revoked = (*roster.revoked, before.serial) if before is not None else roster.revoked
         subjects = {**roster.subjects, name: subject}
-        self._publish(replace(roster, subjects=subjects, revoked=revoked))
+        earlier = [one for one in (*roster.earlier, before) if one and one.ends > _now()]
+        self._publish(replace(roster, subjects=subjects, earlier=tuple(earlier)))
         return folder
 
     def revoke(self, name: str) -> None:
-        """Take a subject's certificate back; hosts know once they have the new roster.
+        """Take a subject's certificates back; hosts know once they have the new roster.
 
         Raises
         ------
@@ -178,12 +227,13 @@ class Authority:
             If there is no such subject.
         """
         roster = self.roster
-        subject = roster.subjects.get(name)
-        if subject is None:
+        if name not in roster.subjects:
             known = ", ".join(roster.subjects) or "nobody"
             raise TrustError(f"no subject {name!r} in {self.folder}; there is {known}")
         rest = {one: its for one, its in roster.subjects.items() if one != name}
-        self._publish(replace(roster, subjects=rest, revoked=(*roster.revoked, subject.serial)))
+        earlier = tuple(one for one in roster.earlier if one.name != name)
+        revoked = (*roster.revoked, *(one.serial for one in roster.of(name)))
+        self._publish(replace(roster, subjects=rest, revoked=revoked, earlier=earlier))
 
     def _last(self, name: str) -> x509.Certificate | None:
         """Return the newest certificate that a subject's folder has."""
@@ -219,13 +269,13 @@ class Authority:
     def _certificate(
         self,
         subject: Subject,
-        key: Ed25519PrivateKey,
+        key: Ed25519PublicKey,
         names: Sequence[x509.GeneralName],
         expires: datetime,
     ) -> x509.Certificate:
         uses = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
         builder = (
-            _builder(_name(subject.common_name), self.certificate.subject, key, expires)
+            _builder(common_name(subject.common_name), self.certificate.subject, key, expires)
             .serial_number(subject.serial)
             .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
             .add_extension(x509.ExtendedKeyUsage(uses), critical=False)
@@ -236,13 +286,13 @@ class Authority:
 
 
 def _builder(
-    subject: x509.Name, issuer: x509.Name, key: Ed25519PrivateKey, expires: datetime
+    subject: x509.Name, issuer: x509.Name, key: Ed25519PublicKey, expires: datetime
 ) -> x509.CertificateBuilder:
     return (
         x509.CertificateBuilder()
         .subject_name(subject)
         .issuer_name(issuer)
-        .public_key(key.public_key())
+        .public_key(key)
         .not_valid_before(_now() - BACKDATED)
         .not_valid_after(expires)
     )
@@ -250,10 +300,6 @@ def _builder(
 
 def _now() -> datetime:
     return datetime.now(UTC).replace(microsecond=0)
-
-
-def _name(common: str) -> x509.Name:
-    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)])
 
 
 def _general_name(address: str) -> x509.GeneralName:
@@ -265,18 +311,6 @@ def _general_name(address: str) -> x509.GeneralName:
         return x509.DNSName(address)
     except ValueError:
         raise TrustError(f"{address!r} is neither a host's name nor an address") from None
-
-
-def _pem(key: Ed25519PrivateKey) -> bytes:
-    return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        folder.chmod(0o700)
-    except OSError as error:
-        raise TrustError(f"{folder}: cannot be made ({error.strerror})") from None
 
 
 def _require_days(days: int) -> None:

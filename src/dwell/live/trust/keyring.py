@@ -14,6 +14,7 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from cryptography.x509.oid import NameOID
 
 from dwell.errors import TrustError
+from dwell.live.trust.request import key_file
 from dwell.live.trust.roster import Roster, Subject
 
 #: From how many days before its end on a certificate is warned of.
@@ -28,12 +29,15 @@ class Keyring:
     ----------
     folder : Path
         With ``ca.pem``, ``cert.pem``, ``key.pem`` and ``roster.json``.
+    key_file : Path
+        Where its own key is.
     """
 
     folder: Path
     own: Subject
     roster: Roster
     expires: datetime
+    key_file: Path
     _key: Ed25519PrivateKey = field(repr=False)
 
     @classmethod
@@ -50,7 +54,7 @@ class Keyring:
         TrustError
             If something is missing, readable by others, damaged, revoked, expired, or another's.
         """
-        authority, certificate, key = _read(folder)
+        authority, certificate, key, path = _read(folder)
         public = authority.public_key()
         if not isinstance(public, Ed25519PublicKey):
             raise TrustError(f"{folder / 'ca.pem'}: has no Ed25519 key")
@@ -62,15 +66,16 @@ class Keyring:
         except (InvalidSignature, ValueError, TypeError):
             raise TrustError(f"{folder / 'cert.pem'}: was not issued by ca.pem") from None
         if key.public_key() != certificate.public_key():
-            raise TrustError(f"{folder}: key.pem does not belong to cert.pem")
+            raise TrustError(f"{folder}: {path.name} does not belong to cert.pem")
         common = str(certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
-        own = roster.subjects.get(common.rpartition(".")[0])
-        if certificate.serial_number in roster.revoked or own is None:
+        known = roster.of(common.rpartition(".")[0])
+        if certificate.serial_number in roster.revoked or not known:
             raise TrustError(f"{folder}: the certificate of {common} has been revoked")
-        if own.serial != certificate.serial_number:
+        own = next((one for one in known if one.serial == certificate.serial_number), None)
+        if own is None:
             raise TrustError(
-                f"{folder}: cert.pem is that of {common}, roster.json has {own.common_name}; "
-                "take both from the authority's folder anew"
+                f"{folder}: cert.pem is that of {common}, roster.json has {known[0].common_name}; "
+                "take both from the authority's folder again"
             )
         expires = certificate.not_valid_after_utc
         if expires <= datetime.now(UTC):
@@ -78,7 +83,7 @@ class Keyring:
                 f"{folder}: the certificate of {common} has expired on {expires:%Y-%m-%d}; "
                 "issue another with dwell keys issue"
             )
-        return cls(folder, own, roster, expires, key)
+        return cls(folder, own, roster, expires, path, key)
 
     def warning(self, now: datetime | None = None) -> str:
         """Return that the certificate ends soon; nothing where it does not."""
@@ -95,17 +100,17 @@ class Keyring:
         return self._key.sign(domain + b"\0" + data)
 
 
-def _read(folder: Path) -> tuple[x509.Certificate, x509.Certificate, Ed25519PrivateKey]:
+def _read(folder: Path) -> tuple[x509.Certificate, x509.Certificate, Ed25519PrivateKey, Path]:
     try:
-        mode = (folder / "key.pem").stat().st_mode
-        if mode & (stat.S_IRWXG | stat.S_IRWXO):
-            raise TrustError(
-                f"{folder / 'key.pem'}: others may use it (mode {stat.S_IMODE(mode):o}); "
-                "chmod 600 it"
-            )
         authority = x509.load_pem_x509_certificate((folder / "ca.pem").read_bytes())
         certificate = x509.load_pem_x509_certificate((folder / "cert.pem").read_bytes())
-        key = load_pem_private_key((folder / "key.pem").read_bytes(), password=None)
+        path = key_file(folder, certificate.public_key())
+        mode = path.stat().st_mode
+        if mode & (stat.S_IRWXG | stat.S_IRWXO):
+            raise TrustError(
+                f"{path}: others may use it (mode {stat.S_IMODE(mode):o}); chmod 600 it"
+            )
+        key = load_pem_private_key(path.read_bytes(), password=None)
     except OSError as error:
         raise TrustError(f"{error.filename}: cannot be read ({error.strerror})") from None
     except (ValueError, TypeError) as error:
@@ -113,5 +118,5 @@ def _read(folder: Path) -> tuple[x509.Certificate, x509.Certificate, Ed25519Priv
             raise
         raise TrustError(f"{folder}: a key or certificate is damaged ({error})") from None
     if not isinstance(key, Ed25519PrivateKey):
-        raise TrustError(f"{folder / 'key.pem'}: is no Ed25519 key")
-    return authority, certificate, key
+        raise TrustError(f"{path}: is no Ed25519 key")
+    return authority, certificate, key, path

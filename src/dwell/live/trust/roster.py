@@ -8,6 +8,7 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -23,9 +24,20 @@ Role: TypeAlias = Literal["node", "controller", "operator", "observer"]
 ROLES: tuple[Role, ...] = ("node", "controller", "operator", "observer")
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,47}")
-VERSION = 1
+VERSION = 2
 MAX_BYTES = 1 << 20
+#: From when on before a certificate's end the status warns; a third of its life, if that is less.
+WARNING = timedelta(days=14)
 DOMAIN = b"dwell roster 1\0"
+
+
+def require_name(name: object) -> None:
+    """Raise a TrustError unless a subject can have a name."""
+    if not isinstance(name, str) or not NAME.fullmatch(name):
+        raise TrustError(
+            f"{name!r} is no name of a subject; write letters, digits, - and _, "
+            "beginning with a letter, 48 at most"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +53,8 @@ class Subject:
         revoked is not taken for the one that followed.
     public_key : str
         Ed25519, base64.
-    expires : str
-        Day, ISO 8601.
+    issued, expires : str
+        ISO 8601, with the offset to UTC.
     """
 
     name: str
@@ -50,20 +62,31 @@ class Subject:
     generation: int
     serial: int
     public_key: str
+    issued: str
     expires: str
 
     def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not NAME.fullmatch(self.name):
-            raise TrustError(
-                f"{self.name!r} is no name of a subject; write letters, digits, - and _, "
-                "beginning with a letter, 48 at most"
-            )
+        require_name(self.name)
         if self.role not in ROLES:
             raise TrustError(f"{self.name}: no role {self.role!r}; there are {', '.join(ROLES)}")
         if type(self.generation) is not int or self.generation < 1:
             raise TrustError(f"{self.name}: generation is {self.generation!r}, not 1 or more")
         if type(self.serial) is not int or self.serial < 1:
             raise TrustError(f"{self.name}: serial is {self.serial!r}, not 1 or more")
+        for instant in (self.issued, self.expires):
+            if datetime.fromisoformat(instant).tzinfo is None:
+                raise TrustError(f"{self.name}: {instant} has no offset to UTC")
+
+    @property
+    def ends(self) -> datetime:
+        """Instant at which its certificate ends."""
+        return datetime.fromisoformat(self.expires)
+
+    @property
+    def warns_from(self) -> datetime:
+        """Instant from which the cell's status warns of the end."""
+        life = self.ends - datetime.fromisoformat(self.issued)
+        return self.ends - min(WARNING, life / 3)
 
     @property
     def common_name(self) -> str:
@@ -95,15 +118,28 @@ class Roster:
     number : int
         Grows with every change.
     subjects : mapping of str to Subject
-        Subjects whose certificates are in force, by name.
+        Subjects with their newest certificates, by name.
     revoked : tuple of int
         Serial numbers of certificates that are not in force.
+    earlier : tuple of Subject
+        Certificates before the newest that are in force until they end, so that hosts may take
+        the newest in any order.
     """
 
     cell: str
     number: int
     subjects: Mapping[str, Subject]
     revoked: tuple[int, ...] = ()
+    earlier: tuple[Subject, ...] = ()
+
+    @property
+    def certificates(self) -> tuple[Subject, ...]:
+        """All that are in force; of one name the newest is the last."""
+        return *self.earlier, *self.subjects.values()
+
+    def of(self, name: str) -> list[Subject]:
+        """Return the certificates of a name, the newest first."""
+        return [one for one in reversed(self.certificates) if one.name == name]
 
     def signed(self, key: Ed25519PrivateKey) -> str:
         """Return it as JSON, signed by the authority."""
@@ -117,7 +153,7 @@ class Roster:
             "dwell": VERSION,
             "cell": self.cell,
             "number": self.number,
-            "subjects": [asdict(subject) for subject in self.subjects.values()],
+            "subjects": [asdict(subject) for subject in self.certificates],
             "revoked": list(self.revoked),
         }
 
@@ -148,7 +184,9 @@ class Roster:
             if isinstance(error, TrustError):
                 raise
             raise TrustError(f"{path}: is no roster ({type(error).__name__}: {error})") from None
-        return cls(cell, number, {subject.name: subject for subject in subjects}, tuple(revoked))
+        newest = {subject.name: subject for subject in subjects}
+        earlier = tuple(one for one in subjects if one is not newest[one.name])
+        return cls(cell, number, newest, tuple(revoked), earlier)
 
 
 def _canonical(document: Mapping[str, Any]) -> bytes:

@@ -22,9 +22,9 @@ class Seals:
     """Signs a process's messages, and checks those of others."""
 
     def __init__(self, keyring: Keyring) -> None:
-        self._keyring = keyring
+        self.keyring = keyring
         self._domain = f"dwell message 1 {keyring.roster.cell} "
-        self._keys: dict[str, Ed25519PublicKey] = {}
+        self._keys: dict[str, list[Ed25519PublicKey]] = {}
         self._good: dict[tuple[str, str, bytes], None] = {}
 
     def seal(self, word: str, data: bytes) -> bytes:
@@ -35,7 +35,7 @@ class Seals:
         word : str
             Kind of the message, by the first word of its key.
         """
-        return self._keyring.sign(self._of(word), data) + data
+        return self.keyring.sign(self._of(word), data) + data
 
     def require(self, word: str, name: str, sealed: bytes) -> None:
         """Raise a TrustError unless a subject has sealed a message.
@@ -43,7 +43,7 @@ class Seals:
         Parameters
         ----------
         name : str
-            Common name of the subject.
+            Name of the subject, who may have used the key of any certificate that is in force.
         """
         known = word, name, sealed
         if known in self._good:
@@ -55,18 +55,20 @@ class Seals:
         self._good[known] = None
 
     def _verifies(self, word: str, name: str, sealed: bytes) -> bool:
-        key = self._keys.get(name)
-        if key is None:
-            subject = self._keyring.roster.subjects.get(name)
-            if subject is None:
-                return False
-            key = self._keys[name] = subject.key
+        if name not in self._keys:
+            self._keys[name] = [subject.key for subject in self.keyring.roster.of(name)]
         signature, data = sealed[:SIGNATURE_BYTES], sealed[SIGNATURE_BYTES:]
-        try:
-            key.verify(signature, self._of(word) + b"\0" + data)
-        except InvalidSignature:
-            return False
-        return True
+        return any(
+            _is_signed(key, signature, self._of(word) + b"\0" + data) for key in self._keys[name]
+        )
 
     def _of(self, word: str) -> bytes:
         return (self._domain + word).encode()
+
+
+def _is_signed(key: Ed25519PublicKey, signature: bytes, data: bytes) -> bool:
+    try:
+        key.verify(signature, data)
+    except InvalidSignature:
+        return False
+    return True
