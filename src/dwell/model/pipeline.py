@@ -93,7 +93,9 @@ class Task:
         default=0,
     )
     run: str | None = key(
-        "Class or function of a live worker, as `package.module:Name`.", default=None
+        "Class or function of a live worker, as `package.module:Name`.",
+        default=None,
+        digested="code",
     )
 
     def __post_init__(self) -> None:
