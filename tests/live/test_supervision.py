@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import shutil
@@ -61,6 +62,32 @@ def test_a_killed_process_is_started_again(supervisor: Supervisor, said: list[st
     until(supervisor, lambda: child.starts == 2)
     assert child.pid != first
     assert said == ["worker@E was killed by SIGKILL"]
+
+
+def test_processes_are_restarted_one_after_another_and_the_stamper_last(
+    supervisor: Supervisor, said: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(supervision, "SETTLE_S", 0.2)
+    monkeypatch.setattr(supervision, "STOP_S", 0.2)
+    deaf = "import signal; signal.signal(15, signal.SIG_IGN); print('deaf', flush=True); "
+    names = ("sink.control@E", "stamper@E", "worker@E")
+    children = [
+        keep(supervisor, who, f"{deaf if who == 'worker@E' else ''}import time; time.sleep(1000)")
+        for who in names
+    ]
+    until(supervisor, lambda: all(child.starts == 1 for child in children))
+    until(supervisor, lambda: "deaf" in children[2].file("log").read_text())
+    supervisor.renew()
+    until(supervisor, lambda: all(child.starts == 2 for child in children))
+    ended = [line for line in said if not line.endswith("is restarted with other code")]
+    assert ended == [
+        "worker@E was killed by SIGKILL: deaf",
+        "sink.control@E was killed by SIGTERM",
+        "stamper@E was killed by SIGTERM",
+    ]
+    # Each had settled before the next one was ended.
+    began = sorted(child.started_s for child in children)
+    assert all(later - earlier > 0.2 for earlier, later in itertools.pairwise(began))
 
 
 def test_a_state_folder_that_is_removed_is_made_again(

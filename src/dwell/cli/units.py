@@ -27,6 +27,8 @@ After=network-online.target{beside}
 User={user}
 StateDirectory=dwell
 {environment}ExecStart={command}
+# Takes an edited cell file over.
+ExecReload=/bin/kill -HUP $MAINPID
 Restart=always
 RestartSec=1
 {settings}
@@ -109,7 +111,8 @@ def unit_texts(
     called = f"Dwell agent of node {node} of cell {problem.name}"
     units = {"dwell-agent.service": unit(called, agent, AGENT, beside=" time-sync.target")}
     if node == problem.controller_node:
-        controller = ("controller", "--cell", str(cell), "--out", f"{STATE}/runs")
+        files = ("--out", f"{STATE}/runs", "--state", STATE)
+        controller = ("controller", "--cell", str(cell), *files)
         called = f"Dwell controller of cell {problem.name}"
         units["dwell-controller.service"] = unit(called, controller, CONTROLLER)
     return units

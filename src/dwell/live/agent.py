@@ -94,6 +94,8 @@ class Agent:
     ----------
     busy_ns : callable
         Returns the core-nanoseconds that the node has been busy so far.
+    changed : callable
+        Returns which files have changed since the node began; empty for none.
     """
 
     def __init__(
@@ -102,8 +104,9 @@ class Agent:
         supervisor: Supervisor,
         busy_ns: Callable[[], int],
         accelerator: Gauge | None = None,
+        changed: Callable[[], str] = str,
     ) -> None:
-        self.place, self.supervisor = place, supervisor
+        self.place, self.supervisor, self._changed = place, supervisor, changed
         self._busy_ns, self._accelerator = busy_ns, accelerator
         self.cpu_clock: Callable[[], int] = time.process_time_ns
         # No guard waits for it: it carries nothing that a cycle needs.
@@ -151,7 +154,7 @@ class Agent:
 
     def _state(self) -> tuple[bool, str]:
         trouble = "" if self._accelerator is None else self._accelerator.trouble()
-        notes = self.supervisor.notes(), trouble
+        notes = self.supervisor.notes(), trouble, self._changed()
         return not self.supervisor.stuck(), "; ".join(note for note in notes if note)
 
     def wake(self, now_ns: int) -> int:

@@ -10,7 +10,7 @@ import shutil
 import signal
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
@@ -31,6 +31,8 @@ FIRST_WAIT_S, LONGEST_WAIT_S = 0.05, 5.0
 STOP_S = 3.5
 #: Time between two looks whether they have, or whether they shall end at once.
 LOOK_S = 0.1
+#: A process that is restarted for other code has lived so long before the next one is.
+SETTLE_S = 1.0
 #: A process that lived so long has recovered.
 HEALTHY_S = 10.0
 #: Deaths of one message before it is put aside.
@@ -128,6 +130,9 @@ class Supervisor:
         self._say = say
         self._oom_kills = _oom_kills()
         self._launcher = launcher
+        # Processes to restart, in their order, and when the first of them was told to end.
+        self._renewed: deque[tuple[SupervisedProcess, Running]] = deque()
+        self._ending_s: float | None = None
         # What has become of the folder, if it was removed, and when.
         self._lost, self._lost_s = "", -math.inf
 
@@ -162,11 +167,34 @@ class Supervisor:
     def step(self) -> None:
         """Look after every process once."""
         ready = self._launcher.ready()
+        self._renew()
         for child in self.children:
             if self._alive(child) or not self._end_group(child):
                 continue
             if ready and time.monotonic() >= child.next_s and not self._adopts(child):
                 self._start(child)
+
+    def renew(self) -> None:
+        """Have all processes that run restarted one after another, sinks and stamper last."""
+        children = sorted(self.children, key=lambda one: one.who.startswith(("sink.", "stamper@")))
+        self._renewed.extend((one, one.process) for one in children if one.process is not None)
+
+    def _renew(self) -> None:
+        """Restart the next process once the one before has settled."""
+        if not self._renewed:
+            return
+        (child, before), now_s = self._renewed[0], time.monotonic()
+        if child.process is not before:
+            if child.process is not None and now_s - child.started_s >= SETTLE_S:
+                self._renewed.popleft()
+                self._ending_s = None
+        elif self._ending_s is None:
+            self._ending_s = now_s
+            self._say(f"{child.who}: is restarted with other code")
+            for number in (signal.SIGTERM, signal.SIGCONT):
+                _send(before.pid, number)
+        elif now_s - self._ending_s > STOP_S:
+            _send(before.pid, signal.SIGKILL)
 
     def _alive(self, child: SupervisedProcess) -> bool:
         if child.process is None:
@@ -378,6 +406,11 @@ class Supervisor:
         while left and time.monotonic() < deadline:
             time.sleep(0.01)
             left = [child for child in left if not self._end_group(child)]
+
+
+def _send(pid: int, number: int) -> None:
+    with suppress(ProcessLookupError):
+        os.kill(pid, number)
 
 
 def _signal(process: psutil.Process, number: int) -> None:
