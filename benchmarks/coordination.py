@@ -22,7 +22,7 @@ import polars as pl
 import dwell
 from benchmarks.canonical import CELL
 from dwell.control.coordination import Coordination, Verdict, Wish
-from dwell.control.ledger import FleetLedger, PricedCell, Seat
+from dwell.control.ledger import FleetLedger, Seat
 from dwell.cost import cost_error, price
 from dwell.estimators.load_table import load_table
 from dwell.model import NodeDisturbance, Problem
@@ -30,7 +30,7 @@ from dwell.model.fleet import Fleet, FleetEntry
 from dwell.model.progress import Progress
 from dwell.record.fleet_run import FleetRun
 from dwell.sim import fleet as fleets
-from dwell.sim.fleet import phased, simulate_fleet
+from dwell.sim.fleet import phased, simulate_fleet, tabled_cells
 from dwell.study.fleet_plan import best_placements
 from dwell.study.intervals import mean_interval
 
@@ -182,25 +182,21 @@ def rules(cells: int, seeds: Sequence[int], pool: ProcessPoolExecutor) -> Iterat
 
 def compare_table(cells: int, seeds: Sequence[int], pool: ProcessPoolExecutor) -> Iterator[str]:
     """Yield how far the table of loads is from long runs of those placements."""
-    fleet = fleet_of(cells, [])
-    specs = [
-        PricedCell(cell.name, problem, cell.streams)
-        for cell, problem in zip(fleet.cells, phased(fleet, seeds[0]), strict=True)
-    ]
-    table = load_table(specs, ["E"])
+    table = load_table(tabled_cells(fleet_of(cells, []), 1), ["E"])
     yield "| candidate | cells | J: table, run | V_D, %: table, run |\n|---|---|---|---|\n"
-    objective = fleet.entries[0].cell.objective
+    objective = table.cells[0].problem.objective
     for name in SPLITS:
         column = table.columns[0, name]
-        for size in range(1, cells + 1, max(cells // 12, 1)):
-            rate, l95_ms = column.violation_rate[size - 1], column.l95_ms[size - 1]
+        for row, level in enumerate(column.level.tolist()):
+            size = round(level / column.level[0])
+            rate, l95_ms = column.violation_rate[row], column.l95_ms[row]
             seen = list(pool.map(partial(long_run, cells, name, size), seeds))
             run_l95_ms, run_rate = np.mean(seen, axis=0)
             j, run_j = (
                 price(one, of, 0.0, 0.0, 0.0, 0.0, objective)
                 for one, of in ((l95_ms, rate), (run_l95_ms, run_rate))
             )
-            error_ms, error = column.l95_error_ms[size - 1], column.violation_error[size - 1]
+            error_ms, error = column.l95_error_ms[row], column.violation_error[row]
             j_error = cost_error((error_ms, error), objective)
             yield (
                 f"| {name} | {size} | {j:.3f} ± {j_error:.3f}, {run_j:.3f} "
@@ -214,7 +210,8 @@ def long_run(cells: int, name: str, size: int, seed: int) -> tuple[float, float]
     fleet = fleet_of(cells, [])
     first = next(iter(phased(fleet, 1)))
     # The phases of the table's cells, other draws.
-    phases = [problem.pipeline.first_release_ms for problem in phased(fleet, 1)][:size]
+    tabled = tabled_cells(fleet, 1)[:size]
+    phases = [cell.problem.pipeline.first_release_ms for cell in tabled]
     (entry,) = fleet.entries
     fleet = replace(
         fleet,

@@ -48,8 +48,8 @@ ALONE: Chosen = {
     "testbed/test_execution.py": (),
 }
 
-#: Files and folders whose tests one process has, one after another: real processes that may take
-#: their time, but look for free ports, or for free CPUs; and what is built once.
+#: Files and folders whose tests one process runs in turn: cells of twenty processes, of which two
+#: at once are too much for two CPUs; what looks for free CPUs; and what is built once.
 TOGETHER = {
     "cells": (
         "cli/test_background.py",
@@ -59,9 +59,6 @@ TOGETHER = {
         "cli/test_new.py",
         "dash/test_live_page.py",
         "dash/test_live_page_with_keys.py",
-        "live/test_security.py",
-        "live/transport",
-        "test_readme.py",
     ),
     "testbeds": (
         "cli/test_testbed.py",
@@ -111,6 +108,7 @@ LISTED = {"alone": ALONE, "exhaustive": EXHAUSTIVE}
 
 #: Files whose tests share nothing, and take longest: any process has any of them.
 APART = (
+    "test_readme.py",
     "test_sanitizers.py",
     "test_compilers.py",
     "reference/test_against.py",

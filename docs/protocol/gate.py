@@ -3,12 +3,17 @@
 A stamper that numbers cycles, and a sink before an actuator; both die and start again. What was
 stamped once may reach the sink as a command at any time later, any number of times, or never. The
 actuator may raise, at a command and when it is told to hold, and has been told in the end.
+
+The stamper's computer may lose its power: its book is then an old one or gone, and its clock may
+be right or not set at all. The sink repeats the run of its newest command, and one message may
+claim any run.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple, TypeAlias
 
 from docs.protocol.checker import Rules, Step, report
@@ -20,7 +25,10 @@ RULES = {
     "memory": "a sink that starts again knows the newest command",
     "before": "a command is remembered before it is applied, not after",
     "age": "a command that is too old is dropped",
-    "run": "a stamper whose book is gone begins a later run",
+    "run": "a stamper whose book is gone begins another run",
+    "boot": "a stamper with a book of another boot begins a run beyond it",
+    "heard": "a stamper without a book of this boot goes beyond the run that the sink repeats",
+    "equal": "an unsigned claim is believed when it comes again without another between",
     "refused": "a command that the actuator has refused is not applied again",
     "again": "an actuator that raises when it is told to hold is told again",
 }
@@ -41,21 +49,28 @@ class Limits:
     crashes : int
         Processes that die and start again, and calls at which the actuator raises.
     losses : int
-        Times that the stamper's book is gone, too.
+        Times that the stamper's book is gone or old, too.
+    lies : int
+        Claims of a run that does not exist.
     block : int
         Numbers that are reserved at a time.
     fresh : int
         Cycles after whose release a command is too old.
     """
 
-    cycles: int = 7
+    cycles: int = 5
     crashes: int = 3
     losses: int = 1
+    lies: int = 1
     block: int = 2
     fresh: int = 3
 
 
 ALL, LIMITS = Rules(), Limits()
+#: All that may happen at once is too much to look at every state.
+CASES = Limits(losses=0, lies=0), Limits(crashes=2)
+#: Run that the clock names at the first start and later, and where it was not set; the highest.
+EARLIER, LATER, UNSET, TOP = 2, 5, 1, 9
 
 
 class State(NamedTuple):
@@ -78,11 +93,15 @@ class State(NamedTuple):
     watch : str
         Whether the actuator is to be told to hold when no command comes: ``armed``; ``rests`` where
         it has been told, or never moved; ``gone`` where it has not, and nobody will tell it.
-    crashes, losses : int
+    unsure : bool
+        Whether the stamper has no book of this boot.
+    claim : tuple
+        Run that was claimed last, and how many times in a row.
+    crashes, losses, lies : int
         How many there have been.
     """
 
-    run: int = 1
+    run: int = EARLIER
     cycle: int = 0
     reserved: int = 0
     stamped: tuple[Number, ...] = ()
@@ -91,8 +110,11 @@ class State(NamedTuple):
     under_way: Number = NONE
     actuated: Number = NONE
     watch: str = "rests"
+    unsure: bool = False
+    claim: tuple[int, int] = (0, 0)
     crashes: int = 0
     losses: int = 0
+    lies: int = 0
 
 
 def initial() -> State:
@@ -103,6 +125,7 @@ def initial() -> State:
 def good(state: State) -> bool:
     """Whether the actuator has had the last cycle, or rests where none may come any more."""
     over = len(state.stamped) == LIMITS.cycles and state.watch == "rests"
+    over = over and state.run >= state.newest[0]
     return over or (bool(state.stamped) and state.actuated == state.stamped[-1])
 
 
@@ -110,6 +133,7 @@ def successors(state: State, rules: Rules = ALL, limits: Limits = LIMITS) -> Ite
     """Return everything that may happen next."""
     yield from _faults(state, rules, limits)
     yield from _stamp(state, limits)
+    yield from _claims(state, rules, limits)
     if state.under_way == NONE:
         for number in set(state.stamped):
             if _passes(state, rules, limits, number):
@@ -147,9 +171,15 @@ def _faults(state: State, rules: Rules, limits: Limits) -> Iterator[Step[State]]
     cycle = state.reserved if rules.holds("reservation") else behind
     yield Step("the stamper starts again", once._replace(cycle=cycle), fault=True)
     if state.losses < limits.losses:
-        run = state.run + 1 if rules.holds("run") else state.run
-        fresh = once._replace(run=run, cycle=0, reserved=0, losses=state.losses + 1)
-        yield Step("the stamper starts again without its book", fresh, fault=True)
+        lost = once._replace(unsure=True, claim=(0, 0), losses=state.losses + 1)
+        for clock in (LATER, UNSET):
+            run = clock if rules.holds("run") else state.run
+            fresh = lost._replace(run=run, cycle=0, reserved=0)
+            yield Step(f"its book is gone, and its clock says {clock}", fresh, fault=True)
+            old = lost._replace(run=max(clock, state.run + 1), cycle=0, reserved=0)
+            if not rules.holds("boot"):
+                old = lost._replace(cycle=1, reserved=1)
+            yield Step(f"its book is old, and its clock says {clock}", old, fault=True)
     known = state.book if rules.holds("memory") else NONE
     watch = "rests" if known == NONE else "armed"
     reborn = once._replace(newest=known, under_way=NONE, watch=watch)
@@ -157,6 +187,29 @@ def _faults(state: State, rules: Rules, limits: Limits) -> Iterator[Step[State]]
     if state.under_way != NONE and not rules.holds("before"):
         applied = reborn._replace(actuated=state.under_way)
         yield Step("the sink applies, and starts again", applied, fault=True)
+
+
+def _claims(state: State, rules: Rules, limits: Limits) -> Iterator[Step[State]]:
+    """Somebody says which run the sink has let through."""
+    if state.newest != NONE and rules.holds("heard"):
+        claimed = _claimed(state, rules, state.newest[0])
+        yield Step(f"the sink says that it knows run {state.newest[0]}", claimed)
+    if state.lies < limits.lies:
+        claimed = _claimed(state, rules, TOP)._replace(lies=state.lies + 1)
+        wrong = "the numbers are used up" if claimed.run > TOP else ""
+        yield Step(f"somebody makes up run {TOP}", claimed, fault=True, wrong=wrong)
+
+
+def _claimed(state: State, rules: Rules, run: int) -> State:
+    """Return what a stamper makes of a claim."""
+    if not state.unsure:
+        return state
+    before, count = state.claim
+    count = min(count + 1, 2) if before == run else 1
+    state = state._replace(claim=(run, count))
+    if run <= state.run or (count < 2 and rules.holds("equal")):
+        return state
+    return state._replace(run=run + 1, claim=(0, 0))
 
 
 def _stamp(state: State, limits: Limits) -> Iterator[Step[State]]:
@@ -198,4 +251,4 @@ def _apply(state: State, rules: Rules, limits: Limits) -> Step[State]:
 
 
 if __name__ == "__main__":
-    report(initial(), [successors], good, RULES)
+    report(initial(), [partial(successors, limits=limits) for limits in CASES], good, RULES)

@@ -31,6 +31,7 @@ from dwell.calibration.round_trips import (
     time_round_trips,
 )
 from dwell.errors import MeasurementError, ProblemError, ProfileError
+from tests.waiting import PATIENCE_S
 
 LOCAL = "127.0.0.1"
 
@@ -52,8 +53,8 @@ def listening(*, idle_s: float = 60) -> Iterator[tuple[int, list[str]]]:
         daemon=True,
     )
     thread.start()
-    yield ports.get(timeout=10), said
-    thread.join(timeout=10)
+    yield ports.get(timeout=PATIENCE_S), said
+    thread.join(timeout=PATIENCE_S)
     assert not thread.is_alive()
 
 
@@ -69,7 +70,7 @@ def peer(serve: Callable[[socket.socket], object]) -> Iterator[int]:
         thread = threading.Thread(target=accept, daemon=True)
         thread.start()
         yield server.getsockname()[1]
-        thread.join(timeout=10)
+        thread.join(timeout=PATIENCE_S)
 
 
 def call(
@@ -161,7 +162,7 @@ def test_a_listener_in_another_process() -> None:
         lines = [process.stderr.readline().rstrip("\n") for _ in range(3)]
     finally:
         process.terminate()
-        process.communicate(timeout=10)
+        process.communicate(timeout=PATIENCE_S)
     assert [line.partition(": ")[2].partition(";")[0] for line in lines] == [
         "15 messages answered",
         "0 messages answered",

@@ -16,3 +16,9 @@ def cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     path = tmp_path / "small.yaml"
     path.write_text(SMALL, encoding="utf-8")
     return path
+
+
+@pytest.fixture(autouse=True)
+def _no_lines_of_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Print no line of progress, as on a machine that is fast enough."""
+    monkeypatch.setattr("dwell.cli.output.EVERY_S", 600.0)

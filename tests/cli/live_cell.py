@@ -6,12 +6,10 @@ import json
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +21,10 @@ from dwell.live.operator_client import OperatorClient
 from dwell.live.wiring import PORTS_PER_ROLE, roles
 from dwell.model.document import to_document
 from tests.cli.small_cell import ROOT, call
+from tests.ports import free_ports
+from tests.waiting import PATIENCE_S
 
 EXAMPLE = ROOT / "examples" / "live"
-PATIENCE_S = 60.0
 
 #: Stages that do what the file `mood` beside them says, and an accelerator's utilisation.
 MOODY = """
@@ -57,20 +56,20 @@ def busy():
 """
 
 
-def free_ports(count: int) -> int:
-    """Return the first of so many ports that nobody has."""
-    for first in range(20_000 + os.getpid() % 1_000, 32_000, count):
-        with ExitStack() as stack, suppress(OSError):
-            for port in range(first, first + count):
-                stack.enter_context(socket.create_server(("127.0.0.1", port)))
-            return first
-    raise AssertionError("no ports")
-
-
 def invoke(*arguments: str | Path) -> tuple[int, str, str]:
     """Run a command in this process."""
     result = call(*arguments)
     return result.exit_code, result.stdout, result.stderr
+
+
+def in_window(placement: str) -> Callable[[dict[str, Any]], bool]:
+    """Return whether a cell is at a placement, and the last window that has closed was, too."""
+
+    def holds(status: dict[str, Any]) -> bool:
+        here = status["placement"], status["window"].get("placement")
+        return here == (placement, placement)
+
+    return holds
 
 
 class RealCell:
@@ -93,9 +92,10 @@ class RealCell:
         document = to_document(dwell.load(self.file))
         document["tasks"]["perception"]["run"] = "moody:Perception"
         document["nodes"]["E"]["accelerators"] = {"gpu": 1}
-        # Other work on this machine may not look like a fault.
-        document["live"] |= {"release": "frames", "max_age_ms": 400, "degraded_at": 1}
-        document["controller"] |= {"guard_cycles": 20, "policy": "LOC"}
+        # Other work on this machine may not look like a fault. Where it does, the guard moves the
+        # cell, which soon proves that it can return.
+        document["live"] |= {"release": "frames", "max_age_ms": 1_000, "degraded_at": 1}
+        document["controller"] |= {"guard_cycles": 40, "probe_cycles": 5, "policy": "LOC"}
         # Tests count windows, and act between two decisions.
         document["controller"]["decide_cycles"] = document["window_cycles"]
         nodes = list(document["nodes"])
@@ -144,11 +144,11 @@ class RealCell:
         self.start("controller", "controller", *words, *more)
 
     def begin(self) -> None:
-        """Start the controller and all agents, and wait until a window has closed."""
+        """Start the controller and all agents, and wait for a window where the policy stays."""
         self.controller()
         for node in ("R2", "E", "R1"):
             self.agent(node)
-        self.until(lambda status: status["window"] and not status["silent"])
+        self.until(lambda status: in_window("LOC")(status) and not status["silent"])
 
     def end(self, name: str) -> int:
         """End a command as systemd would."""
@@ -178,14 +178,14 @@ class RealCell:
         logs = "\n".join(f"{p.name}: {p.read_text()}" for p in self.folder.glob("*.log"))
         raise AssertionError(f"it has not come about: {json.dumps(found, indent=1)}\n{logs}")
 
-    def show(self, holds: Callable[[str], object], *options: str) -> str:
-        """Print the status, by the command, until its output is as wanted; then it exits with 0."""
+    def show(self, holds: Callable[[str], object], *options: str | Path, code: int = 0) -> str:
+        """Print the status, by the command, until its output is as wanted, with its exit code."""
         limit_s = time.monotonic() + PATIENCE_S
         stdout = ""
         while time.monotonic() < limit_s:
-            code, stdout, _ = invoke("live", "status", *options, "--cell", self.file)
-            if holds(stdout):
-                assert code == 0
+            found, stdout, _ = invoke("live", "status", *options, "--cell", self.file)
+            if stdout and holds(stdout):
+                assert found == code
                 return stdout
             time.sleep(0.02)
         raise AssertionError(f"the status never read so; the last one: {stdout}")

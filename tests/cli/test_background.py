@@ -19,9 +19,9 @@ from dwell.live.local_addresses import taken_ports
 from dwell.live.supervision import survivor
 from dwell.live.wiring import wire
 from dwell.record import open_run
-from tests.cli.live_cell import MOODY, PATIENCE_S, RealCell, invoke
+from tests.cli.live_cell import MOODY, RealCell, invoke
 from tests.cli.small_cell import environment
-from tests.waiting import wait_until
+from tests.waiting import PATIENCE_S, wait_until
 
 #: An address for documentation (RFC 5737), which no computer has.
 AWAY = "192.0.2.7"

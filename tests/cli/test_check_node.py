@@ -20,8 +20,34 @@ from tests.cli.small_cell import assert_refused, call
 
 HOSTS = {node: {"port": 7_100 + 100 * i} for i, node in enumerate(("R1", "E", "R2"))}
 STAGES = """
+import time
+
+
 class Bare:
     pass
+
+
+class Keeps:
+    takes_s = 0.0
+
+    def process(self, inputs):
+        return None
+
+    def snapshot(self):
+        time.sleep(self.takes_s)
+        return bytes(9)
+
+    def restore(self, state):
+        assert len(state) == 9
+
+
+class KeepsLong(Keeps):
+    takes_s = 0.3
+
+
+class NeedsStart(Keeps):
+    def snapshot(self):
+        raise RuntimeError("not started")
 """
 
 
@@ -94,6 +120,28 @@ def test_a_stage_that_cannot_run_there_is_told(
     assert [one["path"] for one in found["faults"]] == [path]
     # Another node has nothing to do with it.
     assert call("check", cell, "--node", "R2").exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("run", "timed", "warning"),
+    [
+        ("Keeps", True, ""),
+        ("KeepsLong", True, "no checkpoints are made"),
+        ("NeedsStart", False, "its state was not timed (RuntimeError: not started)"),
+    ],
+)
+def test_the_times_of_a_state_are_shown(folder: Path, run: str, timed: bool, warning: str) -> None:
+    cell = written(folder, {"run": f"own_stages:{run}", "state_bytes": 9})
+    result = call("check", cell, "--node", "E")
+    assert result.exit_code == 0
+    assert ("perception: snapshot() takes " in result.stdout) == timed
+    assert warning in result.stderr
+    assert bool(result.stderr) == bool(warning)
+    states = json.loads(call("check", cell, "--node", "E", "--json").stdout)["states"]
+    assert set(states) == ({"perception"} if timed else set())
+    if timed:
+        assert states["perception"]["bytes"] == 9
+        assert states["perception"]["snapshot_ms"] >= (300 if run == "KeepsLong" else 0)
 
 
 def test_what_nobody_applies_and_what_has_no_stage_is_told_at_once(folder: Path) -> None:

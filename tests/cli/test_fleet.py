@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 from dwell.record import FleetRun, open_fleet
+from dwell.study.capacity import FleetPlayer
+from dwell.study.played_sizes import PlayedSize, Sizes
 from tests.cli.small_cell import ROOT, SMALL, assert_refused, call, read_json
 
 FLEET = """\
@@ -214,6 +216,46 @@ def test_a_capacity_on_a_terminal_with_what_would_change_it(crowd: Path) -> None
     assert call(*command, "--what-if").exit_code == 0
 
 
+def test_an_interrupted_capacity_keeps_its_sizes_and_goes_on(
+    crowd: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = ("fleet", "capacity", crowd, "--policy", "OFF", "--phases", "sync", *FEW, "--json")
+    whole = read_json(call(*command))
+    assert not Path("capacity").exists()
+    play = FleetPlayer.__call__
+
+    def interrupted(self: FleetPlayer, unit: Sizes) -> list[PlayedSize]:
+        if unit.seed > 3:
+            raise KeyboardInterrupt
+        return play(self, unit)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(FleetPlayer, "__call__", interrupted)
+        result = call(*command)
+    assert (result.exit_code, result.stdout) == (130, "")
+    file = Path("capacity/pair-OFF-sync.played")
+    assert f"interrupted: the results of 18 runs are in {file}; the same command" in result.stderr
+
+    def others(self: FleetPlayer, unit: Sizes) -> list[PlayedSize]:
+        assert unit.seed > 3
+        return play(self, unit)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(FleetPlayer, "__call__", others)
+        assert read_json(call(*command)) == whole
+    assert not Path("capacity").exists()
+
+
+def test_a_capacity_warns_of_cells_that_are_played_for_long(
+    crowd: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dwell.study.capacity.MANY_CYCLES", 399)
+    command = ("fleet", "capacity", crowd, "--policy", "OFF", "--phases", "sync", "--most", "1")
+    result = call(*command, "--processes", "1", "--json")
+    assert result.exit_code == 0
+    assert f"{crowd}: warning: cells[0].cell: a run counts 400 cycles of small" in result.stderr
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -239,3 +281,19 @@ def test_the_plan_of_a_fleet(crowd: Path) -> None:
     told = json.loads(call("fleet", "plan", crowd, "--phases", "sync", "--json").stdout)
     assert {"fleet", "seed", "phases", "phi", "table_phi", "cells"} == set(told)
     assert set(told["cells"][0]) == {"cell", "placement", "violation_rate", "l95_ms"}
+
+
+def test_a_plan_names_the_cells_that_stay_above_a_limit(crowd: Path) -> None:
+    """The edge has no room for four cells, and their robots are too slow."""
+    crowd.write_text(FLEET.replace("count: 2", "count: 4"), encoding="utf-8")
+    command = ("fleet", "plan", crowd, "--phases", "sync")
+    found = read_json(call(*command, "--limit", "0.05", "--json"))
+    assert found["limit"] == 0.05
+    assert found["above"] == [one["cell"] for one in found["cells"] if one["violation_rate"] > 0.05]
+    assert 0 < len(found["above"]) < 4
+    text = call(*command, "--limit", "0.05").stdout
+    names = ", ".join(found["above"])
+    assert text.endswith(f"\n{len(found['above'])} of 4 cells stay above 5 %: {names}\n")
+    assert_refused(call(*command, "--limit", "5"), "--limit: 5 is not allowed", "between 0 and 1")
+    crowd.write_text(FLEET, encoding="utf-8")
+    assert call(*command, "--limit", "0.05").stdout.endswith("\n0 of 2 cells stay above 5 %\n")

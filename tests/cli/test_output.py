@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from dwell.cli.output import aligned, progress, working, write_file
+from tests.waiting import wait_until
 
 
 def test_aligned() -> None:
@@ -39,8 +40,27 @@ def test_a_folder_is_not_overwritten(tmp_path: Path) -> None:
         write_file(tmp_path, "text")
 
 
-def test_no_progress_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+def test_short_work_prints_nothing_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     with working("thinking"), progress("simulating") as shown:
-        assert shown is None
+        shown(1, 2)
     captured = capsys.readouterr()
     assert captured.out + captured.err == ""
+
+
+def test_long_work_prints_lines_without_a_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dwell.cli.output.EVERY_S", 0.001)
+    printed = ""
+
+    def has(line: str) -> bool:
+        nonlocal printed
+        printed += capsys.readouterr().err
+        return line in printed.splitlines()
+
+    with progress("playing up to 24 robots") as shown:
+        wait_until(lambda: has("playing up to 24 robots"))
+        shown(3, 24)
+        wait_until(lambda: has("playing up to 24 robots: 3 of 24"))
+    capsys.readouterr()
+    assert capsys.readouterr().err == ""

@@ -23,6 +23,7 @@ from dwell.calibration.round_trips import listen
 from dwell.estimators import Profile
 from tests.cli.small_cell import ROOT, assert_refused, read_json
 from tests.cli.small_cell import call as call_dwell
+from tests.waiting import PATIENCE_S
 
 STAGES = """\
 import os
@@ -101,8 +102,8 @@ def port() -> Iterator[int]:
         daemon=True,
     )
     thread.start()
-    yield ports.get(timeout=10)
-    thread.join(timeout=10)
+    yield ports.get(timeout=PATIENCE_S)
+    thread.join(timeout=PATIENCE_S)
 
 
 def refused(result: Result, code: int, *words: str) -> None:
@@ -273,7 +274,7 @@ def test_an_interrupted_measurement_writes_nothing(folder: Path) -> None:
     assert process.stderr is not None
     assert process.stderr.readline() == "begun\n"
     process.send_signal(signal.SIGINT)
-    stdout, stderr = process.communicate(timeout=30)
+    stdout, stderr = process.communicate(timeout=PATIENCE_S)
     assert (process.returncode, stdout, stderr) == (130, "", "")
     assert not Path("profiles").exists()
 

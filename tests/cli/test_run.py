@@ -183,12 +183,12 @@ def test_a_wrong_argument_changes_nothing(
 
 
 def test_a_scenario_that_the_run_does_not_reach_is_warned_of(cell: Path) -> None:
-    late = cell.read_text(encoding="utf-8") + "  late: [{node: R, at_s: 1000, stress_threads: 3}]\n"
+    late = cell.read_text(encoding="utf-8") + "  late: [{node: R, at_s: 100, stress_threads: 3}]\n"
     cell.write_text(late, encoding="utf-8")
     done = call("run", cell, "--scenario", "late", "--windows", "5")
     assert done.exit_code == 0
-    assert f"{cell}: warning: scenarios.late: begins at 1000 s, " in done.stderr
-    for words in (("--scenario", "stress"), ("--scenario", "late", "--seconds", "1001")):
+    assert f"{cell}: warning: scenarios.late: begins at 100 s, " in done.stderr
+    for words in (("--scenario", "stress"), ("--scenario", "late", "--seconds", "101")):
         length = () if "--seconds" in words else ("--windows", "5")
         again = call("run", cell, *words, *length, "--force")
         assert (again.exit_code, "warning" in again.stderr) == (0, False)

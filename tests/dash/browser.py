@@ -32,11 +32,31 @@ def wait_for(page: Page, expression: str) -> None:
     until(lambda: page.evaluate(f"Boolean({expression})"))
 
 
+#: Counts the requests of a page that have no answer yet.
+COUNTING = """{
+    const plain = window.fetch;
+    window.unanswered = 0;
+    window.fetch = async (...words) => {
+        window.unanswered += 1;
+        try {
+            const answer = await plain(...words);
+            await answer.clone().arrayBuffer();
+            return answer;
+        } finally {
+            window.unanswered -= 1;
+        }
+    };
+}"""
+#: Returns after a few looks in a row at which all requests have been answered.
+SETTLED = """async () => {
+    for (let calm = 0; calm < 5; calm = window.unanswered ? 0 : calm + 1)
+        await new Promise((resolve) => setTimeout(resolve, 20));
+}"""
+
+
 def settled(shown: Page) -> None:
     """Wait until what was asked for is drawn."""
-    shown.wait_for_timeout(100)
-    shown.wait_for_load_state("networkidle")
-    shown.wait_for_timeout(50)
+    shown.evaluate(SETTLED)
 
 
 @contextmanager
@@ -52,6 +72,7 @@ def opened(
     """
     context = browser.new_context(**{"viewport": {"width": 1280, "height": 1000}, **settings})  # type: ignore[arg-type]
     page = context.new_page()
+    page.add_init_script(COUNTING)
     said: list[str] = []
     asked: set[str] = set()
     page.on("console", lambda message: said.append(message.text))

@@ -10,7 +10,8 @@ from collections.abc import Mapping
 import pytest
 
 from dwell.dash.gate import HEADERS
-from tests.dash.served import PATIENCE_S, Served, until
+from tests.dash.served import Served, until
+from tests.waiting import PATIENCE_S
 
 DATA = "/cells", "/view?begin=0&end=1", "/state?at=0", "/jobs?begin=0&end=1", "/events"
 

@@ -19,8 +19,9 @@ import pytest
 import yaml
 
 from dwell.dash.metrics import CellMetrics
-from tests.dash.served import PATIENCE_S, ROOT, Served, started, until
+from tests.dash.served import ROOT, Served, started, until
 from tests.dash.stand_in import StandIn
+from tests.waiting import PATIENCE_S
 
 EXAMPLES = ROOT / "examples/monitoring"
 TOKEN = "a-token-of-the-tests-that-nobody-guesses"

@@ -19,7 +19,7 @@ from dwell.kernels.advance import play
 from dwell.kernels.arrays import lay_out
 from dwell.model import FrozenDict, Problem
 from dwell.model.fleet import Fleet, FleetEntry
-from dwell.sim.fleet import phased, simulate_fleet
+from dwell.sim.fleet import phased, priced_cells, simulate_fleet
 from tests.cells.once import with_windows
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -174,6 +174,17 @@ def test_a_table_has_a_level_for_every_cell_and_grows() -> None:
         assert column.l95_error_ms[0] == pytest.approx(price.l95_error_ms)
         assert (column.l95_error_ms[1:] > price.l95_error_ms).all()
     assert load_table(cells, ["E"]) is load_table(list(cells), ("E",))
+
+
+def test_a_table_of_many_cells_skips_levels_between_one_and_all() -> None:
+    fleet = fleet_of(FleetEntry(CANONICAL, 40))
+    cells = priced_cells(fleet, phased(fleet, 1))
+    table = LoadTable(cells, ["E"], cycles=1)
+    for (_, name), column in table.columns.items():
+        counts = column.level / table.work[0][name][1]
+        assert len(counts) == 14
+        assert (counts[0], counts[-1]) == (pytest.approx(1), pytest.approx(40))
+        assert np.diff(counts).max() < 3 + 1e-9
 
 
 def test_others_of_another_kind_are_beside_those_of_one() -> None:

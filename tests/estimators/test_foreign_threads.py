@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 
 import dwell
+from dwell.control import Controller
 from dwell.estimators import Evidence
 from dwell.estimators.foreign_threads import (
     WINDOWS,
@@ -29,6 +30,7 @@ from dwell.model import (
     Task,
 )
 from dwell.model.fabric import Scheduler
+from dwell.sim.engine import PlayedCell, play_cells
 from tests.cells.generated import make_problem
 from tests.estimators.windows import Row, window
 from tests.reference.test_against import Probe
@@ -262,3 +264,52 @@ def test_few_jobs_say_nothing_nor_what_is_not_known_of_them() -> None:
     cycles = known.cycles
     for unknown in (replace(cycles, start_ns=None), replace(cycles, work_ns=None)):
         assert Stretches(problem).level(replace(known, cycles=unknown), "E") is None
+
+
+# ------------------------------------------------------------------- next to jobs of other cells
+
+
+def of_a_fleet(problem: Problem, policies: Sequence[str], shadow_fraction: float) -> list[Evidence]:
+    """What a window of the first of several equal cells shows that are released together."""
+    real = dwell.draw(problem, scenario="disturbed", seed=3, windows=2)
+    probes = [Probe(shadow_fraction) for _ in policies]
+    cells = [
+        PlayedCell(problem, real, Controller(problem, policy, probe), guarded=False)
+        for policy, probe in zip(policies, probes, strict=True)
+    ]
+    assert play_cells(cells, shared=("E",), by_window=True)
+    return probes[0].evidence
+
+
+@pytest.mark.parametrize("stress", [1, 4, 16])
+@pytest.mark.parametrize("others", [1, 3])
+def test_jobs_of_other_cells_are_no_foreign_threads(others: int, stress: int) -> None:
+    problem = chain(Node("E", "edge", 1), stress=stress, mean_ms=3.0)
+    evidence = of_a_fleet(problem, ["OFF"] * (1 + others), 0.0)[1]
+    found = Stretches(problem, {"E"}).level(evidence, "E")
+    assert found is not None
+    assert found.threads == pytest.approx(stress, rel=0.06)
+    # An estimator that does not know of the others takes their threads for foreign.
+    assert level(problem, evidence).threads > stress + others / 2
+
+
+@pytest.mark.parametrize("stress", [4, 16])
+@pytest.mark.parametrize("others", [1, 3])
+def test_shadow_jobs_next_to_those_of_other_cells(others: int, stress: int) -> None:
+    problem = chain(Node("E", "edge", 1), stress=stress, mean_ms=3.0)
+    evidence = of_a_fleet(problem, ["LOC"] + ["OFF"] * others, 0.25)[1]
+    found = Stretches(problem, {"E"}).level(evidence, "E")
+    assert found is not None
+    assert found.threads == pytest.approx(stress, rel=0.1)
+
+
+@pytest.mark.parametrize("scheduler", ["fifo", "priority"])
+def test_jobs_on_a_shared_node_that_is_not_fair_say_nothing(scheduler: Scheduler) -> None:
+    problem = chain(Node("E", "edge", 1, scheduler), stress=3, mean_ms=3.0)
+    evidence = of_a_fleet(problem, ["OFF", "OFF"], 0.0)[1]
+    assert Stretches(problem, {"E"}).level(evidence, "E") is None
+
+
+def test_jobs_on_a_shared_node_say_nothing_where_the_others_are_not_known() -> None:
+    problem = chain(Node("E", "edge", 1), stress=3)
+    assert Stretches(problem, {"E"}).level(by_hand([40.0] * 9), "E") is None

@@ -20,7 +20,8 @@ CORE = Node("R", "robot", cores=1)
 
 def jobs(task: int, start_ms: list[float], taken_ms: list[float], alone_ms: list[float]) -> Jobs:
     start, one = np.array(start_ms) * MS, np.ones(len(start_ms))
-    return Jobs(start, start + np.array(taken_ms) * MS, np.array(alone_ms) * MS, one, task * one)
+    end, alone = start + np.array(taken_ms) * MS, np.array(alone_ms) * MS
+    return Jobs(start, end, alone, one, task * one, np.arange(len(start_ms)))
 
 
 def test_the_mean_of_what_others_used_while_a_job_ran() -> None:

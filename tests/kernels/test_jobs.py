@@ -54,6 +54,12 @@ def random_evidence(rng: np.random.Generator, problem: Problem) -> Evidence:
     )
 
 
+def random_beside(rng: np.random.Generator, problem: Problem, evidence: Evidence) -> np.ndarray:
+    parts = 1 if evidence.shadows is None else 2
+    shape = len(evidence.release_ns), parts, len(problem.pipeline.tasks), 2
+    return rng.integers(0, 200_000_000, shape)
+
+
 @pytest.mark.parametrize("seed", range(60))
 def test_random_windows_say_the_same_in_both(seed: int) -> None:
     rng, cell = np.random.default_rng(seed), Random(seed)
@@ -65,6 +71,10 @@ def test_random_windows_say_the_same_in_both(seed: int) -> None:
         for name in problem.fabric.nodes:
             found = stretches.level(evidence, name)
             assert found == window_jobs.level(problem, evidence, name)
+            beside = random_beside(rng, problem, evidence)
+            evidence.rows.beside = beside
+            found = Stretches(problem, {name}).level(evidence, name)
+            assert found == window_jobs.level(problem, evidence, name, beside)
         np.testing.assert_array_equal(
             meter.waited_ns(evidence, foreign),
             window_jobs.work_with_waits(problem, evidence, (), foreign),

@@ -34,10 +34,11 @@ from dwell.live.controlled_cell import Recorder
 from dwell.live.recording import RunRecorder
 from dwell.live.run_rows import Rows
 from dwell.live.stage import CellActuator, CellStage, Message
+from dwell.live.stamper import StamperState
 from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import Role
 from dwell.model import Problem, QoS
-from dwell.testbed.chaos.actuations import Seen
+from dwell.testbed.chaos.actuations import Seen, out_of_order
 from dwell.testbed.chaos.faults import Fault, PlannedFault, bound_of, faults_of, planned, struck
 from dwell.testbed.chaos.harness import RECENT_PERIODS, away_from_home
 from dwell.testbed.chaos.invariants import Judge
@@ -77,6 +78,11 @@ ON_THE_WAY = {
 }
 #: Frames per period of a camera at another rate, in a cell whose cycles begin with its frames.
 FRAMES = (0.27, 0.67, 1.7)
+#: Age of the files that a node finds after a loss of power, time in which its first command
+#: arrives, and time that its monotonic clock shows at the start.
+OLD_S, COMMAND_S, UP_NS = 30.0, 8.0, 20_000_000_000
+#: Time of day at the start, and the difference of a clock that was never set.
+TODAY_NS = 1_700_000_000_000_000_000
 #: Periods between two looks at the status.
 LOOK = 2
 #: Words of the keys that the judge hears.
@@ -99,6 +105,8 @@ def faults_in_memory() -> tuple[Fault, ...]:
             for amount in amounts:
                 name = f"{kind} {link.name} {amount:g}"
                 faults.append(Fault(name, "slow", (link.name,), amount, kind))
+    for node in problem.fabric.nodes:
+        faults += [Fault(f"{how} {node}", how, (f"*{node}",)) for how in ("power", "blank")]
     paces = (Fault(f"camera {share:g}", "pace", ("sensing@R1",), share) for share in FRAMES)
     return *faults, *paces
 
@@ -271,6 +279,8 @@ class FaultyWorld(World):
         self.journal = MemoryJournal()
         self.exec_of = exec_ms("SO")
         self._freezes: Counter[MemoryTransport] = Counter()
+        # Nodes whose time of day was never set.
+        self.unset: set[str] = set()
         problem = on(light_cell(), plan.wish or "SO")
         self.frames_per_period = 1.0
         paced = any(one.fault.how == "pace" for one in plan.faults)
@@ -286,7 +296,8 @@ class FaultyWorld(World):
             start_ns=START_NS,
         )
         self.recorder.rows = self.journal.rows
-        self.judge = Judge(self.problem)
+        renews = any(one.fault.how in ("power", "blank") for one in plan.faults)
+        self.judge = Judge(self.problem, renews)
         self.wrong: list[str] = []
         self.network.taps.append(self._hear)
         self._look()
@@ -307,6 +318,13 @@ class FaultyWorld(World):
         if end is not None and not end.frozen:
             self.worker("sensing@R1").framed(end.now_ns)
 
+    def life_of(self, role: Role) -> int:
+        return self.time_of_day(role) + self.lives
+
+    def time_of_day(self, role: Role) -> int:
+        passed_ns = self.network.now_ns - START_NS
+        return passed_ns if role.node in self.unset else TODAY_NS + passed_ns
+
     def stage_of(self, role: Role) -> CellStage:
         return TellingStage(role, self.failing)
 
@@ -321,8 +339,12 @@ class FaultyWorld(World):
 
     def _hear(self, sample: Arrival) -> None:
         if self.keys.word(sample.key) in HEARD:
-            heard = self.network.now_ns, sample.key, sample.payload, sample.header
-            self.wrong += self.judge.hear(*heard)
+            heard, run = (sample.key, sample.payload, sample.header), self.judge.run
+            self.wrong += self.judge.hear(self.network.now_ns, *heard)
+            if -1 < run < self.judge.run:
+                # Numbers of cycles begin again.
+                self.wrong += out_of_order([one for one in self.seen if one.what == APPLY])
+                self.seen.clear()
 
     def away(self, home: str | None) -> str:
         """Return what keeps it from being whole, watched, and where its controller wants it."""
@@ -350,6 +372,8 @@ class FaultyWorld(World):
                 return self._kill(struck(self.problem, fault), draw)
             case "freeze":
                 return self._freeze(struck(self.problem, fault))
+            case "power" | "blank":
+                return self._cut_power(fault, draw)
             case "starve":
                 names = struck(self.problem, replace(fault, whom=(f"*{fault.whom[0]}",)))
                 return self._starve(names, draw)
@@ -395,6 +419,41 @@ class FaultyWorld(World):
                     self.start(who)
 
         return bring_back
+
+    def _cut_power(self, fault: Fault, draw: Random) -> Callable[[], None]:
+        """Cut a node's power; at the end it boots, with old files or none."""
+        (node,) = (who[1:] for who in fault.whom)
+        start = self._kill(names := struck(self.problem, fault), draw)
+
+        def boot() -> None:
+            for who in names:
+                if self.network.end(who) is not None:
+                    self.kill(who)
+            blank = fault.how == "blank"
+            (self.unset.add if blank else self.unset.discard)(node)
+            if node == self.problem.stamper_node:
+                self.boot = f"boot {self.lives}"
+                self.book.entry = None if blank else self._old_entry()
+            for task, highest in self.highest.items():
+                if node in self.problem.pipeline.tasks[task].on:
+                    run, cycle = highest.highest
+                    highest.highest = (-1, -1) if blank else (run, max(cycle - self.old, -1))
+            shown_ns = self.clocks.get(node, Clock()).shown(self.network.now_ns)
+            self._set_clock(node, jump_ns=UP_NS - shown_ns)
+            start()
+
+        return boot
+
+    @property
+    def old(self) -> int:
+        """Cycles within `OLD_S`."""
+        return round(OLD_S * 1e9 / self.period_ns)
+
+    def _old_entry(self) -> StamperState | None:
+        """Return the stamper's book as it may have been `OLD_S` ago."""
+        first = self.book.first
+        cycle = max(self.judge.stamped_ns, default=0)
+        return None if first is None else replace(first, reserved=max(cycle - self.old, 1))
 
     def _come_back(self, who: str) -> None:
         node = who.partition("@")[2].partition(".")[0]
@@ -546,12 +605,21 @@ def _play(world: FaultyWorld, played: Played) -> None:
     weigh(problem, faults, world.seen, outcome)
     recovered(judge, outcome, home)
     outcome.late += beyond(outcome)
+    if len(faults) == 1 and faults[0].how in ("power", "blank"):
+        outcome.wrong += _late_command(world, outcome)
     if len(faults) == 1:
         outcome.late += moved_in_vain(judge, faults[0], term)
     if not any(fault.how in ("jump", "drift") for fault in faults):
         outcome.late += too_old(problem, world.seen, judge.stamped_ns)
     world.wrong += judge.migrations()
     played.wrong += _wrong_record(world)
+
+
+def _late_command(world: FaultyWorld, outcome: Outcome) -> list[str]:
+    """Return that the first command after a fault came too late."""
+    after_ns = [one.at_ns for one in world.seen if one.at_ns > outcome.end_ns]
+    first_s = (min(after_ns, default=outcome.back_ns) - outcome.end_ns) / 1e9
+    return [f"the first command came after {first_s:.1f} s"] if first_s > COMMAND_S else []
 
 
 def _staged(world: FaultyWorld, one: PlannedFault, at_ns: int) -> list[Callable[[], None]]:
@@ -564,7 +632,8 @@ def _staged(world: FaultyWorld, one: PlannedFault, at_ns: int) -> list[Callable[
 
 def _wrong_record(world: FaultyWorld) -> list[str]:
     """Return what is wrong with the record of the run."""
-    cycles = columns(world, "cycles", "number", "actuated")
+    rows = columns(world, "cycles", "run", "number", "actuated")
+    cycles = [(number, actuated) for run, number, actuated in rows if run == world.judge.run]
     decisions = columns(world, "decisions", "last_cycle", "migrated", "reason")
     return wrong_record(
         [number for number, _ in cycles],

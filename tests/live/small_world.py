@@ -25,7 +25,7 @@ from dwell.live.supervision import Supervisor
 from dwell.live.transport.transport import Arrival
 from dwell.live.trust.signing import Seals
 from dwell.live.wiring import Role, roles, wire
-from dwell.live.worker import Job, Worker
+from dwell.live.worker import Chore, Job, Worker
 from dwell.model import Host, Problem, QoS
 from dwell.policies import MinimalPolicy
 from tests.live.memory_transport import Clock, MemoryTransport, Network, NetworkConditions, hears
@@ -94,12 +94,13 @@ class MemoryBook:
 
     def __init__(self) -> None:
         self.entry: StamperState | None = None
+        self.first: StamperState | None = None
 
     def read(self) -> StamperState | None:
         return self.entry
 
     def write(self, entry: StamperState) -> None:
-        self.entry = entry
+        self.entry, self.first = entry, self.first or entry
 
 
 class MemoryHighest:
@@ -192,6 +193,8 @@ class Bench:
     ) -> None:
         self.network, self.end, self.worker, self.exec_ns = network, end, worker, exec_ns
         worker.started = True
+        #: How long calls of the stage about its state take.
+        self.chore_ns: dict[str, int] = {}
         #: Instant of the network at which it looks next whether there is something to do.
         self._look_ns = -1
 
@@ -213,8 +216,14 @@ class Bench:
             self.end.wakes.append(self.work)
             return
         worker, now_ns = self.worker, self.end.now_ns
-        while (chore := worker.next_chore()) is not None:
-            worker.do_chore(chore)
+        if (chore := worker.next_chore(now_ns)) is not None:
+            result = worker.do_chore(chore)
+            end = partial(self._finish_chore, chore, result, now_ns)
+            if lasts_ns := self.chore_ns.get(chore.call, 0):
+                self.network.call_at(self.network.now_ns + lasts_ns, end)
+            else:
+                end()
+            return
         job = worker.next_job(now_ns)
         if job is not None:
             output, age = worker.run(job, now_ns)
@@ -230,6 +239,15 @@ class Bench:
     def _look(self, look_ns: int) -> None:
         if look_ns == self._look_ns:
             self.work()
+
+    def _finish_chore(self, chore: Chore, result: tuple[bytes, str], started_ns: int) -> None:
+        if self.end.closed:
+            return
+        if self.end.frozen:
+            self.end.wakes.append(lambda: self._finish_chore(chore, result, started_ns))
+            return
+        self.worker.finish_chore(chore, *result, started_ns, self.end.now_ns)
+        self.work()
 
     def _finish(self, job: Job, output: Message | None, started_ns: int, age: int) -> None:
         if self.end.closed:
@@ -296,6 +314,7 @@ class World:
         self.roles: dict[str, object] = {}
         self.lives = 0
         self.run_id = 1
+        self.boot = ""
         self.number = 0
         self.policy = policy
         self.seals = seals or {}
@@ -312,10 +331,10 @@ class World:
         end = self.network.transport(who, role.node, clock=clock)
         subject = CONTROLLER if role.kind == "controller" else role.node
         seals = self.seals.get(subject)
-        place = RolePlace(self.problem, who, role.node, end, self.lives, seals=seals)
+        place = RolePlace(self.problem, who, role.node, end, self.life_of(role), seals=seals)
         made: Stamper | Sink | Quiet | ControlledCell | Bench
         if role.kind == "stamper":
-            made = Stamper(place, self.book, self.run_id, end.now_ns)
+            made = Stamper(place, self.book, self.time_of_day(role), end.now_ns, self.boot)
         elif role.kind == "sink":
             made = Sink(place, role.task, self.actuator_of(role), self.highest[role.task])
         elif role.kind == "agent":
@@ -335,6 +354,14 @@ class World:
             made = Bench(self.network, end, worker, self.exec_ns_of(role))
         self.roles[who] = made
         self.network.attach(end, made)
+
+    def life_of(self, role: Role) -> int:
+        """Life of a process that starts."""
+        return self.lives
+
+    def time_of_day(self, role: Role) -> int:
+        """Time of day that a process reads at its start."""
+        return self.run_id
 
     def stage_of(self, role: Role) -> CellStage:
         """Make the stage of a worker."""

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from dwell.live.messages import Completion, Order, Stamp, State, encode
 from dwell.live.stage import Message
 from dwell.live.transport.transport import Arrival
+from dwell.live.worker import Chore
 from dwell.model import Problem
 from tests.live.memory_transport import Clock, NetworkConditions
 from tests.live.small_world import MS, Counting, Passing, World, canonical, on, stateful
@@ -545,7 +546,9 @@ def test_rule_8_a_state_that_comes_too_late_replaces_nothing(problem: Problem) -
     world.run(1_000)
     require_whole(world)
     # Nor where it is handed to the worker itself.
-    worker.do_chore((late, b"3"))
+    chore = Chore(number=late.number, state=late, data=b"3")
+    now_ns = world.network.now_ns
+    worker.finish_chore(chore, *worker.do_chore(chore), now_ns, now_ns)
     world.run(1_000)
     require_whole(world)
 

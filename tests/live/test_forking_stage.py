@@ -16,7 +16,7 @@ from dwell.live.supervision import survivor
 from dwell.testbed.processes import without_keys
 from tests.cli.live_cell import RealCell
 from tests.processes import lives
-from tests.waiting import wait_until
+from tests.waiting import PATIENCE_S, wait_until
 
 WORKER = "planning@R2"
 #: A stage that starts a helper when it starts, and writes down which process of its has started it.
@@ -75,7 +75,7 @@ def cell(tmp_path: Path) -> Iterator[Forking]:
     made = Forking(tmp_path)
     yield made
     made.agent.send_signal(signal.SIGTERM)
-    made.agent.wait(20)
+    made.agent.wait(PATIENCE_S)
 
 
 def test_a_worker_whose_stage_forks_is_started_again_and_its_helpers_end(cell: Forking) -> None:
@@ -88,5 +88,5 @@ def test_a_worker_whose_stage_forks_is_started_again_and_its_helpers_end(cell: F
     assert lives(second)
     others = cell.helpers(f"{WORKER}.shadow")
     cell.agent.send_signal(signal.SIGTERM)
-    assert cell.agent.wait(20) == 0
+    assert cell.agent.wait(PATIENCE_S) == 0
     wait_until(lambda: not any(lives(pid) for pid in (second, *others)))

@@ -13,9 +13,7 @@ import pytest
 
 from dwell.live.launcher import UNKNOWN_CODE, ForkServer, Running
 from dwell.live.supervision import SupervisedProcess, Supervisor
-from tests.waiting import wait_until
-
-PATIENCE_S = 30.0
+from tests.waiting import PATIENCE_S, wait_until
 
 #: Imports something that takes a while, then runs the words of its caller as code.
 PROGRAM = """

@@ -593,6 +593,46 @@ def test_a_stamper_whose_clock_begins_anew() -> None:
     assert hand.column("windows", "lead") == [3]
 
 
+@pytest.mark.parametrize("released_ns", [-NEVER_NS, NEVER_NS - 1])
+def test_a_cycle_that_is_taken_back_takes_its_clock_back(released_ns: int) -> None:
+    hand = Hand()
+    # Each false stamp is the first of a clock that begins anew.
+    for cycle in range(2, 8):
+        hand.release([cycle - 1])
+        hand.windows.stamped(hand.stamp(cycle, at_ns=released_ns), cycle * P)
+        hand.windows.forget(1, cycle)
+    hand.release(range(7, 20))
+    assert hand.close()[-1] > 7
+    hand.record()
+    numbers = hand.column("cycles", "number")
+    assert hand.column("cycles", "release_ns") == [(number - 1) * P for number in numbers]
+
+
+def test_what_is_left_after_a_cycle_is_taken_back_still_tells_false_clocks() -> None:
+    hand = Hand()
+    # Nothing is heard of cycle 2, which is the last that is left.
+    hand.release([1, 3])
+    hand.windows.forget(1, 3)
+    hand.windows.stamped(hand.stamp(3, at_ns=NEVER_NS - 1), 3 * P)
+    hand.release(range(4, 8))
+    hand.close()
+    hand.record()
+    assert max(hand.column("cycles", "release_ns")) < 10 * P
+
+
+@pytest.mark.parametrize(("released_ns", "expected"), [(-NEVER_NS, 0), (NEVER_NS - 1, 2)])
+def test_a_cycle_between_two_others_was_released_between_them(
+    released_ns: int, expected: int
+) -> None:
+    hand = Hand()
+    hand.release([1, 3])
+    hand.windows.stamped(hand.stamp(2, at_ns=released_ns), 3 * P)
+    hand.release(range(4, 8))
+    hand.close()
+    hand.record()
+    assert hand.column("cycles", "release_ns")[:3] == [0, expected * P, 2 * P]
+
+
 def test_every_sink_has_to_report() -> None:
     hand = Hand(small(sinks=3))
     hand.release(range(W + 1))

@@ -207,8 +207,8 @@ def test_no_role_falls_over_what_nobody_meant(world: World, data: st.DataObject)
     for who, role in world.roles.items():
         if isinstance(role, Bench):
             worker = role.worker
-            while (chore := worker.next_chore()) is not None:
-                worker.do_chore(chore)
+            while (chore := worker.next_chore(now_ns)) is not None:
+                worker.finish_chore(chore, *worker.do_chore(chore), now_ns, now_ns)
             assert not worker._jobs, f"{who} would call its stage"
     assert calls == []
 

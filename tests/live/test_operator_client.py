@@ -18,6 +18,7 @@ from dwell.live.transport.zenoh import ZenohTransport
 from dwell.live.wiring import roles, wire
 from dwell.testbed.loopback import on_this_machine
 from tests.cli.live_cell import EXAMPLE
+from tests.waiting import PATIENCE_S
 
 
 def test_asking_for_the_status_imports_nothing_heavy() -> None:
@@ -61,10 +62,10 @@ def test_a_late_answer_to_another_wish_is_not_taken_for_an_answer() -> None:
         server.subscribe(key, answer)
     try:
         with OperatorClient(problem) as client:
-            client.ask("status", patience_s=10.0)
+            client.ask("status", patience_s=PATIENCE_S)
             with pytest.raises(LiveError, match="answers"):
                 client.ask("pin", "SO", patience_s=0.2)
-            assert client.ask("unpin", patience_s=10.0) == {}
+            assert client.ask("unpin", patience_s=PATIENCE_S) == {}
     finally:
         server.close()
     assert pins
@@ -87,11 +88,11 @@ def test_an_answer_is_shown_without_what_a_terminal_would_obey() -> None:
         server.subscribe(key, answer)
     try:
         with OperatorClient(problem) as client:
-            status = client.ask("status", patience_s=10.0)
+            status = client.ask("status", patience_s=PATIENCE_S)
             assert status["note"] == "\\x1b]0;mine\\x07"
             assert status["list"] == ["a\\nb", 3]
-            assert client.look()["answer_age_ms"] == 0.0
+            assert client.look(patience_s=PATIENCE_S)["answer_age_ms"] == 0.0
             with pytest.raises(LiveError, match=re.escape("refused: no\\x1b[2Jbody")):
-                client.ask("pin", "SO")
+                client.ask("pin", "SO", patience_s=PATIENCE_S)
     finally:
         server.close()

@@ -19,6 +19,7 @@ from tests.live.small_world import World, canonical
 MODELS = {"fallbacks": fallbacks, "gate": gate, "orders": orders, "states": states}
 #: The case that shows that a rule is needed, where that is not the first.
 SHOWN = {
+    **{("gate", rule): 1 for rule in ("run", "boot", "heard", "equal")},
     ("orders", "proof"): 1,
     ("orders", "fresh proof"): 1,
     ("orders", "answer"): 1,
@@ -37,13 +38,13 @@ STEPS = 24
     ("model", "limits"),
     [
         *((fallbacks, limits) for limits in fallbacks.CASES),
-        (gate, gate.LIMITS),
+        *((gate, limits) for limits in gate.CASES),
         *((orders, limits) for limits in orders.CASES),
         *((states, limits) for limits in states.CASES),
     ],
     ids=[
         *(f"fallbacks {i}" for i, _ in enumerate(fallbacks.CASES)),
-        "gate",
+        *(f"gate {i}" for i, _ in enumerate(gate.CASES)),
         *(f"orders {i}" for i, _ in enumerate(orders.CASES)),
         *(f"states {i}" for i, _ in enumerate(states.CASES)),
     ],

@@ -17,7 +17,7 @@ from dwell.live.sink import Sink
 from dwell.testbed.processes import without_keys
 from tests.cli.live_cell import RealCell
 from tests.live.small_world import Arm, World, canonical
-from tests.waiting import wait_until
+from tests.waiting import PATIENCE_S, wait_until
 
 SINK = "sink.control@R2"
 #: An actuator that writes down how it is called, and raises as often as a file beside it says.
@@ -107,7 +107,7 @@ def cell(tmp_path: Path) -> Iterator[Ending]:
 
 def end(process: subprocess.Popen[bytes], number: int = signal.SIGTERM) -> int:
     process.send_signal(number)
-    return process.wait(20)
+    return process.wait(PATIENCE_S)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])

@@ -24,9 +24,9 @@ from dwell.live.trust.roster import Subject, write_private
 from dwell.live.wiring import Locator, Role, WiringEntry, wire
 from dwell.model import Endpoint, Host, Problem
 from tests.live.test_wiring import cell, housed
-from tests.live.transport.meshes import free_ports
+from tests.ports import free_ports
+from tests.waiting import PATIENCE_S
 
-PATIENCE_S = 20.0
 STAMPER = "stamper@R1"
 HERE = ["127.0.0.1"]
 

@@ -16,7 +16,7 @@ from msgspec.structs import replace as replaced
 
 from dwell.control import Guard, Probation
 from dwell.live import health, stamper, worker
-from dwell.live.continuity import RESERVED
+from dwell.live.continuity import RESERVED, RunClaims
 from dwell.live.controlled_cell import ControlledCell
 from dwell.live.cycle_ledger import LiveCycle
 from dwell.live.messages import ACTUATED, Accepted, Hop, Order, Stamped
@@ -199,6 +199,20 @@ def says_what_nobody_reads(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(RolePlace, "_sealed", torn)
 
 
+def trusts_a_book_of_another_boot(patch: pytest.MonkeyPatch) -> None:
+    init = Stamper.__init__
+
+    def begun(self: Stamper, place: Any, book: Any, run: int, now_ns: int, boot: str = "") -> None:
+        init(self, place, book, run, now_ns, book.entry.boot if book.entry else boot)
+
+    patch.setattr(Stamper, "__init__", begun)
+
+
+def hears_of_no_run(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(RunClaims, "believed", lambda *_: False)
+    patch.setattr(RunClaims, "below", lambda *_: True)
+
+
 def migrates_at_once(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Touring, "STAY", 0)
     init = ControlledCell.__init__
@@ -267,6 +281,12 @@ PLANTED: dict[str, tuple[Patch, Plan, str]] = {
     "routes": (sends_everywhere, plan("LOC", "cut R1->E"), "LOC has it on"),
     "hops": (says_it_ran_elsewhere, plan("SO", "cut R1->R2"), "not where SO has it"),
     "messages": (says_what_nobody_reads, plan("LOC", "cut R1->E"), "/done/control: "),
+    "a loss of power": (
+        trusts_a_book_of_another_boot,
+        plan("LOC", "power R1"),
+        "is stamped after",
+    ),
+    "an empty state": (hears_of_no_run, plan("LOC", "blank R1"), "is of run"),
     "migrations": (migrates_at_once, plan("", "cut R1->R2"), "cycles apart"),
     "bound": (guard_never_fires, plan("SO", "kill all of E"), "consecutive cycles lost by it"),
     "return": (nothing_is_ever_proven, plan("SO", "kill all of E"), "waited 60 s"),

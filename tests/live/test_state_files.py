@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,7 +16,7 @@ from hypothesis import strategies as st
 
 from dwell.errors import LiveError
 from dwell.live.stamper import StamperState
-from dwell.live.state_files import BookFile, HighestFile, InFlight, make_folder
+from dwell.live.state_files import BookFile, HighestFile, InFlight, boot_id, make_folder
 from dwell.testbed.chaos.disk import SmallDisk, may_mount
 
 
@@ -172,3 +173,25 @@ def test_a_full_disk_keeps_nobody_from_remembering(tmp_path: Path) -> None:
         assert InFlight.read(folder / "inflight") is None
         with pytest.raises(LiveError, match="No space left"):
             BookFile(folder / "another")
+
+
+def test_a_file_that_was_removed_is_there_again_after_the_next_write(tmp_path: Path) -> None:
+    folder = make_folder(tmp_path / "R1")
+    book, highest = BookFile(folder / "book"), HighestFile(folder / "highest")
+    entries = [StamperState(7, 1024, term, "SO", False, "boot") for term in range(1, 4)]
+    book.write(entries[0])
+    highest.store(7, 1)
+    shutil.rmtree(folder)
+    # Until the agent has made the folder again, nothing fails.
+    book.write(entries[1])
+    highest.store(7, 2)
+    make_folder(folder)
+    book.write(entries[2])
+    highest.store(7, 3)
+    assert BookFile(folder / "book").read() == entries[2]
+    assert HighestFile(folder / "highest").load() == (7, 3)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the kernel tells no boot")
+def test_the_boot_has_an_id() -> None:
+    assert boot_id() == boot_id() != ""

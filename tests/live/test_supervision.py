@@ -24,9 +24,7 @@ from dwell.live.supervision import SupervisedProcess, Supervisor, claim
 from dwell.testbed.chaos.disk import SmallDisk, may_mount
 from tests.live.plain_launcher import supervise
 from tests.processes import lives
-from tests.waiting import wait_until
-
-PATIENCE_S = 20.0
+from tests.waiting import PATIENCE_S, wait_until
 
 
 @pytest.fixture

@@ -12,17 +12,15 @@ import numpy as np
 import pytest
 
 from dwell.live.hosting import work
-from dwell.live.messages import Beat, Header, Stamp, decode, encode
+from dwell.live.messages import Beat, Header, Snapshot, Stamp, decode, encode
 from dwell.live.role import RolePlace
 from dwell.live.routing import STAMPER
 from dwell.live.stage import Message
 from dwell.live.transport.transport import Arrival, Receive
 from dwell.live.worker import Worker
 from dwell.model import Problem
-from tests.live.small_world import MS, Bench, Passing, World, canonical
+from tests.live.small_world import MS, Bench, Counting, Passing, World, canonical, stateful
 from tests.waiting import wait_until
-
-PATIENCE_S = 20.0
 
 
 @pytest.fixture(scope="module")
@@ -192,6 +190,38 @@ def test_frames_begin_cycles(problem: Problem, stage: Passing) -> None:
         assert note == "sensing on R1: wait() raised OSError: the cable is off"
     else:
         assert note == "sensing on R1: no method wait(), though live.release is frames"
+
+
+class Slow(Counting):
+    """A stage whose snapshot takes until it is released."""
+
+    def __init__(self) -> None:
+        super().__init__("planning")
+        self.released = threading.Event()
+
+    def snapshot(self) -> bytes:
+        self.released.wait(PATIENCE_S)
+        return super().snapshot()
+
+
+def test_a_worker_s_beats_go_on_while_its_stage_writes_its_state(problem: Problem) -> None:
+    cell = stateful(problem, "planning", 100)
+    wire, stage = Wire(), Slow()
+    place = RolePlace(cell, "planning@R2", "R2", wire)
+    worker = Worker(place, "planning", stage)
+    worker.state_at = 1, 5
+    asked = Snapshot(7, "planning", "R2", "E", 1, 6)
+    worker.receive(Arrival(place.keys.snapshot("planning", "R2"), encode(asked)), 0)
+    stopped = threading.Event()
+    thread = threading.Thread(target=work, args=(worker, wire), kwargs={"stopped": stopped})
+    thread.start()
+    wait_until(lambda: sum(beat.moving and beat.ready for beat in wire.beats) > 5)
+    key = place.keys.state("planning", "E", "R2")
+    assert key not in wire.put_keys
+    stage.released.set()
+    wait_until(lambda: key in wire.put_keys and not wire.beats[-1].moving)
+    stopped.set()
+    thread.join()
 
 
 # ---------------------------------------------------------------------------- the agent

@@ -698,7 +698,8 @@ def play_stamped(
     arrays.tables.stamps[0] = [codes[name] for name in stamps]
     arrays.tables.stamps[1] = [codes[name] for name in others]
     assert advance_to_end(arrays) == Status.FINISHED
-    controller = Controller(problem, problem.initial)
+    # Nothing is decided: no candidate has to be priced.
+    controller = Controller(problem, problem.initial, Level())
 
     def never(at_ns: int) -> bool:
         return False

@@ -40,6 +40,7 @@ class Jobs(NamedTuple):
     alone_ns: Floats
     cores: Floats
     task: Floats
+    row: Floats
 
     @property
     def taken_ns(self) -> Floats:
@@ -73,8 +74,8 @@ def known_jobs(
                 all_threads = asks and node.scheduler == "fair"
                 cores = execution.threads if all_threads else cores_of(node, execution)
                 if begun >= 0 and ended >= 0 and work > 0:
-                    rows.append((begun, ended, work / cores, cores, column))
-    columns = np.array(rows, float).reshape(-1, 5).T
+                    rows.append((begun, ended, work / cores, cores, column, row))
+    columns = np.array(rows, float).reshape(-1, 6).T
     return Jobs(*columns) if is_used else None
 
 
@@ -158,11 +159,21 @@ def is_longer(taken_ns: Floats, alone_ns: Floats) -> bool:
     return bool(np.median(longer_ns) > LEAST_WAIT * np.median(alone_ns))
 
 
-def level(problem: Problem, evidence: Evidence, name: str) -> Level | None:
-    """Foreign threads beside which jobs ran since the last change, but those of bursts."""
+def level(
+    problem: Problem, evidence: Evidence, name: str, beside: Ints | None = None
+) -> Level | None:
+    """Foreign threads beside which jobs ran since the last change, but those of bursts.
+
+    Parameters
+    ----------
+    beside : int64 array, shape (n, parts, tasks, 2), optional
+        Of a node that cells share, `WindowRows.beside`.
+    """
     node = problem.fabric.nodes[name]
+    if beside is not None and (node.scheduler != "fair" or node.quota is not None):
+        return None
     jobs = known_jobs(problem, evidence.cycles, evidence.placement, node, asks=True)
-    before = None
+    before, is_behind = None, jobs is None or len(jobs.cores) < JOBS
     if jobs is None or len(jobs.cores) < JOBS:
         if evidence.shadows is None or not evidence.shadows_share:
             return None
@@ -175,10 +186,17 @@ def level(problem: Problem, evidence: Evidence, name: str) -> Level | None:
     if node.scheduler != "fair":
         threads = slowed * spare - node.cores
     else:
-        mine = used_beside(jobs, jobs)
+        if beside is None:
+            mine = used_beside(jobs, jobs)
+            own = None if before is None else used_beside(jobs, before)
+        else:
+            part = int(is_behind)
+            of = beside[jobs.row.astype(int), part, jobs.task.astype(int)] / jobs.taken_ns[:, None]
+            mine, own = of[:, 0], of[:, 1] if is_behind else None
         threads = slowed * spare - mine
-        if before is not None:
-            threads = behind(slowed, spare, mine, used_beside(jobs, before))
+        if own is not None:
+            found = behind if beside is None else behind_all
+            threads = found(slowed, spare, mine, own)
     # Some jobs leave others room, and take no longer for it: they say only how many there are at
     # most. Each task's jobs since its last change are looked at by themselves.
     since = [since_change(jobs, threads, task) for task in sorted(set(jobs.task.tolist()))]
@@ -208,3 +226,11 @@ def behind(slowed: Floats, spare: float, mine: Floats, own: Floats) -> Floats:
         left = np.where(load <= spare, spare - own, spare * threads / np.maximum(load, 1e-9))
         threads = np.maximum(slowed * left - mine, 0.0)
     return threads
+
+
+def behind_all(slowed: Floats, spare: float, mine: Floats, own: Floats) -> Floats:
+    """The same next to the jobs of all cells, which may fill the node."""
+    free = slowed * (spare - own) - mine
+    half = (slowed * spare - own - mine) / 2
+    full = np.maximum(half + np.sqrt(np.maximum(half * half - own * mine, 0.0)), 0.0)
+    return np.where((free > 0) & (own + free <= spare), free, full)

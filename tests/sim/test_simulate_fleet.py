@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -191,6 +192,24 @@ def test_under_a_ledger_each_move_is_worth_what_it_costs_and_none_goes_back(
     refused = run.decisions.filter(pl.col("refused").is_not_null())
     assert not refused["migrated"].any()
     assert refused["refused"].str.contains("ledger: Φ would|cap of canonical-0").all()
+
+
+def _append(to: list[tuple[int, int]], done: int, total: int) -> None:
+    to.append((done, total))
+
+
+@pytest.mark.parametrize("phases", ["random", "even"])
+def test_seeds_of_a_fleet_share_one_table_of_loads(canonical: Problem, phases: str) -> None:
+    cell = replace(canonical, name=f"alone-{phases}")
+    fleet = hall(cell, 3, phases=phases, coordination="ledger")
+    windows = 6 * len(fleet.cells)
+    totals: list[set[int]] = []
+    for seed in (1, 2, 3):
+        told: list[tuple[int, int]] = []
+        simulate_fleet(fleet, seed=seed, windows=6, progress=partial(_append, told))
+        totals.append({total for _, total in told})
+    # Levels of the table are counted before windows.
+    assert [found == {windows} for found in totals] == [False, True, True]
 
 
 def test_when_the_edge_is_back_nobody_tramples_it(canonical: Problem) -> None:

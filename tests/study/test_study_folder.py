@@ -111,7 +111,7 @@ def kill_when(process: subprocess.Popen[bytes], out: Path, parts: int) -> None:
     """Kill a study as soon as it has so many parts."""
     while len(parts_in(out)) < parts:
         assert process.poll() is None, "it ended by itself"
-        time.sleep(0.001)
+        time.sleep(0.005)
     process.send_signal(signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL
 

@@ -16,8 +16,7 @@ from dwell.model import Constant
 from dwell.testbed.conditions import MOST_ATTEMPTS, Conditions
 from dwell.testbed.link import TunLink
 from tests.testbed.test_packets import ip, udp
-
-PATIENCE_S = 20.0
+from tests.waiting import PATIENCE_S
 
 
 class Ends:

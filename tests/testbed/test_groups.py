@@ -17,10 +17,10 @@ from dwell.model import Quota
 from dwell.testbed.cgroups import Cgroups, find_cgroups
 from dwell.testbed.groups import Groups, Share, group_name
 from tests.testbed.machine import CPU, no_groups, own_name
+from tests.waiting import PATIENCE_S
 
 here = pytest.mark.skipif(bool(no_groups()), reason=no_groups())
 
-PATIENCE_S = 30.0
 BUSY = ["sh", "-c", "while :; do :; done"]
 SHARES = {"A": Share((CPU,), Quota(0.2, 10.0)), "B": Share()}
 

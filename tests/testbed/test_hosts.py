@@ -15,12 +15,12 @@ import pytest
 from dwell.errors import LiveError
 from dwell.testbed.hosts import MTU, Hosts, namespace_path, within
 from tests.testbed.machine import no_hosts, own_name
+from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.skipif(bool(no_hosts()), reason=no_hosts())
 
 NODES = ("A", "B", "C")
 PAIRS = (("A", "B"), ("C", "B"))
-PATIENCE_S = 10.0
 MESSAGE = bytes(400_000)
 
 

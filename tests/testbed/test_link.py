@@ -112,7 +112,8 @@ def test_flows_overtake_each_other_and_a_flow_keeps_its_order(
     hosts: TwoHosts, link: TunLink
 ) -> None:
     probe = Probe(hosts, flows=2)
-    link.set(*AB, delay_ms=Constant(400.0))
+    # Long enough for what follows, on a machine that has a lot else to do.
+    link.set(*AB, delay_ms=Constant(2_000.0))
     probe.send("slow", flow=0)
     while link.read(reset=False)[AB].bursts < 1:
         time.sleep(0.001)

@@ -14,7 +14,7 @@ from dwell.testbed import loopback
 from dwell.testbed.loopback import Loopback, on_this_machine
 from dwell.testbed.timeline import Change, timeline_of
 from tests.cells.light import write_cell
-from tests.waiting import wait_until
+from tests.waiting import PATIENCE_S, wait_until
 
 
 def test_every_process_has_ports_of_its_own_that_are_free(tmp_path: Path) -> None:
@@ -41,10 +41,8 @@ def test_it_comes_up_is_disturbed_and_leaves_nothing(tmp_path: Path) -> None:
     # A worker of the tests may have children of earlier tests, such as a pool's resource tracker.
     before = psutil.Process().children(recursive=True)
     with cell:
-        wait_until(lambda: bool(cell.sample(10.0)["window"]))
-        status = cell.sample(10.0)
-        assert status["placement"] == "SO"
-        assert status["silent"] == []
+        wait_until(lambda: bool(cell.sample(10.0)["window"]) and not cell.sample(10.0)["silent"])
+        assert cell.sample(10.0)["placement"] == "SO"
         changes = timeline_of(problem, "impaired", seed=1, seconds=60).changes
         links: list[Change] = [one for one in changes if one.place in problem.fabric.links]
         assert links
@@ -54,7 +52,7 @@ def test_it_comes_up_is_disturbed_and_leaves_nothing(tmp_path: Path) -> None:
             child for child in psutil.Process().children(recursive=True) if child not in before
         ]
         assert len(children) > len(problem.pipeline.tasks)
-    _, alive = psutil.wait_procs(children, timeout=20)
+    _, alive = psutil.wait_procs(children, timeout=PATIENCE_S)
     assert alive == []
     (run,) = (tmp_path / "there" / "runs").iterdir()
     assert dwell.open_run(run).cycles.height > 0

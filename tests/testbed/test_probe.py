@@ -6,8 +6,7 @@ import time
 
 from dwell.testbed.probe import Lateness, Probe
 from tests.testbed.machine import CPU
-
-PATIENCE_S = 30.0
+from tests.waiting import PATIENCE_S
 
 
 def test_a_probe_tells_how_late_it_was_and_what_its_work_took() -> None:

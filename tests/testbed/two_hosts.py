@@ -10,9 +10,9 @@ from itertools import count
 
 from dwell.errors import LiveError
 from dwell.testbed.hosts import Hosts, within
+from tests.waiting import PATIENCE_S
 
 NODES = "A", "B"
-PATIENCE_S = 20.0
 
 _numbers = count()
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+import time
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import typer
@@ -17,6 +19,42 @@ from dwell.live.stage import CellStage, load_actuator, load_stage
 from dwell.live.wiring import PORTS_PER_ROLE, Role, Wiring, roles, wire
 from dwell.model import Problem
 from dwell.model.bounds import counted
+
+
+@dataclass(slots=True)
+class StateTimes:
+    """How long the stages of a node take to write their states and to read them."""
+
+    #: By task: ``snapshot_ms``, ``restore_ms`` and ``bytes``.
+    tasks: dict[str, dict[str, float]] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+
+    def measure(self, problem: Problem, name: str, stage: CellStage) -> None:
+        """Call both methods of a stage that was made and not started."""
+        began_s = time.perf_counter()
+        try:
+            data = bytes(stage.snapshot())
+            written_s = time.perf_counter()
+            stage.restore(data)
+        except Exception as error:  # the user's code
+            raised = f"{type(error).__name__}: {error}"
+            self.warnings.append(f"tasks.{name}.run: its state was not timed ({raised})")
+            return
+        snapshot_ms = round((written_s - began_s) * 1e3, 3)
+        restore_ms = round((time.perf_counter() - written_s) * 1e3, 3)
+        self.tasks[name] = {
+            "snapshot_ms": snapshot_ms,
+            "restore_ms": restore_ms,
+            "bytes": len(data),
+        }
+        patience_ms = problem.controller.guard_cycles * problem.pipeline.period_ms
+        if snapshot_ms > patience_ms:
+            self.warnings.append(
+                f"tasks.{name}.run: snapshot() takes {snapshot_ms:.0f} ms, longer than "
+                f"guard_cycles periods = {patience_ms:g} ms: no checkpoints are made, and a move "
+                "loses the cycles of that time"
+            )
+
 
 PACKAGES = {"zenoh": "eclipse-zenoh", "msgspec": "msgspec", "psutil": "psutil"}
 
@@ -42,15 +80,17 @@ def check_node(
     sys.path.insert(0, str(cell.resolve().parent))
     wiring, faults = _wiring(problem)
     security, unsafe = _security(problem, node, environment(keys, insecure=insecure))
-    faults += [*unsafe, *_packages(), *_stages(problem, node), *_actuators(problem, node)]
-    warnings = [str(caution) for caution in lint(problem)]
+    states = StateTimes()
+    stages = _stages(problem, node, states)
+    faults += [*unsafe, *_packages(), *stages, *_actuators(problem, node)]
+    warnings = [*(str(caution) for caution in lint(problem)), *states.warnings]
     if security is not None:
         warnings += [line.removeprefix("warning: ") for line in security.warnings()]
     if as_json:
         rows = [{"path": fault.path, "message": fault.message} for fault in faults]
         processes = [] if wiring is None else [role.who for role in wiring.on(node)]
         head = {"node": node, "ready": not faults, "faults": rows, "processes": processes}
-        print_json({**head, "warnings": warnings})
+        print_json({**head, "warnings": warnings, "states": states.tasks})
         return not faults
     for fault in faults:
         typer.echo(f"{cell}: node {node}: {fault}", err=True)
@@ -58,6 +98,11 @@ def check_node(
         typer.echo(f"{cell}: warning: {warning}", err=True)
     if wiring is not None and not faults:
         typer.echo(_summary(problem, wiring, node))
+        for name, one in states.tasks.items():
+            typer.echo(
+                f"{name}: snapshot() takes {one['snapshot_ms']:g} ms for {one['bytes']} bytes, "
+                f"restore() {one['restore_ms']:g} ms"
+            )
     return not faults
 
 
@@ -90,8 +135,8 @@ def _wiring(problem: Problem) -> tuple[Wiring | None, list[Fault]]:
         ]
 
 
-def _stages(problem: Problem, node: str) -> Iterator[Fault]:
-    """Yield what keeps a stage of the node from running."""
+def _stages(problem: Problem, node: str, states: StateTimes) -> Iterator[Fault]:
+    """Yield what keeps a stage of the node from running, and time those that have a state."""
     pipeline = problem.pipeline
     first = next(name for name in pipeline.tasks if not pipeline.inputs(name))
     for name, task in pipeline.tasks.items():
@@ -111,6 +156,8 @@ def _stages(problem: Problem, node: str) -> Iterator[Fault]:
         if frames and not stage.has_frames:
             yield Fault(where, f"{task.run} has no method wait(), and live.release is frames")
         yield from _state(name, task.run, stage, task.state_bytes)
+        if stage.stateful and task.state_bytes:
+            states.measure(problem, name, stage)
 
 
 def _inputs(problem: Problem, name: str, stage: CellStage, where: str) -> Iterator[Fault]:

@@ -142,21 +142,37 @@ def run(
 
 
 @fleet.command()
-def plan(file: FleetArgument, seed: Seed = 1, phases: Phases = None, as_json: Json = False) -> None:
+def plan(
+    file: FleetArgument,
+    seed: Seed = 1,
+    phases: Phases = None,
+    limit: Annotated[
+        float | None, option("SHARE", "Also name the cells whose V_D stays above this, as 0.05.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
     """Find where the cells are best placed while their scenarios go on, all at once.
 
     Φ of the table of loads is least there; what the placements come to is played.
     """
     from dwell.study.fleet_plan import plan_fleet
 
+    if limit is not None:
+        _require_limit(limit)
     planned = _read(file, phases)
     with progress(f"playing loads of {counted(len(planned.cells), 'cell')}") as shown:
         found = plan_fleet(planned, seed=seed, progress=shown)
     if as_json:
         head = {"fleet": planned.name, "seed": seed, "phases": planned.phases}
-        print_json(head | found.as_json())
+        more = {} if limit is None else {"limit": limit, "above": found.above(limit)}
+        print_json(head | found.as_json() | more)
         return
     typer.echo(_plan_text(planned, found, seed))
+    if limit is not None:
+        above = found.above(limit)
+        names = f": {', '.join(above)}" if above else ""
+        cells = counted(len(found.cells), "cell")
+        typer.echo(f"\n{len(above)} of {cells} stay above {limit * 100:g} %{names}")
 
 
 @fleet.command()
@@ -203,36 +219,44 @@ def capacity(
     """
     from dwell.record.fleet_run import fleet_document
     from dwell.report.capacity_page import capacity_page
-    from dwell.study.capacity import capacity_of
+    from dwell.study.capacity import capacity_of, long_runs
+    from dwell.study.played_sizes import KeptSizes
     from dwell.study.what_ifs import WhatIf, changes_of, served_by
 
-    if not 0 < limit < 1:
-        raise typer.BadParameter(f"--limit: {limit:g} is not allowed; it must be between 0 and 1")
+    _require_limit(limit)
     read = _read(file, phases, policy=policy)
-    page = out
-    if page is None and not as_json:
-        names = ", ".join(dict.fromkeys(read.policy_of(one) for one in read.entries))
-        page = Path("capacity", file_name(f"{read.name}-{names}-{read.phases}.html"))
+    names = ", ".join(dict.fromkeys(read.policy_of(one) for one in read.entries))
+    usual = Path("capacity", file_name(f"{read.name}-{names}-{read.phases}.html"))
+    page = out or (None if as_json else usual)
     mark = mark_of(fleet_document(read), limit, most, what_if)
     if page is not None:
         require_own(page, mark)
-    settings: dict[str, Any] = {"limit": limit, "most": most, "processes": processes}
-    with progress(f"playing up to {most} robots") as shown:
-        found = capacity_of(read, **settings, progress=shown)
+    warn(file, long_runs(read))
+    kept = KeptSizes((out or usual).with_suffix(".played"))
+    settings: dict[str, Any] = {"limit": limit, "most": most, "processes": processes, "kept": kept}
     changes = []
-    # Numbers of robots compare where the limit is on the same.
-    settings["on_excess"] = found.limit_on == "excess"
-    for change in changes_of(read) if what_if else ():
-        with progress(f"what if: {change.text}") as shown:
-            changes.append(WhatIf(change.text, change.capacity(**settings, progress=shown)))
     served = None
-    if asked is not None and found.robots < asked:
-        with working(f"looking for a change that serves {asked} robots"):
-            served = served_by(read, asked, **settings)
+    try:
+        with progress(f"playing up to {most} robots") as shown:
+            found = capacity_of(read, **settings, progress=shown)
+        # Numbers of robots compare where the limit is on the same.
+        settings["on_excess"] = found.limit_on == "excess"
+        for change in changes_of(read) if what_if else ():
+            with progress(f"what if: {change.text}") as shown:
+                changes.append(WhatIf(change.text, change.capacity(**settings, progress=shown)))
+        if asked is not None and found.robots < asked:
+            with progress(f"looking for a change that serves {asked} robots"):
+                served = served_by(read, asked, **settings)
+    except KeyboardInterrupt:
+        runs = counted(kept.count, "run")
+        interrupted(
+            f"the results of {runs} are in {kept.file}; the same command goes on from there"
+        )
     if page is not None or figures is not None:
         shown_page = capacity_page(read.name, found, changes)
         with working("writing the report"):
             write_report(shown_page, page, figures=figures, static=False, mark=mark)
+    kept.remove()
     if as_json:
         more: dict[str, Any] = {"what_if": [one.as_json() for one in changes]} if what_if else {}
         if asked is not None:
@@ -285,6 +309,11 @@ def _plan_text(of: Fleet, found: FleetPlan, seed: int) -> str:
     if len(rows) > SHOWN:
         lines.append(f"{len(rows) - SHOWN} more, with fewer misses, are in --json")
     return "\n".join(lines)
+
+
+def _require_limit(limit: float) -> None:
+    if not 0 < limit < 1:
+        raise typer.BadParameter(f"--limit: {limit:g} is not allowed; it must be between 0 and 1")
 
 
 def read_phases(text: str | None) -> str | tuple[float, ...] | None:

@@ -6,6 +6,7 @@ import hashlib
 import json
 import re
 import sys
+import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from dwell.record import Run
     from dwell.report.page import Page
 
+#: Seconds between two lines of progress where stderr is no terminal.
+EVERY_S = 10.0
 BLOCKS = "▁▂▃▄▅▆▇█"
 
 
@@ -157,8 +160,8 @@ def working(what: str) -> Iterator[None]:
 
 
 @contextmanager
-def progress(what: str, *, cycles: float | None = None) -> Iterator[Progress | None]:
-    """Show on stderr how much is done, where that is a terminal; None elsewhere.
+def progress(what: str, *, cycles: float | None = None) -> Iterator[Progress]:
+    """Show on stderr how much is done: a bar on a terminal, elsewhere a line every `EVERY_S`.
 
     Parameters
     ----------
@@ -168,7 +171,8 @@ def progress(what: str, *, cycles: float | None = None) -> Iterator[Progress | N
         Cycles of each item that is counted; the rate is shown where it is given.
     """
     if not sys.stderr.isatty():
-        yield None
+        with _lines(what) as show:
+            yield show
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
@@ -184,13 +188,35 @@ def progress(what: str, *, cycles: float | None = None) -> Iterator[Progress | N
     with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
         row = bar.add_task(what, total=None, rate="")
 
-        def show(done: int, total: int) -> None:
+        def shown(done: int, total: int) -> None:
             bar.update(row, completed=done, total=total)
             speed = bar.tasks[0].speed
             if cycles is not None and speed is not None:
                 bar.update(row, rate=f"{speed * cycles / 1e6:.2f} M cycles/s")
 
+        yield shown
+
+
+@contextmanager
+def _lines(what: str) -> Iterator[Progress]:
+    """Print a line on stderr every `EVERY_S` seconds."""
+    over, told = threading.Event(), what
+
+    def show(done: int, total: int) -> None:
+        nonlocal told
+        told = f"{what}: {done} of {total}"
+
+    def tell() -> None:
+        while not over.wait(EVERY_S):
+            typer.echo(told, err=True)
+
+    teller = threading.Thread(target=tell, daemon=True)
+    teller.start()
+    try:
         yield show
+    finally:
+        over.set()
+        teller.join()
 
 
 def proof(proving: Mapping[str, Any]) -> str:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from dwell.control.coordination import Asked, Coordination, Verdict, Wish
 from dwell.control.course import Course
+from dwell.control.watchdog import Doubts, Expected, SeenWindow, Watchdog
 from dwell.control.windows import (
     missed_cycles,
     seen_costs,
@@ -205,6 +206,11 @@ class Controller:
         self.course = Course(str(initial) if known else problem.initial)
         if coordination is not None:
             coordination.place(self.course.placement)
+        #: The incumbent whose windows are compared with its estimates.
+        self._watched, self._watchdog = "", Watchdog(problem.window_cycles)
+        self._doubts = Doubts(problem.window_cycles)
+        #: What was last seen under each candidate.
+        self._seen_under: dict[str, QoS] = {}
         #: What the next decision looks at, as the engine counts.
         self.looked = LookedAt(0, problem.decide_cycles - 1, problem.decide_cycles)
         #: Rows of ``decisions``: `decision_columns`, then why it was not carried out, or None.
@@ -425,6 +431,8 @@ class Controller:
         if not self._estimator.learns:
             # It knows no more of the incumbent than the window shows.
             estimates[incumbent] = observed
+        else:
+            estimates |= self._doubted(observed, estimates)
         missing = [one for one in self._names if not isinstance(estimates.get(one), QoS)]
         if missing:
             who, window = type(self.estimator).__name__, self.looked.window
@@ -434,13 +442,45 @@ class Controller:
             )
         return FrozenDict(estimates)
 
+    def _doubted(self, observed: QoS, estimates: Mapping[str, QoS]) -> Mapping[str, QoS]:
+        """Return what was seen of candidates whose estimates are not what windows show.
+
+        The incumbent is compared (see `dwell.control.watchdog`). A cell whose fleet knows what the
+        others do is compared by the fleet: its estimates are those of the cell alone.
+        """
+        incumbent, (_, last_cycle, cycles) = self.course.placement, self.looked
+        self._seen_under[incumbent] = observed
+        doubted = self._doubts.at(last_cycle)
+        if self.coordination is not None and self.coordination.knows_others:
+            self._watched = ""
+            return {name: self._seen_under[name] for name in doubted - {incumbent}}
+        if self._watched != incumbent:
+            self._watched, whole = incumbent, self.problem.window_cycles
+            self._watchdog = Watchdog(whole, last_cycle - cycles, trusts=incumbent not in doubted)
+        self._watch(observed, estimates)
+        if not self._watchdog.trusts:
+            self._doubts.go_on(incumbent, last_cycle)
+        return {name: self._seen_under[name] for name in self._doubts.at(last_cycle)}
+
+    def _watch(self, observed: QoS, estimates: Mapping[str, QoS]) -> None:
+        """Compare the incumbent's window with its estimate, if it can be compared."""
+        incumbent, (_, last_cycle, cycles) = self.course.placement, self.looked
+        seen = SeenWindow(observed.l95_ms, observed.violation_rate, last_cycle, cycles)
+        estimate, deviations = estimates.get(incumbent), self._estimator.deviations(incumbent)
+        if not isinstance(estimate, QoS) or deviations is None or not self._watchdog.is_due(seen):
+            return
+        played = Expected.of_estimate(estimate, deviations, self.problem.window_cycles)
+        if self._watchdog.compare(seen, played):
+            self._doubts.change(incumbent, last_cycle, trusts=self._watchdog.trusts)
+
     def _consider(
         self, proposal: Proposal, estimates: Mapping[str, QoS], coordination: Coordination
     ) -> None:
         """Have the fleet look at what the policy has decided."""
         decision, incumbent = proposal.decision, self.course.placement
         by_price = self._policy.by_price
-        wish = Wish(decision, estimates, incumbent, self._estimator, by_price)
+        seen = SeenWindow(*proposal.seen[:2], *proposal.looked[1:])
+        wish = Wish(decision, estimates, incumbent, self._estimator, by_price, seen, self._doubts)
         verdict = coordination.consider(wish)
         proposal.verdict, name = verdict, verdict.name
         if name != decision.name:
@@ -611,7 +651,7 @@ class Controller:
         if proposal.verdict is not None:
             asked = proposal.verdict.asked
             if why is None and proposal.verdict.why is not None:
-                why = f"{proposal.wished}: {proposal.verdict.why}"
+                why = f"{proposal.wished or incumbent}: {proposal.verdict.why}"
         window, *cycles = proposal.looked
         dwell_cycles = decision.dwell * self.problem.decide_cycles
         dwell = dwell_cycles // self.problem.window_cycles

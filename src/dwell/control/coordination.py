@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar, NamedTuple, Protocol, TypeAlias
+from typing import NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.control.watchdog import Doubts, SeenWindow
 from dwell.estimators.protocol import CellEstimator
 from dwell.model import Decision, QoS
 
@@ -49,6 +50,10 @@ class Wish(NamedTuple):
     by_price : bool
         Whether the policy would move to any candidate that is cheap enough, so that another one
         may be taken in the place of its own.
+    seen : SeenWindow, optional
+        What the decision looks at.
+    doubts : Doubts, optional
+        Candidates of the cell whose windows were not what was played.
     """
 
     decision: Decision
@@ -56,18 +61,17 @@ class Wish(NamedTuple):
     incumbent: str
     estimator: CellEstimator
     by_price: bool
+    seen: SeenWindow | None = None
+    doubts: Doubts | None = None
 
 
 class Coordination(Protocol):
-    """Says of a decision whether it may be carried out, or what is to be done in its place.
+    """Says of a decision whether it may be carried out, or what is to be done in its place."""
 
-    Attributes
-    ----------
-    knows_others : bool
-        Whether what other cells of the fleet do is known, so that it is no foreign load.
-    """
-
-    knows_others: ClassVar[bool] = False
+    @property
+    def knows_others(self) -> bool:
+        """Whether what other cells of the fleet do is known, so that it is no foreign load."""
+        return False
 
     def consider(self, wish: Wish) -> Verdict:
         """Look at what a policy has decided at a close."""

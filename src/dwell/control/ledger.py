@@ -13,6 +13,10 @@ A move counts from then on, before any window shows it. Under given presents Φ 
 placements alone, and every move lowers it by more than the least Δ_min: the number of moves is
 finite, whatever the table says, and at most (Φ at first − least Φ) / least Δ_min.
 
+A cell whose windows are not what was played for it leaves Φ until they are again (see
+`dwell.control.watchdog`). Its load stays where it is; the proof holds from one such change to the
+next.
+
 What is lowered is the sum of the cells' costs; or the worst of them: costs are rounded up to
 multiples of the least Δ_min and sorted from the largest, the smaller list is the better one, and
 of equal lists that with the smaller sum.
@@ -24,12 +28,20 @@ import bisect
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dwell.control.coordination import Coordination, Verdict, Wish
+from dwell.control.watchdog import (
+    NOT_AS_PLAYED,
+    WAS_NOT_AS_PLAYED,
+    Doubts,
+    Expected,
+    SeenWindow,
+    Watchdog,
+)
 from dwell.cost import GAIN_TOLERANCE, exceeds, excess, hamming, price
 from dwell.estimators.fleet_prices import CellTerms, FleetPrice, FleetPrices, PricedCell
 from dwell.estimators.load_table import LoadTable, load_table
@@ -56,7 +68,9 @@ class FleetLedger:
         Nodes that are one computer for all cells.
     objective : {"sum", "worst"}
     table : LoadTable, optional
-        What proposes; made of the cells where None.
+        Proposes moves; made of `tabled` where None.
+    tabled : sequence of PricedCell, optional
+        Cells at the phases that the table is made for; `cells` where None.
     prices : FleetPrices, optional
         What plays.
     progress : callable, optional
@@ -74,6 +88,8 @@ class FleetLedger:
         The table, added up.
     round : int
         Number of the round: of the closes since the fleet was last played.
+    absent : set of int
+        Cells that have left Φ, since their windows are not what was played (see `watch`).
     """
 
     def __init__(
@@ -83,12 +99,13 @@ class FleetLedger:
         objective: FleetObjective = "sum",
         *,
         table: LoadTable | None = None,
+        tabled: Sequence[PricedCell] | None = None,
         prices: FleetPrices | None = None,
         progress: Progress | None = None,
     ) -> None:
         self.cells, self.shared, self.objective = tuple(cells), tuple(shared), objective
         problems = [cell.problem for cell in cells]
-        self.table = load_table(cells, shared, progress) if table is None else table
+        self.table = table or load_table(tabled or cells, shared, progress)
         self.prices = prices or FleetPrices(cells, shared)
         self.loads = Loads(self.table)
         self._terms = [CellTerms(problem, shared) for problem in problems]
@@ -106,7 +123,15 @@ class FleetLedger:
         #: Place of each cell where they take turns, and how long one is.
         self.order = [names.index(cell.name) for cell in cells]
         self.turn_ns = max(round(problem.window_ms * 1e6) for problem in problems)
-        #: How often any cell has moved; and of each cell what it was when it was looked at.
+        self.absent: set[int] = set()
+        self._watchdogs = [Watchdog(problem.window_cycles) for problem in problems]
+        #: Candidates of each cell that are doubted at its last close.
+        self._doubted: list[set[str]] = [set()] * len(self.cells)
+        self._declared = [prices_of(problem) for problem in problems]
+        #: How often Φ has become another function; and of each cell what it was when it was last
+        #: looked at.
+        self._changes = 0
+        #: How often any cell has moved.
         self._moves = 0
         self._looked = [(-1, -1)] * len(self.cells)
         self._refusals: list[dict[str, str]] = [{} for _ in self.cells]
@@ -121,6 +146,34 @@ class FleetLedger:
             self.placements[index] = name
             self._at = self.loads.at(self.placements)
             self._moves += 1
+            self._changes += 1
+
+    def watch(self, index: int, seen: SeenWindow, doubts: Doubts, estimator: CellEstimator) -> bool:
+        """Compare a window with what was played; returns whether that is what was seen.
+
+        A cell whose estimator learns leaves Φ when it is not, and comes back when it is again. As
+        long as it is away, its estimator takes all load of shared nodes for foreign.
+        """
+        dog, name = self._watchdogs[index], self.placements[index]
+        if dog.is_due(seen, self._moves):
+            self._begin()
+            cell = self.prices.price(tuple(self.placements)).cells[index]
+            cycles = self.cells[index].problem.window_cycles
+            if cell is not None:
+                played = Expected.of(cell.windows, self._declared[index][name], cycles)
+                if dog.compare(seen, played) and estimator.learns:
+                    self.absent ^= {index}
+                    self._changes += 1
+                    estimator.share(self.shared, len(self.cells), known=dog.trusts)
+                    doubts.change(name, seen.last_cycle, trusts=dog.trusts)
+        doubted = doubts.at(seen.last_cycle)
+        self._changes += doubted != self._doubted[index]
+        self._doubted[index] = doubted
+        return dog.trusts
+
+    def _begin(self) -> None:
+        """Have what plays know the presents; absent cells do not speak of shared nodes."""
+        self.prices.begin(self.presents, self.absent)
 
     def note(self, index: int, estimates: Mapping[str, QoS], estimator: CellEstimator) -> None:
         """Take note of what a cell knows of itself, where that is new."""
@@ -135,7 +188,9 @@ class FleetLedger:
     def consider(self, index: int, decision: Decision, *, by_price: bool) -> Verdict:
         """Say where a cell is to be that its policy has decided on (see `Wish`)."""
         wished = decision.name
-        state = self._moves, self._revisions[index]
+        if index in self.absent:
+            return self._outside(index, decision)
+        state = self._changes, self._revisions[index]
         if self._looked[index] != state:
             self._looked[index] = state
             self._refusals[index] = {}
@@ -151,8 +206,11 @@ class FleetLedger:
             return self._refused(index, wished)
         asked: tuple[float, float] | None = None
         for name in names:
+            if name in self._doubted[index]:
+                self._refusals[index][name] = WAS_NOT_AS_PLAYED
+                continue
             before, after = self._played(index, name)
-            asked = before.phi, after.phi
+            asked = self._phi(before), self._phi(after)
             why = self._objection(index, name, before, after)
             if why is None:
                 verdict = Verdict(name, None, (*asked, self.round))
@@ -163,6 +221,15 @@ class FleetLedger:
         verdict = self._refused(index, wished, asked)
         self.round += asked is not None
         return verdict
+
+    def _outside(self, index: int, decision: Decision) -> Verdict:
+        """Let a cell that has left Φ do as it likes, except take more of a shared node."""
+        candidates, here = self.cells[index].problem.candidates, self.placements[index]
+        before, after = candidates[here], candidates[decision.name]
+        if any(node in self.shared and before[task] != node for task, node in after.items()):
+            return Verdict(here, NOT_AS_PLAYED, (None, None, self.round))
+        self.place(index, decision.name)
+        return Verdict(decision.name, None, (None, None, self.round))
 
     def _refused(
         self, index: int, wished: str, asked: tuple[float, float] | None = None
@@ -175,14 +242,29 @@ class FleetLedger:
 
     def _promising(self, index: int) -> list[str]:
         """Candidates by which the table's Φ falls by more than is owed; best first."""
-        found = []
+        found, here = [], self.placements[index]
+        at_stake = self.alone[index][here] + self._beyond_table(index)
         for name in self.cells[index].problem.candidates:
-            if name != self.placements[index]:
-                rise = self.loads.rise(self._at, index, self.placements[index], name)
-                rise += self.alone[index][name] - self.alone[index][self.placements[index]]
+            if name != here:
+                rise = self.loads.rise(self._at, index, here, name)
+                rise += self.alone[index][name] - at_stake
                 if exceeds(-rise, self.owed(index, name)) or self._helps_the_worst(index, name):
                     found.append((rise, name))
         return [name for _, name in sorted(found)[:LOOKS]]
+
+    def _beyond_table(self, index: int) -> float:
+        """J of a cell as played, less what the table says, where foreign load is on shared nodes.
+
+        The table knows no foreign load beyond the declared: it takes such a node for idle.
+        """
+        known = [one for i, one in enumerate(self.presents) if i not in self.absent]
+        if not any(one.threads.keys() & self.shared for one in known):
+            return 0.0
+        self._begin()
+        cell, here = self.prices.price(tuple(self.placements)).cells[index], self.placements[index]
+        load = self._at.loads.get(self.loads.resource(index, here) or "", 0.0)
+        says = self.alone[index][here] + self.loads.wait(index, here, load)
+        return 0.0 if cell is None else cell.cost - says
 
     def _helps_the_worst(self, index: int, name: str) -> bool:
         """Whether the table thinks so."""
@@ -203,7 +285,7 @@ class FleetLedger:
         return problem.controller.min_improvement + weight * hamming(there, here)
 
     def _played(self, index: int, name: str) -> tuple[FleetPrice, FleetPrice]:
-        self.prices.begin(self.presents)
+        self._begin()
         before = self.prices.price(tuple(self.placements))
         return before, self.prices.price(tuple(self._with(index, name)))
 
@@ -213,12 +295,14 @@ class FleetLedger:
         """Why a cell must not move, by what has been played."""
         costs = [*before.costs, before.shared], [*after.costs, after.shared]
         if not self._is_better(*costs, self.owed(index, name)):
-            rises = after.phi - before.phi
+            rises = self._phi(after) - self._phi(before)
             if rises > 0:
                 return f"ledger: Φ would rise by {rises:.3g}"
             return f"ledger: Φ would fall by {-rises:.3g}, {self.owed(index, name):.3g} is owed"
         if self._has_caps:
             for i, cell in enumerate(self.cells):
+                if i in self.absent:
+                    continue
                 caps, one, other = cell.problem.objective, before.qos(i), after.qos(i)
                 if one and other and excess(one, caps) <= 0 < excess(other, caps):
                     return f"cap of {cell.name}"
@@ -229,24 +313,35 @@ class FleetLedger:
             one, other = self._from_the_worst(before), self._from_the_worst(after)
             if one != other:
                 return other < one
-        return exceeds(sum(before) - sum(after), owed)
+        return exceeds(sum(self._present(before)) - sum(self._present(after)), owed)
+
+    def _present(self, costs: Sequence[float]) -> list[float]:
+        """Costs without those of absent cells."""
+        return [cost for i, cost in enumerate(costs) if i not in self.absent]
+
+    def _phi(self, played: FleetPrice) -> float:
+        """Φ of the cells that are present."""
+        return sum(self._present(played.costs)) + played.shared
 
     def _from_the_worst(self, costs: Sequence[float]) -> list[int]:
         """Costs of cells in steps of the least Δ_min, the largest first."""
-        step, own = self._least or GAIN_TOLERANCE, costs[: len(self.cells)]
+        step, own = self._least or GAIN_TOLERANCE, self._present(costs[: len(self.cells)])
         return sorted((math.ceil((cost - GAIN_TOLERANCE) / step) for cost in own), reverse=True)
 
 
 class Seat(Coordination):
     """A cell's place in a ledger."""
 
-    knows_others: ClassVar[bool] = True
-
     def __init__(self, ledger: FleetLedger, index: int) -> None:
         self.ledger, self._index = ledger, index
 
     def __repr__(self) -> str:
         return f"<Seat of {self.ledger.cells[self._index].name}>"
+
+    @property
+    def knows_others(self) -> bool:
+        """Whether the cell is in Φ."""
+        return self._index not in self.ledger.absent
 
     def meet(self, estimator: CellEstimator) -> None:
         """Have the estimator take notice of the fleet."""
@@ -267,7 +362,14 @@ class Seat(Coordination):
         """Have the ledger look at what the policy has decided."""
         self.ledger.place(self._index, wish.incumbent)
         self.ledger.note(self._index, wish.estimates, wish.estimator)
-        return self.ledger.consider(self._index, wish.decision, by_price=wish.by_price)
+        is_as_played = True
+        if wish.seen is not None and wish.doubts is not None and len(self.ledger.cells) > 1:
+            asked = wish.seen, wish.doubts, wish.estimator
+            is_as_played = self.ledger.watch(self._index, *asked)
+        verdict = self.ledger.consider(self._index, wish.decision, by_price=wish.by_price)
+        if is_as_played or verdict.why or verdict.name != wish.incumbent:
+            return verdict
+        return verdict._replace(why=NOT_AS_PLAYED)
 
 
 class AtLoad(NamedTuple):

@@ -161,6 +161,7 @@ class FleetPrices:
         ]
         self._terms = [CellTerms(cell.problem, self.shared) for cell in self.cells]
         self._presents: list[Present] = [AS_DECLARED] * len(self.cells)
+        self._absent: frozenset[int] = frozenset()
         self._real = list(self._declared)
         self._alone: list[dict[str, CellPrice]] = [{} for _ in self.cells]
         self._known: dict[Placements, FleetPrice] = {}
@@ -173,13 +174,19 @@ class FleetPrices:
         """Whether a placement has anything on a shared node."""
         return not set(self.shared).isdisjoint(placement.values())
 
-    def begin(self, presents: Sequence[Present]) -> None:
-        """Begin with other presents, one a cell; of a shared node the middle of them holds."""
+    def begin(self, presents: Sequence[Present], absent: Collection[int] = ()) -> None:
+        """Begin with other presents, one a cell; of a shared node the middle of them holds.
+
+        Parameters
+        ----------
+        absent : collection of int
+            Cells whose presents do not count on shared nodes.
+        """
         given = zip(presents, self._presents, strict=True)
         changed = [i for i, (present, before) in enumerate(given) if present is not before]
-        if not changed:
+        if not changed and self._absent == frozenset(absent):
             return
-        self._presents = list(presents)
+        self._presents, self._absent = list(presents), frozenset(absent)
         # What befalls shared nodes is played with the first cell.
         for i in dict.fromkeys((0, *changed)):
             cell, declared = self.cells[i], self._declared[i]
@@ -196,10 +203,11 @@ class FleetPrices:
             threads.pop(name, None)
             down.discard(name)
             if index == 0:
-                said = sorted(one.threads.get(name, 0.0) for one in self._presents)
-                if middle := said[len(said) // 2]:
+                known = [one for i, one in enumerate(self._presents) if i not in self._absent]
+                said = sorted(one.threads.get(name, 0.0) for one in known)
+                if said and (middle := said[len(said) // 2]):
                     threads[name] = middle
-                if any(name in one.down for one in self._presents):
+                if any(name in one.down for one in known):
                     down.add(name)
         return replace(present, threads=FrozenDict(threads), down=frozenset(down))
 

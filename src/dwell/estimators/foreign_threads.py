@@ -6,7 +6,7 @@ there the cell's own jobs tell, by how much longer they took than the core time 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 from typing import NamedTuple
 
@@ -123,10 +123,16 @@ class Stretches:
     Some jobs leave others room, and take no longer for it: they show only how many threads there
     are at most. The jobs of each task since its last change are compared with their times alone;
     tasks of which most jobs are slowed count, if there are any.
+
+    Parameters
+    ----------
+    shared : collection of str
+        Nodes on which jobs run next to those of other cells. They speak only where all share the
+        cores evenly, and the evidence says next to how many threads each job ran.
     """
 
-    def __init__(self, problem: Problem) -> None:
-        self._problem = problem
+    def __init__(self, problem: Problem, shared: Collection[str] = ()) -> None:
+        self._problem, self._shared = problem, shared
         self._on: dict[str, NodeJobs] = {}
 
     def level(self, evidence: Evidence, name: str) -> Level | None:
@@ -135,7 +141,14 @@ class Stretches:
         Own jobs count if there are enough, else shadow jobs, where these share what own jobs leave
         with foreign threads as equals.
         """
-        told = level(self._jobs_on(name), evidence.rows, shadows=evidence.shadows_share)
+        rows, is_shared = evidence.rows, name in self._shared
+        node = self._problem.fabric.nodes[name]
+        if is_shared and (
+            rows.beside is None or node.scheduler != "fair" or node.quota is not None
+        ):
+            return None
+        shadows = evidence.shadows_share
+        told = level(self._jobs_on(name), rows, shadows=shadows, is_shared=is_shared)
         if told is None:
             return None
         threads, error, is_slowed = told

@@ -1,11 +1,10 @@
 """Load table: what candidates of a fleet's cells come to by how loaded a shared node is.
 
-Of every kind of cell and every candidate that uses a shared node, one cell after another is played
-on it together, until all cells of the fleet are there: those of the kind first, the others beside
-them on what they have most work with. All levels are played on the same draws, and what a cell
-alone comes to is known well, so that this is a control variate: as much as windows show together
-with those of the cell alone is told from its price (DOI 10.1287/opre.30.5.961). The table says what
-would be worth a look; Φ itself is played (see `dwell.estimators.fleet_prices`).
+For every kind of cell and every candidate that uses a shared node, more and more cells are played
+on it together, from one up to all cells of the fleet: those of the kind first, then the others on
+the candidate with which they have most work. All levels are played on the same draws, and the price
+of a cell alone is known well, so that it serves as a control variate (DOI 10.1287/opre.30.5.961).
+The table proposes moves; Φ itself is played (see `dwell.estimators.fleet_prices`).
 """
 
 from __future__ import annotations
@@ -27,6 +26,8 @@ Floats: TypeAlias = NDArray[np.float64]
 
 #: Cycles of all levels of a candidate together; fewest and most of a cell at each level.
 CYCLES, FEWEST, MOST = 1_000_000, 3_000, 15_000
+#: Most levels of a candidate; between them the table is interpolated.
+LEVELS = 14
 #: How many fleets are remembered.
 KEPT = 8
 
@@ -86,12 +87,15 @@ class LoadTable:
         self.cells, self.shared = tuple(cells), tuple(shared)
         self.kinds = kinds_of(cells)
         self.work = tuple(_work(cell.problem, shared) for cell in cells)
+        count = sum(map(bool, self.work))
+        self._counts = {1 + (count - 1) * i // (LEVELS - 1) for i in range(LEVELS)}
         if cycles is None:
-            cycles = min(max(2 * CYCLES // (len(cells) * len(cells)), FEWEST), MOST)
+            cycles = 2 * CYCLES // (len(cells) * len(self._counts))
+            cycles = min(max(cycles, FEWEST), MOST)
         plays = FleetPrices(cells, shared, cycles * len(cells))
         asked = [(kind, name) for kind in dict.fromkeys(self.kinds) for name in self.work[kind]]
         self.columns: dict[tuple[int, str], LoadColumn] = {}
-        done, levels = 0, len(asked) * sum(map(bool, self.work))
+        done, levels = 0, len(asked) * len(self._counts)
         for group in asked:
             rows = []
             for row in self._levels(plays, *group):
@@ -109,7 +113,7 @@ class LoadTable:
         return self.work[index][name][1]
 
     def _levels(self, plays: FleetPrices, kind: int, name: str) -> Iterator[tuple[float, ...]]:
-        """Yield rows of a column, one cell more at each."""
+        """Yield rows of a column, with more cells at each."""
         mine = [i for i, of in enumerate(self.kinds) if of == kind]
         others = [i for i, of in enumerate(self.kinds) if of != kind and self.work[i]]
         placements: list[str | None] = [None] * len(self.cells)
@@ -117,11 +121,13 @@ class LoadTable:
         price, alone = prices_of(self.cells[kind].problem)[name], None
         known = np.array([price.l95_ms, price.violation_rate])
         known_error = np.array([price.l95_error_ms, price.violation_error])
-        for i in mine + others:
+        for count, i in enumerate(mine + others, 1):
             # The others ask for as much as they may.
             placed = name if i in mine else max(self.work[i], key=partial(self._asked, i))
             placements[i], (resource, work) = placed, self.work[i][placed]
             level += work if resource == asked else 0.0
+            if count not in self._counts:
+                continue
             found = plays.price(tuple(placements)).cells
             windows = np.mean([cell.windows for j in mine if (cell := found[j])], axis=0)
             alone = windows if alone is None else alone

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from functools import partial
 from typing import NamedTuple, TypeAlias
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from dwell.cost import cost, cost_error, hamming
 from dwell.estimators.evidence import Evidence
-from dwell.estimators.foreign_threads import ForeignThreads, Level, Stretches
+from dwell.estimators.foreign_threads import ForeignThreads, Stretches
 from dwell.estimators.link_rates import Rate
 from dwell.estimators.measured import Message, Meter, Part, groups, parts_of
 from dwell.estimators.presents import Playing, Present
@@ -41,10 +41,6 @@ FIRST_STEPS = 6
 ROUNDS, STEPS = 2, 2
 #: How many standard errors a difference of two prices must be from what would decide otherwise.
 BAND = 2.0
-
-
-def _says_nothing() -> None:
-    """Stand for jobs that say nothing of foreign threads."""
 
 
 class _Declared(NamedTuple):
@@ -101,19 +97,23 @@ class Online(CellEstimator):
         #: Whether the present is another one, or has newer values of the same.
         self._has_changed = self._has_grown = False
 
-    def share(self, nodes: Collection[str], cells: int) -> None:
-        """Take note of nodes whose other jobs are those of a fleet's cells, and accounted for.
+    def share(self, nodes: Collection[str], cells: int, *, known: bool = True) -> None:
+        """Take note of nodes whose other jobs are those of a fleet's cells (see `CellEstimator`).
 
-        Jobs on them say nothing of foreign threads, nor of waits: they run beside jobs that are
-        not in the evidence. What others take of the node still does. Cells take turns in sending
-        shadows there.
+        Jobs there say nothing of waits, since the jobs of other cells are not in the evidence. They
+        say how many foreign threads there are where it is known next to how many threads of the
+        fleet they ran. Cells take turns in sending shadows there.
         """
-        self._shared, self._declared = frozenset(nodes), {}
+        shared, self._declared = frozenset(nodes), {}
+        self._shared = shared if known else frozenset()
         self._meter = Meter(self.problem, self._shared)
-        for name, sent in self._sent.items():
+        for link, rate in self._rates.items():
+            self._meter.set_rate(link, rate.mbps)
+        self._stretches = Stretches(self.problem, self._shared)
+        for name in self.problem.candidates:
             of = {
-                one: share / cells if one.partition(".")[0] in self._shared else share
-                for one, share in sent.items()
+                one: share / cells if one.partition(".")[0] in shared else share
+                for one, share in self._sent_under(name).items()
             }
             self._sent[name] = FrozenDict(of)
 
@@ -192,6 +192,10 @@ class Online(CellEstimator):
                 estimates = self._priced(names, foreign)
         return estimates
 
+    def deviations(self, name: str) -> tuple[float, float]:
+        """Return standard deviations of one window under a candidate (see `CellEstimator`)."""
+        return self._playing.deviations(name)
+
     def _priced(self, names: list[str], foreign: Foreign) -> dict[str, QoS]:
         """Every candidate's metrics; of those that are played by what they have come to."""
         played = {name: self._playing.played(name) for name in names}
@@ -267,13 +271,8 @@ class Online(CellEstimator):
         price = self._playing.prices[incumbent]
         for name, foreign in self._foreign.items():
             usual, deviation = price.foreign[name], price.foreign_deviation[name]
+            level = partial(self._stretches.level, evidence, name)
             is_full = name in seen.full
-            if name in self._shared:
-                if is_full:
-                    continue
-                level: Callable[[], Level | None] = _says_nothing
-            else:
-                level = partial(self._stretches.level, evidence, name)
             changed = foreign.see(seen.shares[name], usual, deviation, level, is_full=is_full)
             if changed:
                 self._has_changed = True

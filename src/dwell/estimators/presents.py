@@ -266,6 +266,19 @@ class Playing:
             twin.price = self._price(name, twin.steps)
         return twin.price
 
+    def deviations(self, name: str) -> tuple[float, float]:
+        """Return standard deviations of one window: of its L95, milliseconds, and its V_D."""
+        price = self.prices[name]
+        usual = price.l95_deviation_ms, price.violation_deviation
+        steps = self._twins[name].steps if self._twins else ()
+        if len(steps) < 2:
+            return usual
+        shown = np.array([[step.l95_ms, step.violation_rate] for step in steps])
+        # Of few values the deviation is itself hardly known.
+        few = (len(steps) + 1) / (len(steps) - 1) * math.sqrt(self._step)
+        l95_ms, rate = (few * shown.std(axis=0)).tolist()
+        return max(l95_ms, usual[0]), max(rate, usual[1])
+
     def tail_error_ms(self, name: str, off: float) -> float:
         """Return the error of a candidate's L95 by the error of the share of lost cycles."""
         latency_ns = np.concatenate([step.latency_ns for step in self._twins[name].steps])

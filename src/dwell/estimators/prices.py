@@ -44,6 +44,10 @@ Ints: TypeAlias = NDArray[np.int64]
 SEED = 20_250_601
 #: Standard errors that are good enough: of L95 as a share of it, and of V_D.
 L95_SHARE, RATE = 0.01, 0.0025
+#: Deviations from the mean within which a window agrees with the price.
+AGREES = 4.0
+#: One in so many pairs of windows in succession may be further off, both of them.
+RARE = 300
 #: How much of a candidate is played at most.
 MOST_CYCLES, MOST_EVENTS = 100_000, 10_000_000
 #: Windows that are played first: those in which queues settle, which do not count, and others; of a
@@ -85,6 +89,10 @@ class Price:
         Share of the windows that lose more than 5 % of their cycles.
     is_settled : bool
         Whether the halves of the windows have the same means, to three of their errors.
+    l95_deviation_ms, violation_deviation : float
+        Deviation of one window from the means: by how much windows differ, by the errors of the
+        means, which know of slow processes, and so large that both of two windows in succession
+        are beyond `AGREES` deviations in one of `RARE` cases at most.
     """
 
     l95_ms: float
@@ -99,6 +107,8 @@ class Price:
     cycles: int
     lost_windows: float
     is_settled: bool
+    l95_deviation_ms: float
+    violation_deviation: float
 
     @property
     def qos(self) -> QoS:
@@ -356,7 +366,17 @@ def price_of(
         is_settled=bool(slow.loops)
         or slow.is_timed
         or (_is_settled(windows_ms, l95_error_ms) and _is_settled(rates, violation_error)),
+        l95_deviation_ms=_deviation(windows_ms, l95_error_ms),
+        violation_deviation=_deviation(rates, violation_error),
     )
+
+
+def _deviation(windows: Floats, error: float) -> float:
+    """Return the deviation of one window from the mean (see `Price`)."""
+    off = np.abs(windows - windows.mean())
+    two = np.sort(np.append(0.0, np.minimum(off[:-1], off[1:])))[::-1]
+    rare = float(two[len(off) // RARE])
+    return max(float(windows.std()), error * math.sqrt(len(windows)), rare / AGREES)
 
 
 def _is_settled(by_window: Floats, error: float) -> bool:

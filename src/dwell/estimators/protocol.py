@@ -144,10 +144,23 @@ class CellEstimator(ABC):
     ) -> Mapping[str, QoS]:
         """As `Estimator.estimate`."""
 
+    def deviations(self, name: str) -> tuple[float, float] | None:
+        """Return standard deviations of one window under a candidate: of L95 (ms), and of V_D.
+
+        None where they are not known, so that no window can be compared with the estimate.
+        """
+        return None
+
     def support(self) -> Mapping[str, Support]:
         """Say what stands behind the estimates, where it supports them."""
         return {}
 
-    def share(self, nodes: Collection[str], cells: int) -> None:
-        """Take note of nodes whose other jobs are those of a fleet's cells, and accounted for."""
+    def share(self, nodes: Collection[str], cells: int, *, known: bool = True) -> None:
+        """Take note of nodes whose other jobs are those of a fleet's cells.
+
+        Parameters
+        ----------
+        known : bool
+            Whether their load is accounted for; if not, it counts as foreign.
+        """
         return

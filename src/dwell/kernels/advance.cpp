@@ -36,10 +36,11 @@ DWELL_EXPORT void dwell_post_event(const Tables* tables, i64 at_ns, i64 key) noe
   queue.save(tables->clock[0]);
 }
 
-// Writes what the logs still have of cycles, and of those of their shadows, as rows of a `Window`.
+// Writes what the logs still have of cycles, and of those of their shadows, as rows of a `Window`;
+// into `beside`, where cells share servers, two integrals for each job (see `Log`).
 DWELL_EXPORT void dwell_logged_window(const Tables* tables, i64 cell_0, i64 n_cells, i64 first,
-                                      i64 n, i64 n_tasks, const i64* flows, i64 n_flows,
-                                      i64* out) noexcept {
+                                      i64 n, i64 n_tasks, const i64* flows, i64 n_flows, i64* out,
+                                      i64* beside) noexcept {
   const Simulation<false, false> s(*tables);
   for (i64 cycle = first; cycle < first + n; ++cycle) {
     for (i64 cell = cell_0; cell < cell_0 + n_cells; ++cell) {
@@ -53,6 +54,9 @@ DWELL_EXPORT void dwell_logged_window(const Tables* tables, i64 cell_0, i64 n_ce
         end_ns[task] = s.log_outcome[at] == kDone ? s.log[at].end_ns : -1;
         work_ns[task] = s.log[at].work_ns;
         start_ns[task] = s.log[at].start_ns;
+        if (beside == nullptr) continue;
+        *beside++ = s.log[at].used_ns;
+        *beside++ = s.log[at].above_ns;
       }
       for (i64 i = 0; i < n_flows; ++i) arrived_ns[i] = s.log_arrived[row * s.n_flows + flows[i]];
       out = start_ns + n_tasks;

@@ -19,7 +19,7 @@ _post = foreign("dwell_post_event", None, c_void_p, c_int64, c_int64)
 _send = foreign("dwell_send_state", None, c_void_p, *(c_int64,) * 5, POINTER(c_int64))
 _end_repeats = foreign("dwell_end_repeats", None, c_void_p, *(c_int64,) * 2)
 _logged = foreign(
-    "dwell_logged_window", None, c_void_p, *(c_int64,) * 5, c_void_p, c_int64, c_void_p
+    "dwell_logged_window", None, c_void_p, *(c_int64,) * 5, c_void_p, c_int64, *(c_void_p,) * 2
 )
 
 
@@ -61,10 +61,13 @@ def logged_window(of: CellArrays, first: int, last: int, flows: Ints) -> WindowR
     """
     part, tasks, count = of.part, of.part.tasks, len(flows)
     table = np.empty((last - first, part.rows * (1 + 4 * tasks + count)), np.int64)
-    rows = WindowRows(table, tasks, count)
+    beside = None
+    if of.whole.tables.clock[0]["has_shared"]:
+        beside = np.empty((last - first, part.rows, tasks, 2), np.int64)
+    rows = WindowRows(table, tasks, count, beside)
     _logged()(
         *(of.whole.address, part.row, part.rows, first, last - first, tasks),
-        *(flows.ctypes.data, count, rows.row.rows),
+        *(flows.ctypes.data, count, rows.row.rows, rows.beside_address),
     )
     return rows
 

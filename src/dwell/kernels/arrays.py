@@ -732,7 +732,7 @@ class _Layout:
             **{name: np.array(values, types[name]) for name, values in lists.items()},
             "changes": changes,
             "latency_ns": np.full((cells, cycles), NEVER_NS),
-            "log": _as_rows("log", np.full((logged * self.max_tasks, 4), -1)),
+            "log": _as_rows("log", np.full((logged * self.max_tasks, 6), -1)),
             "log_arrived": np.full((logged, self.max_flows), -1),
             "route": np.array(self.route, np.int32).reshape(len(self.route), self.max_flows),
             "shadow_parts": np.array(self.shadow_parts, np.int8).reshape(-1, self.max_tasks),

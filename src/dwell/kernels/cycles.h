@@ -20,10 +20,16 @@ i64 core_time(const S& s, const Job& job, i64 cycle) {
 template <class S>
 void log_job(S& s, i64 cell, i64 cycle, i64 task, const Job& job, Outcome outcome, i64 end_ns) {
   if (S::kPlain || s.log.size == 0) return;
-  const i64 entry = s.log_entry(cell, cycle, task);
+  const i64 row = s.log_entry(cell, cycle, task);
   const i64 work_ns = outcome == kDone ? core_time(s, job, cycle) : -1;
-  s.log[entry] = Log{job.ready_ns, job.started_ns, end_ns, work_ns};
-  s.log_outcome[entry] = outcome;
+  Log& entry = s.log[row];
+  if (outcome == kDone) {
+    log_beside(s, s.server(s.site(job)), entry, 1, end_ns);
+  } else {
+    entry.used_ns = entry.above_ns = 0;
+  }
+  entry = Log{job.ready_ns, job.started_ns, end_ns, work_ns, entry.used_ns, entry.above_ns};
+  s.log_outcome[row] = outcome;
 }
 
 // Forgets what the logs have of an earlier cycle in the place of this one.
@@ -31,7 +37,7 @@ template <class S>
 void clear_log(S& s, i64 cell, i64 cycle) {
   if (S::kPlain || s.log.size == 0) return;
   const i64 row = s.log_row(cell, cycle);
-  std::fill_n(&s.log[row * s.n_tasks], s.n_tasks, Log{-1, -1, -1, -1});
+  std::fill_n(&s.log[row * s.n_tasks], s.n_tasks, Log{-1, -1, -1, -1, 0, 0});
   std::fill_n(&s.log_outcome[row * s.n_tasks], s.n_tasks, i8{kInFlight});
   std::fill_n(&s.log_arrived[row * s.n_flows], s.n_flows, i64{-1});
 }

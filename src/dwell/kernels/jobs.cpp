@@ -12,6 +12,7 @@ namespace dwell {
 struct RanJob {
   f64 start_ns, end_ns, alone_ns, cores;
   f64 threads, slowed;  // foreign threads that it ran beside, and how many times as long as alone
+  f64 used, above;      // threads of all cells' jobs next to it, and of those that go first
   i64 row, task;
 
   f64 taken_ns() const { return std::max(end_ns - start_ns, 1.0); }
@@ -131,7 +132,8 @@ bool add_job(const NodeJobs& node, const Window& window, i64 begin, i64 row, i64
   const i64* start_ns = work_ns + node.n_tasks;
   if (cores == 0.0 || *end_ns < 0 || *work_ns <= 0 || *start_ns < 0) return false;
   const f64 alone_ns = static_cast<f64>(*work_ns) / cores;
-  out = {static_cast<f64>(*start_ns), static_cast<f64>(*end_ns), alone_ns, cores, 0, 0, row, task};
+  const f64 begun = static_cast<f64>(*start_ns), ended = static_cast<f64>(*end_ns);
+  out = {begun, ended, alone_ns, cores, 0, 0, 0, 0, row, task};
   return true;
 }
 
@@ -227,8 +229,11 @@ i64 newest(const f64* values, i64 n, f64* scratch) {
   return most >= kChanged ? best : 0;
 }
 
-// The jobs of the CPU of a node, of all cycles or of all shadows, candidate after candidate.
-Jobs jobs_on(const NodeJobs& node, const Window& window, i64 begin, RanJob* out, bool* any) {
+// The jobs of the CPU of a node, of all cycles or of all shadows, candidate after candidate; next
+// to how many threads of all cells each ran, where that is logged.
+Jobs jobs_on(const NodeJobs& node, const Window& window, i64 begin, const i64* beside, RanJob* out,
+             bool* any) {
+  const i64 parts = window.width > width_of(node) ? 2 : 1;
   Jobs jobs{out, 0};
   for (i64 one = -1; (one = next_candidate(window, begin, one)) >= 0;) {
     *any |= runs_on(node, one);
@@ -237,6 +242,12 @@ Jobs jobs_on(const NodeJobs& node, const Window& window, i64 begin, RanJob* out,
       for (i64 task = 0; task < node.n_tasks; ++task) {
         RanJob& job = out[jobs.n];
         if (!add_job(node, window, begin, row, task, job)) continue;
+        if (beside != nullptr) {
+          const i64* of_job =
+              beside + 2 * ((row * parts + (begin > 0 ? 1 : 0)) * node.n_tasks + task);
+          job.used = static_cast<f64>(of_job[0]) / job.taken_ns();
+          job.above = static_cast<f64>(of_job[1]) / job.taken_ns();
+        }
         job.row = jobs.n++;
       }
     }
@@ -253,6 +264,15 @@ f64 threads_behind(f64 slowed, f64 spare, f64 mine, f64 own) {
     threads = std::max(slowed * left - mine, 0.0);
   }
   return threads;
+}
+
+// The same next to the jobs of all cells, which may fill the node: of s threads own jobs leave
+// c s / (own + s) where all are slowed.
+f64 threads_behind_all(f64 slowed, f64 spare, f64 mine, f64 own) {
+  const f64 free = slowed * (spare - own) - mine;
+  if (free > 0.0 && own + free <= spare) return free;
+  const f64 half = (slowed * spare - own - mine) / 2;
+  return std::max(half + std::sqrt(std::max(half * half - own * mine, 0.0)), 0.0);
 }
 
 // Keeps of the jobs of each task those since its last change, of those tasks alone whose jobs are
@@ -301,34 +321,42 @@ DWELL_EXPORT void dwell_add_waits(const NodeJobs* nodes, i64 n_nodes, const Wind
 
 // Tells from the jobs on a node beside how many foreign threads they ran since the last change,
 // with the standard error, into `out`: 0 where they say nothing, 2 where most are slowed, else 1.
-DWELL_EXPORT i64 dwell_level(const NodeJobs* node, const Window* window, i64 shadows,
-                             RanJob* scratch, f64* out) noexcept {
+// `beside` is what `dwell_logged_window` has written of a node that cells share, else null.
+DWELL_EXPORT i64 dwell_level(const NodeJobs* node, const Window* window, const i64* beside,
+                             i64 shadows, RanJob* scratch, f64* out) noexcept {
   const i64 room = window->n * node->n_tasks;
   RanJob* behind = scratch + room;
   CoreUse* uses_out = reinterpret_cast<CoreUse*>(behind + room);
   f64* values = reinterpret_cast<f64*>(uses_out + 4 * room);
   bool has_own = false;
-  const Jobs own = jobs_on(*node, *window, 0, scratch, &has_own);
+  const Jobs own = jobs_on(*node, *window, 0, beside, scratch, &has_own);
   Jobs jobs = own;
   bool any = false;
   const bool is_behind = own.n < kJobs;
   if (is_behind) {
     if (shadows == 0 || window->width <= width_of(*node)) return 0;
-    jobs = jobs_on(*node, *window, width_of(*node), behind, &any);
+    jobs = jobs_on(*node, *window, width_of(*node), beside, behind, &any);
     if (jobs.n < kJobs) return 0;
   }
   const auto same = [](f64 used) { return used; };
   Uses uses{uses_out, 0}, before{uses_out + 2 * room, 0};
-  if (node->is_fair != 0) {
+  if (node->is_fair != 0 && beside == nullptr) {
     integrate(uses = uses_of(jobs, uses_out), same);
     if (is_behind) integrate(before = uses_of(own, uses_out + 2 * room), same);
+    has_own = has_own && is_behind;
+  } else {
+    has_own = node->is_fair != 0 && is_behind;
   }
   for (RanJob& job : jobs) {
     job.slowed = job.taken_ns() / job.alone_ns;
-    const f64 mine = node->is_fair != 0 ? used_beside(uses, job) : node->n_cores;
-    job.threads = is_behind && has_own && node->is_fair != 0
-                      ? threads_behind(job.slowed, node->spare, mine, used_beside(before, job))
-                      : job.slowed * node->spare - mine;
+    if (node->is_fair != 0 && beside == nullptr) {
+      job.used = used_beside(uses, job);
+      job.above = used_beside(before, job);
+    }
+    const f64 mine = node->is_fair != 0 ? job.used : node->n_cores;
+    const auto of_shadow = beside == nullptr ? threads_behind : threads_behind_all;
+    job.threads = has_own ? of_shadow(job.slowed, node->spare, mine, job.above)
+                          : job.slowed * node->spare - mine;
   }
   const bool is_slowed = keep_newest(jobs, values);
   for (i64 i = 0; i < jobs.n; ++i) values[i] = jobs.first[i].threads;

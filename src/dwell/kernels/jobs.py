@@ -13,7 +13,7 @@ from dwell.kernels.meter import WindowRows
 from dwell.kernels.rows import Floats, structs
 
 #: Numbers of scratch for each job of a window, own jobs and shadow jobs.
-SCRATCH = 36
+SCRATCH = 40
 
 
 class NodeJobs(NamedTuple):
@@ -69,13 +69,17 @@ class WaitingJobs:
         _add_waits()(self._rows, len(self._rows), byref(window.row), scratch.ctypes.data)
 
 
-def level(node: NodeJobs, window: WindowRows, *, shadows: bool) -> tuple[float, float, bool] | None:
+def level(
+    node: NodeJobs, window: WindowRows, *, shadows: bool, is_shared: bool = False
+) -> tuple[float, float, bool] | None:
     """Tell beside how many foreign threads the jobs of a node ran since the last change.
 
     Parameters
     ----------
     shadows : bool
         Whether shadow jobs count where there are too few own jobs.
+    is_shared : bool
+        Whether jobs of other cells run there, too (`WindowRows.beside`).
 
     Returns
     -------
@@ -83,7 +87,8 @@ def level(node: NodeJobs, window: WindowRows, *, shadows: bool) -> tuple[float, 
         See `dwell.estimators.foreign_threads.Level`; None where jobs say nothing.
     """
     out, row, scratch = (c_double * 2)(), node.row(window.flows), _scratch(window)
-    found = _level()(byref(row), byref(window.row), shadows, scratch.ctypes.data, out)
+    beside = window.beside_address if is_shared else None
+    found = _level()(byref(row), byref(window.row), beside, shadows, scratch.ctypes.data, out)
     return (out[0], out[1], found == 2) if found else None
 
 
@@ -92,4 +97,4 @@ def _scratch(window: WindowRows) -> Floats:
 
 
 _add_waits = foreign("dwell_add_waits", None, c_void_p, c_int64, c_void_p, c_void_p)
-_level = foreign("dwell_level", c_int64, c_void_p, c_void_p, c_int64, c_void_p, c_void_p)
+_level = foreign("dwell_level", c_int64, *(c_void_p,) * 3, c_int64, *(c_void_p,) * 2)

@@ -48,10 +48,14 @@ class WindowRows:
         See `of`.
     tasks, flows : int
         Number of tasks and flows.
+    beside : int64 array, shape (n, 1 or 2, tasks, 2), optional
+        Two integrals over the run of each job, of the cycles and then of their shadows. The first
+        is of the threads of all cells on its server, its own included. The second, for shadow
+        jobs, is of the threads of the own jobs of all cells. Only where cells share nodes.
     """
 
-    def __init__(self, table: Ints, tasks: int, flows: int) -> None:
-        self.table, self.tasks, self.flows = table, tasks, flows
+    def __init__(self, table: Ints, tasks: int, flows: int, beside: Ints | None = None) -> None:
+        self.table, self.tasks, self.flows, self.beside = table, tasks, flows, beside
         self.row = structs()["Window"](table.ctypes.data, *table.shape)
 
     @classmethod
@@ -93,17 +97,22 @@ class WindowRows:
         )
 
     @property
+    def beside_address(self) -> int | None:
+        """Address of `beside`."""
+        return None if self.beside is None else self.beside.ctypes.data
+
+    @property
     def has_shadows(self) -> bool:
         """Whether there are columns of shadows."""
         return bool(self.table.shape[1] > 1 + 4 * self.tasks + self.flows)
 
-    def __reduce__(self) -> tuple[type[WindowRows], tuple[Ints, int, int]]:
+    def __reduce__(self) -> tuple[type[WindowRows], tuple[Ints, int, int, Ints | None]]:
         # A copy has an address of its own.
-        return WindowRows, (self.table, self.tasks, self.flows)
+        return WindowRows, (self.table, self.tasks, self.flows, self.beside)
 
     def copy(self) -> WindowRows:
         """Return a copy, for what changes it."""
-        return WindowRows(self.table.copy(), self.tasks, self.flows)
+        return WindowRows(self.table.copy(), self.tasks, self.flows, self.beside)
 
     def unknown(self, limit_ns: int) -> tuple[bool, bool, bool]:
         """Return what has to be looked at.

@@ -109,7 +109,7 @@ struct Crossing;  // of meter.cpp
   field(i8, scheduler) field(i8, is_down) field(i8, is_dirty) field(i8, is_cpu)                  \
   field(i8, is_stopped) /* by its quota */                                                       \
   field(f64, busy_ns) field(f64, behind_ns) field(f64, spare) field(f64, background)             \
-  field(f64, beside) field(f64, pace)
+  field(f64, beside) field(f64, pace) field(f64, used_ns) /* integral of `used` */
 
 // `tick_ns` is the time between ticks, 0 for a quota that is noticed at once; at time 0 the last
 // tick was `tick_ago_ns` and the last begin of a period `period_ago_ns` ago. `has_turn` says
@@ -171,8 +171,11 @@ struct Crossing;  // of meter.cpp
   field(i64, cycle) field(i32, candidate) field(i32, pair) field(i32, live)                      \
   field(i32, sinks_left) field(i32, is_lost)
 
+// `used_ns` is the integral of `used` of the job's server while the job ran, and `above_ns` that of
+// the server above it; both where cells share servers.
 #define DWELL_LOG(field)                                                                         \
-  field(i64, ready_ns) field(i64, start_ns) field(i64, end_ns) field(i64, work_ns)
+  field(i64, ready_ns) field(i64, start_ns) field(i64, end_ns) field(i64, work_ns)               \
+  field(i64, used_ns) field(i64, above_ns)
 
 // Cycles as they could be known when a window closed, or a decision was due: `uncut_ms` is L95
 // without the cell's `longest_ms`.

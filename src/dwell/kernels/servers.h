@@ -97,12 +97,33 @@ void mark(S& s, Server& server) {
   first.is_dirty |= is_below(s, server) ? kBelowIsDirty : kIsDirty;
 }
 
+// Whether logs say next to which jobs of other cells a job ran.
+template <class S>
+bool logs_beside(const S& s) {
+  return !S::kPlain && s.log.size > 0 && s.clock[0].has_shared != 0;
+}
+
+// Integral of the threads, or places, that jobs have used of a server up to now.
+inline i64 used_until(const Server& server, i64 now) {
+  const f64 since_ns = static_cast<f64>(now - server.last_ns);
+  return whole_ns(std::rint(server.used_ns + since_ns * static_cast<f64>(server.used)));
+}
+
+// Integrals for a job of a server, as its log has them.
+template <class S>
+void log_beside(const S& s, const Server& server, Log& entry, i64 sign, i64 now) {
+  if (!logs_beside(s)) return;
+  entry.used_ns += sign * used_until(server, now);
+  if (is_below(s, server)) entry.above_ns += sign * used_until(s.servers[server.above], now);
+}
+
 // Brings a server's busy time up to now; returns the time since it last was.
 template <class S>
 i64 account(S& s, Server& server, i64 now) {
   const i64 elapsed = now - server.last_ns;
   const i64 busy = server.used + server.stress;
   server.last_ns = now;
+  if (logs_beside(s)) server.used_ns += static_cast<f64>(elapsed) * static_cast<f64>(server.used);
   if (elapsed <= 0 || server.is_down) return elapsed;
   if (is_below(s, server)) {
     if (server.is_stopped) return elapsed;
@@ -209,7 +230,9 @@ template <class S>
 void note_start(S& s, i64 key, Job& job, i64 now) {
   job.started_ns = now;
   if (S::kPlain || s.log.size == 0) return;
-  s.log[s.log_entry(cell_of(key), cycle_of(key), item_of(key))].start_ns = now;
+  Log& entry = s.log[s.log_entry(cell_of(key), cycle_of(key), item_of(key))];
+  entry.start_ns = now;
+  log_beside(s, s.server(s.site(job)), entry, -1, now);
 }
 
 // Lets a job run, or go on, that has so much work left.

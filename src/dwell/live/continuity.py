@@ -11,6 +11,8 @@ another, and none between them went on from what was believed.
 `OvershootDetector`: a life or an instant may be any time ahead, as a computer may have slept. But
 where `CONFIRMATIONS` in a row grow behind the one that is believed, that one was false.
 
+`RunClaims`: a stamper without the book of its last run learns that run from others.
+
 `SetbackDetector`: what was due on a clock that has been set back would be due too late.
 """
 
@@ -28,6 +30,11 @@ CONFIRMATIONS = 5
 LATENESS_NS = 2_000_000_000
 #: Cycles that may be released in a period (`release: frames`).
 MOST_A_PERIOD = 2
+
+#: Equal claims in a row that are believed of a sender that signs nothing.
+CLAIMS = 3
+#: No claimed run is believed from here on: the last quarter of the range stays free.
+CLAIMED_RUN_LIMIT = 3 << 60
 
 #: Run and number.
 Cycle: TypeAlias = tuple[int, int]
@@ -105,6 +112,30 @@ class Continuity:
     def _follows(self, before: Cycle, heard_ns: int, cycle: Cycle, now_ns: int) -> bool:
         step = cycle[1] - before[1]
         return cycle[0] == before[0] and 0 < step <= self._ahead(heard_ns, now_ns)
+
+
+class RunClaims:
+    """Runs that other processes name, each with its number of equal claims in a row.
+
+    Parameters
+    ----------
+    needed : int
+        Number of claims that are believed: 1 where they are signed.
+    """
+
+    def __init__(self, needed: int) -> None:
+        self._needed = needed
+        self._claims: dict[str, tuple[int, int]] = {}
+
+    def believed(self, who: str, run: int) -> bool:
+        """Note a claim; whether it is believed now."""
+        known, count = self._claims.get(who, (run, 0))
+        self._claims[who] = run, count + 1 if known == run else 1
+        return self._claims[who][1] >= self._needed and run < CLAIMED_RUN_LIMIT
+
+    def below(self, run: int, who: str) -> bool:
+        """Whether a process has named a run, and none beyond this one."""
+        return self._claims.get(who, (NEVER_NS, 0))[0] <= run
 
 
 class SetbackDetector:

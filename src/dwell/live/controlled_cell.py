@@ -42,6 +42,9 @@ RESEND_NS = 40_000_000
 #: Stamps in a row that say that the cell has been moved, where no answer says so.
 CONFIRMATIONS = 3
 
+#: A state on its way has this share of its link, as 1 / share.
+TRANSFER_SHARE = 2
+
 #: Why a cell is moved: the policy's reasons, the guard, a person's wish, an unknown order.
 MOVED_BY = ("migrate", "capped", "infeasible", "guard", "pinned", "drained", "ordered")
 
@@ -79,6 +82,7 @@ class _Move:
     phase: Phase
     forks: tuple[tuple[str, str], ...] = ()
     awaited: dict[int, str] = field(default_factory=dict)
+    patience_ns: int = PATIENCE_NS
     order: Order | None = None
     sent_ns: int = 0
     refused: str = ""
@@ -205,6 +209,9 @@ class ControlledCell:
             beat = self.pulse.receive(sample, now_ns)
             if beat is not None:
                 self._compare_clocks(beat, now_ns, direct=keys.came_directly(sample.key))
+                if beat.moving and self._move is not None:
+                    # Its stage writes or reads the state.
+                    self._move.since_ns = now_ns
             return
         windows = self.windows
         try:
@@ -321,6 +328,11 @@ class ControlledCell:
         else:
             self._stay(f"the placement became {placement} meanwhile")
             self.moves["guard" if by_guard else "ordered"] += 1
+            if by_guard and move is not None:
+                # It may be where the move led, but no state has come along.
+                self.refused = (
+                    f"the guard moved the cell to {placement} before the move to {move.name}"
+                )
         if by_guard:
             if self.windows is not None:
                 controller.looked = self.windows.fell(run, term)
@@ -482,11 +494,25 @@ class ControlledCell:
         phase: Phase = "fork" if forks else "order"
         wish = "pinned" if self.pinned else "drained"
         reason = wish if proposal is None else proposal.decision.reason
-        self._move = _Move(name, reason, now_ns, phase, forks, proposal=proposal)
+        patience_ns = PATIENCE_NS + self._transfer_ns(forks)
+        self._move = _Move(
+            *(name, reason, now_ns, phase, forks), patience_ns=patience_ns, proposal=proposal
+        )
         self.refused = ""
         if self.windows is not None:
             self.windows.ordered(self.course.run, self.course.term)
         self._push(self._move, now_ns)
+
+    def _transfer_ns(self, forks: tuple[tuple[str, str], ...]) -> int:
+        """Return the time that states on their way take, which share their links."""
+        problem = self.place.problem
+        here, transfer_s = problem.candidates[self.course.placement], 0.0
+        for task, to in forks:
+            link = problem.fabric.links.get(f"{here[task]}->{to}")
+            if link is not None:
+                bits = 8 * problem.pipeline.tasks[task].state_bytes
+                transfer_s += TRANSFER_SHARE * bits / (link.rate_mbps * 1e6)
+        return round(transfer_s * 1e9)
 
     def _push(self, move: _Move, now_ns: int) -> None:
         """Send what the present phase of a migration asks for."""
@@ -554,7 +580,7 @@ class ControlledCell:
             self.write()
         move = self._move
         if move is not None:
-            if now_ns - move.since_ns > PATIENCE_NS:
+            if now_ns - move.since_ns > move.patience_ns:
                 self._give_up(now_ns)
             elif now_ns - move.sent_ns >= RESEND_NS:
                 self._push(move, now_ns)

@@ -229,10 +229,13 @@ def _drain(
     """Do all that there is to do."""
     while True:
         with hosted.lock:
-            chore = worker.next_chore()
+            chore = worker.next_chore(clock())
             job = None if chore is not None else worker.next_job(clock())
         if chore is not None:
-            worker.do_chore(chore)
+            started_ns = clock()
+            result = worker.do_chore(chore)
+            with hosted.lock:
+                worker.finish_chore(chore, *result, started_ns, clock())
             continue
         if job is None:
             return

@@ -243,7 +243,11 @@ class LiveWindows:
         for known in [known for known in self._by_key if known >= key]:
             del self._by_key[known]
         last = max(self._by_key.values(), key=lambda known: known.key, default=None)
-        self._newest = None if last is None else (last, last.stamped_ns)
+        # The stamp that was wrong may have moved the origin. Only later stamps show that it was.
+        heard_ns = (one.stamped_ns for one in self._by_key.values() if one.stamped_ns is not None)
+        self._newest = None if last is None else (last, max(heard_ns, default=None))
+        if last is not None:
+            self.origin_ns = last.origin_ns
         self.record.newest_done = min(self.record.newest_done, (run, cycle - 1))
         for one in (self._window, self._stretch):
             one.at = min(one.at, len(self._line))
@@ -278,6 +282,11 @@ class LiveWindows:
     def _identify(self, cycle: LiveCycle, stamp: Stamp) -> None:
         cycle.identify(stamp)
         if cycle.row < 0:
+            line = self._line
+            place = bisect.bisect_left(line, cycle.key, key=lambda other: other.key)
+            # Releases never decrease; a stamp that says otherwise is damaged.
+            around = [other.at_ns for other in line[max(place - 1, 0) : place + 2]]
+            cycle.at_ns = sorted((around[0], cycle.at_ns, around[-1]))[1]
             self._begin_again()
         self.record.touch(cycle)
 

@@ -221,6 +221,10 @@ class Beat(_Array, frozen=True):
         Digest of the cell file, so that different files are noticed.
     note : str
         Why it is not ready, or the last failure.
+    run : int
+        Run of the last command that a sink let through; 0 from other processes.
+    moving : bool
+        Whether a worker writes or reads a state that an order asked for.
     """
 
     who: Name
@@ -234,6 +238,8 @@ class Beat(_Array, frozen=True):
     cell: Annotated[str, msgspec.Meta(max_length=64)] = ""
     note: Words = ""
     version: Annotated[str, msgspec.Meta(max_length=64)] = ""
+    run: Count = 0
+    moving: bool = False
 
 
 class Order(_Array, frozen=True):
@@ -374,6 +380,8 @@ class State(_Array, frozen=True):
         Task, and where the state comes from.
     number : int
         Number of the `Snapshot` it answers; 0 for a checkpoint, which waits until it is needed.
+    cost_ns : int
+        Time that `snapshot` took.
     """
 
     run: Count
@@ -381,6 +389,7 @@ class State(_Array, frozen=True):
     task: Name
     node: Name
     number: Count = 0
+    cost_ns: Count = 0
 
     @property
     def key(self) -> tuple[int, int]:

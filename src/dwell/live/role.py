@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
 
 import msgspec
 
@@ -50,6 +50,15 @@ if TYPE_CHECKING:
     from dwell.live.trust.signing import Seals
 
 T = TypeVar("T", bound=msgspec.Struct)
+
+
+class BeatState(NamedTuple):
+    """Fields of a beat that only some processes fill (see `Beat`)."""
+
+    term: int = 0
+    placement: str = ""
+    run: int = 0
+    moving: bool = False
 
 
 class RoleLogic(Protocol):
@@ -292,7 +301,7 @@ class Pulse:
     state : callable
         Returns whether the process is ready, and what keeps it from that or went wrong last.
     holds : callable, optional
-        Returns the stamper's term and placement.
+        Returns the rest of the beat.
     hears : iterable of (str, str), optional
         Nodes and processes, or ``*``, whose beats it wants; by default the stamper's only.
     every : int
@@ -303,7 +312,7 @@ class Pulse:
         self,
         place: RolePlace,
         state: Callable[[], tuple[bool, str]],
-        holds: Callable[[], tuple[int, str]] | None = None,
+        holds: Callable[[], BeatState] = BeatState,
         *,
         hears: Iterable[tuple[str, str]] | None = None,
         every: int = 1,
@@ -445,10 +454,10 @@ class Pulse:
 
     def _put(self, now_ns: int, ready: bool, note: str, heard: tuple[Heard, ...]) -> None:
         place = self.place
-        term, placement = self._holds() if self._holds is not None else (0, "")
+        term, placement, run, moving = self._holds()
         beat = Beat(
             *(place.who, place.node, place.life, now_ns, ready, heard, term, placement),
-            *(self._digest, printable(note)[:2000], __version__),
+            *(self._digest, printable(note)[:2000], __version__, run, moving),
         )
         place.put_twice(self._key, beat)
 

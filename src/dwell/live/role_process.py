@@ -30,7 +30,7 @@ from dwell.live.security import Security
 from dwell.live.sink import Rest, Sink
 from dwell.live.stage import CellActuator, load_actuator, load_stage
 from dwell.live.stamper import Stamper
-from dwell.live.state_files import BookFile, HighestFile, InFlight, make_folder
+from dwell.live.state_files import BookFile, HighestFile, InFlight, boot_id, make_folder
 from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import Role as Named
 from dwell.live.wiring import wire
@@ -92,7 +92,7 @@ def _run(
         return True
     if role.kind == "stamper":
         book = BookFile(folder / f"{role.who}.book")
-        stamper = Stamper(place, book, time.time_ns(), clock())
+        stamper = Stamper(place, book, time.time_ns(), clock(), boot_id())
         if group is not None:
             stamper.group_clock = group.taken_ns
         _host(stamper, place, stopped, clock)

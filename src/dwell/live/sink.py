@@ -9,7 +9,7 @@ from dwell.errors import LiveError
 from dwell.live.control_group import UNKNOWN
 from dwell.live.messages import ACTUATED, NOT_APPLIED, STALE, Completion, Header
 from dwell.live.payloads import read_payload
-from dwell.live.role import Pulse, RolePlace
+from dwell.live.role import BeatState, Pulse, RolePlace
 from dwell.live.stage import CellActuator, Message
 from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import longest_bytes
@@ -48,7 +48,7 @@ class Sink:
         self.offsets = place.offsets()
         #: What its node has taken, where something counts it.
         self.group_clock: Callable[[], int] = lambda: UNKNOWN
-        self.pulse = Pulse(place, self._state)
+        self.pulse = Pulse(place, self._state, self._passed)
         self.counts = {ACTUATED: 0, NOT_APPLIED: 0, "behind": 0, STALE: 0, "silences": 0}
         # Of the last command, and of the last silence: what the actuator has raised.
         self.trouble = self._restless = ""
@@ -156,6 +156,9 @@ class Sink:
 
     def _state(self) -> tuple[bool, str]:
         return True, "; ".join(filter(None, (self._restless, self.trouble)))
+
+    def _passed(self) -> BeatState:
+        return BeatState(run=max(self.newest[0], 0))
 
     def wake(self, now_ns: int) -> int:
         """Beat, and call the watchdog where no command came; returns when something is due.

@@ -10,7 +10,7 @@ from msgspec.structs import asdict
 
 from dwell.control import CellGuard, shadow_stamps
 from dwell.errors import LiveError
-from dwell.live.continuity import RESERVED, SetbackDetector
+from dwell.live.continuity import CLAIMS, RESERVED, RunClaims, SetbackDetector
 from dwell.live.control_group import UNKNOWN
 from dwell.live.keys import CONTROLLER
 from dwell.live.latencies import Intervals
@@ -28,7 +28,7 @@ from dwell.live.messages import (
     Stamped,
     encode,
 )
-from dwell.live.role import Pulse, RolePlace
+from dwell.live.role import BeatState, Pulse, RolePlace
 from dwell.live.routing import STAMPER, Destination, Routes
 from dwell.live.transport.transport import Arrival
 
@@ -50,6 +50,8 @@ class StamperState:
         No cycle from this number on has been stamped.
     on_fallback : bool
         Whether the placement is the guard's.
+    boot : str
+        Kernel's boot in which it was written. After a loss of power the disk may have an old one.
     """
 
     run: Count
@@ -57,6 +59,7 @@ class StamperState:
     term: Count
     placement: str
     on_fallback: bool
+    boot: str = ""
 
 
 class Book(Protocol):
@@ -77,15 +80,24 @@ class Stamper:
     Parameters
     ----------
     run : int
-        Run id where the book has none; larger than any before.
+        Time of day: number of a new run, unless a later run is known.
+    boot : str
+        Id of the kernel's present boot.
     """
 
-    def __init__(self, place: RolePlace, book: Book, run: int, now_ns: int) -> None:
-        self.place, self._book = place, book
+    def __init__(self, place: RolePlace, book: Book, run: int, now_ns: int, boot: str = "") -> None:
+        self.place, self._book, self._boot = place, book, boot
         problem = place.problem
         entry = book.read()
+        # Without a book of this boot, other processes may know a later run.
+        self._unsure = entry is None or entry.boot != boot
+        self._claims = RunClaims(CLAIMS if place.seals is None else 1)
         if entry is None or entry.placement not in problem.candidates:
-            entry = StamperState(run, 0, 1, problem.initial, False)
+            later = run if entry is None else max(run, entry.run + 1)
+            entry = StamperState(later, 0, 1, problem.initial, False)
+        elif self._unsure:
+            placed = entry.placement, entry.on_fallback
+            entry = StamperState(max(run, entry.run + 1), 0, 1, *placed)
         self.cycle = entry.reserved
         self._reserved = entry.reserved
         self.routes = Routes(problem)
@@ -192,15 +204,32 @@ class Stamper:
         if direct:
             presence.heard(f"{beat.node}->{self.place.node}", now_ns)
             self.intervals.hear(beat, now_ns)
+        if beat.who.startswith("sink."):
+            self._claimed(beat.who, beat.run)
         for heard in beat.heard:
             age_ns = max(beat.sent_ns - heard.at_ns, 0)
             presence.heard(f"{heard.node}->{beat.node}", now_ns - age_ns)
         worker, _, extra = beat.who.partition(".")
+        if beat.moving and self._forks and beat.who in self._workers():
+            # An order asked for its state, so its cycles wait.
+            self.guard.restart()
         if extra in ("", "1") and "@" in worker:
             if beat.ready:
                 presence.heard(worker, now_ns)
             elif not extra:
                 presence.gone(worker)
+
+    def _claimed(self, who: str, run: int) -> None:
+        """Begin a run beyond one that another process names, unless the book is whole."""
+        if not self._unsure or not self._claims.believed(who, run) or run <= self.run:
+            return
+        self._ahead, self._answered = None, None
+        self._partial.clear()
+        # Cycles of the run before never complete: processes downstream know a later one.
+        self.guard.restart()
+        self.guard.failures.restart()
+        self.course.enter(run + 1, self.term + 1)
+        self._write()
 
     def _completed(self, done: Completion, now_ns: int) -> None:
         stamp = done.stamp
@@ -235,6 +264,7 @@ class Stamper:
 
     def _order(self, order: Order, now_ns: int) -> None:
         """Answer an order; the same one twice gets the same answer."""
+        self._claimed(CONTROLLER, order.run)
         answered = self._answered
         if answered is not None and answered[:2] == (order.controller, order.number):
             answer = answered[2]
@@ -342,7 +372,7 @@ class Stamper:
     def _write(self) -> None:
         course = self.course
         holds = course.term, course.placement, course.by_guard
-        self._book.write(StamperState(course.run, self._reserved, *holds))
+        self._book.write(StamperState(course.run, self._reserved, *holds, self._boot))
 
     # -------------------------------------------------------------------------- cycles
 
@@ -381,6 +411,8 @@ class Stamper:
         whole = [self.placement]
         if now_ns - self._since_ns > START_NS:
             whole += self.place.problem.controller.fallbacks
+        elif self._unsure and not all(self._claims.below(self.run, who) for who in self._gates()):
+            return False
         presence = self.guard.presence
         name = next((name for name in whole if presence.whole(name, now_ns)), None)
         if name is None:
@@ -390,12 +422,23 @@ class Stamper:
         self._begun, self._next_ns = True, now_ns
         return True
 
+    def _workers(self) -> Iterator[str]:
+        """Names of the workers under the placement that holds."""
+        placed = self.place.problem.candidates[self.placement]
+        return (f"{task}@{node}" for task, node in placed.items())
+
+    def _gates(self) -> Iterator[str]:
+        """Names of the sinks' processes under the placement that holds."""
+        placed = self.place.problem.candidates[self.placement]
+        return (f"sink.{task}@{placed[task]}" for task in self._sinks)
+
     def _release(self, released_ns: int, now_ns: int) -> None:
         """Stamp a cycle and send it to the source tasks."""
         group_ns = self.group_clock()
         if self.cycle + 1 >= self._reserved:
             self._reserved = self.cycle + RESERVED
-            self._write()
+        # At every cycle: a state folder that was removed and made again has no book.
+        self._write()
         early, self._ahead = self._ahead, None
         stamp = early or self._stamp(self.cycle, released_ns)
         self.cycle += 1
@@ -445,5 +488,5 @@ class Stamper:
     def _ready(self) -> tuple[bool, str]:
         return True, ""
 
-    def _holds(self) -> tuple[int, str]:
-        return self.course.term, self.course.placement
+    def _holds(self) -> BeatState:
+        return BeatState(self.course.term, self.course.placement)

@@ -9,6 +9,7 @@ import shlex
 import stat
 import struct
 import zlib
+from contextlib import suppress
 from pathlib import Path
 
 import msgspec
@@ -21,8 +22,17 @@ _LENGTH = struct.Struct("<QI")
 # Number of writes, length of the content, and a checksum of both.
 _SLOT = struct.Struct("<QII")
 _BOOK_BYTES = 2_048
+_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 #: Bits of a folder's mode by which its group, or everybody, may change what is in it.
 OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
+
+
+def boot_id() -> str:
+    """Return the id of the kernel's present boot; nothing if the system has none."""
+    try:
+        return _BOOT_ID.read_text(encoding="ascii").strip()
+    except OSError:
+        return ""
 
 
 def make_folder(path: Path) -> Path:
@@ -106,12 +116,14 @@ class _Slots:
     """Two slots of mapped memory, written in turn.
 
     Mapped memory outlives its process, and a full disk does not stop a write. A process that dies
-    during a write spoils only the slot that was not the last.
+    during a write spoils only the slot that was not the last. A file that was removed is made again
+    by the next write.
     """
 
     def __init__(self, path: Path, size: int) -> None:
-        self._size = _SLOT.size + size
+        self._path, self._size = path, _SLOT.size + size
         self._map = _required(path, 2 * self._size)
+        self._file = _identity(path)
         self._number = 0
         self.content = b""
         for begin in (0, self._size):
@@ -122,12 +134,26 @@ class _Slots:
 
     def write(self, content: bytes) -> None:
         """Write the slot that was not the last."""
+        if _identity(self._path) != self._file:
+            # Until it can be made again, the writes go to the file that was removed.
+            with suppress(OSError):
+                self._map = _mapped(self._path, 2 * self._size)
+                self._file = _identity(self._path)
         self._number, self.content = self._number + 1, content
         begin = self._number % 2 * self._size
         place = begin + _SLOT.size
         self._map[place : place + len(content)] = content
         check = zlib.crc32(content, self._number & 0xFFFFFFFF)
         _SLOT.pack_into(self._map, begin, self._number, len(content), check)
+
+
+def _identity(path: Path) -> tuple[int, int]:
+    """Return device and number of a file; (-1, -1) if there is none."""
+    try:
+        status = os.lstat(path)
+    except OSError:
+        return -1, -1
+    return status.st_dev, status.st_ino
 
 
 class BookFile:

@@ -24,7 +24,7 @@ from dwell.live.messages import (
 )
 from dwell.live.offsets import Offsets
 from dwell.live.payloads import read_payload, write_payload
-from dwell.live.role import Pulse, RolePlace
+from dwell.live.role import BeatState, Pulse, RolePlace
 from dwell.live.routing import STAMPER, Routes
 from dwell.live.stage import CellStage, Message
 from dwell.live.transport.transport import Arrival
@@ -35,6 +35,10 @@ from dwell.model.instants import EVIDENCE_NS, NEVER_NS
 MAX_JOINS = 64
 #: Periods between two beats of a shadow worker.
 SHADOW_BEAT = 10
+#: Cost of a checkpoint, multiplied by this, passes before the next one.
+CHECKPOINT_SPACING = 20
+#: Longest time that others wait for a call of snapshot() or restore() that an order asked for.
+MOVING_NS = 10_000_000_000
 #: By source task: header, payload, and when it was handed over.
 Inputs: TypeAlias = dict[str, tuple[Header, bytes, int]]
 NOT_COUNTED = Counts(), UNKNOWN, Counts()
@@ -68,6 +72,31 @@ class Job:
         """All jobs behind it, each once."""
         hops = (hop for header, _, _ in self.inputs.values() for hop in header.hops)
         return tuple({(hop.task, hop.node): hop for hop in hops}.values())
+
+
+@dataclass(frozen=True, slots=True)
+class Chore:
+    """A call of the stage between two jobs: snapshot() for other nodes, or restore().
+
+    Parameters
+    ----------
+    to : tuple of str
+        Nodes that get the snapshot.
+    number : int
+        Number of the request; 0 for a checkpoint.
+    state : State, optional
+        State to take over, with its bytes.
+    """
+
+    to: tuple[str, ...] = ()
+    number: int = 0
+    state: State | None = None
+    data: bytes = b""
+
+    @property
+    def call(self) -> str:
+        """Name of the call."""
+        return "snapshot()" if self.state is None else "restore()"
 
 
 @dataclass(slots=True)
@@ -214,8 +243,8 @@ class Worker:
         #: Run and cycle of the newest stamp that has come with an input.
         self._newest = (-1, -1)
         # What came because the state comes here, too; of that, what is to be worked on.
-        self._forked: deque[Job] = deque(maxlen=MAX_JOINS)
-        self._replay: deque[Job] = deque(maxlen=MAX_JOINS)
+        self._forked: deque[Job] = deque(maxlen=10 * MAX_JOINS)
+        self._replay: deque[Job] = deque(maxlen=10 * MAX_JOINS)
         self._follows = False
         self._restored: Restored | None = None
         # Run and cycle: the last in the state, in one taken over, worked on by order.
@@ -224,6 +253,11 @@ class Worker:
         self.trouble = ""
         self.busy_since_ns: int | None = None
         self._busy_cycle = 0
+        self._chore: Chore | None = None
+        # Nodes that a checkpoint is due for; cost of the last snapshot, here or by its header, and
+        # when it ended here.
+        self._checkpoint_to: tuple[str, ...] = ()
+        self._cost_ns, self._snapshot_ns = 0, -NEVER_NS
         self.replaced = 0
         self.failures = 0
         # Calls of process() in a row that brought nothing that could be sent; when the last ended.
@@ -240,7 +274,8 @@ class Worker:
         hears = [] if shadow else [*before, *primary]
         # The guard waits for no shadow worker.
         slow = SHADOW_BEAT if shadow else 1
-        self.pulse = Pulse(place, self._state, hears=[place.stamper, *hears], every=slow)
+        hears = [place.stamper, *hears]
+        self.pulse = Pulse(place, self._state, self._moves, hears=hears, every=slow)
 
     # ------------------------------------------------------------------------ hearing
 
@@ -344,6 +379,7 @@ class Worker:
             raise LiveError(f"{self.task}: a state of {length} bytes; at most {longest} are taken")
         kept = self._answers if state.number else self._checkpoints
         kept[state.node] = state, sample.payload
+        self._cost_ns = self._cost_ns or state.cost_ns
 
     @property
     def _restoring(self) -> tuple[State, bytes] | None:
@@ -357,35 +393,60 @@ class Worker:
             return None
         return found if (asked.run, asked.cycle - 1) <= found[0].key <= self._newest else None
 
-    def next_chore(self) -> Snapshot | tuple[State, bytes] | None:
-        """Return what to do with the state before the next job; `do_chore` has to follow."""
+    def next_chore(self, now_ns: int) -> Chore | None:
+        """Return the chore before the next job; `do_chore` and `finish_chore` have to follow."""
         if self.busy_since_ns is not None or not self.started:
             return None
         asked = self._asked
         if asked is not None and self.state_at >= (asked.run, asked.cycle - 1):
-            self._asked = None
-            return asked
-        if (chore := self._restoring) is not None:
+            self._asked, chore = None, Chore((asked.to,), asked.number)
+        elif (found := self._restoring) is not None:
             self._awaited = None
             self._answers.clear()
+            chore = Chore((), found[0].number, *found)
+        elif self._checkpoint_to:
+            chore = Chore(self._checkpoint_to)
+        else:
+            return None
+        self._checkpoint_to = ()
+        self._chore, self.busy_since_ns, self._now_ns = chore, now_ns, now_ns
+        if chore.number:
+            # The guard must not take this silence for a fault.
+            self.pulse.send(now_ns)
         return chore
 
-    def do_chore(self, chore: Snapshot | tuple[State, bytes]) -> None:
-        """Hand the state out, or take one over; calls the stage."""
-        if isinstance(chore, Snapshot):
-            self._send_state(chore.to, chore.number)
-            return
-        state, data = chore
-        order, failed = state.key, ""
-        if order < self._worked_at:
+    def do_chore(self, chore: Chore) -> tuple[bytes, str]:
+        """Call the stage; returns the snapshot, and why it failed or nothing."""
+        state = chore.state
+        if state is None:
+            try:
+                return bytes(self.stage.snapshot()), ""
+            except Exception as error:  # the user's code
+                return b"", f"snapshot() failed ({type(error).__name__}: {error})"
+        if state.key < self._worked_at:
             cycle = self._worked_at[1]
-            failed = f"{self.task}: a state of cycle {state.cycle} came after one of {cycle}"
-        elif order >= self._restored_at:
-            failed = self._take_over(state, data)
-            if not failed:
-                self._follows = True
-                self._replay.clear()
-                self._replay.extend(job for job in self._forked if job.order > self.state_at)
+            return b"", f"{self.task}: a state of cycle {state.cycle} came after one of {cycle}"
+        if state.key < self._restored_at:
+            return b"", ""
+        return b"", self._take_over(state, chore.data)
+
+    def finish_chore(
+        self, chore: Chore, data: bytes, failed: str, started_ns: int, ended_ns: int
+    ) -> None:
+        """Send a snapshot, or follow with a state that was taken over."""
+        self.busy_since_ns = self._chore = None
+        state = chore.state
+        if state is None:
+            self._cost_ns, self._snapshot_ns = max(ended_ns - started_ns, 0), ended_ns
+            if failed:
+                self._failed(failed)
+            else:
+                self._send_state(chore, data)
+            return
+        if not failed and state.key == self._restored_at:
+            self._follows = True
+            self._replay.clear()
+            self._replay.extend(job for job in self._forked if job.order > self.state_at)
         who = state.number, self.task, self.place.node
         self._restored = Restored(*who, *state.key, failed)
         if failed:
@@ -396,23 +457,17 @@ class Worker:
             self.place.put(self.place.keys.restored(), self._restored)
             self._restored = None
 
-    def _send_state(self, to: str, number: int) -> None:
-        place, stage = self.place, self.stage
-        if not stage.stateful:
-            return
+    def _send_state(self, chore: Chore, data: bytes) -> None:
+        place = self.place
         run, cycle = (max(part, 0) for part in self.state_at)
-        try:
-            data = bytes(stage.snapshot())
-        except Exception as error:  # the user's code
-            self._failed(f"snapshot() failed ({type(error).__name__}: {error})")
-            return
         if len(data) > (longest := longest_bytes(self._state_bytes)):
             self._failed(_too_long(f"its state of {len(data)}", longest, "state_bytes"))
             return
-        header = encode(State(run, cycle, self.task, place.node, number))
-        lane = lane_of(self._state_bytes)
-        key = place.keys.state(self.task, to, place.node)
-        place.transport.put(key, data, header, lane=lane)
+        state = State(run, cycle, self.task, place.node, chore.number, self._cost_ns)
+        header, lane = encode(state), lane_of(self._state_bytes)
+        for node in chore.to:
+            key = place.keys.state(self.task, node, place.node)
+            place.transport.put(key, data, header, lane=lane)
 
     def _take_over(self, state: State, data: bytes) -> str:
         """Restore a state; returns what went wrong, or nothing."""
@@ -441,15 +496,28 @@ class Worker:
             return UNKNOWN
         return job.header.stamp.cycle - state.cycle
 
-    def _checkpoint_due(self, job: Job) -> None:
-        """Copy the state to the fallbacks' nodes every so many cycles."""
-        every = self.place.problem.live.checkpoint_cycles
-        if not (self._stateful and every) or job.header.stamp.cycle % every:
-            return
+    @property
+    def _checkpoint_nodes(self) -> tuple[str, ...]:
+        """Nodes of the fallbacks that get checkpoints from here."""
         problem = self.place.problem
+        if not (self._stateful and problem.live.checkpoint_cycles):
+            return ()
         nodes = {problem.candidates[name][self.task] for name in problem.controller.fallbacks}
-        for node in sorted(nodes - {self.place.node}):
-            self._send_state(node, 0)
+        return tuple(sorted(nodes - {self.place.node}))
+
+    @property
+    def _too_slow(self) -> bool:
+        """Whether a checkpoint would keep cycles waiting until the guard moves."""
+        return self._cost_ns > self.place.patience_ns
+
+    def _plan_checkpoint(self, job: Job, now_ns: int) -> None:
+        """Have a checkpoint follow a job, every so many cycles, at most a 20th of the time."""
+        nodes = self._checkpoint_nodes
+        if not nodes or job.header.stamp.cycle % self.place.problem.live.checkpoint_cycles:
+            return
+        rests = 0 <= now_ns - self._snapshot_ns < CHECKPOINT_SPACING * self._cost_ns
+        if not (rests or self._too_slow):
+            self._checkpoint_to = nodes
 
     # --------------------------------------------------------------------------- jobs
 
@@ -483,6 +551,7 @@ class Worker:
             or self._source is not None
             or self._asked is not None
             or self._restoring is not None
+            or self._checkpoint_to
         )
         return bool(waits) and self.busy_since_ns is None
 
@@ -606,7 +675,7 @@ class Worker:
                     continue
                 key = place.keys.inputs(target, node, to)
                 place.transport.put(key, data, head, lane=lane_of(declared))
-            self._checkpoint_due(job)
+            self._plan_checkpoint(job, ended_ns)
 
     def framed(self, now_ns: int) -> None:
         """Ask the stamper for a cycle: the source has a frame."""
@@ -628,10 +697,12 @@ class Worker:
     def _state(self) -> tuple[bool, str]:
         where = f"{self.task} on {self.place.node}"
         limit_ns = self.place.hang_ns
-        if self.busy_since_ns is not None and self._now_ns - self.busy_since_ns > limit_ns:
-            since_s = (self._now_ns - self.busy_since_ns) / 1e9
-            cycle = self._busy_cycle
-            return False, f"{where}: cycle {cycle}: process() has not returned for {since_s:.0f} s"
+        if self.busy_since_ns is not None:
+            busy_ns, chore = self._now_ns - self.busy_since_ns, self._chore
+            call = f"cycle {self._busy_cycle}: process()" if chore is None else chore.call
+            if busy_ns > (limit_ns if chore is None else MOVING_NS):
+                since_s = busy_ns / 1e9
+                return False, f"{where}: {call} has not returned for {since_s:.0f} s"
         if not self.started:
             return False, self.trouble or f"{where}: start() has not returned yet"
         count = self._failed_in_a_row
@@ -646,7 +717,20 @@ class Worker:
                 True,
                 self.trouble or f"{where}: wait() has brought no frame for {silent_s:.0f} s",
             )
-        return True, self.trouble
+        return True, self.trouble or self._without_checkpoints()
+
+    def _without_checkpoints(self) -> str:
+        if not (self._too_slow and self._checkpoint_nodes):
+            return ""
+        cost_s, period_ms = self._cost_ns / 1e9, self.place.period_ns / 1e6
+        call = f"{self.task}@{self.place.node}'s snapshot()"
+        return f"no checkpoints: {call} takes {cost_s:.2g} s of a period of {period_ms:g} ms"
+
+    def _moves(self) -> BeatState:
+        """Tell others to wait while a state that an order asked for is written or read."""
+        since_ns, chore = self.busy_since_ns, self._chore
+        called = chore is not None and chore.number > 0 and since_ns is not None
+        return BeatState(moving=called and self._now_ns - (since_ns or 0) <= MOVING_NS)
 
     def wake(self, now_ns: int) -> int:
         """Beat; returns when the next beat is due."""

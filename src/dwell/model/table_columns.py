@@ -257,7 +257,8 @@ DECISIONS = (
         "refused",
         "String",
         "What was decided and not done, and why: `migrated` is false then, `placement` the old "
-        "one, and `reason` the policy's.",
+        "one, and `reason` the policy's. In a fleet also the incumbent while its windows are not "
+        "what was played.",
         null="what was decided was done",
         of=("live", "fleet"),
     ),

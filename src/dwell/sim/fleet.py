@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -210,6 +210,21 @@ def _phase_ms(phases: Phases, cell: FleetCell, place: int, count: int, seed: int
     return 0.0
 
 
+def priced_cells(fleet: Fleet, problems: Iterable[Problem]) -> list[PricedCell]:
+    """Return the cells of a fleet, undisturbed, as its ledger prices them."""
+    pairs = zip(fleet.cells, problems, strict=True)
+    return [PricedCell(cell.name, problem, cell.streams) for cell, problem in pairs]
+
+
+def tabled_cells(fleet: Fleet, seed: int) -> list[PricedCell]:
+    """Return the cells as the table of loads has them: evenly spread where phases are drawn.
+
+    So one table serves all seeds.
+    """
+    spread = fleet.changed(phases="even") if fleet.phases == "random" else fleet
+    return priced_cells(spread, phased(spread, seed))
+
+
 def drawn(
     fleet: Fleet, problems: Mapping[str, Problem], seed: int, duration_ns: int
 ) -> dict[str, Realisation]:
@@ -251,8 +266,13 @@ def coordinations(
 ) -> Iterator[Coordination | None]:
     """Yield what each cell asks before it moves; None where it asks nobody."""
     if fleet.coordination == "ledger":
-        specs = [PricedCell(cell.name, problems[cell.name], cell.streams) for cell in fleet.cells]
-        ledger = FleetLedger(specs, fleet.shared, fleet.objective, progress=progress)
+        ledger = FleetLedger(
+            priced_cells(fleet, problems.values()),
+            fleet.shared,
+            fleet.objective,
+            tabled=tabled_cells(fleet, seed),
+            progress=progress,
+        )
     for i, cell in enumerate(fleet.cells):
         if fleet.coordination == "ledger":
             yield Seat(ledger, i)

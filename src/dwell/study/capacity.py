@@ -9,10 +9,10 @@ played until the limit is passed for certain; the sizes of a policy are found by
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import fmean
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from dwell.sim.fleet import simulate_fleet, waiting_in_fleet
 from dwell.sim.static_fleet import StaticFleet
 from dwell.sim.waiting import Waiting
 from dwell.study.intervals import Interval, share_difference_interval, share_interval
+from dwell.study.played_sizes import KeptSizes, PlayedSize, Sizes, study_of
 from dwell.study.twins import with_twins
 from dwell.study.workers import available_processes, spread
 
@@ -35,6 +36,8 @@ SEEDS = tuple(range(1, 11))
 DRAWS = tuple(range(1, 101))
 CYCLES_OF_A_DRAW = 200
 MOST = 128
+#: Counted cycles of a cell in one run above which there is a warning.
+MANY_CYCLES = 2_000_000
 #: Share of cycles that one cell alone may miss where an excess over it is of any use.
 USELESS = 0.5
 ROUNDING = 1e-12
@@ -44,33 +47,6 @@ NORMAL = 1.96
 TOGETHER = 8
 #: Seeds that say where cycles wait.
 WAITING_SEEDS = 3
-
-
-class PlayedSize(NamedTuple):
-    """One size under one seed.
-
-    Parameters
-    ----------
-    rate : float
-        V_D of the cell that misses most. Which cell that is, one half of the cycles says, and the
-        other half how much it misses: the largest of several noisy rates would be too high.
-    half : float
-        Half the difference between both halves: how far `rate` may be off by its cycles.
-    used : mapping of str to float
-        Utilisation of the shared resources.
-    """
-
-    rate: float
-    half: float
-    used: Mapping[str, float]
-
-    @classmethod
-    def of(cls, missed: Iterable[NDArray[np.bool_]], used: Mapping[str, float]) -> PlayedSize:
-        """Sum up whether each counted cycle of each cell missed."""
-        halves = np.array([[part.mean() for part in np.array_split(one, 2)] for one in missed])
-        first, last = halves.argmax(axis=0)
-        late, early = float(halves[first, 1]), float(halves[last, 0])
-        return cls((late + early) / 2, (late - early) / 2, used)
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,14 +183,6 @@ PLAIN = (
 )
 
 
-class Sizes(NamedTuple):
-    """Sizes that are played together, under one seed."""
-
-    first: int
-    last: int
-    seed: int
-
-
 @dataclass(frozen=True, slots=True)
 class FleetPlayer:
     """Plays a fleet in some sizes, in whichever process.
@@ -292,6 +260,7 @@ def capacity_of(
     cycles: int | None = None,
     twins: Mapping[str, int] | None = None,
     processes: int | None = None,
+    kept: KeptSizes | None = None,
     progress: Progress | None = None,
 ) -> Capacity:
     """Find how many cells of the first entry a fleet may have.
@@ -319,6 +288,8 @@ def capacity_of(
         How many more servers there are like a shared node; cells take them in turn.
     processes : int, optional
         One a CPU where None.
+    kept : KeptSizes, optional
+        Sizes that an interrupted study has played; those that are played now are added.
     progress : callable, optional
         Called with the number of sizes that are done, and `most`.
 
@@ -332,16 +303,14 @@ def capacity_of(
     fleet.with_count(most)
     is_static = fleet.is_static
     draws = fleet.phases == "random"
-    if cycles is None and draws and is_static:
-        fleet, cycles = _with_short_warmup(fleet), CYCLES_OF_A_DRAW
-    duration_ns = _duration_ns(fleet, CYCLES if cycles is None else cycles)
+    fleet, duration_ns = _length(fleet, cycles)
     player = FleetPlayer(fleet, duration_ns, twins or {})
     known = tuple(seeds or (DRAWS if draws else SEEDS))
     # A run has one draw of phases, and windows that differ.
     kinds = 1 if draws else max(duration_ns - fleet.warmup_ns, 1) // fleet.duration_ns(1)
     sizes = _Sizes(limit, kinds, on_excess=on_excess)
     workers = available_processes() if processes is None else processes
-    search = _Search(player, sizes, most, workers, progress)
+    search = _Search(player, sizes, most, workers, kept, progress)
     if is_static:
         search.every_size(known)
     else:
@@ -492,16 +461,17 @@ class _Search:
         sizes: _Sizes,
         most: int,
         processes: int,
+        kept: KeptSizes | None,
         progress: Progress | None,
     ) -> None:
         self.player, self.sizes, self.most = player, sizes, most
-        self.processes, self.progress = processes, progress
+        self.processes, self.kept, self.progress = processes, kept, progress
 
     def every_size(self, seeds: Sequence[int]) -> None:
         """Play sizes from the smallest on until one is over the limit for certain."""
         sizes, done = self.sizes, 0
 
-        def take(unit: Sizes, played: Sequence[PlayedSize]) -> bool:
+        def take(unit: Sizes, played: list[PlayedSize]) -> bool:
             nonlocal done
             sizes.take(unit, played)
             while sizes.seeds(done + 1) == len(seeds):
@@ -520,7 +490,7 @@ class _Search:
             for first in steps
             for seed in seeds
         ]
-        spread(self.player, units, processes=self.processes, take=take)
+        self._spread(units, take)
         for size in [one for one in sizes.played if one > done]:
             del sizes.played[size]
 
@@ -555,12 +525,27 @@ class _Search:
     def _play(self, size: int, seeds: Sequence[int]) -> None:
         units = [Sizes(size, size, seed) for seed in seeds]
 
-        def take(unit: Sizes, played: Sequence[PlayedSize]) -> None:
-            self.sizes.take(unit, played)
-
-        if units:
-            spread(self.player, units, processes=self.processes, take=take)
+        self._spread(units, self.sizes.take)
         self._tell(size)
+
+    def _spread(
+        self, units: Sequence[Sizes], take: Callable[[Sizes, list[PlayedSize]], bool | None]
+    ) -> None:
+        """Take what is known of some units, and play the others."""
+        kept, player = self.kept, self.player
+        if kept is None:
+            spread(player, units, processes=self.processes, take=take)
+            return
+        study = study_of(player.fleet, player.duration_ns, player.servers)
+        known = {unit: kept.known(study, unit) for unit in units}
+
+        def keep(unit: Sizes, played: list[PlayedSize]) -> bool | None:
+            kept.keep(study, unit, played)
+            return take(unit, played)
+
+        if not any(take(unit, played) for unit, played in known.items() if played is not None):
+            new = [unit for unit, played in known.items() if played is None]
+            spread(player, new, processes=self.processes, take=keep)
 
     def _tell(self, done: int) -> None:
         if self.progress is not None:
@@ -573,10 +558,33 @@ def _with_short_warmup(fleet: Fleet) -> Fleet:
     return replace(fleet, entries=tuple(entries))
 
 
-def _duration_ns(fleet: Fleet, cycles: int) -> int:
-    """Return how long a fleet is played so that each cell counts so many cycles, in windows."""
+def _length(fleet: Fleet, cycles: int | None) -> tuple[Fleet, int]:
+    """Return a fleet as it is played, and how long: each cell counts so many cycles, in windows."""
+    if cycles is None and fleet.phases == "random" and fleet.is_static:
+        fleet, cycles = _with_short_warmup(fleet), CYCLES_OF_A_DRAW
+    needed = CYCLES if cycles is None else cycles
     cells = [entry.cell for entry in fleet.entries]
-    return fleet.warmup_ns + max(-(-cycles // c.window_cycles) * c.window_ns for c in cells)
+    counted_ns = max(-(-needed // cell.window_cycles) * cell.window_ns for cell in cells)
+    return fleet, fleet.warmup_ns + counted_ns
+
+
+def long_runs(fleet: Fleet, cycles: int | None = None) -> Iterator[Fault]:
+    """Yield a warning for each cell of which a run counts more than `MANY_CYCLES` cycles.
+
+    All cells are played as long as the slowest one needs (see `capacity_of`).
+    """
+    played, duration_ns = _length(fleet, cycles)
+    counted_ns = duration_ns - played.warmup_ns
+    slowest = max((entry.cell for entry in played.entries), key=lambda cell: cell.window_ns)
+    for i, entry in enumerate(played.entries):
+        count = counted_ns // entry.cell.pipeline.period_ns
+        if count > MANY_CYCLES:
+            yield Fault(
+                f"cells[{i}].cell",
+                f"a run counts {count:,} cycles of {entry.cell.name}, above {MANY_CYCLES:,}, since "
+                f"{slowest.name} needs {counted_ns / 1e9:g} s; if that takes too long, ask for "
+                "these cells alone",
+            )
 
 
 def _require_capacity(fleet: Fleet) -> None:

@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 
 from dwell.control.ledger import Loads
-from dwell.estimators.fleet_prices import CellTerms, FleetPrice, FleetPrices, PricedCell
+from dwell.estimators.fleet_prices import CellTerms, FleetPrice, FleetPrices
 from dwell.estimators.load_table import load_table
 from dwell.estimators.prices import prices_of
 from dwell.model.fleet import Fleet
 from dwell.model.progress import Progress
 from dwell.model.qos import QoS
 from dwell.record import FleetRun
-from dwell.sim.fleet import phased
+from dwell.sim.fleet import phased, priced_cells, tabled_cells
 
 #: Levels of the load of a shared resource: of the only one, of each of several.
 LEVELS, LEVELS_OF_SEVERAL = 400, 40
@@ -60,6 +60,10 @@ class FleetPlan:
         """What each cell comes to."""
         priced = map(self.played.qos, range(len(self.placements)))
         return {name: qos for name, qos in zip(self.placements, priced, strict=True) if qos}
+
+    def above(self, limit: float) -> list[str]:
+        """Return the cells that miss a larger share of their deadlines than a limit."""
+        return [name for name, qos in self.cells.items() if qos.violation_rate > limit]
 
     def regret(self, run: FleetRun) -> float:
         """How far Φ of a run, by what its windows show, is above that of the plan: a share of it.
@@ -114,11 +118,10 @@ def plan_fleet(fleet: Fleet, *, seed: int = 1, progress: Progress | None = None)
         Told how many of how many levels of the table have been played.
     """
     cells = [
-        PricedCell(cell.name, problem, cell.streams, cell.entry.scenario)
-        for cell, problem in zip(fleet.cells, phased(fleet, seed), strict=True)
+        replace(one, scenario=cell.entry.scenario)
+        for cell, one in zip(fleet.cells, priced_cells(fleet, phased(fleet, seed)), strict=True)
     ]
-    undisturbed = [replace(cell, scenario="baseline") for cell in cells]
-    table = load_table(undisturbed, fleet.shared, progress)
+    table = load_table(tabled_cells(fleet, seed), fleet.shared, progress)
     loads = Loads(table)
     alone = [
         {

@@ -6,6 +6,7 @@ controller makes of it is the controller's.
 
 from __future__ import annotations
 
+import os
 import socket
 import time
 from collections.abc import Mapping, Sequence
@@ -40,7 +41,9 @@ def on_this_machine(problem: Problem) -> Problem:
         If there are not enough ports.
     """
     count = PORTS_PER_ROLE * len(roles(problem))
-    for base in PORTS:
+    # Ports are taken later: two processes that look at the same moment begin apart.
+    begin = os.getpid() % max(len(PORTS) // 3, 1)
+    for base in (*PORTS[begin:], *PORTS[:begin]):
         if all(_free(port) for port in range(base, base + count)):
             return with_hosts(problem, lambda node: ADDRESS, base)
     raise LiveError(f"no {count} free ports in a row on this machine")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 import subprocess
 import sys
 import threading
@@ -15,11 +14,11 @@ from dwell.live.transport.transport import Arrival, Lane, Transport
 from dwell.live.transport.zenoh import ZenohSettings, ZenohTransport
 from dwell.live.wiring import SESSIONS, Locator, Role, WiringEntry
 from tests.live.memory_transport import Network
+from tests.ports import free_ports
+from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).resolve().parents[3]
 
-#: Never waited for where everything works.
-PATIENCE_S = 20.0
 #: Between two ends of a new connection Zenoh delivers everything at first, then nothing for a
 #: moment, and then what is subscribed to: one message that is heard does not promise the next.
 STEADY = 3
@@ -162,22 +161,6 @@ def full_entry(names: Sequence[str], who: str, first_port: int) -> WiringEntry:
         name: tuple(endpoint(other, i) for other in earlier) for i, name in enumerate(SESSIONS)
     }
     return WiringEntry(Role(who, node, "worker"), listen, connect if earlier else {})
-
-
-def free_ports(count: int) -> int:
-    """First of that many ports that nobody listens on, below those the kernel gives away."""
-    for first in range(21_000, 30_000, count):
-        sockets = [socket.socket() for _ in range(count)]
-        try:
-            for i, one in enumerate(sockets):
-                one.bind(("127.0.0.1", first + i))
-        except OSError:
-            continue
-        finally:
-            for one in sockets:
-                one.close()
-        return first
-    raise AssertionError("no free ports")
 
 
 def introduce(

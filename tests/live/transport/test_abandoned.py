@@ -10,6 +10,7 @@ from queue import SimpleQueue
 import pytest
 
 from dwell.live.transport.abandoned import CROWD, AbandonedConnections
+from tests.waiting import PATIENCE_S
 
 
 @pytest.mark.parametrize("spare", [1_000, 0])
@@ -38,4 +39,4 @@ def test_abandoned_connections_are_found_by_their_port(spare: int) -> None:
         assert watch.count() == {port: CROWD - 1}
         stack.callback(watch.stop)
         watch.start()
-        assert renewed.get(timeout=20) == port
+        assert renewed.get(timeout=PATIENCE_S) == port

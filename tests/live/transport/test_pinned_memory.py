@@ -21,9 +21,9 @@ from dwell.live.wiring import Session, longest_message_bytes, wire
 from dwell.model import Host, Problem
 from tests.live.test_security import issued, tls
 from tests.live.test_wiring import cell, housed
-from tests.live.transport.meshes import free_ports
+from tests.ports import free_ports
+from tests.waiting import PATIENCE_S
 
-PATIENCE_S = 30.0
 MB = 1 << 20
 #: Of the messages: some longer and some shorter than what was read once.
 LENGTHS = [(30 + 50 * i // 36) * MB for i in range(37)]

@@ -27,8 +27,9 @@ from dwell.live.transport.zenoh import (
     _Sender,
 )
 from dwell.live.wiring import Locator, Role, WiringEntry
-from tests.live.transport.meshes import PATIENCE_S, Inbox, ZenohMesh, introduce
+from tests.live.transport.meshes import Inbox, ZenohMesh, introduce
 from tests.live.transport.peer import digest
+from tests.waiting import PATIENCE_S
 
 ME, NEAR, FAR, WITNESS = "me@R1", "near@R1", "far@E", "witness@R1"
 TASK = {NEAR: "R1", FAR: "E"}

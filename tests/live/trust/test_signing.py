@@ -35,6 +35,7 @@ from dwell.live.trust.authority import Authority
 from dwell.live.trust.keyring import Keyring
 from dwell.live.trust.signing import Seals
 from dwell.model import Problem
+from dwell.model.document import fingerprint
 from tests.live.memory_transport import MemoryTransport
 from tests.live.small_world import Counting, World, canonical, on, stateful
 
@@ -65,6 +66,35 @@ def world(problem: Problem, seals: dict[str, Seals]) -> World:
     made.run(1_000)
     assert made.stamper.placement == "SO"
     return made
+
+
+def test_a_stamper_without_book_and_clock_follows_what_is_signed(world: World) -> None:
+    before = world.stamper.run
+    world.kill("stamper@R1")
+    world.book.entry, world.run_id, world.boot = None, 0, "another"
+    world.start("stamper@R1")
+    applied = len(world.cycles)
+    world.run(1_000)
+    assert world.stamper.run == before + 1
+    assert len(world.cycles) > applied + 10
+
+
+@pytest.mark.parametrize(("signs", "believed"), [("R2", True), ("E", False)])
+def test_one_signed_claim_of_a_run_is_believed(
+    world: World, seals: dict[str, Seals], signs: str, believed: bool
+) -> None:
+    world.kill("stamper@R1")
+    world.book.entry, world.boot = None, "another"
+    world.start("stamper@R1")
+    stamper, who = world.stamper, "sink.control@R2"
+    now_ns = world.network.now_ns
+    digest = fingerprint(world.problem)
+    beat = Beat(who, "R2", 10**9, now_ns, True, cell=digest, run=stamper.run + 5)
+    key = world.keys.detour(world.keys.beat("R2", who))
+    data = seals[signs].seal(world.keys.word(key), encode(beat))
+    before = stamper.run
+    stamper.receive(Arrival(key, data), now_ns)
+    assert stamper.run == (before + 6 if believed else before)
 
 
 def ordered(world: World, order: Order, seals: Seals | None, word: str = "order") -> Arrival:

@@ -18,7 +18,7 @@ from dwell.testbed.chaos.light_cell import document
 from dwell.testbed.chaos.stages import APPLY, HOLD
 from dwell.testbed.chaos.strike import Outcome, beyond, moved_in_vain
 from tests.live.real_cell import RealCell
-from tests.waiting import wait_until
+from tests.waiting import PATIENCE_S, wait_until
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ def test_the_end_of_a_terminal_completes_the_run(cell: RealCell) -> None:
     """Goes on from the tests before."""
     controller = cell.testbed.processes.running["controller@E"]
     controller.send_signal(signal.SIGHUP)
-    assert controller.wait(30) == 0
+    assert controller.wait(PATIENCE_S) == 0
     (folder,) = cell.runs
     assert (folder / "run.json").is_file()
     cycles = dwell.open_run(folder).cycles

@@ -13,7 +13,19 @@ from dwell.live.wiring import lane_of, roles
 from dwell.model import Problem
 
 How: TypeAlias = Literal[
-    "kill", "freeze", "cut", "slow", "fail", "jump", "drift", "starve", "fill", "hog", "pace"
+    "kill",
+    "freeze",
+    "cut",
+    "slow",
+    "fail",
+    "jump",
+    "drift",
+    "starve",
+    "fill",
+    "hog",
+    "pace",
+    "power",
+    "blank",
 ]
 
 #: What oscillators do, and what nobody's should.

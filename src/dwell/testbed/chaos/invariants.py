@@ -61,12 +61,15 @@ class Judge:
 
     Parameters
     ----------
+    renews : bool
+        Whether a fault may have taken the stamper's book, so that a later run may begin.
     held : dict of int to bool
         Whether the controller holds the cell where it is in a term, and not the guard, as the
         stamper was heard to say.
     """
 
     problem: Problem
+    renews: bool = False
     counts: Counter[str] = field(default_factory=Counter)
     terms: dict[int, Term] = field(default_factory=dict)
     stamped_ns: dict[int, int] = field(default_factory=dict)
@@ -105,8 +108,24 @@ class Judge:
 
     # ------------------------------------------------------------------------- stamps
 
+    @property
+    def run(self) -> int:
+        """Run of the last stamp; -1 before the first."""
+        return self._last[0]
+
+    def _begin_run(self) -> None:
+        """Forget the run before: its numbers and terms may return."""
+        self.terms.clear()
+        self.held.clear()
+        self.stamped_ns.clear()
+        self._stamps.clear()
+        self._moved.clear()
+        self._looked, self._last = -1, (-1, -1, -1)
+
     def _stamped(self, at_ns: int, stamp: Stamp) -> list[str]:
         violations = []
+        if self.renews and -1 < self.run < stamp.run:
+            self._begin_run()
         run, cycle, term = self._last
         if run not in (-1, stamp.run):
             violations.append(f"cycle {stamp.cycle} is of run {stamp.run}, after {run}")
@@ -227,7 +246,9 @@ class Judge:
     def _unserved(self, first: int, last: int, seen: Sequence[Seen]) -> str:
         """Return how the actuator lacked commands in some cycles."""
         released_ns = [at_ns for cycle, at_ns in self.stamped_ns.items() if first <= cycle <= last]
-        passed_ns = max(released_ns, default=0) - min(released_ns, default=0)
+        if not released_ns:  # cycles of a run before
+            return ""
+        passed_ns = max(released_ns) - min(released_ns)
         due = max(passed_ns // self.problem.pipeline.period_ns + 1, len(released_ns))
         applied = silences = 0
         follows = False

@@ -197,7 +197,8 @@ def weigh(
     steps = [one.placement for one in applied]
     outcome.moved = " ".join(b for a, b in pairwise(["", *steps]) if a != b)
     stamper = f"*{problem.stamper_node}", f"stamper@{problem.stamper_node}"
-    if any(fault.how == "kill" and set(fault.whom) & set(stamper) for fault in faults):
+    ends = "kill", "power", "blank"
+    if any(fault.how in ends and set(fault.whom) & set(stamper) for fault in faults):
         outcome.lost = -1
     outcome.wrong += out_of_order(applied)
     if all(hit_by(problem, fault) is not None or not _strikes_sink(fault) for fault in faults):
