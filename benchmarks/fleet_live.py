@@ -51,7 +51,7 @@ from dwell.live.messages import (
 )
 from dwell.live.wiring import Wiring, roles, wire
 from dwell.model import Problem
-from dwell.model.document import fingerprint
+from dwell.model.document import digests
 from dwell.record import open_run
 
 if TYPE_CHECKING:
@@ -143,7 +143,7 @@ class _Cell:
     def __init__(self, number: int, problem: Problem, put: Callable[[str, str, bytes], None]):
         self.number, self.problem, self._put = number, problem, put
         self.keys = Keys(problem.name)
-        self.digest = fingerprint(problem)
+        self.digest = digests(problem)["wiring"]
         self.everybody = [(r.who, r.node) for r in roles(problem) if r.kind != "controller"]
         self.run = time.time_ns()
         self.cycle, self.term, self.placement = 0, 1, problem.initial

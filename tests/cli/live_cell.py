@@ -133,7 +133,14 @@ class RealCell:
 
     def controller(self, *more: str) -> None:
         """Start the controller."""
-        words = ("--cell", self.file, "--out", self.folder / "runs")
+        words = (
+            "--cell",
+            self.file,
+            "--out",
+            self.folder / "runs",
+            "--state",
+            self.folder / "kept",
+        )
         self.start("controller", "controller", *words, *more)
 
     def begin(self) -> None:

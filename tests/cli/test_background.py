@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -17,7 +18,8 @@ import yaml
 from dwell.live.local_addresses import taken_ports
 from dwell.live.supervision import survivor
 from dwell.live.wiring import wire
-from tests.cli.live_cell import RealCell, invoke
+from dwell.record import open_run
+from tests.cli.live_cell import MOODY, RealCell, invoke
 from tests.cli.small_cell import environment
 from tests.waiting import PATIENCE_S, wait_until
 
@@ -68,6 +70,9 @@ class Cell:
     def taken(self) -> str:
         entries = wire(self.problem).entries.values()
         return taken_ports(end.port for entry in entries for end in entry.listen.values())
+
+    def cell_log(self, node: str, who: str) -> str:
+        return (self.folder / node / f"{who}.log").read_text()
 
     def assert_nothing_is_there(self) -> None:
         assert self.taken() == ""
@@ -162,6 +167,120 @@ def test_what_dead_agents_have_left_is_named_and_ended(cell: Cell) -> None:
     assert "sink.control@R2" in told
     assert cell.running("**/*.pid") == {}
     assert cell.taken() == ""
+
+
+def test_an_edited_cell_is_taken_over_after_an_orderly_end_alone(cell: Cell) -> None:
+    """Whatever dies meanwhile begins with the bytes that all others have."""
+    assert cell.up()[0] == 0
+    cell.cell.until(lambda status: status["window"] and not status["silent"])
+    text = cell.file.read_text()
+    cell.file.write_text(text.replace("guard_cycles: 20", "guard_cycles: 21"))
+    cell.cell.module.write_text("broken(")
+    words = "cell.yaml, moody.py on E have changed since "
+    cell.cell.until(lambda status: words in cell.cell.note("agent@E")(status))
+    assert words in cell.cell.until(lambda status: status["changed"])["changed"]
+    # A worker, and an agent with all that is its.
+    killed = {who: one for who, one in cell.running("E/*.pid").items() if who != "agent@E"}
+    for process in [cell.running("*.pid")["agent@E"], *killed.values()]:
+        process.send_signal(signal.SIGKILL)
+    agent = [sys.executable, "-m", "dwell", "agent", "--node", "E", "--cell", str(cell.file)]
+    state = str(cell.folder / "E")
+    with subprocess.Popen([*agent, "--state", state], env=environment()) as started:
+        cell.cell.until(
+            lambda status: (
+                status["health"] == "ok"
+                and not {"perception@E", "agent@E"} & status["strangers"].keys()
+                and status["processes"]["perception@E"]["age_ms"] < 1_000
+            )
+        )
+        started.kill()
+    # The end of the computer; its next start.
+    for process in cell.running("**/*.pid").values():
+        process.send_signal(signal.SIGKILL)
+    wait_until(lambda: not cell.running("**/*.pid"))
+    code, _, error = cell.up()
+    assert code == 0, error
+    assert "cell.yaml, moody.py on R1, E, R2 have changed since " in error
+    cell.cell.until(lambda status: status["window"] and not status["silent"])
+    assert "guard_cycles: 20" in (cell.folder / "R1" / "cell" / "cell.yaml").read_text()
+
+    assert cell.down()[0] == 0
+    cell.cell.module.write_text(MOODY)
+    code, _, error = cell.up()
+    assert (code, error) == (0, "")
+    assert "guard_cycles: 21" in (cell.folder / "R1" / "cell" / "cell.yaml").read_text()
+
+
+def test_other_decisions_are_taken_over_while_every_process_runs_on(cell: Cell) -> None:
+    code, error = cell.refused("--again")
+    assert (code, "does not run here; this starts it: dwell live up " in error) == (1, True)
+    assert cell.up()[0] == 0
+    cell.cell.until(lambda status: status["window"] and not status["silent"])
+    assert invoke("live", "pin", "SO", "--cell", cell.file)[0] == 0
+    running = cell.running("**/*.pid")
+    (first,) = cell.out.glob("light-follower-*")
+    text = cell.file.read_text()
+    cell.file.write_text(text.replace("min_improvement: 0.05", "min_improvement: 0.5"))
+    code, told, error = cell.up("--again")
+    assert (code, error) == (0, "")
+    assert "decision is taken over by agent@E, agent@R1, agent@R2, controller@E" in told
+    # The same processes, of the same numbers, since the same instants.
+    assert cell.running("**/*.pid") == running
+    status = cell.cell.until(lambda status: status["window"] and not status["silent"])
+    assert (status["pinned"], status["placement"], status["changed"]) == ("SO", "SO", None)
+    assert not any("changed" in process["note"] for process in status["processes"].values())
+    assert (first / "run.json").exists()
+    assert cell.down()[0] == 0
+    (second,) = (one.parent for one in cell.out.glob("*/run.json") if one.parent != first)
+    before, after = open_run(first), open_run(second)
+    assert "continues" not in before.meta
+    assert after.meta["continues"] == first.name
+    found = [run.problem.controller.min_improvement for run in (before, after)]
+    assert found == [0.05, 0.5]
+
+
+def test_other_code_is_taken_over_node_by_node(cell: Cell) -> None:
+    assert cell.up()[0] == 0
+    cell.cell.until(lambda status: status["window"] and not status["silent"])
+    # Perception is on E; R1 and R2 have what every candidate needs.
+    assert invoke("live", "pin", "SO", "--cell", cell.file)[0] == 0
+    assert invoke("live", "unpin", "--cell", cell.file)[0] == 0
+    before = cell.running("**/*.pid")
+    cell.cell.module.write_text(MOODY.replace("the old code", "the new code"))
+    code, told, error = cell.up("--again")
+    assert (code, error) == (0, "")
+    assert told.splitlines()[:1] == ["E runs the new code"]
+    assert "code is taken over by " in told
+    after = cell.running("**/*.pid")
+    assert after.keys() == before.keys()
+    same = {who for who in before if before[who] == after[who]}
+    assert same == {"agent@E", "agent@R1", "agent@R2", "controller@E"}
+    assert "the new code" in cell.cell_log("E", "perception@E")
+    status = cell.cell.until(lambda status: status["health"] == "ok")
+    assert status["drained"] == []
+    assert cell.down()[0] == 0
+
+
+def test_other_wiring_ends_all_and_starts_it_where_that_is_allowed(cell: Cell) -> None:
+    assert cell.up()[0] == 0
+    cell.cell.until(lambda status: status["window"] and not status["silent"])
+    before, text = cell.running("**/*.pid"), cell.file.read_text()
+    cell.file.write_text(text.replace("policy: LOC", "policy: NO"))
+    code, error = cell.refused("--again")
+    assert (code, "unknown policy 'NO'" in error) == (2, True)
+    cell.file.write_text(text.replace("guard_cycles: 20", "guard_cycles: 21"))
+    code, error = cell.refused("--again")
+    assert code == 1
+    assert re.search(r"takes about \d+ s without commands; with --yes it is done", error)
+    assert cell.running("**/*.pid") == before
+    code, told, error = cell.up("--again", "--yes")
+    assert (code, error) == (0, "")
+    assert "s without commands" in told
+    assert "light-follower is up: " in told
+    assert all(who in told for who in ("agent@R1", "agent@E", "agent@R2", "controller@E"))
+    cell.cell.until(lambda status: status["window"] and status["health"] == "ok")
+    assert not {*before.values()} & {*cell.running("**/*.pid").values()}
+    assert cell.up("--again")[1].startswith("cell.yaml: text is taken over by agent@E, ")
 
 
 def test_a_taken_port_is_named_and_nothing_is_started(cell: Cell) -> None:

@@ -14,8 +14,9 @@ import pytest
 import dwell
 from dwell.cli.units import escaped_name, unit_texts, verify
 from dwell.live.wiring import wire
-from tests.cli.live_cell import PATIENCE_S, RealCell
+from tests.cli.live_cell import RealCell
 from tests.cli.small_cell import ROOT, SMALL, assert_refused, call
+from tests.waiting import PATIENCE_S
 
 CELL = ROOT / "examples" / "live" / "cell.yaml"
 PROBLEM = dwell.load(CELL)

@@ -33,7 +33,7 @@ from tests.live.memory_transport import Clock, MemoryTransport, Network, Network
 from tests.live.plain_launcher import PlainLauncher
 
 # All processes of a cell are here, and take the digest of one and the same.
-role_module.fingerprint = lru_cache(role_module.fingerprint)  # type: ignore[attr-defined]
+role_module.digests = lru_cache(role_module.digests)  # type: ignore[attr-defined]
 
 MS = 1_000_000
 #: What the stages of the canonical cell take.

@@ -15,7 +15,8 @@ from dwell.live.ending import end_when_told
 if "nohup" in sys.argv:
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
 stopped = threading.Event()
-end_when_told(stopped, lambda: os._exit(9))
+again = (lambda: print("again", flush=True)) if "again" in sys.argv else None
+end_when_told(stopped, lambda: os._exit(9), again)
 print("waits", flush=True)
 stopped.wait()
 print("ends", flush=True)
@@ -38,12 +39,13 @@ for i in range(2000):
 """
 
 
-def start(*words: str) -> subprocess.Popen[str]:
+def start(*words: str, leads: bool = False) -> subprocess.Popen[str]:
     process = subprocess.Popen(
         [sys.executable, "-c", PROGRAM, *words],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
+        start_new_session=leads,
     )
     assert said(process) == "waits"
     return process
@@ -172,3 +174,19 @@ assert stopped.wait(20)
 def test_helpers_of_a_stage_can_be_ended_by_signals(how: str) -> None:
     program = HELPERS.replace("CALL", how)
     subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
+
+
+@pytest.mark.parametrize("words", [("again",), ("again", "nohup")])
+def test_a_hangup_has_a_service_take_files_over(words: tuple[str, ...]) -> None:
+    with start(*words, leads=True) as process:
+        for _ in range(2):
+            process.send_signal(signal.SIGHUP)
+            assert said(process) == "again"
+        process.send_signal(signal.SIGTERM)
+        assert said(process) == "ends"
+
+
+def test_a_hangup_ends_a_process_of_a_terminal() -> None:
+    with start("again") as process:
+        process.send_signal(signal.SIGHUP)
+        assert said(process) == "ends"

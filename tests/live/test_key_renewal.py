@@ -20,7 +20,7 @@ from dwell.live.trust.request import request_certificate
 from dwell.live.trust.roster import write_private
 from dwell.live.trust.signing import Seals
 from dwell.model import Problem
-from dwell.model.document import fingerprint
+from dwell.model.document import digests
 from tests.live.memory_transport import Network
 from tests.live.small_world import canonical
 
@@ -72,7 +72,7 @@ class Host:
 
     def hear(self, node: str, roster: int) -> None:
         """Hear the agent of another node, which uses a roster."""
-        cell = fingerprint(self.problem)
+        cell = digests(self.problem)["wiring"]
         beat = Beat(f"agent@{node}", node, 1, roster, True, cell=cell, roster=roster)
         assert self.pulse.detector.hear(beat, roster)
 

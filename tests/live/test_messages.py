@@ -30,7 +30,7 @@ from dwell.live.stage import Message
 from dwell.live.transport.transport import Arrival
 from dwell.live.worker import MAX_JOINS
 from dwell.model import Problem
-from dwell.model.document import fingerprint
+from dwell.model.document import digests
 from tests.fuzz.targets import KINDS, wholes
 from tests.live.small_world import (
     EXEC_MS,
@@ -237,7 +237,7 @@ def test_a_flood_of_well_formed_messages_takes_no_memory() -> None:
     world = World(problem(), policy="dtp")
     world.run(500)
     now_ns = world.network.now_ns
-    keys, digest = world.stamper.place.keys, fingerprint(world.problem)
+    keys, digest = world.stamper.place.keys, digests(world.problem)["wiring"]
     tasks = world.problem.pipeline.tasks
 
     def say(number: int) -> list[Arrival]:
@@ -296,7 +296,7 @@ def test_a_flood_of_well_formed_messages_takes_no_memory() -> None:
 
 def test_a_beat_of_an_unknown_process_is_not_heard(world: World) -> None:
     stamper = world.stamper
-    beat = Beat("ghost@E", "E", 1, 1, True, cell=fingerprint(world.problem))
+    beat = Beat("ghost@E", "E", 1, 1, True, cell=digests(world.problem)["wiring"])
     stamper.receive(Arrival(stamper.place.keys.beat("E", "ghost@E"), encode(beat)), 0)
     assert stamper.pulse.detector.last("ghost@E") is None
     assert "ghost@E on E is no process of cell 'canonical'" in stamper.place.complaints

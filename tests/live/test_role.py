@@ -9,7 +9,7 @@ from dwell.live.messages import Beat, encode
 from dwell.live.role import RIVAL_BEATS, Pulse, RolePlace
 from dwell.live.transport.transport import Arrival
 from dwell.model import Problem
-from dwell.model.document import fingerprint
+from dwell.model.document import digests
 from tests.live.memory_transport import Network
 from tests.live.small_world import MS, World, canonical
 
@@ -23,7 +23,7 @@ def test_other_cell_files_and_versions_are_named(problem: Problem) -> None:
     world = World(problem, policy="dtp")
     world.run(1_000)
     stamper = world.stamper
-    digest = fingerprint(world.problem)
+    digest = digests(world.problem)["wiring"]
     key = stamper.place.keys.beat("E", "agent@E")
 
     def beat(cell: str, version: str) -> str:
@@ -71,7 +71,7 @@ def test_two_processes_of_one_name_are_noticed(problem: Problem) -> None:
     key = place.keys.beat("E", "agent@E")
 
     def beat(life: int, sent_ns: int) -> None:
-        one = Beat("agent@E", "E", life, sent_ns, True, cell=fingerprint(problem))
+        one = Beat("agent@E", "E", life, sent_ns, True, cell=digests(problem)["wiring"])
         pulse.receive(Arrival(key, encode(one)), sent_ns)
 
     beat(1, 1)

@@ -13,7 +13,7 @@ from dwell.live.messages import Beat, encode
 from dwell.live.stamper import Stamper
 from dwell.live.transport.transport import Arrival
 from dwell.model import Problem
-from dwell.model.document import fingerprint
+from dwell.model.document import digests
 from tests.live.small_world import MS, World, canonical
 
 
@@ -151,7 +151,7 @@ def test_a_book_of_this_boot_goes_on(problem: Problem) -> None:
 
 def claim(world: World, run: int, times: int) -> None:
     """Have somebody say in a sink's beats that it let a run through."""
-    digest = fingerprint(world.problem)
+    digest = digests(world.problem)["wiring"]
     for number in range(times):
         # Later than all that the sink says itself for a while.
         sent_ns = world.network.now_ns + (number + 1) * MS

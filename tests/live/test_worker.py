@@ -22,8 +22,6 @@ from dwell.model import Problem
 from tests.live.small_world import MS, Bench, Counting, Passing, World, canonical, stateful
 from tests.waiting import PATIENCE_S, wait_until
 
-PATIENCE_S = 20.0
-
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:

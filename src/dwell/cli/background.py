@@ -13,11 +13,12 @@ import os
 import shlex
 import shutil
 import signal
+import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,8 +26,10 @@ import psutil
 import typer
 
 from dwell.errors import LiveError, ProblemError
+from dwell.live.kept_cell import Change, KeptCell, cell_here, change, forget
 from dwell.live.local_addresses import is_here, listening_ports, taken_ports, why_not_listen
 from dwell.live.log import printable
+from dwell.live.operator_client import OperatorClient
 from dwell.live.process_group import ProcessGroup
 from dwell.live.security import Security
 from dwell.live.stage_modules import require_stages
@@ -34,13 +37,17 @@ from dwell.live.state_files import make_folder, open_own
 from dwell.live.state_folder import logs
 from dwell.live.supervision import LOG_BYTES, survivor, write_mark
 from dwell.live.transport.orphans import remove_orphans
-from dwell.live.wiring import Role, Wiring, wire
+from dwell.live.wiring import Role, Wiring, roles, wire
 from dwell.model import Problem
 
 #: How long a process has to listen, and to end after it was told to: an actuator is told to stop
 #: for two seconds, and a controller completes its run's folder.
 START_S, END_S = 30.0, 30.0
 LOOK_S = 0.1
+#: How long a step of a take-over may last: the processes of a node restart one after another.
+TAKEN_S = 120.0
+#: How long the processes of a cell take to end in order, about.
+STOPPED_S = 2.0
 #: How much of the log of a process that does not start is shown.
 LAST_LINES = 5
 
@@ -159,7 +166,8 @@ def _command(role: Role, file: Path, folder: Path, out: Path, policy: str | None
     words = [sys.executable, "-m", "dwell", role.kind, "--cell", str(file.resolve())]
     if role.kind == "agent":
         return [*words, "--node", role.node, "--state", str(folder / role.node)]
-    return [*words, "--out", str(out), *(() if policy is None else ("--policy", policy))]
+    words += ["--out", str(out), "--state", str(folder.parent)]
+    return [*words, *(() if policy is None else ("--policy", policy))]
 
 
 def _require_down(background: Background, wiring: Wiring, file: Path) -> None:
@@ -294,6 +302,178 @@ class _Start:
             if not self._was[path]:
                 with suppress(OSError):
                     path.rmdir()
+
+
+# ------------------------------------------------------------------------- again
+
+
+def again(
+    file: Path,
+    root: Path,
+    environment: Mapping[str, str],
+    say: Callable[[str], None],
+    *,
+    yes: bool = False,
+) -> list[str]:
+    """Have what runs here take over an edited cell file, edited modules, or another Dwell.
+
+    Parameters
+    ----------
+    yes : bool
+        Whether all may end where the wiring is another.
+
+    Returns
+    -------
+    list of str
+        Nodes that were ended, and have to be started.
+
+    Raises
+    ------
+    ProblemError
+        If the cell cannot run.
+    LiveError
+        If it does not run here, or is not taken over, or has another wiring and may not end.
+    TrustError
+        If the keys are not those of an operator, and nodes have other code.
+    """
+    kept, new = cell_here(file, root), KeptCell.of(file)
+    problem = new.problem()
+    here = Background(problem, root / problem.name)
+    running, remedy = here.running(), shlex.quote(str(file))
+    if kept.folder is None or not running:
+        raise LiveError(f"{file}: does not run here; this starts it: dwell live up {remedy}")
+    found = change(kept, new)
+    agents = [who for who in running if who.startswith("agent@")]
+    nodes = [who.partition("@")[2] for who in agents]
+    wiring = wire(problem)
+    require_stages(problem, file, [node for node in nodes if node in problem.fabric.nodes])
+    if found == "wiring":
+        pause = (
+            f"{file}: its wiring is another: all processes end and start together, which takes "
+            f"about {_pause_s(kept.problem(), root, running):.0f} s without commands"
+        )
+        if not yes:
+            raise LiveError(f"{pause}; with --yes it is done")
+        say(pause)
+        down(kept.problem(), root / kept.problem().name)
+        forget(file, root)
+        _say_left(file, problem, found, running, say)
+        return nodes
+    fixed = {role.node for role in roles(problem) if role.kind in ("stamper", "sink")}
+    if found == "code":
+        # The robot stops as short as it can: nodes that can be empty are the first.
+        agents.sort(key=lambda who: who.partition("@")[2] in fixed)
+        with OperatorClient(problem, environment) as visitor:
+            for who in agents:
+                node = wiring.entry(who).role.node
+                with _moved_off(visitor, node):
+                    before = _survivors((here.folder / node).glob("*.pid"))
+                    _hand_over(here, who, running[who], new)
+                    _await_restarts(visitor, here, node, before)
+                say(f"{node} runs the new code")
+    else:
+        for who in agents:
+            _hand_over(here, who, running[who], new)
+    for who in running.keys() - {*agents}:
+        port = wiring.entry(who).listen["control"].port
+        _hand_over(here, who, running[who], new, None if found == "text" else port)
+    say(f"{file.name}: {found} is taken over by {', '.join(running)}")
+    _say_left(file, problem, found, running, say)
+    return []
+
+
+def _pause_s(problem: Problem, root: Path, running: Mapping[str, psutil.Process]) -> float:
+    """Return how long it will take to end all and start it: as long as the last start took."""
+    began_s = min(process.create_time() for process in running.values())
+    there = _survivors((root / problem.name).glob("*/*.pid")).values()
+    # Some may have been restarted since.
+    started_s = statistics.median([began_s, *(process.create_time() for process in there)])
+    longest_ms = max(task.start_ms for task in problem.pipeline.tasks.values())
+    return STOPPED_S + started_s - began_s + longest_ms / 1e3
+
+
+def _hand_over(
+    here: Background, who: str, process: psutil.Process, new: KeptCell, port: int | None = None
+) -> None:
+    """Have an agent or a controller keep new bytes; with a port, it begins again and listens."""
+    place, before = here.folder / who.removeprefix("agent@"), process.cmdline()
+
+    def done() -> bool:
+        if KeptCell.of(new.file, [place]).contents != new.contents:
+            return False
+        return port is None or (process.cmdline() != before and port in listening_ports())
+
+    process.send_signal(signal.SIGHUP)
+    _until(f"{who} has not taken {new.file.name} over", done)
+
+
+@contextmanager
+def _moved_off(visitor: OperatorClient, node: str) -> Iterator[None]:
+    """Have as few stages as possible on a node meanwhile; then what operators wanted before."""
+    status = visitor.ask("status")
+    clear = {
+        name: [*placement.values()].count(node)
+        for name, placement in visitor.problem.candidates.items()
+        if {*status["drained"]}.isdisjoint(placement.values())
+    }
+    target = min(clear, key=lambda name: (clear[name], name != status["placement"]))
+    visitor.ask("pin", target)
+    try:
+        _until(
+            f"{node} cannot be left for {target}",
+            lambda: visitor.ask("status")["placement"] == target,
+        )
+        yield
+    finally:
+        pinned = status["pinned"]
+        visitor.ask("pin" if pinned else "unpin", pinned or "")
+
+
+def _await_restarts(
+    visitor: OperatorClient, here: Background, node: str, before: Mapping[str, psutil.Process]
+) -> None:
+    """Return when the processes of a node are others than before, and ready."""
+
+    def ready() -> bool:
+        running = _survivors((here.folder / node).glob("*.pid"))
+        if any(running.get(who) in (None, process) for who, process in before.items()):
+            return False
+        known, now_s = visitor.ask("status")["processes"], time.time()
+        # The beat that says so may be of the process before.
+        return all(
+            known[who]["ready"] and known[who]["age_ms"] / 1e3 < now_s - process.create_time()
+            for who, process in running.items()
+        )
+
+    _until(f"not all processes of {node} are ready", ready)
+
+
+def _until(what: str, holds: Callable[[], bool]) -> None:
+    end_s = time.monotonic() + TAKEN_S
+    while not holds():
+        if time.monotonic() > end_s:
+            raise LiveError(f"{what} after {TAKEN_S:.0f} s; see the logs")
+        time.sleep(LOOK_S)
+
+
+def _say_left(
+    file: Path,
+    problem: Problem,
+    found: Change,
+    running: Collection[str],
+    say: Callable[[str], None],
+) -> None:
+    """Say on which other computers a change has to be taken over, too."""
+    whom = {f"controller@{problem.controller_node}": problem.controller_node}
+    if found in ("code", "wiring"):
+        whom |= {f"agent@{node}": node for node in problem.fabric.nodes}
+    left = dict.fromkeys(node for who, node in whom.items() if who not in running)
+    if left and found != "text":
+        yes = " --yes" if found == "wiring" else ""
+        say(
+            f"left to do: copy the files to {', '.join(left)}; there: dwell live up --again{yes} "
+            f"{shlex.quote(str(file))}"
+        )
 
 
 # ------------------------------------------------------------------------- down

@@ -87,6 +87,9 @@ def agent(
     insecure: Insecure = False,
     log_format: Logs = LogFormat.TEXT,
     owner: Owner = None,
+    renews: Annotated[
+        bool, typer.Option("--renews", help="Restart what it takes over.", hidden=True)
+    ] = False,
 ) -> None:
     """Run a node of a live cell: its workers, and on the right nodes stamper and sinks."""
     from dwell.live import node_command
@@ -104,12 +107,17 @@ def agent(
             keys=keys,
             insecure=insecure,
             owner=owner,
+            renews=renews,
         )
 
 
 def controller(
     cell: Annotated[list[Path], option("FILE", "Cell file; may be repeated.", "--cell")],
     out: Annotated[Path, option("FOLDER", "Where the runs' folders go.")] = Path("runs"),
+    state: Annotated[
+        Path | None,
+        option("FOLDER", "Where it keeps what it began with; by default below ~/.local."),
+    ] = None,
     policy: Policy = None,
     name: Annotated[
         str | None, typer.Option(help="Of this controller; its process id if not given.")
@@ -126,6 +134,7 @@ def controller(
     insecure: Insecure = False,
     log_format: Logs = LogFormat.TEXT,
     owner: Owner = None,
+    continues: Annotated[str, option("JSON", "Runs that it continues.", hidden=True)] = "{}",
 ) -> None:
     """Decide where the stages of live cells run."""
     from dwell.live import node_command
@@ -135,6 +144,7 @@ def controller(
         node_command.controller(
             cell,
             out,
+            state=state,
             policy=policy,
             name=name,
             jobs=jobs,
@@ -142,6 +152,7 @@ def controller(
             keys=keys,
             insecure=insecure,
             owner=owner,
+            continues=continues,
         )
 
 
@@ -173,12 +184,12 @@ def status(
     """Show how a cell is, and first what is wrong with it."""
     if check and watch:
         raise typer.BadParameter("--check looks once; leave --watch out")
-    from dwell.cellfile import load_without_traces
+    from dwell.live.kept_cell import cell_here
     from dwell.live.local_addresses import running_elsewhere
     from dwell.live.operator_client import OperatorClient
     from dwell.live.security import environment
 
-    problem = load_without_traces(cell)
+    problem = cell_here(cell, state_root()).problem()
     with OperatorClient(problem, environment(keys, insecure=insecure)) as visitor:
         if watch:
             _watch(visitor, stages=stages, as_json=as_json)
@@ -326,19 +337,35 @@ def up(
     ] = None,
     policy: Policy = None,
     out: Annotated[Path, option("FOLDER", "Where the runs' folders go.")] = Path("runs"),
+    again: Annotated[
+        bool, flag("--again", "Have what runs here take over an edited cell file or module.")
+    ] = False,
+    yes: Annotated[
+        bool, flag("--yes", "With --again: end all and start it, if nothing less will do.")
+    ] = False,
     state: Root = None,
     keys: Keys = None,
     insecure: Insecure = False,
 ) -> None:
     """Start a cell's part on this computer in the background: agents, and its controller here."""
-    from dwell.cellfile import load, load_without_traces
     from dwell.cli import background
+    from dwell.live.kept_cell import cell_here
     from dwell.live.security import environment
 
-    problem = load_without_traces(cell)
+    if again:
+        given = environment(keys, insecure=insecure)
+        node = background.again(cell, state_root(state), given, typer.echo, yes=yes)
+        if not node:
+            return
+    kept = cell_here(cell, state_root(state))
+    if kept.folder is not None:
+        kept.install()
+    problem = kept.problem()
     nodes = background.nodes_here(problem, node or ())
     if problem.controller_node in nodes:
-        problem = load(cell)
+        problem = kept.problem(traces=True)
+    if changed := kept.told(", ".join(nodes)):
+        typer.echo(f"warning: {changed}", err=True)
     folder = state_root(state) / problem.name
     names = background.up(
         cell,
@@ -355,11 +382,13 @@ def up(
 @live.command()
 def down(cell: CellArgument, state: Root = None) -> None:
     """End what `up` has started, in order: the robot's actuators are told to stop."""
-    from dwell.cellfile import load_without_traces
     from dwell.cli import background
+    from dwell.live.kept_cell import cell_here, forget
 
-    problem = load_without_traces(cell)
-    names = background.down(problem, state_root(state) / problem.name)
+    root = state_root(state)
+    problem = cell_here(cell, root).problem()
+    names = background.down(problem, root / problem.name)
+    forget(cell, root)
     ended = f"is down: {', '.join(names)}" if names else "does not run here"
     typer.echo(f"{problem.name} {ended}")
 
@@ -417,11 +446,12 @@ def units(
 def _ask(
     cell: Path, what: str, about: str, keys: Path | None, *, insecure: bool, as_json: bool
 ) -> None:
-    from dwell.cellfile import load_without_traces
+    from dwell.live.kept_cell import cell_here
     from dwell.live.operator_client import OperatorClient
     from dwell.live.security import environment
 
-    with OperatorClient(load_without_traces(cell), environment(keys, insecure=insecure)) as visitor:
+    problem = cell_here(cell, state_root()).problem()
+    with OperatorClient(problem, environment(keys, insecure=insecure)) as visitor:
         answer = visitor.ask(what, about)
         # The answer comes before the move that was asked for.
         until_s = time.monotonic() + MOVES_S
@@ -479,6 +509,8 @@ def status_lines(status: dict[str, Any], *, stages: bool = False) -> list[str]:
             f"{window['cost']:.3f}, {window['reason']}; {released}silences {status['silences']}; "
             f"utilisation {used}"
         )
+    if status["changed"]:
+        lines.append(f"controller: {status['changed']}")
     lines += [f"  {who:24} differs    {why}" for who, why in sorted(status["strangers"].items())]
     lines += [f"  {who:24} not heard" for who in status["silent"]]
     processes = status["processes"]

@@ -31,6 +31,8 @@ Type=notify
 User={user}
 StateDirectory=dwell
 {environment}ExecStart={command}
+# Takes an edited cell file over.
+ExecReload=/bin/kill -HUP $MAINPID
 Restart=always
 RestartSec=1
 {settings}
@@ -119,7 +121,8 @@ def unit_texts(
     name = f"dwell-agent@{escaped_name(problem.name)}-{escaped_name(node)}.service"
     units = {name: unit(called, agent, AGENT, beside=" time-sync.target")}
     if node == problem.controller_node:
-        controller = ("controller", "--cell", str(cell), "--out", f"{STATE}/runs")
+        files = ("--out", f"{STATE}/runs", "--state", STATE)
+        controller = ("controller", "--cell", str(cell), *files)
         called = f"Dwell controller of cell {problem.name}"
         name = f"dwell-controller@{escaped_name(problem.name)}.service"
         units[name] = unit(called, controller, CONTROLLER)

@@ -98,6 +98,8 @@ class Agent:
         Returns the core-nanoseconds that the node has been busy so far.
     stages : callable, optional
         Returns the counts of the node's workers.
+    changed : callable
+        Returns which files have changed since the node began; empty for none.
     """
 
     def __init__(
@@ -107,8 +109,9 @@ class Agent:
         busy_ns: Callable[[], int],
         accelerator: Gauge | None = None,
         stages: Callable[[], Iterable[StageCounts]] = tuple,
+        changed: Callable[[], str] = str,
     ) -> None:
-        self.place, self.supervisor = place, supervisor
+        self.place, self.supervisor, self._changed = place, supervisor, changed
         self._read_stages = stages
         self._stages: tuple[StageCounts, ...] = ()
         self._busy_ns, self._accelerator = busy_ns, accelerator
@@ -165,7 +168,7 @@ class Agent:
 
     def _state(self) -> tuple[bool, str]:
         trouble = "" if self._accelerator is None else self._accelerator.trouble()
-        notes = self.supervisor.notes(), trouble
+        notes = self.supervisor.notes(), trouble, self._changed()
         return not self.supervisor.stuck(), "; ".join(note for note in notes if note)
 
     def wake(self, now_ns: int) -> int:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any, Literal, Protocol, TypeAlias
@@ -101,13 +101,21 @@ class ControlledCell:
     ----------
     name : str
         Name of this controller, by which others that would take charge tell it apart.
+    changed : callable
+        Returns which files have changed since it began; empty for none.
     """
 
     def __init__(
-        self, place: RolePlace, controller: Controller, recorder: Recorder, name: str, now_ns: int
+        self,
+        place: RolePlace,
+        controller: Controller,
+        recorder: Recorder,
+        name: str,
+        now_ns: int,
+        changed: Callable[[], str] = str,
     ) -> None:
         self.place, self.controller, self.name = place, controller, name
-        self._recorder = recorder
+        self._recorder, self._changed = recorder, changed
         self.offsets = place.offsets()
         self.windows: LiveWindows | None = None
         # Of the others the relay's agent tells it now and then. What beats say of the clocks is
@@ -766,6 +774,7 @@ class ControlledCell:
             **self._missing(now_ns),
             "complaints": dict(list(self.place.complaints.items())[-10:]),
             "record": self._recorder.trouble or None,
+            "changed": self._changed() or None,
         }
         health, headline = diagnose(self.place.problem, status)
         return {"health": health, "headline": headline, **status}

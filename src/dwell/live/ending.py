@@ -6,13 +6,18 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Mapping
+from functools import partial
 from types import FrameType
 from typing import TypeAlias
 
 Handler: TypeAlias = "Callable[[int, FrameType | None], object] | int | None"
 
 
-def end_when_told(stopped: threading.Event, at_once: Callable[[], None]) -> None:
+def end_when_told(
+    stopped: threading.Event,
+    at_once: Callable[[], None],
+    again: Callable[[], object] | None = None,
+) -> None:
     """Have SIGTERM, SIGINT and SIGHUP set an event.
 
     The end of a terminal brings several SIGHUP, and none to a process that was started to outlive
@@ -22,8 +27,17 @@ def end_when_told(stopped: threading.Event, at_once: Callable[[], None]) -> None
     ----------
     at_once : callable
         Called when SIGTERM or SIGINT comes after another of these signals.
+    again : callable, optional
+        Called in a thread at SIGHUP instead, if the process leads a session: a service, or what
+        `dwell live up` has started, has no terminal.
     """
     told = False
+    ending = [signal.SIGTERM, signal.SIGINT]
+    if again is not None and os.getsid(0) == os.getpid():
+        start_again = partial(threading.Thread, target=again, name="again", daemon=True)
+        signal.signal(signal.SIGHUP, lambda *_: start_again().start())
+    elif signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+        ending.append(signal.SIGHUP)
 
     def handle(number: int, frame: FrameType | None) -> None:
         nonlocal told
@@ -34,11 +48,7 @@ def end_when_told(stopped: threading.Event, at_once: Callable[[], None]) -> None
             threading.Thread(target=stopped.set, name="ending", daemon=True).start()
         told = True
 
-    usual: dict[int, Handler] = {
-        number: signal.signal(number, handle)
-        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
-        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN
-    }
+    usual: dict[int, Handler] = {number: signal.signal(number, handle) for number in ending}
     _restore_in_children(handle, usual)
 
 

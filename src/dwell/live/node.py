@@ -14,12 +14,15 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
+
 from dwell.control import Controller
 from dwell.errors import KernelError, LiveError
 from dwell.live.agent import Agent, Gauge, busy_ns_of
 from dwell.live.control_group import own_group
 from dwell.live.controlled_cell import ControlledCell
 from dwell.live.hosting import PLAIN, Hosted, Platform, keep_collections_short, take_turns
+from dwell.live.kept_cell import CellKeeper
 from dwell.live.launcher import ForkServer
 from dwell.live.log import Log
 from dwell.live.recording import RunRecorder
@@ -42,6 +45,20 @@ if TYPE_CHECKING:
 MISTAKEN = frozenset({errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP})
 
 
+class Continued(msgspec.Struct, frozen=True):
+    """The run of a cell that its controller has ended, and what operators wanted then.
+
+    Parameters
+    ----------
+    folder : str
+        The run's; empty where there is none.
+    """
+
+    folder: str = ""
+    pinned: str = ""
+    drained: tuple[str, ...] = ()
+
+
 def run_agent(
     problem: Problem,
     node: str,
@@ -51,6 +68,8 @@ def run_agent(
     stopped: threading.Event,
     *,
     hurried: threading.Event | None = None,
+    keeper: CellKeeper | None = None,
+    renews: bool = False,
     cpus: Iterable[int] | None = None,
     accelerator: Callable[[], float] | None = None,
     environment: Mapping[str, str] | None = None,
@@ -67,6 +86,10 @@ def run_agent(
         Returns the words that start a process, by the process's name.
     hurried : Event, optional
         Has its processes end at once, and not in order, once it is told to stop.
+    keeper : CellKeeper, optional
+        Keeps the cell file for the processes; without one they read the file itself.
+    renews : bool
+        Whether the processes that it takes over are to be restarted.
     accelerator : callable, optional
         Returns the utilisation of the node's accelerators, a share from 0 to 1. It counts where the
         cell says that the node has one kind of them.
@@ -107,6 +130,9 @@ def run_agent(
         security = replace(security, keyring=installed(source, folder / "keys"))
     transport = platform.transport(security, who, node)
     place = security.place(who, node, transport, Log(say))
+    # Only what runs is kept: a file that could not be started can be corrected.
+    if keeper is not None:
+        keeper.begin(stopped)
     launcher = ForkServer(program, environment)
     supervisor = Supervisor(make_folder(folder), say, launcher)
     try:
@@ -115,7 +141,9 @@ def run_agent(
                 supervisor.keep(role.who, words(role.who))
         gauge = None if accelerator is None else Gauge(accelerator)
         stages = partial(read_books, problem, wiring.on(node), folder)
-        agent = Agent(place, supervisor, _busy_clock(problem, node, say), gauge, stages)
+        changed = str if keeper is None else keeper.told
+        busy_ns = _busy_clock(problem, node, say)
+        agent = Agent(place, supervisor, busy_ns, gauge, stages, changed)
         clock, complain = platform.clock(problem, node), place.complain
         hosted = Hosted(agent, transport, clock, stopped=stopped, complain=complain)
         each_turn = [service.step]
@@ -131,10 +159,20 @@ def run_agent(
             each_turn.append(renewal.step)
         keep_collections_short()
         service.ready()
+        if keeper is not None:
+            keeper.renew = supervisor.restart_in_turn
+            if renews:
+                supervisor.restart_in_turn()
         take_turns([hosted], each_turn)
+        if keeper is not None and not keeper.replaced:
+            keeper.end()
     finally:
         service.stopping()
-        failed = supervisor.stop(hurried=hurried)
+        if keeper is not None and keeper.replaced:
+            launcher.stop()  # the agent that takes this one's place takes the processes over
+            failed = {}
+        else:
+            failed = supervisor.stop(hurried=hurried)
         place.transport.close()
         # Those that have been killed could not remove theirs.
         remove_orphans()
@@ -169,19 +207,25 @@ def run_controller(
     out: Path,
     stopped: threading.Event,
     *,
+    keepers: Mapping[str, CellKeeper] | None = None,
+    continues: Mapping[str, Continued] | None = None,
     policy: str | None = None,
     name: str | None = None,
     jobs: bool = False,
     environment: Mapping[str, str] | None = None,
     platform: Platform = PLAIN,
     say: Callable[[str], None] = print,
-) -> list[Path]:
+) -> dict[str, Continued]:
     """Control cells until told to stop.
 
     Parameters
     ----------
     out : Path
         Where the runs' folders go, one a cell and run.
+    keepers : mapping of str to CellKeeper, optional
+        Keep the cell files, by the names of the cells.
+    continues : mapping of str to Continued, optional
+        Last runs of a controller that took over edited files, by the names of the cells.
     policy : str, optional
         Instead of the cells' own.
     name : str, optional
@@ -195,8 +239,8 @@ def run_controller(
 
     Returns
     -------
-    list of Path
-        Folders of the runs.
+    dict of str to Continued
+        The runs, by the names of the cells.
 
     Raises
     ------
@@ -221,7 +265,7 @@ def run_controller(
     name = name or f"controller-{os.getpid()}"
     # No message waits for long while a window closes.
     sys.setswitchinterval(0.0005)
-    recorders = []
+    recorders: dict[str, tuple[RunRecorder, ControlledCell]] = {}
     environment = dict(os.environ if environment is None else environment)
     service = Service(f"controller@{problems[0].controller_node}", environment)
     with ExitStack() as stack:
@@ -234,10 +278,17 @@ def run_controller(
             transport = platform.transport(security, f"controller@{node}", node)
             place = security.place(f"controller@{node}", node, transport, Log(say))
             stack.callback(_close, place)
-            controller = _controller(problem, policy, say)
-            recorder = RunRecorder(out, problem, controller, say, jobs=jobs)
+            controller = controller_of(problem, policy, say)
+            before = (continues or {}).get(problem.name, Continued())
+            folder = before.folder and Path(before.folder).name
+            recorder = RunRecorder(out, problem, controller, say, jobs=jobs, continues=folder)
             clock = platform.clock(problem, node)
-            cell = ControlledCell(place, controller, recorder, name, time.time_ns())
+            changed: Callable[[], str] = str
+            if (keeper := (keepers or {}).get(problem.name)) is not None:
+                keeper.begin(stopped)
+                changed = keeper.told
+            cell = ControlledCell(place, controller, recorder, name, time.time_ns(), changed)
+            cell.pinned, cell.drained = before.pinned, {*before.drained}
             hosted.append(
                 Hosted(
                     *(cell, transport, clock),
@@ -250,17 +301,17 @@ def run_controller(
                 from dwell.live.key_renewal import KeyRenewal
 
                 connect = partial(_connected, platform, security, place.who, None)
-                folder = security.keyring.folder
-                each_turn.append(KeyRenewal(folder, hosted[-1], cell.pulse, connect).step)
-            recorders.append((recorder, cell))
+                keys = security.keyring.folder
+                each_turn.append(KeyRenewal(keys, hosted[-1], cell.pulse, connect).step)
+            recorders[problem.name] = recorder, cell
         keep_collections_short()
         service.ready()
         try:
             take_turns(hosted, each_turn)
         finally:
             service.stopping()
-            folders = [_finished(recorder, cell) for recorder, cell in recorders]
-        return [folder for folder in folders if folder is not None]
+            ended = {name: _finished(*recorded) for name, recorded in recorders.items()}
+        return ended
 
 
 def _close(place: RolePlace) -> None:
@@ -277,7 +328,7 @@ def _connected(
     return platform.transport(renewed, who, who.partition("@")[2])
 
 
-def _controller(problem: Problem, policy: str | None, say: Callable[[str], None]) -> Controller:
+def controller_of(problem: Problem, policy: str | None, say: Callable[[str], None]) -> Controller:
     """Make a cell's controller; without the compiled kernel only one that prices nothing."""
     try:
         return Controller(problem, policy)
@@ -302,6 +353,7 @@ class _AsSeen:
         return dict.fromkeys(self._names, observed)
 
 
-def _finished(recorder: RunRecorder, cell: ControlledCell) -> Path | None:
+def _finished(recorder: RunRecorder, cell: ControlledCell) -> Continued:
     cell.write()
-    return recorder.finish(cell.finish())
+    folder = recorder.finish(cell.finish())
+    return Continued(str(folder) if folder else "", cell.pinned, tuple(sorted(cell.drained)))

@@ -4,25 +4,29 @@ from __future__ import annotations
 
 import fnmatch
 import os
+import signal
 import sys
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from dwell.cellfile import load, load_without_traces
+import msgspec
+
 from dwell.errors import ExitCode
 from dwell.live.ending import end_when_told
 from dwell.live.hosting import PLAIN, Platform
+from dwell.live.kept_cell import CellKeeper, KeptCell
 from dwell.live.lint import lint
 from dwell.live.log import say
-from dwell.live.node import run_agent, run_controller
+from dwell.live.node import Continued, controller_of, run_agent, run_controller
 from dwell.live.parent_death import end_with_owner
 from dwell.live.role_command import server, words
 from dwell.live.security import environment
 from dwell.live.stage import load_function
 from dwell.live.state_folder import state_root
 from dwell.live.wiring import roles
+from dwell.model import Problem
 
 T = TypeVar("T")
 
@@ -43,6 +47,7 @@ def agent(
     keys: Path | None = None,
     insecure: bool = False,
     owner: int | None = None,
+    renews: bool = False,
     platform: Platform = PLAIN,
 ) -> None:
     """Run a node of a live cell until told to end (see `run_agent`).
@@ -62,6 +67,8 @@ def agent(
         Keyring; that of the environment if not given.
     owner : int, optional
         Id of the process that this one ends with.
+    renews : bool
+        As in `run_agent`.
     platform : Platform, optional
         Clock and transport; without faults if not given.
 
@@ -72,37 +79,50 @@ def agent(
     DwellError
         If the cell cannot be read, or the agent cannot run.
     """
-    problem = load_without_traces(cell)
+    kept = KeptCell.of(cell, state_root().glob(f"*/{node}") if state is None else [state])
+    problem = kept.problem()
     for caution in lint(problem):
         say(f"warning: {caution}")
-    folder = state or state_root() / problem.name / node
-    sys.path.insert(0, str(cell.resolve().parent))
+    folder = state or kept.folder or state_root() / problem.name / node
+    kept.install()
     read = None if accelerator is None else load_function(accelerator, "--accelerator")
     wanted = _cpus(cpus)
     there = sorted(role.who for role in roles(problem) if role.node == node)
     of = _by_process("--cpus-of", cpus_of, there, lambda text: _cpus(text, "--cpus-of", wanted))
     priorities = _by_process("--realtime", realtime, there, _priority)
-    hurried = threading.Event()
+    hurried, keeper = threading.Event(), CellKeeper(kept, folder, node, say)
+
+    def take_over() -> None:
+        keeper.take_over()
+        if keeper.replaced:
+            stopped.set()
+
+    stopped = _until_told(owner, hurried.set, take_over)
     run_agent(
         problem,
         node,
         folder,
-        server(cell.resolve(), platform.program, owner),
+        server(cell.resolve(), platform.program, owner, folder),
         lambda who: words(cell.resolve(), who, folder, of.get(who), priorities.get(who)),
-        _until_told(owner, hurried.set),
+        stopped,
         hurried=hurried,
+        keeper=keeper,
+        renews=renews,
         cpus=wanted,
         accelerator=read,
         environment=environment(keys, insecure=insecure),
         platform=platform,
         say=say,
     )
+    if keeper.replaced:
+        _replace_process("--renews")
 
 
 def controller(
     cells: Sequence[Path],
     out: Path,
     *,
+    state: Path | None = None,
     policy: str | None = None,
     name: str | None = None,
     jobs: bool = False,
@@ -110,6 +130,7 @@ def controller(
     keys: Path | None = None,
     insecure: bool = False,
     owner: int | None = None,
+    continues: str = "{}",
     platform: Platform = PLAIN,
 ) -> None:
     """Decide where the stages of live cells run until told to end (see `run_controller`).
@@ -118,8 +139,13 @@ def controller(
     ----------
     out : Path
         Where the runs' folders go.
+    state : Path, optional
+        With a folder per cell, where the controller keeps what it began with; `state_root` if not
+        given.
     cpus, keys, owner, platform : optional
         As those of an `agent`.
+    continues : str
+        As in `run_controller`, in JSON.
 
     Raises
     ------
@@ -131,9 +157,33 @@ def controller(
     wanted = _cpus(cpus)
     if wanted is not None:
         os.sched_setaffinity(0, wanted)
-    problems = [load(file) for file in cells]
-    folders = run_controller(
-        *(problems, out, _until_told(owner, lambda: os._exit(ExitCode.FAILED))),
+    root = state_root(state)
+    problems: list[Problem] = []
+    keepers: dict[str, CellKeeper] = {}
+    for file in cells:
+        kept = KeptCell.of(file, root.glob("*/controller@*"))
+        kept.install()
+        problem = kept.problem(traces=True)
+        node = problem.controller_node
+        folder = kept.folder or root / problem.name / f"controller@{node}"
+        problems.append(problem)
+        keepers[problem.name] = CellKeeper(kept, folder, node, say)
+    renewed = threading.Event()
+
+    def take_over() -> None:
+        found = [
+            keeper.take_over(lambda new: controller_of(new.problem(traces=True), policy, say))
+            for keeper in keepers.values()
+        ]
+        if {"decision", "code"} & {*found}:
+            renewed.set()
+            stopped.set()
+
+    stopped = _until_told(owner, lambda: os._exit(ExitCode.FAILED), take_over)
+    ended = run_controller(
+        *(problems, out, stopped),
+        keepers=keepers,
+        continues=msgspec.json.decode(continues, type=dict[str, Continued]),
         policy=policy,
         name=name,
         jobs=jobs,
@@ -141,8 +191,23 @@ def controller(
         platform=platform,
         say=say,
     )
-    for folder in folders:
-        say(f"run: {folder}")
+    for one in ended.values():
+        if one.folder:
+            say(f"run: {one.folder}")
+    if renewed.is_set():
+        _replace_process("--continues", msgspec.json.encode(ended).decode())
+    for keeper in keepers.values():
+        keeper.end()
+
+
+def _replace_process(*more: str) -> None:
+    """Begin again as the same process, which imports its modules again."""
+    # Until it listens to signals, a further one must not end it.
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    words = sys.orig_argv[1:]
+    if more[0] in words:
+        words = words[: words.index(more[0])]
+    os.execv(sys.executable, [sys.executable, *words, *more])  # noqa: S606 - our own command
 
 
 def _by_process(
@@ -185,9 +250,11 @@ def _cpus(
     return cpus
 
 
-def _until_told(owner: int | None, at_once: Callable[[], None]) -> threading.Event:
+def _until_told(
+    owner: int | None, at_once: Callable[[], None], again: Callable[[], object]
+) -> threading.Event:
     """Return an event that is set when this process is told to end, or its owner has ended."""
     stopped = threading.Event()
     end_with_owner(stopped, owner)
-    end_when_told(stopped, at_once)
+    end_when_told(stopped, at_once, again)
     return stopped

@@ -34,6 +34,8 @@ class RunRecorder:
     ----------
     jobs : bool
         Whether to keep the jobs, and what each process took of the CPUs, too.
+    continues : str
+        Name of the folder of the run before, which had other settings; empty for none.
 
     Attributes
     ----------
@@ -53,10 +55,12 @@ class RunRecorder:
         say: Callable[[str], None],
         *,
         jobs: bool = False,
+        continues: str = "",
         most_waiting: int = MOST_WAITING,
     ) -> None:
         self.out, self.problem, self.controller, self.jobs = out, problem, controller, jobs
         self._say, self._most = say, most_waiting
+        self._continues = {"continues": continues} if continues else {}
         self._run: int | None = None
         self._journal: Journal | None = None
         self._rows: deque[tuple[Rows, dict[str, object]]] = deque()
@@ -181,6 +185,7 @@ class RunRecorder:
             "cell": self.problem.name,
             "scenario": "live",
             **self.controller.described(),
+            **self._continues,
             "problem": to_document(self.controller.problem),
             "versions": {
                 "dwell": __version__,

@@ -31,7 +31,7 @@ from dwell.live.transport.transport import Arrival, Transport
 from dwell.live.wiring import roles
 from dwell.model import Problem
 from dwell.model.bounds import require
-from dwell.model.document import fingerprint
+from dwell.model.document import digests
 from dwell.model.instants import NEVER_NS
 from dwell.version import __version__
 
@@ -322,7 +322,7 @@ class Pulse:
         self.detector = FailureDetector(place.who, place.patience_ns)
         self._state, self._holds = state, holds
         self._every_ns = every * place.period_ns
-        self._digest = fingerprint(place.problem)
+        self._digest = digests(place.problem)["wiring"]
         self._nodes = frozenset(place.problem.fabric.nodes)
         self._known = {role.who: role.node for role in roles(place.problem)}
         self._next_ns = self._sent_ns = -NEVER_NS

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     from dwell.live.hosting import Platform
 
 
-def server(cell: Path, program: Sequence[str], owner: int | None = None) -> list[str]:
+def server(
+    cell: Path, program: Sequence[str], owner: int | None = None, state: Path | None = None
+) -> list[str]:
     """Return the command of the process that those of a cell are forked from.
 
     Parameters
@@ -32,9 +34,12 @@ def server(cell: Path, program: Sequence[str], owner: int | None = None) -> list
         Module that runs this one or stands for it, with its first arguments (see `Platform`).
     owner : int, optional
         Id of the process that all of them end with.
+    state : Path, optional
+        Folder of the node's files.
     """
     ends_with = [] if owner is None else ["--owner", str(owner)]
-    return [sys.executable, "-m", *program, "--cell", str(cell), "--serve", *ends_with]
+    kept = [] if state is None else ["--state", str(state)]
+    return [sys.executable, "-m", *program, "--cell", str(cell), "--serve", *kept, *ends_with]
 
 
 def words(
@@ -84,7 +89,7 @@ def main(arguments: Sequence[str] | None = None, platform: Platform | None = Non
     options = parser.parse_args(arguments)
     try:
         if options.serve:
-            return _serve(options.cell, options.owner, platform)
+            return _serve(options.cell, options.state, options.owner, platform)
         return _run(options, platform)
     except DwellError as error:
         print(error, file=sys.stderr)
@@ -97,13 +102,13 @@ def main(arguments: Sequence[str] | None = None, platform: Platform | None = Non
         return 2
 
 
-def _serve(cell: Path, owner: int | None, platform: Platform | None) -> int:
+def _serve(cell: Path, state: Path, owner: int | None, platform: Platform | None) -> int:
     """Import what every process needs, and fork; in a forked process, run it."""
-    from dwell.cellfile import load_without_traces
     from dwell.live import memory, parent_death, role_process, supervision  # noqa: F401
+    from dwell.live.kept_cell import KeptCell
     from dwell.live.launcher import serve
 
-    load_without_traces(cell)
+    KeptCell.of(cell, [state]).problem()
     words = serve()
     if words is None:
         return 0
@@ -117,11 +122,9 @@ def _run(options: argparse.Namespace, platform: Platform | None) -> int:
     _schedule(options.who, options.cpus, options.realtime)
     stopped = threading.Event()
     end_when_told(stopped, lambda: os._exit(ExitCode.FAILED))
-    # The user's stages lie beside their cell file.
-    sys.path.insert(0, str(options.cell.resolve().parent))
 
-    from dwell.cellfile import load_without_traces
     from dwell.live.hosting import PLAIN
+    from dwell.live.kept_cell import KeptCell
     from dwell.live.log import escape_output
     from dwell.live.memory import keep_memory
     from dwell.live.parent_death import end_with_owner
@@ -134,7 +137,10 @@ def _run(options: argparse.Namespace, platform: Platform | None) -> int:
     keep_memory()
     end_with_owner(stopped, options.owner)
     claim(options.state, options.who)
-    problem = load_without_traces(options.cell)
+    # What the node's agent keeps; the files, where the process was started by hand.
+    kept = KeptCell.of(options.cell, [options.state])
+    kept.install()
+    problem = kept.problem()
     try:
         in_order = run_process(problem, options.who, options.state, stopped, platform or PLAIN)
     finally:

@@ -199,8 +199,7 @@ class Supervisor:
         if self._turn is not None:
             child, since_s, starts = self._turn
             if child.starts == starts and child.pid is not None and now_s > since_s + STOP_S:
-                with suppress(ProcessLookupError):
-                    os.kill(child.pid, signal.SIGKILL)
+                _send(child.pid, signal.SIGKILL)
             ready = child.starts > starts and child.file("ready").exists()
             if not ready and now_s < since_s + TURN_S:
                 return
@@ -211,8 +210,8 @@ class Supervisor:
             child.failures = 0
             self._say(f"{child.who}: is restarted")
             if child.pid is not None:
-                with suppress(ProcessLookupError):
-                    os.kill(child.pid, signal.SIGTERM)
+                for number in (signal.SIGTERM, signal.SIGCONT):
+                    _send(child.pid, number)
 
     def _alive(self, child: SupervisedProcess) -> bool:
         if child.process is None:
@@ -429,6 +428,11 @@ class Supervisor:
         while left and time.monotonic() < deadline:
             time.sleep(0.01)
             left = [child for child in left if not self._end_group(child)]
+
+
+def _send(pid: int, number: int) -> None:
+    with suppress(ProcessLookupError):
+        os.kill(pid, number)
 
 
 def _signal(process: psutil.Process, number: int) -> None:

@@ -312,8 +312,7 @@ def session_of(entry: WiringEntry, lane: Lane, key: str) -> Session:
 
 def _shadows(problem: Problem) -> frozenset[tuple[str, str]]:
     """Where shadow jobs may run: tasks on nodes, sinks left out, as a shadow stops before them."""
-    settings = problem.controller
-    if settings.estimator == "profile" and not settings.fallbacks:
+    if not problem.controller.shadow_workers:
         return frozenset()
     pipeline = problem.pipeline
     return frozenset(

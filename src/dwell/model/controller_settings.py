@@ -30,6 +30,7 @@ class ControllerSettings:
         "A policy, `package.module:Class` of your own, or a candidate: the placement that never "
         "moves.",
         default="dtp",
+        digested="decision",
     )
     initial: str | None = key("Candidate to start with.", default=None, usual="the first")
     decide_cycles: int | None = key(
@@ -37,31 +38,38 @@ class ControllerSettings:
         DECIDE_CYCLES,
         default=None,
         usual="W/4, rounded down, and at least 1",
+        digested="decision",
     )
     min_dwell: int | None = key(
         "Windows that a placement stays at least (N_min).",
         MIN_DWELL,
         default=None,
         usual="0 with an estimator that states its errors, else 3",
+        digested="decision",
     )
     min_dwell_cycles: int = key(
         "Cycles that a placement stays at least, where N_min windows are fewer.",
         MIN_DWELL_CYCLES,
         default=0,
+        digested="decision",
     )
     min_improvement: float = key(
         "Improvement of J that a migration must promise (Delta_min).",
         MIN_IMPROVEMENT,
         default=0.05,
+        digested="decision",
     )
     escape: bool = key(
-        "Whether an incumbent over a cap may leave before the hysteresis is met.", default=False
+        "Whether an incumbent over a cap may leave before the hysteresis is met.",
+        default=False,
+        digested="decision",
     )
     estimator: str | None = key(
         "How the QoS of candidates is estimated; also `package.module:Class` of your own.",
         default=None,
         usual="`corrected`; `profile` for a placement that never moves, `latency-first` and "
         "`atp-thresholds`",
+        digested="decision",
     )
     shadow_fraction: float | Literal["auto"] = key(
         "Share of cycles that are also sent through each alternative, where the estimator uses "
@@ -69,9 +77,13 @@ class ControllerSettings:
         "cycles next to nothing.",
         replace(SHADOW_FRACTION, word=AUTO),
         default=AUTO,
+        digested="decision",
     )
     half_life_windows: float = key(
-        "Windows after which a measurement counts half.", HALF_LIFE_WINDOWS, default=2.0
+        "Windows after which a measurement counts half.",
+        HALF_LIFE_WINDOWS,
+        default=2.0,
+        digested="decision",
     )
     migration: Literal["warm", "cold"] = key(
         "`warm`: a moved task is ready at once; `cold`: after its `start_ms` and the transfer of "
@@ -104,6 +116,11 @@ class ControllerSettings:
         TIME_MS,
         default=0.0,
     )
+
+    @property
+    def shadow_workers(self) -> bool:
+        """Whether nodes keep workers for shadow jobs: to measure with, or to prove ways back."""
+        return self.estimator != "profile" or bool(self.fallbacks)
 
     @property
     def failures_in_a_row(self) -> int:

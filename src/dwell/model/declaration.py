@@ -14,6 +14,7 @@ from typing import (
     Any,
     Literal,
     NamedTuple,
+    TypeAlias,
     TypeVar,
     Union,
     dataclass_transform,
@@ -30,6 +31,9 @@ T = TypeVar("T")
 
 #: Where a field keeps its `Declaration`.
 KEY = "dwell"
+#: Who reads a key in a live cell: all processes alike (`wiring`), the controller alone
+#: (`decision`), or each node for itself: the code that it runs, and how it is reached.
+Digested: TypeAlias = Literal["wiring", "decision", "code", "hosts"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +52,8 @@ class Declaration:
         What holds where it is not given, in words, where that follows from others.
     is_rare : bool
         Whether a document leaves it out where it is as usual.
+    digested : str
+        Digest that it is part of, and all below it (`dwell.model.document.digests`).
     """
 
     says: str
@@ -55,6 +61,7 @@ class Declaration:
     named: str | None = None
     usual: str | None = None
     is_rare: bool = False
+    digested: Digested = "wiring"
 
 
 def key(
@@ -66,9 +73,10 @@ def key(
     named: str | None = None,
     usual: str | None = None,
     is_rare: bool = False,
+    digested: Digested = "wiring",
 ) -> Any:
     """Declare a field of a class that is `declared` (see `Declaration`)."""
-    about = {KEY: Declaration(says, bound, named, usual, is_rare)}
+    about = {KEY: Declaration(says, bound, named, usual, is_rare, digested)}
     if default_factory is not MISSING:
         return dataclasses.field(default_factory=default_factory, metadata=about)
     return dataclasses.field(default=default, metadata=about)

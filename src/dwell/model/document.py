@@ -8,10 +8,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import is_dataclass
 from functools import lru_cache
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, get_args
 
 from dwell.errors import Fault, ProblemError
-from dwell.model.declaration import declared_fields
+from dwell.model.controller_settings import ControllerSettings
+from dwell.model.declaration import Digested, declared_fields
 from dwell.model.fabric import Link, Node
 from dwell.model.live import LiveSettings
 from dwell.model.objective import Objective
@@ -227,22 +228,29 @@ def _objective(problem: Problem) -> Document:
     return document
 
 
-def fingerprint(problem: Problem) -> str:
-    """Return a short digest of what all nodes of a live cell have to agree on.
+def digests(problem: Problem) -> dict[Digested, str]:
+    """Return short digests of a live cell, by who reads what they are made of.
 
-    Left out is what each node may say for itself: the code it runs, how it reaches others, and the
-    data of traces, which a node need not have. The order of nodes and tasks is not left out: ports
-    are given out by it.
+    Processes hear each other if their `wiring` is equal. Data of traces are in none, since a node
+    need not have them. The order of nodes and tasks counts: ports are given out by it.
     """
     document = to_document(problem)
-    live = {**document.get("live", {})}
-    for key in ("hosts", "actuators", "mode", "observer"):
-        live.pop(key, None)
-    document["live"] = live
-    for task in document["tasks"].values():
-        task.pop("run", None)
-    text = json.dumps(_without_data(document))
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    document["live"] = document.get("live", {})
+    sections: list[tuple[str, type, Document]] = [
+        ("objective", Objective, document["objective"]),
+        ("controller", ControllerSettings, document["controller"]),
+        ("live", LiveSettings, document["live"]),
+        *((f"tasks.{name}", Task, task) for name, task in document["tasks"].items()),
+    ]
+    parts: dict[Digested, Document] = {part: {} for part in get_args(Digested)}
+    for path, kind, values in sections:
+        for field in declared_fields(kind):
+            if field.key.digested != "wiring" and field.named in values:
+                parts[field.key.digested][f"{path}.{field.named}"] = values.pop(field.named)
+    # Which processes there are follows from the estimator, too.
+    parts["wiring"] = {**document, "shadow workers": problem.controller.shadow_workers}
+    texts = {part: json.dumps(_without_data(values)) for part, values in parts.items()}
+    return {part: hashlib.sha256(text.encode()).hexdigest()[:16] for part, text in texts.items()}
 
 
 def _without_data(part: Any) -> Any:

@@ -51,7 +51,10 @@ class LiveSettings:
     """What the live runtime needs to know beside the problem."""
 
     hosts: Mapping[str, Host] = key(
-        "Where each node is reached.", default_factory=FrozenDict, usual="all are this machine"
+        "Where each node is reached.",
+        default_factory=FrozenDict,
+        usual="all are this machine",
+        digested="hosts",
     )
     release: Literal["timer", "frames"] = key(
         "Whether a cycle begins by the clock (`timer`), or when the first source has a picture "
@@ -64,7 +67,9 @@ class LiveSettings:
         default="estimated",
     )
     mode: Literal["control", "advise"] = key(
-        "Whether decisions are carried out (`control`) or recorded (`advise`).", default="control"
+        "Whether decisions are carried out (`control`) or recorded (`advise`).",
+        default="control",
+        digested="decision",
     )
     relay: str | None = key(
         "Node that carries small messages where a direct link fails.",
@@ -94,10 +99,12 @@ class LiveSettings:
     actuators: Mapping[str, str] = key(
         "What applies the commands of a sink task, as `package.module:Name`.",
         default_factory=FrozenDict,
+        digested="code",
     )
     observer: str | None = key(
         "What looks on where `dwell live run` runs the cell, as `package.module:Name`.",
         default=None,
+        digested="decision",
     )
 
     def __post_init__(self) -> None:

@@ -72,13 +72,14 @@ class Caps:
 class Objective:
     """What makes one placement better than another: all that J needs besides the metrics."""
 
-    weights: Weights = key("Weights of the terms of J.")
-    targets: Targets = key("Design targets.")
-    caps: Caps = key("Hard caps.", default_factory=Caps)
+    weights: Weights = key("Weights of the terms of J.", digested="decision")
+    targets: Targets = key("Design targets.", digested="decision")
+    caps: Caps = key("Hard caps.", default_factory=Caps, digested="decision")
     tiers: Mapping[str, Tier] = key(
         "Nodes whose utilisation counts, and as which tier.",
         default_factory=FrozenDict,
         usual="all, as their own tier",
+        digested="decision",
     )
     accelerators: Mapping[str, Tier] = key(
         "Tier of every kind of accelerators that counts in J beside the nodes, by the name of the "

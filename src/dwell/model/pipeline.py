@@ -93,7 +93,9 @@ class Task:
         default=0,
     )
     run: str | None = key(
-        "Class or function of a live worker, as `package.module:Name`.", default=None
+        "Class or function of a live worker, as `package.module:Name`.",
+        default=None,
+        digested="code",
     )
     warmup_jobs: int = key(
         "First jobs of a live worker that do not count in times of stages and in estimators.",

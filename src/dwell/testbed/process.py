@@ -111,6 +111,7 @@ def _agent_parser() -> argparse.ArgumentParser:
     parser.add_argument("--cpus-of", action="append", default=[])
     parser.add_argument("--realtime", action="append", default=[])
     parser.add_argument("--accelerator")
+    parser.add_argument("--renews", action="store_true")
     return parser
 
 
@@ -118,7 +119,9 @@ def _controller_parser() -> argparse.ArgumentParser:
     parser = _parser("controller")
     parser.add_argument("--cell", dest="cells", action="append", type=Path, required=True)
     parser.add_argument("--out", type=Path, default=Path("runs"))
+    parser.add_argument("--state", type=Path)
     parser.add_argument("--policy")
+    parser.add_argument("--continues", default="{}")
     parser.add_argument("--name")
     parser.add_argument("--jobs", action=argparse.BooleanOptionalAction, default=_set("DWELL_JOBS"))
     return parser

@@ -152,7 +152,7 @@ class Processes:
             Further arguments.
         """
         runs = self.folder / "runs" if out is None else out
-        words = ["--out", str(runs), *self._more, *more]
+        words = ["--out", str(runs), "--state", str(self.folder), *self._more, *more]
         self._start("controller", self.problem.controller_node, words)
 
     def _start(self, kind: str, node: str, words: Sequence[str]) -> None:

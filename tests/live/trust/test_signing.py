@@ -35,7 +35,7 @@ from dwell.live.trust.authority import Authority
 from dwell.live.trust.keyring import Keyring
 from dwell.live.trust.signing import Seals
 from dwell.model import Problem
-from dwell.model.document import fingerprint
+from dwell.model.document import digests
 from tests.live.memory_transport import MemoryTransport
 from tests.live.small_world import Counting, World, canonical, on, stateful
 
@@ -88,7 +88,7 @@ def test_one_signed_claim_of_a_run_is_believed(
     world.start("stamper@R1")
     stamper, who = world.stamper, "sink.control@R2"
     now_ns = world.network.now_ns
-    digest = fingerprint(world.problem)
+    digest = digests(world.problem)["wiring"]
     beat = Beat(who, "R2", 10**9, now_ns, True, cell=digest, run=stamper.run + 5)
     key = world.keys.detour(world.keys.beat("R2", who))
     data = seals[signs].seal(world.keys.word(key), encode(beat))
