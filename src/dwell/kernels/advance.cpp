@@ -55,8 +55,9 @@ DWELL_EXPORT void dwell_logged_window(const Tables* tables, i64 cell_0, i64 n_ce
         work_ns[task] = s.log[at].work_ns;
         start_ns[task] = s.log[at].start_ns;
         if (beside == nullptr) continue;
-        *beside++ = s.log[at].used_ns;
-        *beside++ = s.log[at].above_ns;
+        beside[0] = s.log[at].used_ns;
+        beside[1] = s.log[at].above_ns;
+        beside += 2;
       }
       for (i64 i = 0; i < n_flows; ++i) arrived_ns[i] = s.log_arrived[row * s.n_flows + flows[i]];
       out = start_ns + n_tasks;
