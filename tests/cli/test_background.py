@@ -174,7 +174,7 @@ def test_an_edited_cell_is_taken_over_after_an_orderly_end_alone(cell: Cell) -> 
     assert cell.up()[0] == 0
     cell.cell.until(lambda status: status["window"] and not status["silent"])
     text = cell.file.read_text()
-    cell.file.write_text(text.replace("guard_cycles: 20", "guard_cycles: 21"))
+    cell.file.write_text(text.replace("guard_cycles: 40", "guard_cycles: 41"))
     cell.cell.module.write_text("broken(")
     words = "cell.yaml, moody.py on E have changed since "
     cell.cell.until(lambda status: words in cell.cell.note("agent@E")(status))
@@ -202,13 +202,13 @@ def test_an_edited_cell_is_taken_over_after_an_orderly_end_alone(cell: Cell) -> 
     assert code == 0, error
     assert "cell.yaml, moody.py on R1, E, R2 have changed since " in error
     cell.cell.until(lambda status: status["window"] and not status["silent"])
-    assert "guard_cycles: 20" in (cell.folder / "R1" / "cell" / "cell.yaml").read_text()
+    assert "guard_cycles: 40" in (cell.folder / "R1" / "cell" / "cell.yaml").read_text()
 
     assert cell.down()[0] == 0
     cell.cell.module.write_text(MOODY)
     code, _, error = cell.up()
     assert (code, error) == (0, "")
-    assert "guard_cycles: 21" in (cell.folder / "R1" / "cell" / "cell.yaml").read_text()
+    assert "guard_cycles: 41" in (cell.folder / "R1" / "cell" / "cell.yaml").read_text()
 
 
 def test_other_decisions_are_taken_over_while_every_process_runs_on(cell: Cell) -> None:
@@ -268,7 +268,7 @@ def test_other_wiring_ends_all_and_starts_it_where_that_is_allowed(cell: Cell) -
     cell.file.write_text(text.replace("policy: LOC", "policy: NO"))
     code, error = cell.refused("--again")
     assert (code, "unknown policy 'NO'" in error) == (2, True)
-    cell.file.write_text(text.replace("guard_cycles: 20", "guard_cycles: 21"))
+    cell.file.write_text(text.replace("guard_cycles: 40", "guard_cycles: 41"))
     code, error = cell.refused("--again")
     assert code == 1
     assert re.search(r"takes about \d+ s without commands; with --yes it is done", error)

@@ -201,7 +201,7 @@ def test_a_click_opens_a_cell_at_the_same_place_and_leads_back(shown: Page, runs
 @in_browser
 def test_a_fleet_plays_steps_and_zooms(shown: Page) -> None:
     shown.get_by_role("combobox").select_option("5")
-    shown.get_by_role("button", name="Play").click()
+    shown.get_by_role("button", name="Play", exact=True).click()
     wait_for(shown, "window.page.at > 1")
     shown.get_by_role("button", name="Pause").click()
     at = shown.evaluate("window.page.at")

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Page
+from playwright.sync_api import Browser, Page, expect
 
 import dwell
 from tests.dash.browser import chromium, in_browser, opened, settled, wait_for
@@ -163,7 +163,7 @@ def test_a_screen_reader_has_a_name_for_everything(shown: Page) -> None:
     assert nameless == []
     assert shown.locator("h1").count() == 1
     assert shown.locator("[role=status]").count() >= 2
-    assert "plan on" in (shown.locator(".topology title").first.text_content() or "")
+    expect(shown.locator(".topology title").first).to_contain_text("plan on")
 
 
 def test_nothing_slides_where_motion_is_not_wanted(browser: Browser, page: Served) -> None:

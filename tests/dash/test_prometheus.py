@@ -194,7 +194,7 @@ def test_rules_and_dashboard_ask_for_series_that_there_are() -> None:
     cell = StandIn()
     cell.well()
     cell.cycle(0, 20)
-    known = {"dwell_certificate_expiry_timestamp_seconds"}
+    known = {"dwell_certificate_days", "dwell_certificate_expiry_timestamp_seconds"}
     for family in CellMetrics(cell.observer).collect():
         known |= {sample.name for sample in family.samples}
     asked = {name for query in queries().values() for name in re.findall(r"dwell_\w+", query)}
@@ -205,6 +205,7 @@ def test_rules_and_dashboard_ask_for_series_that_there_are() -> None:
         *("dwell_unread_cycles_total", "dwell_task_placement_info"),
         *("dwell_silences_total", "dwell_release_ratio", "dwell_stage_seconds"),
         *("dwell_stage_inputs_total", "dwell_flow_bytes_total"),
+        "dwell_certificate_days",
     }
 
 

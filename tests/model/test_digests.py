@@ -78,6 +78,7 @@ tasks:
     scale: load
     start_ms: 10
     state_bytes: 100
+    warmup_jobs: 3
   look: {"on": {R: {exec_ms: 2, accelerator: gpu}}}
   act: {"on": {R: {exec_ms: 1}}}
 flows:
