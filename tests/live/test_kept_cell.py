@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from dwell.live import kept_cell
+from dwell.live import state_files
 from dwell.live.kept_cell import CellKeeper, KeptCell, cell_here, change, forget
 from dwell.version import __version__
 from tests.waiting import wait_until
@@ -60,7 +60,7 @@ def test_a_start_after_an_orderly_end_reads_the_file_unless_the_computer_was_sta
     assert KeptCell.of(cell, [folder]).folder is None
     boot = tmp_path / "boot_id"
     boot.write_text("another")
-    monkeypatch.setattr(kept_cell, "BOOT_ID", boot)
+    monkeypatch.setattr(state_files, "BOOT_ID", boot)
     assert KeptCell.of(cell, [folder]).folder == folder
 
 

@@ -348,14 +348,15 @@ def again(
     wiring = wire(problem)
     require_stages(problem, file, [node for node in nodes if node in problem.fabric.nodes])
     if found == "wiring":
+        old = kept.problem()
         pause = (
             f"{file}: its wiring is another: all processes end and start together, which takes "
-            f"about {_pause_s(kept.problem(), root, running):.0f} s without commands"
+            f"about {_pause_s(old, root, running):.0f} s without commands"
         )
         if not yes:
             raise LiveError(f"{pause}; with --yes it is done")
         say(pause)
-        down(kept.problem(), root / kept.problem().name)
+        down(old, root / old.name)
         forget(file, root)
         _say_left(file, problem, found, running, say)
         return nodes

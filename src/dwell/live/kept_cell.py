@@ -27,7 +27,7 @@ from dwell.cellfile import load, load_without_traces
 from dwell.errors import DwellError, LiveError
 from dwell.files import write_whole
 from dwell.live.failures import start_thread
-from dwell.live.state_files import make_folder
+from dwell.live.state_files import boot_id, make_folder
 from dwell.model import FrozenDict, Problem
 from dwell.model.document import digests
 from dwell.version import __version__
@@ -36,7 +36,6 @@ from dwell.version import __version__
 Change: TypeAlias = Literal["text", "decision", "code", "wiring"]
 #: In a state folder: where the bytes are, and the file that says what they are.
 FOLDER, INDEX = "cell", "cell.json"
-BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 #: Time between two comparisons with the files.
 COMPARE_S = 2.0
 #: Modules that a cell file names, as ``package.module:Name``.
@@ -99,7 +98,7 @@ class KeptCell:
         for folder in folders:
             with suppress(OSError, msgspec.MsgspecError):
                 index = msgspec.json.decode((folder / INDEX).read_bytes(), type=_Index)
-                if index.file == str(file) and index.ended != _boot_id():
+                if index.file == str(file) and index.ended != _this_boot():
                     kept = folder / FOLDER
                     paths = [path for path in sorted(kept.rglob("*")) if path.is_file()]
                     contents = {str(path.relative_to(kept)): path.read_bytes() for path in paths}
@@ -130,7 +129,7 @@ class KeptCell:
         A computer that is shut down ends its nodes in order, too.
         """
         with suppress(OSError):
-            self._write_index(folder, ended=_boot_id())
+            self._write_index(folder, ended=_this_boot())
 
     def _write_index(self, folder: Path, *, ended: str = "") -> None:
         index = _Index(str(self.file), self.since_s, self.version, ended)
@@ -188,10 +187,12 @@ def change(old: KeptCell, new: KeptCell) -> Change:
     DwellError
         If one of the cell files is at fault.
     """
-    before, after = digests(old.problem()), digests(new.problem())
+    problems = old.problem(), new.problem()
+    before, after = map(digests, problems)
     differ = {part for part in before if before[part] != after[part]}
     series = {kept.version.rpartition(".")[0] for kept in (old, new)}
-    if old.problem().name != new.problem().name or differ & {"wiring", "hosts"} or len(series) > 1:
+    is_renamed = problems[0].name != problems[1].name
+    if is_renamed or differ & {"wiring", "hosts"} or len(series) > 1:
         return "wiring"
     modules = [{**kept.contents, kept.file.name: b""} for kept in (old, new)]
     if modules[0] != modules[1] or "code" in differ or old.version != new.version:
@@ -375,8 +376,6 @@ def _contents(file: Path) -> dict[str, bytes]:
     return contents
 
 
-def _boot_id() -> str:
-    try:
-        return BOOT_ID.read_text().strip()
-    except OSError:
-        return "unknown"
+def _this_boot() -> str:
+    """Return the id of the kernel's boot; never empty, which stands for a node that runs."""
+    return boot_id() or "unknown"

@@ -22,7 +22,7 @@ _LENGTH = struct.Struct("<QI")
 # Number of writes, length of the content, and a checksum of both.
 _SLOT = struct.Struct("<QII")
 _BOOK_BYTES = 2_048
-_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 #: Bits of a folder's mode by which its group, or everybody, may change what is in it.
 OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
@@ -30,7 +30,7 @@ OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 def boot_id() -> str:
     """Return the id of the kernel's present boot; nothing if the system has none."""
     try:
-        return _BOOT_ID.read_text(encoding="ascii").strip()
+        return BOOT_ID.read_text(encoding="ascii").strip()
     except OSError:
         return ""
 
