@@ -15,23 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dwell.model import (
-    Constant,
-    Execution,
-    Fabric,
-    Flow,
-    Link,
-    Node,
-    Objective,
-    Pipeline,
-    Placement,
-    Problem,
-    Targets,
-    Task,
-    Weights,
-)
-from dwell.model.fleet import Fleet, FleetEntry
 from dwell.study.capacity import DRAWS, capacity_of
+from tests.cells.fleets import BESIDE_MS, fleet_of, one_job
 
 STUDIES, TRUTHS, MOST = 200, 20_000, 40
 PERIOD_MS, WORK_MS, LIMIT = 10.0, 1.0, 0.05
@@ -60,29 +45,6 @@ CELLS = (
     Known("one core, D 6", 6.0, 1),
     Known("two cores, D 3", 3.0, 2),
 )
-
-
-def cell_of(known: Known) -> Problem:
-    """Return a cell with nothing but a job on the shared node."""
-    tasks = {
-        "sense": Task("sense", {"R": Execution(Constant(0.0))}),
-        "work": Task("work", {"R": Execution(Constant(9.0)), "S": Execution(Constant(WORK_MS))}),
-    }
-    placed = {"sense": "R"}
-    return Problem(
-        name="known",
-        pipeline=Pipeline(tasks, (Flow("sense", "work"),), PERIOD_MS, known.deadline_ms),
-        fabric=Fabric(
-            {"R": Node("R", "robot", 1), "S": Node("S", "edge", known.cores, "fifo")},
-            {"R->S": Link("R", "S", Constant(0.0))},
-        ),
-        candidates={
-            "OFF": Placement({**placed, "work": "S"}),
-            "LOC": Placement({**placed, "work": "R"}),
-        },
-        objective=Objective(Weights(), Targets(known.deadline_ms)),
-        window_cycles=20,
-    )
 
 
 def true_capacity(known: Known) -> int:
@@ -118,7 +80,14 @@ def worst_rate(known: Known, size: int, rng: np.random.Generator) -> float:
 
 def studies(known: Known, count: int) -> Iterator[tuple[int, int, int]]:
     """Yield robots and interval of disjoint studies."""
-    fleet = Fleet("known", (FleetEntry(cell_of(known), 1),), ("S",), "random", "none")
+    cell = one_job(
+        WORK_MS,
+        name="known",
+        period_ms=PERIOD_MS,
+        deadline_ms=known.deadline_ms + 2 * BESIDE_MS,
+        cores=known.cores,
+    )
+    fleet = fleet_of((cell, 1), phases="random")
     for i in range(count):
         seeds = range(1 + i * len(DRAWS), 1 + (i + 1) * len(DRAWS))
         found = capacity_of(fleet, policy="OFF", most=20, seeds=seeds, processes=1)
