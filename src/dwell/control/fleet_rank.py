@@ -43,6 +43,10 @@ class FleetRank:
         steps = (math.ceil((cost - GAIN_TOLERANCE) / self._step) for cost in own)
         return tuple(sorted(map(float, steps), reverse=True))
 
+    def phi(self, costs: Sequence[float], absent: Collection[int] = ()) -> float:
+        """Return Φ of costs as those of `first`."""
+        return sum(cost for i, cost in enumerate(costs) if i not in absent)
+
     def of(self, costs: Sequence[float], owed: float = 0.0) -> Rank:
         """Return the rank of costs, of which the smaller one is better."""
         return (*self.first(costs), sum(costs) + owed)
@@ -58,8 +62,4 @@ class FleetRank:
         one, other = self.first(before, absent), self.first(after, absent)
         if one != other:
             return other < one
-        was, becomes = (
-            sum(cost for i, cost in enumerate(costs) if i not in absent)
-            for costs in (before, after)
-        )
-        return exceeds(was - becomes, owed)
+        return exceeds(self.phi(before, absent) - self.phi(after, absent), owed)

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from dwell.control.coordination import Coordination, Verdict, Wish
 from dwell.control.fleet_rank import FleetRank
-from dwell.control.table_loads import Loads
+from dwell.control.table_loads import Loads, moved
 from dwell.control.watchdog import (
     NOT_AS_PLAYED,
     WAS_NOT_AS_PLAYED,
@@ -269,11 +269,8 @@ class FleetLedger:
         if self.objective != "worst":
             return False
         before = self.loads.costs(self.placements, self.alone)
-        after = self.loads.costs(self._with(index, name), self.alone)
+        after = self.loads.costs(moved(self.placements, index, name), self.alone)
         return self.rank.first(after, self.absent) < self.rank.first(before, self.absent)
-
-    def _with(self, index: int, name: str) -> list[str]:
-        return [*self.placements[:index], name, *self.placements[index + 1 :]]
 
     def owed(self, index: int, name: str) -> float:
         """What Φ has to fall by at least for a cell to move: Δ_min + α_S·S."""
@@ -285,13 +282,13 @@ class FleetLedger:
     def _played(self, index: int, name: str) -> tuple[FleetPrice, FleetPrice]:
         self._begin()
         before = self.prices.price(tuple(self.placements))
-        return before, self.prices.price(tuple(self._with(index, name)))
+        return before, self.prices.price(moved(self.placements, index, name))
 
     def _objection(
         self, index: int, name: str, before: FleetPrice, after: FleetPrice
     ) -> str | None:
         """Why a cell must not move, by what has been played."""
-        costs = [*before.costs, before.shared], [*after.costs, after.shared]
+        costs = before.parts, after.parts
         if not self.rank.is_better(*costs, self.owed(index, name), self.absent):
             rises = self._phi(after) - self._phi(before)
             if rises > 0:
@@ -308,8 +305,7 @@ class FleetLedger:
 
     def _phi(self, played: FleetPrice) -> float:
         """Φ of the cells that are in it."""
-        costs = [*played.costs, played.shared]
-        return sum(cost for i, cost in enumerate(costs) if i not in self.absent)
+        return self.rank.phi(played.parts, self.absent)
 
 
 class Seat(Coordination):

@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
-from dwell.control.table_loads import AtLoad, Loads
+from dwell.control.table_loads import AtLoad, Loads, moved
 from dwell.estimators.fleet_prices import PricedCell
 
 #: Value of placements; the smaller one is better.
@@ -90,9 +90,9 @@ class Neighbours:
             if loads.resource(i, name) is not None
         )
 
-        def may_pay(*moved: _Move) -> bool:
-            leaves = any(loads.resource(one.cell, placements[one.cell]) for one in moved)
-            return sum(one.own for one in moved) < (relief if leaves else 0.0)
+        def may_pay(*some: _Move) -> bool:
+            leaves = any(loads.resource(one.cell, placements[one.cell]) for one in some)
+            return sum(one.own for one in some) < (relief if leaves else 0.0)
 
         for move in sorted(moves, key=lambda move: move.rise):
             if may_pay(move):
@@ -120,7 +120,7 @@ class Neighbours:
     ) -> _Move:
         loads, here = self._loads, placements[i]
         rise = costs[i][name] - costs[i][here] + loads.rise(at, i, here, name) - rest
-        after = loads.at(_one(placements, i, name))
+        after = loads.at(moved(placements, i, name))
         resource = loads.resource(i, name)
         if resource is not None:
             near = [
@@ -162,15 +162,10 @@ def descend(
             return best
 
 
-def _one(placements: Sequence[str], i: int, name: str) -> list[str]:
-    return [*placements[:i], name, *placements[i + 1 :]]
-
-
 def _with(placements: Sequence[str], *moves: _Move) -> tuple[str, ...]:
-    found = list(placements)
     for move in moves:
-        found[move.cell] = move.name
-    return tuple(found)
+        placements = moved(placements, move.cell, move.name)
+    return tuple(placements)
 
 
 def _nearness(one: PricedCell, other: PricedCell) -> float:

@@ -135,6 +135,11 @@ class Loads:
         return [*costs, sum(self._of_one[one] * load for one, load in loads.items())]
 
 
+def moved(placements: Sequence[str], index: int, name: str) -> tuple[str, ...]:
+    """Return placements with another candidate of one cell."""
+    return (*placements[:index], name, *placements[index + 1 :])
+
+
 def _between(x: float, xs: Sequence[float], ys: Sequence[float]) -> float:
     """Interpolate; beyond an end it is as there."""
     i = bisect.bisect_right(xs, x)

@@ -105,9 +105,14 @@ class FleetPrice:
         return [cell.cost for cell in self.cells if cell is not None]
 
     @property
+    def parts(self) -> list[float]:
+        """J of every cell; then, the cost of shared nodes."""
+        return [*self.costs, self.shared]
+
+    @property
     def phi(self) -> float:
         """Φ."""
-        return sum(self.costs) + self.shared
+        return sum(self.parts)
 
     def qos(self, index: int) -> QoS | None:
         """What a cell came to, with the utilisation of shared nodes."""

@@ -159,7 +159,7 @@ def _as_played(
             if len(played) >= most:
                 return None
             played[placements] = prices.price(placements)
-        return rank.of([*played[placements].costs, played[placements].shared])
+        return rank.of(played[placements].parts)
 
     near = Neighbours(prices.cells, loads)
 
