@@ -245,8 +245,8 @@ def run_controller(
     Raises
     ------
     LiveError
-        If two cells have one name, or ports cannot be had, or the runs' folder can be made by
-        nobody, or a cell leaves this computer without keys.
+        If two cells have one name, ports are taken, the runs' folder cannot be made, or a cell
+        leaves this computer without keys.
     TrustError
         If the keys are not the controller's.
     KernelError
