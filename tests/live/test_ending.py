@@ -18,7 +18,8 @@ stopped = threading.Event()
 again = (lambda: print("again", flush=True)) if "again" in sys.argv else None
 end_when_told(stopped, lambda: os._exit(9), again)
 print("waits", flush=True)
-stopped.wait()
+while not stopped.wait(0.1):  # Python handles a signal that comes just before a wait after it.
+    pass
 print("ends", flush=True)
 sys.stdin.readline()
 print("has ended", flush=True)
@@ -94,7 +95,8 @@ import concurrent.futures, multiprocessing, os, signal, threading, time
 from dwell.live.ending import end_when_told
 
 def nap():
-    time.sleep(100)
+    for _ in range(1000):  # Python handles a signal that comes just before a sleep after it.
+        time.sleep(0.1)
 
 def fail():
     raise ValueError
