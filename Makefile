@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 UV := $(BIN)/uv
 # The folders that hold Python.
-CODE := $(shell find src tests examples benchmarks docs reproduction -name '*.py' 2>/dev/null | cut -d/ -f1 | sort -u)
+CODE := conftest.py $(shell find src lab tests examples benchmarks docs reproduction -name '*.py' 2>/dev/null | cut -d/ -f1 | sort -u)
 
 # Where Python keeps what it has compiled, a process begins in half the time.
 unexport PYTHONDONTWRITEBYTECODE
@@ -19,7 +19,7 @@ COMPILE := $(UV) pip compile --quiet --python $(BIN)/python --universal --python
 	--generate-hashes --custom-compile-command "make lock" $(if $(UPGRADE),--upgrade)
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test test-all check types tidy bench paper deadlines planted faults seeds chaos soak fuzz audit sbom lock clean again
+.PHONY: help env demo test test-sim test-live test-lab test-all check types tidy bench paper deadlines planted faults seeds chaos soak fuzz audit sbom lock clean again
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' Makefile
@@ -48,8 +48,8 @@ $(VENV)/.pinned: $(VENV)/.uv requirements/dev.txt requirements/zig.txt
 
 # Compiles the kernel; where that is not possible, says so, and tries again the next time. A short
 # run has Python compile the modules that runs need.
-$(VENV)/.installed: $(VENV)/.pinned pyproject.toml hatch_build.py $(SOURCES) $(if $(wildcard $(KERNEL)),,again)
-	$(UV) pip install --quiet --python $(BIN)/python --no-build-isolation --no-deps --editable .
+$(VENV)/.installed: $(VENV)/.pinned pyproject.toml lab/pyproject.toml hatch_build.py $(SOURCES) $(if $(wildcard $(KERNEL)),,again)
+	$(UV) pip install --quiet --python $(BIN)/python --no-build-isolation --no-deps --editable . --editable lab
 	$(UV) pip check --quiet --python $(BIN)/python
 	@test -f $(KERNEL) || $(BIN)/python hatch_build.py || true
 	@$(BIN)/python -m dwell run examples/canonical.yaml --windows 20 \
@@ -63,12 +63,24 @@ demo: env ## Simulate and report an example into demo-out/ (REAL=path: on a real
 # pytest ends with 5 where ARGS leave nothing to run.
 TESTS := $(BIN)/python -m pytest
 BESIDE := -n auto --no-loadscope-reorder
+# Folders of tests, by flat.
+SIMULATOR := cellfile control estimators kernels model policies record reference regression report sim study
+LIVE := calibration dash live
 
 test: env ## Run the tests (ARGS="-k name" passes options to pytest, "--hypothesis-profile night" tries more)
 	$(TESTS) $(BESIDE) -m "not exhaustive and not alone" $(ARGS) || [ $$? -eq 5 ]
 	$(TESTS) -m "not exhaustive and alone" $(ARGS) || [ $$? -eq 5 ]
 
-test-all: env ## Run the tests that `make test` leaves out (tests/conftest.py)
+test-sim: env ## Run the tests of the simulator, without those of commands
+	$(TESTS) $(BESIDE) -m "not exhaustive and not alone" $(addprefix tests/,$(SIMULATOR)) $(ARGS)
+
+test-live: env ## Run the tests of the live runtime, its page and `dwell profile`
+	$(TESTS) $(BESIDE) -m "not exhaustive and not alone" $(addprefix tests/,$(LIVE)) $(ARGS)
+
+test-lab: env ## Run the tests of the laboratory
+	$(TESTS) $(BESIDE) -m "not exhaustive and not alone" lab/tests $(ARGS)
+
+test-all: env ## Run the tests that `make test` leaves out (conftest.py)
 	$(TESTS) $(BESIDE) -m "exhaustive and not alone" $(ARGS) || [ $$? -eq 5 ]
 	$(TESTS) -m "exhaustive and alone" $(ARGS) || [ $$? -eq 5 ]
 
@@ -136,7 +148,8 @@ sbom: $(VENV)/tools/release ## Write what is pinned to dist/sbom.json (CycloneDX
 lock: $(VENV)/.uv ## Pin the dependencies of pyproject.toml again (UPGRADE=1: to the newest)
 	$(COMPILE) --group uv --output-file requirements/uv.txt
 	$(COMPILE) pyproject.toml --extra report --extra sim --output-file requirements/runtime.txt
-	$(COMPILE) pyproject.toml --all-extras --group dev --constraint requirements/runtime.txt \
+	$(COMPILE) pyproject.toml lab/pyproject.toml --all-extras --group pyproject.toml:dev \
+		--no-emit-package dwell-placement --constraint requirements/runtime.txt \
 		--output-file requirements/dev.txt
 	$(COMPILE) --group fuzz --output-file requirements/fuzz.txt
 	$(COMPILE) --group release --output-file requirements/release.txt

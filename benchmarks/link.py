@@ -11,10 +11,10 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 
 from benchmarks.figures import Figure, Goal, Section
+from dwell.live.local.linked_transport import LinkedTransport
+from dwell.live.local.message_links import LinkEnds, LinkFile
 from dwell.live.transport.transport import Arrival, Lane, Receive
 from dwell.model import Constant
-from dwell.testbed.linked_transport import LinkedTransport
-from dwell.testbed.message_links import LinkEnds, LinkFile
 
 NODES = ("R1", "E")
 SIZES = {"200 bytes": 200, "300 kB": 300_000}

@@ -20,12 +20,12 @@ import yaml
 import dwell
 from benchmarks.timing import ROOT
 from dwell.errors import LiveError
+from dwell.live.local.loopback import Loopback, on_this_machine
 from dwell.live.messages import Header, decode
 from dwell.live.stage import Message
 from dwell.live.transport.transport import Arrival
 from dwell.live.worker import Worker
 from dwell.model import Problem
-from dwell.testbed.loopback import Loopback, on_this_machine
 
 #: Where the actuator writes, and what: cycle, release, and the instant of the call.
 OBSERVED = "DWELL_BENCH_OBSERVED"

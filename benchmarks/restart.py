@@ -24,9 +24,9 @@ import dwell
 from benchmarks.figures import Figure, Goal, Section
 from benchmarks.live_cell import Applied, LightCell
 from benchmarks.timing import ROOT
+from dwell.live.local.burner import Burner
 from dwell.model.document import to_document
-from dwell.testbed.burner import Burner
-from dwell.testbed.chaos.stalls import StallDetector
+from dwell_lab.chaos.stalls import StallDetector
 
 EXAMPLE = ROOT / "examples" / "live" / "cell.yaml"
 #: Where the cell is pinned; the workers of E have no cycles then.

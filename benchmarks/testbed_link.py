@@ -22,11 +22,11 @@ import numpy as np
 
 from benchmarks.figures import Figure, Goal, Section
 from benchmarks.link_end import Specification
+from dwell.live.local.message_links import LinkFile
 from dwell.model import Constant, Normal
-from dwell.testbed.forwarder import Passed
-from dwell.testbed.hosts import Hosts
-from dwell.testbed.link import TunLink
-from dwell.testbed.message_links import LinkFile
+from dwell_lab.testbed.forwarder import Passed
+from dwell_lab.testbed.hosts import Hosts
+from dwell_lab.testbed.link import TunLink
 
 ROOT = Path(__file__).resolve().parents[1]
 NODES = "A", "B"

@@ -25,8 +25,8 @@ MODULES = {path.stem for path in SOURCES.glob("[a-z]*.py")}
 
 def test_every_room_has_its_sentence() -> None:
     table = PAGE.partition("## The rooms")[2].partition("\n## ")[0]
-    rooms = re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)
-    assert sorted(rooms) == sorted(PACKAGES | MODULES)
+    rooms = re.findall(r"^\| \w* ?\| `(\w+)` \|", table, re.MULTILINE)
+    assert sorted(rooms) == sorted({"dwell_lab"} | PACKAGES | MODULES)
 
 
 def test_every_room_is_in_the_picture() -> None:
@@ -70,7 +70,7 @@ def listed(kind: str) -> dict[str, list[str]]:
 def test_no_module_has_the_name_of_another_one_but_for_those_listed() -> None:
     places = defaultdict(list)
     for path in SOURCES.rglob("[a-z]*.py"):
-        if package_of(path) != "cli":
+        if package_of(path) != "cli" and path.parent.name != "commands":
             places[path.stem].append(package_of(path))
     assert twice(places) == listed("module")
 
@@ -138,13 +138,89 @@ def test_a_string_names_modules_of_its_own_package_alone() -> None:
 def test_only_the_command_imports_the_facade() -> None:
     """The façade may import all, so that what it is imported by would be above all."""
     found = {
-        name.partition("/")[0]
+        name.rpartition("/")[0]
         for name, tree in TREES.items()
         for node in ast.walk(tree)
         if (isinstance(node, ast.Import) and any(one.name == "dwell" for one in node.names))
         or (isinstance(node, ast.ImportFrom) and node.module == "dwell")
     }
-    assert found == {"cli"}
+    assert found == {"cli", "live/commands"}
+
+
+SIMULATOR = (
+    *("cost", "kernels", "policies", "estimators", "cellfile", "record", "control", "sim"),
+    *("study", "report", "files"),
+)
+#: What may import the façade, which may import all.
+COMMANDS = ("cli", "live.commands", "lab")
+#: Packages, each with the packages and modules that its files may import. Besides, all may import
+#: `errors`, `display` and `version`, and all but `files` may import `model`.
+MAY_IMPORT = {
+    "errors": (),
+    "files": (),
+    "display": (),
+    "version": (),
+    "model": (),
+    "cost": (),
+    "kernels": (),
+    "policies": ("cost",),
+    "estimators": ("cost", "kernels"),
+    "cellfile": ("files", "policies.registry", "estimators.registry"),
+    "record": ("cellfile", "files"),
+    "control": ("cost", "policies", "estimators"),
+    "sim": ("control", "record", "kernels"),
+    "study": (
+        "sim",
+        "record",
+        "cellfile",
+        "control",
+        "cost",
+        "policies",
+        "estimators",
+        "kernels",
+        "files",
+    ),
+    "report": ("study", "record", "policies.registry", "estimators.registry", "files"),
+    "live": ("control", "record", "cellfile", "files"),
+    "live.local": ("live", "sim", "record", "cellfile", "files"),
+    "dash": ("live", "record", "cellfile", "study"),
+    "calibration": ("record", "cellfile", "sim", "files"),
+    "cli": SIMULATOR,
+    "live.commands": (*SIMULATOR, "live", "live.local", "dash", "calibration", "cli"),
+    "lab": (*SIMULATOR, "live", "live.local", "calibration", "cli"),
+}
+
+
+def room(module: str) -> str:
+    """Return the row of a module in the table; empty for the façade."""
+    parts = module.split(".")
+    if parts[0] == "dwell_lab":
+        return "lab"
+    deeper = ".".join(parts[1:3])
+    return deeper if deeper in MAY_IMPORT else "".join(parts[1:2])
+
+
+def test_every_file_imports_what_its_package_may() -> None:
+    graph = grimp.build_graph("dwell", "dwell_lab", cache_dir=None)
+    assert {room(one) for one in graph.modules} - {"", "__main__"} == MAY_IMPORT.keys()
+    wrong = [
+        f"{importer} imports {imported}"
+        for importer in graph.modules
+        if room(importer) in MAY_IMPORT
+        for imported in graph.find_modules_directly_imported_by(importer)
+        if not may_import(room(importer), imported)
+    ]
+    assert not wrong
+
+
+def may_import(importer: str, imported: str) -> bool:
+    """Whether the table lets a package import a module."""
+    target = room(imported)
+    always = {importer, "errors", "display", "version", *(["model"] if importer != "files" else [])}
+    if target in always or (not target and importer in COMMANDS):
+        return True
+    rows = MAY_IMPORT[importer]
+    return target in rows or imported.removeprefix("dwell.") in rows
 
 
 def test_no_file_stands_on_itself() -> None:

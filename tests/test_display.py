@@ -52,8 +52,8 @@ from dwell.study import (
     mean_interval,
     open_study,
     run_study,
-    validate,
 )
+from dwell_lab.validation.validation import validate
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"

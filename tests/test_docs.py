@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from dwell.cli.commands import app
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "lab").rglob("*.md")])
 EXECUTED = (
     "README.md",
     "docs/estimators.md",
@@ -23,10 +23,11 @@ EXECUTED = (
     "docs/profiling.md",
     "docs/studies.md",
     "docs/tutorial.md",
-    "docs/validation.md",
+    "lab/docs/validation.md",
 )
 
-# These go on until they are told to end, or need those that do; tests/cli/test_live.py runs them.
+# They run until they are interrupted, or need those that do; tests/live/commands/test_live.py
+# runs them.
 LASTING = ("agent", "controller", "demo", "live")
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)

@@ -20,6 +20,7 @@ __all__ = [
     "LiveError",
     "MeasurementError",
     "MetricError",
+    "MissingPartError",
     "PlacementError",
     "PolicyError",
     "ProblemError",
@@ -44,6 +45,9 @@ LONGEST = 300
 PACKAGE = os.path.join(os.path.dirname(__file__), "")
 #: Name of the distribution: `dwell` on the package index is somebody else's.
 DISTRIBUTION = "dwell-placement"
+
+#: The line that installs the laboratory, which no index has, from a checkout.
+INSTALL_LAB = "in a checkout of Dwell: python -m pip install ./lab"
 
 #: By module: the package that brings it, and the extra that brings the package.
 OPTIONAL = {
@@ -149,6 +153,10 @@ class MetricError(DwellError, ValueError):
 
 class PolicyError(DwellError, ValueError):
     """A policy is unknown, or decided something that cannot be done."""
+
+
+class MissingPartError(DwellError, ValueError):
+    """A name or a command is of a distribution of Dwell that is not installed."""
 
 
 class SimulationError(DwellError, RuntimeError):

@@ -214,7 +214,7 @@ def test_collections_are_counted() -> None:
 
 @pytest.fixture
 def _nothing_is_frozen() -> Iterator[None]:
-    """Have the collector look at what tests/conftest.py keeps from it."""
+    """Have the collector look at what conftest.py keeps from it."""
     gc.unfreeze()
     yield
     gc.freeze()

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from tests.cli.live_cell import RealCell, invoke
-from tests.cli.test_live_secure import SecureCell
 from tests.dash.served import serving, until, until_state
+from tests.live.commands.test_live_secure import SecureCell
 
 
 @pytest.fixture(scope="module")

@@ -21,9 +21,9 @@ from dataclasses import asdict
 from pathlib import Path
 
 from dwell.errors import DwellError
-from dwell.testbed.chaos.light_cell import EXEC_MS, PERIOD_MS
-from dwell.testbed.chaos.stalls import StallDetector
-from dwell.testbed.chaos.strike import Outcome
+from dwell_lab.chaos.light_cell import EXEC_MS, PERIOD_MS
+from dwell_lab.chaos.stalls import StallDetector
+from dwell_lab.chaos.strike import Outcome
 from tests.live.real_cell import FAULTS, HomeFault, RealCell, mixed, strike
 
 #: Faults that one cell goes through before another is started.

@@ -11,19 +11,19 @@ import yaml
 
 import dwell
 from dwell.cellfile import from_document
-from dwell.testbed.chaos.faults import Fault, bound_of, faults_of
-from dwell.testbed.chaos.harness import CLOCK_FILE, Harness, environment_of
-from dwell.testbed.chaos.light_cell import (
+from dwell.live.local.loopback import Loopback, on_this_machine
+from dwell_lab.chaos.faults import Fault, bound_of, faults_of
+from dwell_lab.chaos.harness import CLOCK_FILE, Harness, environment_of
+from dwell_lab.chaos.light_cell import (
     EXEC_MS,
     MAX_AGE_MS,
     PERIOD_MS,
     document,
     exec_ms,
 )
-from dwell.testbed.chaos.stalls import StallDetector
-from dwell.testbed.chaos.strike import Outcome, beyond
-from dwell.testbed.chaos.strike import strike as strike_by
-from dwell.testbed.loopback import Loopback, on_this_machine
+from dwell_lab.chaos.stalls import StallDetector
+from dwell_lab.chaos.strike import Outcome, beyond
+from dwell_lab.chaos.strike import strike as strike_by
 
 
 def wrong_record(

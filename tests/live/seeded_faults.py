@@ -38,13 +38,13 @@ from dwell.live.stamper import StamperState
 from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import Role
 from dwell.model import Problem, QoS
-from dwell.testbed.chaos.actuations import Seen, out_of_order
-from dwell.testbed.chaos.faults import Fault, PlannedFault, bound_of, faults_of, planned, struck
-from dwell.testbed.chaos.harness import RECENT_PERIODS, away_from_home
-from dwell.testbed.chaos.invariants import Judge
-from dwell.testbed.chaos.light_cell import CANDIDATES, WINDOW_CYCLES, document, exec_ms
-from dwell.testbed.chaos.stages import APPLY, FRAME_BYTES, HOLD, NODES, SAID, ZERO
-from dwell.testbed.chaos.strike import (
+from dwell_lab.chaos.actuations import Seen, out_of_order
+from dwell_lab.chaos.faults import Fault, PlannedFault, bound_of, faults_of, planned, struck
+from dwell_lab.chaos.harness import RECENT_PERIODS, away_from_home
+from dwell_lab.chaos.invariants import Judge
+from dwell_lab.chaos.light_cell import CANDIDATES, WINDOW_CYCLES, document, exec_ms
+from dwell_lab.chaos.stages import APPLY, FRAME_BYTES, HOLD, NODES, SAID, ZERO
+from dwell_lab.chaos.strike import (
     RECOVERED_S,
     Outcome,
     beyond,

@@ -26,9 +26,9 @@ from typing import NamedTuple
 import psutil
 
 from dwell.errors import DwellError, LiveError
-from dwell.testbed.chaos.harness import Harness
-from dwell.testbed.chaos.light_cell import PERIOD_MS
-from dwell.testbed.processes import expected
+from dwell.live.local.processes import expected
+from dwell_lab.chaos.harness import Harness
+from dwell_lab.chaos.light_cell import PERIOD_MS
 from tests.live.real_cell import RealCell
 
 HOME = "SO"

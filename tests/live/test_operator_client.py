@@ -11,12 +11,12 @@ import pytest
 import dwell
 from dwell.errors import LiveError
 from dwell.live.keys import Keys
+from dwell.live.local.loopback import on_this_machine
 from dwell.live.messages import Answer, Ask, decode, encode
 from dwell.live.operator_client import OperatorClient
 from dwell.live.transport.transport import Arrival
 from dwell.live.transport.zenoh import ZenohTransport
 from dwell.live.wiring import roles, wire
-from dwell.testbed.loopback import on_this_machine
 from tests.cli.live_cell import EXAMPLE
 from tests.waiting import PATIENCE_S
 

@@ -15,9 +15,9 @@ from pathlib import Path
 import pytest
 
 from dwell.errors import LiveError
-from dwell.testbed.chaos.light_cell import EXEC_MS, MAX_AGE_MS, PERIOD_MS
-from dwell.testbed.chaos.stalls import StallDetector
-from dwell.testbed.chaos.strike import Outcome
+from dwell_lab.chaos.light_cell import EXEC_MS, MAX_AGE_MS, PERIOD_MS
+from dwell_lab.chaos.stalls import StallDetector
+from dwell_lab.chaos.strike import Outcome
 from tests.live.real_cell import FAULTS, HomeFault, RealCell, mixed, strike
 
 pytestmark = pytest.mark.skipif(

@@ -24,7 +24,7 @@ from dwell.model import Problem
 from dwell.record import open_run
 from dwell.record.journal import JOURNAL, MARK
 from dwell.report.run_page import run_page
-from dwell.testbed.chaos.disk import limit_file_size
+from dwell_lab.chaos.disk import limit_file_size
 from tests.live.small_world import EXEC_MS, Recorded, canonical
 from tests.reference.derivation import require_derived
 from tests.report.pages import table_of

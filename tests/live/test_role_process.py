@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 import yaml
 
+from dwell.live.local.processes import without_keys
 from dwell.live.role_process import bring_to_rest
 from dwell.live.sink import Sink
-from dwell.testbed.processes import without_keys
 from tests.cli.live_cell import RealCell
 from tests.live.small_world import Arm, World, canonical
 from tests.waiting import PATIENCE_S, wait_until

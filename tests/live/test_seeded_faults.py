@@ -25,8 +25,8 @@ from dwell.live.routing import Routes
 from dwell.live.sink import Sink
 from dwell.live.stamper import Stamper
 from dwell.live.worker import Worker
-from dwell.testbed.chaos.faults import PlannedFault
-from dwell.testbed.chaos.light_cell import CANDIDATES
+from dwell_lab.chaos.faults import PlannedFault
+from dwell_lab.chaos.light_cell import CANDIDATES
 from tests.live.seeded_faults import (
     FaultyWorld,
     Plan,

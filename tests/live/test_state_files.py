@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from dwell.errors import LiveError
 from dwell.live.stamper import StamperState
 from dwell.live.state_files import BookFile, HighestFile, InFlight, boot_id, make_folder
-from dwell.testbed.chaos.disk import SmallDisk, may_mount
+from dwell_lab.chaos.disk import SmallDisk, may_mount
 
 
 def test_a_book_is_read_as_it_was_written(tmp_path: Path) -> None:

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from dwell.cli.background import log_of
 from dwell.errors import ProblemError
+from dwell.live.commands.background import log_of
 from dwell.live.state_folder import logs, state_root
 
 

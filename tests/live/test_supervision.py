@@ -20,7 +20,7 @@ from dwell.errors import LiveError
 from dwell.live import supervision
 from dwell.live.state_files import InFlight
 from dwell.live.supervision import SupervisedProcess, Supervisor, claim
-from dwell.testbed.chaos.disk import SmallDisk, may_mount
+from dwell_lab.chaos.disk import SmallDisk, may_mount
 from tests.live.plain_launcher import supervise
 from tests.processes import lives
 from tests.waiting import PATIENCE_S, wait_until

@@ -21,7 +21,7 @@ import pytest
 from dwell.errors import RunError, UnwritableError
 from dwell.record import Journal, Run, open_run, require_free, seal_run
 from dwell.record.journal import JOURNAL, note_in_journal, read_plain_journal
-from dwell.testbed.chaos.disk import SmallDisk, limit_file_size, may_mount
+from dwell_lab.chaos.disk import SmallDisk, limit_file_size, may_mount
 
 COLUMNS: dict[str, dict[str, Any]] = {
     "cycles": {"cycle": "Int64", "placement": ["LOC", "SO"], "latency_ns": "Int64"},

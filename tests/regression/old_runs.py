@@ -19,12 +19,12 @@ import polars as pl
 
 import dwell
 from dwell.record.journal import JOURNAL
-from dwell.study import validate
-from dwell.testbed.campaign import Campaign, entrant
-from dwell.testbed.execution import run_campaign
+from dwell_lab.testbed.campaign import Campaign, entrant
+from dwell_lab.testbed.execution import run_campaign
+from dwell_lab.validation.validation import validate
+from lab.tests.testbed.simulated_runs import ALWAYS_IDLE, SimulatedRuns
 from tests.cells.light import write_cell
 from tests.cells.small import make_problem
-from tests.testbed.simulated_runs import ALWAYS_IDLE, SimulatedRuns
 
 FOLDER = Path(__file__).parent / "data" / "old-runs"
 EXPECTED = FOLDER / "facts.json"

@@ -11,6 +11,9 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
+#: Share of the time of a CPU that may go to other virtual machines.
+STOLEN_MOST = 0.02
+
 
 @dataclass(frozen=True, slots=True)
 class MachineConditions:

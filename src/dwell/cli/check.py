@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
+from itertools import chain
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
@@ -16,6 +17,7 @@ from dwell.display import milliseconds
 from dwell.errors import ExitCode, Fault, PolicyError, ProblemError
 from dwell.model.bounds import counted
 from dwell.model.controller_settings import AUTO
+from dwell.model.entry_points import WARNINGS, added, added_name
 
 if TYPE_CHECKING:
     from dwell.estimators.prices import Price
@@ -49,9 +51,9 @@ def check(
     except ProblemError as error:
         _refuse(error.faults, str(error), as_json=as_json)
     if node is not None:
-        from dwell.cli.check_node import check_node
-
-        if not check_node(problem, cell, node, keys, insecure=insecure, as_json=as_json):
+        if not added_name("check_node")(
+            problem, cell, node, keys, insecure=insecure, as_json=as_json
+        ):
             raise typer.Exit(ExitCode.WRONG)
         return
     if faults := tuple(class_faults(problem)):
@@ -61,7 +63,6 @@ def check(
     from dwell.estimators.prices import prices_of
     from dwell.estimators.registry import resolved
     from dwell.estimators.shadow_price import affordable
-    from dwell.live.lint import lint
     from dwell.model.evolve import evolve
     from dwell.policies.registry import estimator_of
 
@@ -73,7 +74,7 @@ def check(
     warnings = (
         *warnings_of(problem),
         *unpriced(problem, scenario, cycles),
-        *lint(problem),
+        *chain.from_iterable(warn(problem) for warn in added(WARNINGS).values()),
     )
     if as_json:
         rows = [_fault(warning) for warning in warnings]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,21 +12,16 @@ from typer.core import TyperGroup
 from dwell import __version__
 from dwell.cli.check import check
 from dwell.cli.completion import completion
-from dwell.cli.dash import dash
 from dwell.cli.demo import demo
 from dwell.cli.fleet import fleet
-from dwell.cli.keys import keys
-from dwell.cli.live import agent, controller, live
 from dwell.cli.new import new
 from dwell.cli.options import Json, Keys, argument
-from dwell.cli.profile import profile
 from dwell.cli.report import report
 from dwell.cli.run import run
 from dwell.cli.schema import schema
 from dwell.cli.study import study
-from dwell.cli.testbed import testbed
-from dwell.cli.validate import validate
-from dwell.errors import ExitCode, line_and_code
+from dwell.errors import INSTALL_LAB, ExitCode, MissingPartError, line_and_code
+from dwell.model.entry_points import COMMANDS, added
 
 
 class Commands(TyperGroup):
@@ -98,13 +94,30 @@ def doctor(
         raise typer.Exit(ExitCode.FAILED)
 
 
-for command in (
-    *(check, run, study, report, dash, validate, new, schema, demo, doctor, completion),
-    *(agent, controller),
-):
+#: Commands of dwell-lab.
+OF_LAB = ("testbed", "validate")
+
+for command in (check, run, study, report, new, schema, demo, doctor, completion):
     app.command()(command)
 app.add_typer(fleet, name="fleet")
-app.add_typer(profile, name="profile")
-app.add_typer(live, name="live")
-app.add_typer(keys, name="keys")
-app.add_typer(testbed, name="testbed")
+for name, command in added(COMMANDS).items():
+    if isinstance(command, typer.Typer):
+        app.add_typer(command, name=name)
+    else:
+        app.command(name)(command)
+
+
+def _missing(name: str) -> Callable[[], None]:
+    def command() -> None:
+        raise MissingPartError(f"dwell {name} needs dwell-lab; {INSTALL_LAB}")
+
+    return command
+
+
+for name in set(OF_LAB) - added(COMMANDS).keys():
+    settings = {
+        "allow_extra_args": True,
+        "help_option_names": [],
+        "ignore_unknown_options": True,
+    }
+    app.command(name, hidden=True, context_settings=settings)(_missing(name))

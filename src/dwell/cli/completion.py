@@ -109,10 +109,3 @@ def several_policies(context: typer.Context, incomplete: str) -> list[str]:
     """Offer the last of several policies with commas."""
     head, comma, last = incomplete.rpartition(",")
     return [f"{head}{comma}{name}" for name in policies(context, last)]
-
-
-def processes(context: typer.Context) -> list[str]:
-    """Offer the processes on this computer that have a log."""
-    from dwell.live.state_folder import logs, state_root
-
-    return list(logs(state_root(context.params.get("state"))))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -124,30 +123,10 @@ Insecure = Annotated[
     ),
 ]
 
-
-class LogFormat(StrEnum):
-    """Forms of the log on stderr."""
-
-    TEXT = "text"
-    JSON = "json"
-
-
-Logs = Annotated[
-    LogFormat,
-    typer.Option("--log-format", help="Form of the log on stderr: lines of text, or of JSON."),
-]
 TestbedName = Annotated[
     str, typer.Option("--name", help="Of the testbed, among others on this machine.")
 ]
 Json = Annotated[bool, flag("--json", "Print JSON on stdout.")]
-
-
-def begin_log(log_format: LogFormat, who: str) -> None:
-    """Have a process print its log in a form."""
-    if log_format is LogFormat.JSON:
-        from dwell.live.log import log_as_json
-
-        log_as_json(who)
 
 
 def require_one_length(windows: int | None, seconds: float | None) -> None:
@@ -185,20 +164,3 @@ def windows_of(seconds: float, *problems: Problem) -> int:
         period_ms = problem.pipeline.period_ms
         require_length(windows, problem.window_cycles, period_ms, f"--seconds {seconds:g}")
     return windows
-
-
-def seconds_of_runs(cell: Path, windows: int | None, seconds: float | None) -> float:
-    """Return how long each run on a testbed takes; 120 s where neither length is given.
-
-    Raises
-    ------
-    typer.BadParameter
-        If both are given.
-    """
-    require_one_length(windows, seconds)
-    if windows is None:
-        return 120.0 if seconds is None else seconds
-    import dwell
-    from dwell.testbed.run import length_s
-
-    return length_s(dwell.load(cell), windows)

@@ -67,12 +67,15 @@ def report(
     as_json: Json = False,
 ) -> None:
     """Write the page of runs, fleets, studies, campaigns: one HTML file that needs nothing else."""
-    from dwell.record.campaign_folder import is_campaign
+    from dwell.model.entry_points import PAGES, added
     from dwell.record.fleet_run import is_fleet
+    from dwell.report.added import FolderPages
     from dwell.study.study_folder import is_study, open_study
 
     page = out or folder / PAGE
-    kinds = {"campaign": is_campaign, "study": is_study, "fleet": is_fleet}
+    folders = {name: kind for name, kind in added(PAGES).items() if isinstance(kind, FolderPages)}
+    kinds = {name: kind.holds for name, kind in folders.items()}
+    kinds |= {"study": is_study, "fleet": is_fleet}
     kind = next((kind for kind, is_one in kinds.items() if is_one(folder)), "run")
     for what, wanted in (("a trace", trace), ("an MCAP file", mcap)):
         if wanted is not None and kind != "run":
@@ -83,10 +86,8 @@ def report(
     mark = mark_of(str(folder.resolve())) if run is None else mark_of_run(run)
     if page != folder / PAGE:
         require_own(page, mark)
-    if kind == "campaign":
-        from dwell.cli.campaign import report_campaign
-
-        report_campaign(folder, page, figures=figures, static=static, as_json=as_json)
+    if kind in folders:
+        folders[kind].write(folder, page, figures=figures, static=static, as_json=as_json)
         return
     extras: dict[str, Any] = {}
     files: dict[Path, Content] = {}

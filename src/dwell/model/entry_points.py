@@ -1,4 +1,7 @@
-"""Classes by name: ours by a dotted path, other packages' by entry points; imported when asked."""
+"""Classes by name: ours by a dotted path, those of other packages by entry points.
+
+They are imported when they are needed.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +11,51 @@ from functools import lru_cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from dwell.errors import DwellError
+from dwell.errors import INSTALL_LAB, DwellError, MissingPartError
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
+
+
+#: Groups of what the upper flats, and other distributions, add: commands and groups of commands;
+#: pages (`dwell.report.added`); warnings of `dwell check`, of a cell; what `dwell doctor` looks at,
+#: for a cell or None and a keyring; names in our packages, as ``study.validate``.
+COMMANDS = "dwell.commands"
+PAGES = "dwell.pages"
+WARNINGS = "dwell.warnings"
+CHECKS = "dwell.checks"
+NAMES = "dwell.names"
+#: Names that dwell-lab adds.
+OF_LAB = ("study.Validation", "study.validate")
 
 
 def class_at(path: str) -> Any:
     """Import a class of ours from ``module:Class``."""
     module, _, attribute = path.partition(":")
     return getattr(import_module(module), attribute)
+
+
+def added(group: str) -> dict[str, Any]:
+    """Return all that a group of entry points adds, by name in order; all of it is imported."""
+    return {name: entry.load() for name, entry in sorted(_declared(group).items())}
+
+
+def added_name(name: str) -> Any:
+    """Return the object that a distribution adds to ours under a name, as ``study.validate``.
+
+    Raises
+    ------
+    MissingPartError
+        If dwell-lab adds it, which is not installed; with the command that installs it.
+    AttributeError
+        If nothing adds the name.
+    """
+    entry = _declared(NAMES).get(name)
+    if entry is not None:
+        return entry.load()
+    if name in OF_LAB:
+        raise MissingPartError(f"{name} of the package dwell needs dwell-lab; {INSTALL_LAB}")
+    raise AttributeError(f"module 'dwell' has no attribute {name!r}")
 
 
 def names_with(ours: Iterable[str], group: str) -> tuple[str, ...]:

@@ -16,6 +16,8 @@ from html import escape
 
 from dwell.model import Problem
 from dwell.model.bounds import counted
+from dwell.model.entry_points import PAGES, added
+from dwell.report.added import ResultPages
 from dwell.report.figure import svg
 from dwell.report.formatting import write_ms
 from dwell.report.method import placements_table
@@ -64,8 +66,7 @@ def _answer(shown: object) -> Page:
     from dwell.report.comparison_page import comparison_page
     from dwell.report.run_page import run_page
     from dwell.report.study_page import study_page
-    from dwell.report.validation_page import validation_page
-    from dwell.study import Comparison, StudyRuns, Validation
+    from dwell.study import Comparison, StudyRuns
 
     match shown:
         case Run():
@@ -74,9 +75,10 @@ def _answer(shown: object) -> Page:
             return comparison_page(shown, sections=1)
         case StudyRuns():
             return study_page(shown, sections=1)
-        case Validation():
-            return validation_page(shown, sections=1)
         case _:
+            for kind in added(PAGES).values():
+                if isinstance(kind, ResultPages) and kind.kind == type(shown).__name__:
+                    return kind.page(shown, 1)
             raise TypeError(f"nothing shows a {type(shown).__name__}")
 
 

@@ -42,6 +42,4 @@ from .study import Study as Study
 from .study import load_study as load_study
 from .study_folder import Shard as Shard
 from .study_folder import open_study as open_study
-from .validation import Validation as Validation
-from .validation import validate as validate
 from .what_ifs import changes_of as changes_of

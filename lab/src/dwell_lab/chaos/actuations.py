@@ -1,0 +1,134 @@
+"""Actuations: the calls of the actuator, by its own log (see `stages.Witness`)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Self
+
+from dwell_lab.chaos.light_cell import CANDIDATES
+from dwell_lab.chaos.stages import APPLY, HOLD, NODES, RECORD, ZERO
+
+_PLACEMENTS = {(p["perception"], p["planning"]): name for name, p in CANDIDATES.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """A call of the actuator.
+
+    Parameters
+    ----------
+    what : int
+        `APPLY`, `HOLD`, `ZERO`, or `START` of its process.
+    placement : str
+        Candidate of the light cell that the command came through, by its own account.
+    cycle : int
+        Cycle by the runtime.
+    said : int
+        Cycle by the command itself.
+    released_ns : int
+        Release as the source saw it.
+    at_ns : int
+        On the true clock.
+    """
+
+    what: int
+    placement: str
+    pid: int
+    cycle: int
+    said: int
+    released_ns: int
+    at_ns: int
+
+    @classmethod
+    def of(cls, what: int, perception: int, planning: int, pid: int, *numbers: int) -> Self:
+        """Read a record of the actuator (see `stages.RECORD`)."""
+        where = _PLACEMENTS.get((NODES[perception], NODES[planning]), "?")
+        return cls(what, where, pid, *numbers)
+
+
+class Actuations:
+    """Calls that the actuator has written down, as far as they have been read."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.all = path, list[Seen]()
+        self._read = 0
+
+    def look(self) -> None:
+        """Read the new calls."""
+        if not self.path.exists():
+            return
+        with self.path.open("rb") as file:
+            file.seek(self._read)
+            data = file.read()
+        whole = len(data) - len(data) % RECORD.size
+        self._read += whole
+        for at in range(0, whole, RECORD.size):
+            self.all.append(Seen.of(*RECORD.unpack_from(data, at)))
+
+    @property
+    def applied(self) -> list[Seen]:
+        """Commands applied."""
+        return [seen for seen in self.all if seen.what == APPLY]
+
+    def healthy(self, home: str | None = None) -> int:
+        """Cycles since the last one that was lost, or took another placement than `home`."""
+        self.look()
+        count, following = 0, None
+        for seen in reversed(self.all):
+            if seen.what != APPLY:
+                continue
+            gap = following is not None and following - seen.cycle > 1
+            if gap or (home is not None and seen.placement != home):
+                break
+            count, following = count + 1, seen.cycle
+        return count
+
+    def last(self) -> Seen | None:
+        """Return the last command that was applied."""
+        self.look()
+        return next((seen for seen in reversed(self.all) if seen.what == APPLY), None)
+
+    def since(self, at_ns: int) -> list[Seen]:
+        """Calls of the actuator from an instant on."""
+        self.look()
+        calls = []
+        for seen in reversed(self.all):
+            if seen.at_ns < at_ns:
+                break
+            calls.append(seen)
+        return calls[::-1]
+
+
+def out_of_order(applied: Sequence[Seen]) -> list[str]:
+    """Return commands that came twice, out of order, or with another cycle's number."""
+    violations = [
+        f"cycle {later.cycle} actuated after {before.cycle}"
+        for before, later in pairwise(applied)
+        if later.cycle <= before.cycle
+    ]
+    return violations + [f"cycle {s.cycle} carries {s.said}" for s in applied if s.cycle != s.said]
+
+
+def unsafe(seen: Sequence[Seen], limit_ms: float) -> list[str]:
+    """Return silences in which the actuator was not told in time that no command comes.
+
+    A sink that is dead or frozen itself tells it nothing; of that no more is asked than that it
+    never applies what has become old.
+    """
+    silences = []
+    commands = [place for place, one in enumerate(seen) if one.what == APPLY]
+    for before, later in pairwise(commands):
+        gap_ms = (seen[later].at_ns - seen[before].at_ns) / 1e6
+        stopped_ns = [one.at_ns for one in seen[before + 1 : later] if one.what in (HOLD, ZERO)]
+        if gap_ms <= limit_ms:
+            continue
+        waited_ms = (stopped_ns[0] - seen[before].at_ns) / 1e6 if stopped_ns else gap_ms
+        if waited_ms > limit_ms:
+            silences.append(
+                f"no command for {gap_ms:.0f} ms after cycle {seen[before].cycle}, "
+                f"and no hold() within {limit_ms:.0f} ms"
+            )
+    return silences

@@ -1,0 +1,160 @@
+"""Records a cell's messages from the wire, in a process that is no part of the cell.
+
+It has sessions of its own, sends nothing, and decodes nothing: a record is the instant on the true
+clock, the key, and the message; of a stage's message, its header.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from dwell.errors import LiveError
+from dwell.live.keys import Keys
+from dwell.live.local.child import Child, Parent, Started
+from dwell.live.local.testbed import LocalTestbed
+from dwell.live.transport.transport import Arrival
+from dwell.live.wiring import SESSIONS, Role, Session, Wiring, WiringEntry
+from dwell_lab.chaos.invariants import Judge
+
+_HEAD = struct.Struct("<QIII")
+#: How long it may take until everything is heard for the first time, seconds.
+HEARD_S = 20.0
+
+
+def entry_for(wiring: Wiring, nodes: Sequence[str]) -> WiringEntry:
+    """Return the endpoints of a listener to all processes of some nodes."""
+    connect: dict[Session, list[Any]] = {}
+    for entry in wiring.entries.values():
+        if entry.role.node in nodes:
+            for session, end in entry.listen.items():
+                connect.setdefault(session, []).append(end)
+    role = Role(f"tap.{os.getpid()}", nodes[0], "visitor")
+    ends = {name: tuple(connect[name]) for name in SESSIONS if name in connect}
+    return WiringEntry(role, {}, ends)
+
+
+class Wiretap(Child):
+    """The process, as its parent sees it; a context manager.
+
+    Parameters
+    ----------
+    nodes : sequence of str
+        Whose processes are listened to.
+    prefix : sequence of str
+        Words of a command that runs what follows where these nodes are reached.
+    """
+
+    def __init__(
+        self, cell: Path, nodes: Sequence[str], out: Path, prefix: Sequence[str] = ()
+    ) -> None:
+        name = f"tap at {','.join(nodes)}"
+        settings = cell, nodes, out
+        super().__init__("dwell_lab.chaos.wiretap", name, settings, prefix=prefix)
+
+
+class Records:
+    """The records that a wiretap has written, as far as they have been read."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._read = path, 0
+
+    def news(self) -> Iterator[tuple[int, str, bytes, bytes]]:
+        """Yield the new records: instant, key, message and header."""
+        if not self._path.exists():
+            return
+        with self._path.open("rb") as file:
+            file.seek(self._read)
+            data = file.read()
+        at = 0
+        while at + _HEAD.size <= len(data):
+            at_ns, key, payload, header = _HEAD.unpack_from(data, at)
+            end = at + _HEAD.size + key + payload + header
+            if end > len(data):
+                break
+            at += _HEAD.size
+            name = data[at : at + key].decode()
+            message = data[at + key : at + key + payload]
+            yield at_ns, name, message, data[at + key + payload : end]
+            at = end
+        self._read += at
+
+
+class ActuatorObserver(Started):
+    """Hears a cell by wiretaps on all its nodes, and judges what it hears; a context manager."""
+
+    def __init__(self, testbed: LocalTestbed, cell: Path) -> None:
+        super().__init__()
+        self.judge = Judge(testbed.problem)
+        self._taps: list[Wiretap] = []
+        self._records: list[Records] = []
+        for nodes, prefix in testbed.taps().items():
+            out = testbed.folder / f"heard-{'-'.join(nodes)}"
+            self._taps.append(Wiretap(cell, nodes, out, prefix))
+            self._records.append(Records(out))
+
+    def _start(self) -> None:
+        """Listen until something has been heard."""
+        for tap in self._taps:
+            self._stack.enter_context(tap)
+        until = time.monotonic() + HEARD_S
+        while not {"stamped", "done", "in"} <= self.judge.counts.keys():
+            if time.monotonic() > until:
+                raise LiveError(f"of the cell only {sorted(self.judge.counts)} is heard")
+            time.sleep(0.05)
+            self.look()
+
+    def look(self) -> list[str]:
+        """Return the faults of the messages heard since the last call."""
+        news = [one for records in self._records for one in records.news()]
+        news.sort(key=lambda one: one[0])
+        violations = [wrong for one in news for wrong in self.judge.hear(*one)]
+        return violations + self.judge.migrations()
+
+
+def main() -> None:
+    """Listen until the parent ends, or wants this to."""
+    from dwell.cellfile import load
+    from dwell.live.local.linked_transport import without_source
+    from dwell.live.security import INSECURE
+    from dwell.live.transport.zenoh import ZenohTransport
+    from dwell.live.wiring import wire
+
+    with ExitStack() as stack:
+
+        def begin(settings: tuple[Path, Sequence[str], Path]) -> Callable[[None], None]:
+            cell, nodes, out = settings
+            os.environ[INSECURE] = "1"
+            problem = load(cell)
+            file = stack.enter_context(out.open("ab", buffering=0))
+            transport = ZenohTransport(entry_for(wire(problem), nodes))
+            stack.callback(transport.close)
+            lock = threading.Lock()
+            keys = Keys(problem.name)
+            inputs = keys.inputs("", "", "").rstrip("/")
+
+            def write(sample: Arrival) -> None:
+                at_ns = time.monotonic_ns()
+                payload = b"" if sample.key.startswith(inputs) else sample.payload
+                key = sample.key.encode()
+                _, header = without_source(sample.header)
+                lengths = len(key), len(payload), len(header)
+                with lock:
+                    file.write(_HEAD.pack(at_ns, *lengths) + key + payload + header)
+
+            for key in (keys.stamped(), keys.order(), keys.accepted(), keys.done("*")):
+                transport.subscribe(key, write)
+            transport.subscribe(keys.inputs("*", "*", "*"), write)
+            return lambda _: None
+
+        Parent().serve(begin)
+
+
+if __name__ == "__main__":
+    main()

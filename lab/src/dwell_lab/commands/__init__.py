@@ -1,0 +1,1 @@
+"""The commands `dwell testbed` and `dwell validate`."""

@@ -1,0 +1,81 @@
+"""`dwell testbed chaos`: faults befall a cell, and somebody watches what it promises."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dwell.cli.options import Json, Seed, argument, flag, option
+from dwell.cli.output import json_text, print_json, write_file
+from dwell.errors import ExitCode
+from dwell.live.log import say
+
+#: A folder with this file is a campaign's, and may be replaced by the next.
+MARK = ".dwell-chaos"
+
+
+def chaos(
+    cell: Annotated[
+        Path | None, argument("[CELL]", "Cell file; a light cell if not given.")
+    ] = None,
+    minutes: Annotated[float | None, typer.Option(min=0.1, help="No fault begins later.")] = None,
+    faults: Annotated[int | None, typer.Option(min=1, help="How many.")] = None,
+    seed: Seed = 1,
+    only: Annotated[
+        int | None, typer.Option(min=1, help="Nothing but this fault of the timeline.")
+    ] = None,
+    out: Annotated[
+        Path | None, option("FOLDER", "Where logs, runs and what was seen go, to be kept.")
+    ] = None,
+    hosts: Annotated[
+        bool, flag("--hosts", "Every node on a host of its own of a testbed; needs root.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Have faults befall a cell on this machine, and watch whether it keeps its promises.
+
+    Processes are killed and frozen, links cut, clocks set wrong, CPUs and disks taken away, one
+    after the other, by a seed, for two minutes if nothing else is said.
+    """
+    from dwell.live.local.playing import interruptible, make_folder
+    from dwell_lab.chaos.disk import unmount_leftovers
+    from dwell_lab.chaos.fault_campaign import FaultCampaign, Staging, summary
+
+    if minutes is None and faults is None:
+        minutes = 2.0
+    folder = Path(tempfile.mkdtemp(prefix="dwell-chaos-")) if out is None else out
+    if out is not None:
+        unmount_leftovers(out)
+        make_folder(out, MARK, "a chaos campaign's")
+    what = ("" if cell is None else f" {cell}") + (" --hosts" if hosts else "")
+    campaign = FaultCampaign(
+        Staging(cell, folder, seed, hosts=hosts),
+        f"dwell testbed chaos{what} --seed {seed}",
+        say,
+    )
+    seconds = None if minutes is None else 60 * minutes
+    result = campaign.result
+    with interruptible():
+        try:
+            campaign.run(seconds=seconds, faults=1 if only is not None else faults, only=only)
+        except KeyboardInterrupt:
+            result.wrong.append("interrupted")
+    document = result.document()
+    if out is not None:
+        write_file(out / "chaos.json", json_text(document))
+    if as_json:
+        print_json(document)
+    else:
+        for line in summary(document):
+            typer.echo(line)
+    if out is None:
+        if result.wrong:
+            typer.echo(f"what there was is kept in {folder}", err=True)
+        else:
+            shutil.rmtree(folder, ignore_errors=True)
+    if result.wrong:
+        raise typer.Exit(ExitCode.FAILED)

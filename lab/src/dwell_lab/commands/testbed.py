@@ -1,0 +1,183 @@
+"""`dwell testbed`: cells on hosts, links and CPUs of their own, on one machine."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from dwell.cli.options import (
+    CellArgument,
+    Json,
+    Policy,
+    Scenario,
+    Seconds,
+    Seed,
+    TestbedName,
+    Windows,
+    argument,
+    flag,
+    option,
+    require_one_length,
+)
+from dwell.cli.output import aligned, file_name, print_json
+from dwell.errors import ExitCode
+from dwell.live.log import say
+from dwell_lab.commands.campaign import campaign
+from dwell_lab.commands.chaos import chaos
+from dwell_lab.commands.lengths import seconds_of_runs
+
+testbed = typer.Typer(
+    no_args_is_help=True,
+    help="Run cells on hosts, links and CPUs of their own on this machine, and measure them.",
+)
+
+
+@testbed.command()
+def run(
+    cell: CellArgument,
+    scenario: Scenario = "baseline",
+    policy: Policy = None,
+    windows: Windows = None,
+    seconds: Seconds = None,
+    seed: Seed = 1,
+    out: Annotated[
+        Path | None, option("FOLDER", "Where logs and the run go; below testbed-out if not given.")
+    ] = None,
+    name: TestbedName = "bed",
+    jobs: Annotated[bool, flag("--jobs", "Keep every job of the run.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Play a scenario once, and take everything down again. Needs root.
+
+    60 windows, if neither --windows nor --seconds is given.
+    """
+    import dwell
+    from dwell_lab.testbed.run import length_s, run_once
+
+    require_one_length(windows, seconds)
+    problem = dwell.load(cell)
+    parts = (problem.name, scenario, policy or problem.controller.policy, str(seed))
+    folder = out or Path("testbed-out", file_name("-".join(parts)))
+    saved = run_once(
+        problem,
+        scenario=scenario,
+        policy=policy,
+        seconds=seconds or length_s(problem, windows or 60),
+        seed=seed,
+        out=folder,
+        name=name,
+        jobs=jobs,
+        tell=say,
+    )
+    _sum_up(saved, as_json=as_json)
+
+
+def _sum_up(folder: Path, *, as_json: bool) -> None:
+    """Print what the run showed; it has failed where the machine was under pressure."""
+    import dwell
+    from dwell_lab.testbed.run import summary
+
+    result = dwell.open_run(folder)
+    pressure = result.meta.get("pressure") or {}
+    totals = summary(result)
+    failed = bool(pressure.get("failed"))
+    if as_json:
+        head = {key: result.meta.get(key) for key in ("cell", "scenario", "seed", "policy")}
+        print_json({**head, **totals, "failed": failed, "why": pressure.get("why"), "run": folder})
+    else:
+        typer.echo(_lines(totals))
+        typer.echo(f"\nrun: {folder}")
+    if failed:
+        say(
+            f"error: the machine was the bottleneck in {totals['excluded']} of {totals['windows']} "
+            f"windows ({pressure['why']}); run it on a machine that does nothing else"
+        )
+        raise typer.Exit(ExitCode.FAILED)
+
+
+def _lines(totals: dict[str, Any]) -> str:
+    def number(value: float | None, scale: float, unit: str) -> str:
+        return "-" if value is None else f"{scale * value:.1f} {unit}"
+
+    rows = [
+        ("windows after the warm-up", str(totals["windows"])),
+        ("excluded: the machine was the bottleneck", str(totals["excluded"])),
+        ("L95, mean of windows", number(totals["l95_ms"], 1.0, "ms")),
+        ("missed deadlines (V_D)", number(totals["violation_rate"], 100.0, "%")),
+        ("migrations", str(totals["migrations"])),
+    ]
+    rows += [
+        (f"utilisation of {node}", number(used, 100.0, "%"))
+        for node, used in totals["utilisation"].items()
+    ]
+    return aligned(("", ""), rows).lstrip("\n")
+
+
+@testbed.command()
+def doctor(
+    cells: Annotated[
+        list[Path] | None, argument("CELL...", "Cell files to have checked too.")
+    ] = None,
+    watch: Annotated[
+        float, option("SECONDS", "Watch for so long whether the machine stands still.", min=0)
+    ] = 0.0,
+    as_json: Json = False,
+) -> None:
+    """Say what this machine can do as a testbed and what it cannot, and what to install."""
+    import dwell
+    from dwell.cli.findings import print_findings
+    from dwell_lab.testbed.doctor import examine
+
+    findings = examine([dwell.load(cell) for cell in cells or ()], watch_s=watch)
+    missing = [one for one in findings if one.needed and not one.ok]
+    if as_json:
+        rows = [asdict(one) for one in findings]
+        print_json({"ok": not missing, "findings": rows})
+    else:
+        print_findings(findings, broken="MISSING", lacking="without")
+    if missing:
+        raise typer.Exit(ExitCode.FAILED)
+
+
+testbed.command()(campaign)
+
+
+@testbed.command()
+def calibrate(
+    cell: CellArgument,
+    out: Annotated[Path, option("FILE", "Cell file to write.")],
+    runs: Annotated[
+        list[Path] | None,
+        argument(
+            "RUN...",
+            "Folders of runs with their jobs: baseline, and single-task stress. Without any, "
+            "the baseline is run under every candidate.",
+        ),
+    ] = None,
+    windows: Windows = None,
+    seconds: Seconds = None,
+    seed: Seed = 1,
+    name: TestbedName = "calibrate",
+    real: Annotated[
+        bool, flag("--real-links", "Links are real: their delays are what was measured.")
+    ] = False,
+) -> None:
+    """Put what runs have shown of tasks and links into a cell file.
+
+    A run that is made takes 120 s, if neither --windows nor --seconds is given.
+    """
+    from dwell_lab.testbed.calibrate import calibrate as write_calibrated
+    from dwell_lab.testbed.calibrate import make_runs
+
+    if not runs:
+        folder = out.with_name(f"{out.stem}.runs")
+        length_s = seconds_of_runs(cell, windows, seconds)
+        runs = make_runs(cell, folder, seconds=length_s, seed=seed, name=name, tell=say)
+    write_calibrated(cell, runs, out, emulated=not real, say=typer.echo)
+    typer.echo(f"written to {out}")
+
+
+testbed.command()(chaos)

@@ -1,0 +1,399 @@
+"""Measured: times and loads of tasks, links and nodes in the windows of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.errors import RunError
+from dwell.model import LinkDisturbance, Problem
+from dwell.model.scenario import is_always_on
+from dwell_lab.testbed.speeds import work_ms
+
+if TYPE_CHECKING:
+    import polars as pl
+
+    from dwell.record import Run
+
+Floats: TypeAlias = NDArray[np.float64]
+SiteName: TypeAlias = tuple[str, str]
+
+#: Least number of jobs from which anything is taken.
+LEAST_JOBS = 100
+#: Quantile of a waiting time at which a quota has hardly had a part in it.
+UNHINDERED = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class DisturbedPlaces:
+    """Nodes and links that a run's scenario disturbed.
+
+    Parameters
+    ----------
+    nodes : frozenset of str
+        With foreign threads, or down.
+    stressed : frozenset of str
+        Nodes that had foreign threads all the time.
+    """
+
+    nodes: frozenset[str]
+    links: frozenset[tuple[str, str]]
+    stressed: frozenset[str] = frozenset()
+
+    @classmethod
+    def of(cls, run: Run) -> DisturbedPlaces:
+        """Read a run's record.
+
+        Raises
+        ------
+        RunError
+            If its scenario is not among those of its cell, or the cell cannot be read.
+        """
+        scenario = str(run.meta.get("scenario") or "baseline")
+        scenarios = run.problem.scenarios
+        if scenario not in scenarios and scenario not in ("baseline", "live"):
+            raise RunError(f"scenario {scenario!r} is none of the cell's; what was it?")
+        nodes, links, stressed = set(), set(), set()
+        for item in (*scenarios.get(scenario, ()), *(run.played or ())):
+            if isinstance(item, LinkDisturbance):
+                links.add((item.source, item.target))
+                continue
+            nodes.add(item.node)
+            if item.stress_threads and is_always_on(item):
+                stressed.add(item.node)
+        return cls(frozenset(nodes), frozenset(links), frozenset(stressed))
+
+
+@dataclass(frozen=True, slots=True)
+class Visit:
+    """Jobs of one task on one node in one run.
+
+    Parameters
+    ----------
+    stage_ms : float64 array, shape (jobs,)
+        Time that the stage needs where nothing hinders it, in the order of cycles.
+    beside_ms : float64 array, shape (jobs,)
+        CPU time that its node took meanwhile for others, by thread of the job, beyond what it takes
+        in the mean of as long: both use up the quota. 0 where nothing counts it, and of a task that
+        an accelerator runs.
+    cycles, windows : int64 array, shape (jobs,)
+    """
+
+    stage_ms: Floats
+    beside_ms: Floats
+    cycles: NDArray[np.int64]
+    windows: NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """Measurements of a run, from its windows that are neither warm-up nor mixed nor excluded.
+
+    Parameters
+    ----------
+    placement : str
+        Candidate of all its windows; empty where it moved.
+    windows : int
+        Number of the windows used.
+    visits : dict of (str, str) to Visit
+        By task and node.
+    rates : dict of (str, str) to float
+        Cores that each process took, by node and process.
+    starts : dict of (str, str, bool) to float
+        Jobs a second, by task, node, and whether they are shadows.
+    spent_ms : dict of (str, str, bool) to float
+        Mean CPU time of their stage.
+    used : dict of str to float
+        Cores that were busy on each node.
+    work_ms : dict of str to float
+        CPU time of a fixed piece of work on every node (`dwell_lab.testbed.speeds`).
+    begins_ms, ends_ms : dict of (str, str) to float
+        From the arrival of the last input, or a release, to the start of the job; of sinks, from
+        the end of the job to that of the cycle. Unhindered, but where something counts what the
+        node took: since a release, and to the end of the cycle.
+    handovers_ms : dict of (str, str) to float
+        By task and node: CPU time that the node took between a release, or the job before on the
+        same node, and the job; where something counts it.
+    beside : dict of str to (float, float)
+        By node: CPU time of other processes while jobs ran, and how long these ran, seconds; of
+        nodes where something counts it.
+    outside : dict of str to (float, float)
+        The same of everybody else on the node's CPUs.
+    delays_ms : dict of (str, str, str, str) to float64 array
+        By source, target, and the nodes of both: from the end of the job that sent a message to its
+        arrival.
+    """
+
+    name: str
+    run: Run
+    disturbed: DisturbedPlaces
+    placement: str
+    windows: int
+    visits: dict[SiteName, Visit]
+    rates: dict[tuple[str, str], float]
+    starts: dict[tuple[str, str, bool], float]
+    spent_ms: dict[tuple[str, str, bool], float]
+    used: dict[str, float]
+    handovers_ms: dict[SiteName, float] = field(default_factory=dict)
+    beside: dict[str, tuple[float, float]] = field(default_factory=dict)
+    outside: dict[str, tuple[float, float]] = field(default_factory=dict)
+    work_ms: dict[str, float] = field(default_factory=dict)
+    begins_ms: dict[SiteName, float] = field(default_factory=dict)
+    ends_ms: dict[SiteName, float] = field(default_factory=dict)
+    delays_ms: dict[tuple[str, str, str, str], Floats] = field(default_factory=dict)
+
+
+def look_at(name: str, run: Run, problem: Problem) -> Measured:
+    """Measure a run that kept its jobs.
+
+    Raises
+    ------
+    RunError
+        If it kept no jobs or no CPU times, is of another pipeline, or no window can be used.
+    """
+    import polars as pl
+
+    if not run.has_jobs or "cpu_ns" not in run.jobs.columns:
+        raise RunError(f"{name}: it kept no jobs with CPU times; record it with --jobs")
+    _require_same(name, run, problem)
+    windows = usable(run)
+    if not windows.height:
+        raise RunError(f"{name}: no window is left after warm-up, mixed and excluded ones")
+    jobs = run.jobs.with_columns(pl.col("cycle").cast(pl.Int64))
+    if "shadow" not in jobs.columns:
+        jobs = jobs.with_columns(shadow=False)
+    jobs = jobs.join(cycles_in(windows, problem), on="cycle").filter(
+        pl.col("outcome").cast(str) == "done"
+    )
+    jobs = jobs.with_columns(
+        pl.col("task", "node").cast(str), took=pl.col("end_ns") - pl.col("start_ns")
+    ).filter(pl.col("cpu_ns").is_not_null() & (pl.col("took") >= 0))
+    jobs = jobs.sort("cycle", maintain_order=True)
+    placements = set(windows["placement"].cast(str))
+    jobs_s = windows.height * problem.window_cycles * problem.pipeline.period_ms / 1e3
+    jobs = jobs.with_columns(accompanied=_accompanied(jobs))
+    visits, starts, spent_ms = {}, {}, {}
+    for (task, node, shadow), of in jobs.group_by("task", "node", "shadow", maintain_order=True):
+        key = str(task), str(node), bool(shadow)
+        cpu_ms = of["cpu_ns"].to_numpy() / 1e6
+        starts[key] = of.height / jobs_s
+        spent_ms[key] = float(cpu_ms.mean())
+        if not shadow:
+            execution = problem.pipeline.tasks[key[0]].on[key[1]]
+            on_cpu = execution.accelerator is None
+            stage_ms = cpu_ms / execution.threads if on_cpu else of["took"].to_numpy() / 1e6
+            visits[key[:2]] = Visit(
+                np.asarray(stage_ms, np.float64),
+                _beside_ms(of) / execution.threads if on_cpu else np.zeros(of.height),
+                of["cycle"].to_numpy(),
+                of["window"].to_numpy().astype(np.int64),
+            )
+    own = jobs.filter(~pl.col("shadow"))
+    handovers_ms = _taken_ms(own, "handover_ns")
+    sources = {
+        site: ms for site, ms in handovers_ms.items() if not problem.pipeline.inputs(site[0])
+    }
+    endings_ms = _taken_ms(own, "ending_ns")
+    return Measured(
+        name=name,
+        run=run,
+        disturbed=DisturbedPlaces.of(run),
+        placement=placements.pop() if len(placements) == 1 else "",
+        windows=windows.height,
+        visits=visits,
+        rates=_rates(run, windows, problem),
+        starts=starts,
+        spent_ms=spent_ms,
+        used={
+            node: float(windows[f"u_{node}"].to_numpy().mean()) * of.capacity
+            for node, of in problem.fabric.nodes.items()
+        },
+        handovers_ms=handovers_ms,
+        beside=_while_jobs_ran(own.filter(~pl.col("accompanied")), "others_ns"),
+        outside=_while_jobs_ran(own, "outside_ns"),
+        work_ms=work_ms(run),
+        delays_ms=_delays(own, problem),
+        begins_ms=_begins(own, run, problem) | sources,
+        ends_ms=_ends(own, run, problem) | endings_ms,
+    )
+
+
+def _require_same(name: str, run: Run, problem: Problem) -> None:
+    try:
+        theirs = run.problem
+    except RunError as error:
+        raise RunError(f"{name}: {error}") from None
+    faults = [
+        f"{name}: its {what} are {', '.join(sorted(was))}, those of the cell "
+        f"{', '.join(sorted(own))}"
+        for what, was, own in (
+            ("tasks", set(theirs.pipeline.tasks), set(problem.pipeline.tasks)),
+            ("nodes", set(theirs.fabric.nodes), set(problem.fabric.nodes)),
+        )
+        if was != own
+    ]
+    sites = run.jobs.select("task", "node").unique().cast(dict.fromkeys(("task", "node"), str))
+    faults += [
+        f"{name}: {task} ran on {node}, where the cell has no such task"
+        for task, node in sites.iter_rows()
+        if not faults and node not in problem.pipeline.tasks[task].on
+    ]
+    for field_name, there, here in (
+        ("window_cycles", theirs.window_cycles, problem.window_cycles),
+        ("period_ms", theirs.pipeline.period_ms, problem.pipeline.period_ms),
+    ):
+        if there != here:
+            faults.append(f"{name}: {field_name} was {there}, not {here}")
+    if faults:
+        raise RunError("\n".join(faults))
+
+
+def usable(run: Run) -> pl.DataFrame:
+    """Return the windows of a run after the warm-up that are of one placement and undisturbed."""
+    import polars as pl
+
+    windows = run.windows.filter(~pl.col("warmup") & ~pl.col("mixed"))
+    if "unproven" in windows.columns:
+        windows = windows.filter(~pl.col("unproven"))
+    pressure = run.meta.get("pressure")
+    out = pressure.get("excluded", ()) if isinstance(pressure, Mapping) else ()
+    return windows.filter(~pl.col("window").is_in([int(number) for number in out]))
+
+
+def cycles_in(windows: pl.DataFrame, problem: Problem) -> pl.DataFrame:
+    """Return the cycles of windows: `window`, and `cycle` (Int64)."""
+    import polars as pl
+
+    ranges = pl.int_ranges("first_cycle", pl.col("first_cycle") + problem.window_cycles)
+    return windows.select("window", cycle=ranges).explode("cycle").cast({"cycle": pl.Int64})
+
+
+def _while_jobs_ran(own: pl.DataFrame, column: str) -> dict[str, tuple[float, float]]:
+    """CPU time that others took while jobs ran, and how long these ran, s, by node."""
+    import polars as pl
+
+    if column not in own.columns:
+        return {}
+    sums = (
+        own.filter(pl.col(column).is_not_null())
+        .group_by("node")
+        .agg(pl.col(column).sum() / 1e9, pl.col("took").sum() / 1e9)
+    )
+    return {node: (taken_s, took_s) for node, taken_s, took_s in sums.iter_rows()}
+
+
+def _accompanied(jobs: pl.DataFrame) -> pl.Series:
+    """Whether another job of the cell, or a shadow, ran on the same node meanwhile."""
+    import polars as pl
+
+    order = jobs.with_row_index().sort("node", "start_ns", "end_ns")
+    ended = pl.col("end_ns").cum_max().shift(1).over("node")
+    follows = pl.col("start_ns").shift(-1).over("node")
+    met = order.with_columns(
+        accompanied=((ended > pl.col("start_ns")) | (follows < pl.col("end_ns"))).fill_null(
+            value=False
+        )
+    )
+    return met.sort("index")["accompanied"]
+
+
+def _beside_ms(of: pl.DataFrame) -> Floats:
+    """CPU time that a site's node took beside each of its jobs, beyond the mean, ms.
+
+    Unknown of a job that another one accompanied: it is that of the job before.
+    """
+    import polars as pl
+
+    if "others_ns" not in of.columns:
+        return np.zeros(of.height)
+    alone = ~pl.col("accompanied") & pl.col("others_ns").is_not_null()
+    known = of.filter(alone)
+    if not known.height:
+        return np.zeros(of.height)
+    rate = float(known["others_ns"].sum()) / max(float(known["took"].sum()), 1.0)
+    more = pl.when(alone).then(pl.col("others_ns") - rate * pl.col("took")) / 1e6
+    return of.select(more.forward_fill().backward_fill()).to_series().to_numpy()
+
+
+def _taken_ms(own: pl.DataFrame, column: str) -> dict[SiteName, float]:
+    """Mean CPU time that nodes took around their jobs, where it is known of enough of them."""
+    import polars as pl
+
+    if column not in own.columns:
+        return {}
+    means = (
+        own.filter(pl.col(column).is_not_null())
+        .group_by("task", "node")
+        .agg(pl.col(column).mean() / 1e6, jobs=pl.len())
+        .filter(pl.col("jobs") >= LEAST_JOBS)
+    )
+    return {(task, node): mean_ms for task, node, mean_ms, _ in means.iter_rows()}
+
+
+def _rates(run: Run, windows: pl.DataFrame, problem: Problem) -> dict[tuple[str, str], float]:
+    """Cores that each process took in the windows; each counts from its release to its close."""
+    import polars as pl
+
+    if not run.has_processes:
+        return {}
+    size, grace_ns = problem.window_cycles, problem.controller.close_grace_ms * 1e6
+    span_ns = windows.height * (size * problem.pipeline.period_ms * 1e6 + grace_ns)
+    counted = run.processes.filter(pl.col("window").is_in(windows["window"].to_list()))
+    sums = counted.group_by(pl.col("node").cast(str), "process").agg(pl.col("cpu_ns").sum())
+    return {(node, process): cpu_ns / span_ns for node, process, cpu_ns in sums.iter_rows()}
+
+
+def _delays(own: pl.DataFrame, problem: Problem) -> dict[tuple[str, str, str, str], Floats]:
+    """Delays of messages, by flow and nodes; of joins it is not known which input came last."""
+    import polars as pl
+
+    delays: dict[tuple[str, str, str, str], Floats] = {}
+    for flow in problem.pipeline.flows:
+        if len(problem.pipeline.inputs(flow.target)) > 1:
+            continue
+        sent = own.filter(pl.col("task") == flow.source).select("cycle", "end_ns", "node")
+        came = own.filter(pl.col("task") == flow.target).select("cycle", "ready_ns", to="node")
+        both = sent.join(came, on="cycle", maintain_order="left")
+        for (node, to), of in both.group_by("node", "to", maintain_order=True):
+            delay_ms = (of["ready_ns"] - of["end_ns"]).to_numpy() / 1e6
+            delays[flow.source, flow.target, str(node), str(to)] = delay_ms
+    return delays
+
+
+def _begins(own: pl.DataFrame, run: Run, problem: Problem) -> dict[SiteName, float]:
+    import polars as pl
+
+    tasks, pipeline = problem.pipeline.tasks, problem.pipeline
+    offset_ms = {name: task.offset_ms for name, task in tasks.items() if not pipeline.inputs(name)}
+    released = run.cycles.select(pl.col("cycle").cast(pl.Int64), "release_ns")
+    since_ns = (
+        pl.when(pl.col("task").is_in(list(offset_ms))).then("release_ns").otherwise("ready_ns")
+    )
+    offsets = pl.col("task").replace_strict(offset_ms, default=0.0, return_dtype=pl.Float64)
+    waits = own.join(released, on="cycle", how="left")
+    return _unhindered(waits, (pl.col("start_ns") - since_ns) / 1e6 - offsets)
+
+
+def _ends(own: pl.DataFrame, run: Run, problem: Problem) -> dict[SiteName, float]:
+    import polars as pl
+
+    sinks = [name for name in problem.pipeline.tasks if not problem.pipeline.outputs(name)]
+    if len(sinks) > 1:
+        return {}
+    cycles = run.cycles.filter(pl.col("latency_ns").is_not_null())
+    done = cycles.select(
+        pl.col("cycle").cast(pl.Int64), done=pl.col("release_ns") + pl.col("latency_ns")
+    )
+    of = own.filter(pl.col("task") == sinks[0]).join(done, on="cycle")
+    return _unhindered(of, (pl.col("done") - pl.col("end_ns")) / 1e6)
+
+
+def _unhindered(jobs: pl.DataFrame, wait_ms: pl.Expr) -> dict[SiteName, float]:
+    """Quick waits of jobs, by task and node."""
+    quick_ms = wait_ms.quantile(UNHINDERED, "linear").clip(0.0)
+    quick = jobs.group_by("task", "node").agg(quick_ms.alias("ms"))
+    return {(task, node): ms for task, node, ms in quick.iter_rows()}

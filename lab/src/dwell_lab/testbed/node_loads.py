@@ -1,0 +1,127 @@
+"""Node loads: what nodes do besides jobs, and how busy nodes slow their jobs down.
+
+Everything that a node does and that is in no task's cost (agents, stampers, sinks, the controller,
+workers without jobs and the messaging that delays nothing) is its background.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from dwell.model import Problem
+from dwell.model.bounds import BACKGROUND_HZ, CONTENTION
+from dwell_lab.testbed.measured import LEAST_JOBS, Measured, SiteName
+from dwell_lab.testbed.speeds import Usual
+from dwell_lab.testbed.task_costs import TaskCost
+
+#: Wakes that come together: a message wakes a thread that waits for sockets, one that reads, and a
+#: worker's. In a trace of the scheduler under the example, the time from any instant until a thread
+#: wakes or sleeps is as long as with 0.40 (E) to 0.52 (R1) times as many that come alone.
+TOGETHER = 2.2
+
+
+def backgrounds(
+    measured: Sequence[Measured], costs: Mapping[SiteName, TaskCost], problem: Problem
+) -> dict[str, float]:
+    """Cores of every node that neither its jobs nor foreign threads took.
+
+    Of a node with a quota its control group says what was taken in all; elsewhere, where others
+    may have the same CPUs, only the cell's own processes are counted.
+    """
+    result = {}
+    for node, of in problem.fabric.nodes.items():
+        left = []
+        for one in measured:
+            processes = [rate for (where, _), rate in one.rates.items() if where == node]
+            if node in one.disturbed.nodes or not processes:
+                continue
+            used = one.used[node] if of.quota is not None else sum(processes)
+            sites_ = ((key, rate) for key, rate in one.starts.items() if key[1] == node)
+            jobs = sum(rate * _cores_ms(key, one, costs, problem) / 1e3 for key, rate in sites_)
+            left.append((used - jobs, one.windows))
+        if left:
+            values, weights = zip(*left, strict=True)
+            mean = float(np.average(values, weights=weights))
+            result[node] = min(max(mean, 0.0), 0.9 * of.capacity)
+    return result
+
+
+def beside_jobs(measured: Sequence[Measured], behind: Mapping[str, float]) -> dict[str, float]:
+    """Cores of every node's background that were taken while its jobs ran, where it is known."""
+    result = {}
+    for node, cores in behind.items():
+        of = [
+            one.beside[node] for one in measured if node in one.beside.keys() - one.disturbed.nodes
+        ]
+        if (taken := _cores(of)) is not None:
+            result[node] = min(taken, cores)
+    return result
+
+
+def _cores(of: Sequence[tuple[float, float]]) -> float | None:
+    """CPU time taken while jobs ran, over how long these ran; None where none did."""
+    took_s = sum(took for _, took in of)
+    return sum(taken for taken, _ in of) / took_s if took_s > 0 else None
+
+
+def contentions(measured: Sequence[Measured]) -> dict[str, float]:
+    """Share of the time of every node's jobs in which its CPUs worked for others.
+
+    From runs without any stress: nodes may share CPUs, and one that is stressed takes more of them.
+    """
+    result = {}
+    calm = [one for one in measured if not one.disturbed.nodes]
+    for node in sorted({node for one in calm for node in one.outside}):
+        of = [one.outside[node] for one in calm if node in one.outside]
+        if (taken := _cores(of)) is not None:
+            result[node] = min(taken, CONTENTION.high)
+    return result
+
+
+def wakes(measured: Sequence[Measured], problem: Problem) -> dict[str, float]:
+    """How often in a second threads of a node wake, where the kernel looks at ticks otherwise."""
+    result = {}
+    for name, node in problem.fabric.nodes.items():
+        counted = [one.run.meta.get("wakes_hz") or {} for one in measured]
+        known = [float(of[name]) for of in counted if name in of]
+        if known and node.quota is not None and node.quota.tick_ms > 0:
+            result[name] = min(sum(known) / len(known) / TOGETHER, BACKGROUND_HZ.high)
+    return result
+
+
+def interferences(
+    measured: Sequence[Measured], costs: Mapping[SiteName, TaskCost], usual: Usual
+) -> dict[str, float]:
+    """How many times as much core time stages took on nodes that were stressed all the time."""
+    sums: dict[str, list[float]] = {}
+    for one in measured:
+        for site, visit in one.visits.items():
+            node = site[1]
+            if node in one.disturbed.stressed and site in costs:
+                total = sums.setdefault(node, [0.0, 0.0, 0.0])
+                total[0] += float(visit.stage_ms.sum()) / usual.factor(one.work_ms, *site)
+                total[1] += len(visit.stage_ms) * costs[site].stage_ms
+                total[2] += len(visit.stage_ms)
+    return {
+        node: max(took / alone, 1.0)
+        for node, (took, alone, jobs) in sums.items()
+        if jobs >= LEAST_JOBS
+    }
+
+
+def _cores_ms(
+    key: tuple[str, str, bool],
+    one: Measured,
+    costs: Mapping[SiteName, TaskCost],
+    problem: Problem,
+) -> float:
+    """Core time, ms, of a job as a simulator will charge it."""
+    execution = problem.pipeline.tasks[key[0]].on[key[1]]
+    if execution.accelerator is not None:
+        return 0.0
+    site = costs.get(key[:2])
+    if site is None:
+        return one.spent_ms[key]
+    return one.spent_ms[key] + execution.threads * (site.before_ms + site.after_ms)

@@ -1,0 +1,198 @@
+"""Speeds: how fast the CPUs of a testbed's nodes were in a run, and a cell on slower ones.
+
+A machine that others share is now faster and now slower: what the same work takes of a CPU's time
+changes by a fifth within the hour. The probes of a run do a fixed piece of work all the time
+(`dwell_lab.testbed.probe`), and know nothing of the cell. A calibrated cell says how fast the CPUs
+were that it was measured on, and how much each stage depends on that; a run that is compared with
+it is predicted on CPUs as fast as its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from statistics import fmean, median
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dwell.model import FrozenDict, Problem, Trace
+from dwell.model.bounds import CONTENTION
+from dwell.model.process import TraceTable
+
+if TYPE_CHECKING:
+    from dwell.model import Execution, Process
+    from dwell.record import Run
+
+
+@dataclass(frozen=True, slots=True)
+class Usual:
+    """How fast the CPUs were that a cell was measured on, and how much stages depend on it.
+
+    Parameters
+    ----------
+    work_ms : mapping of str to float
+        CPU time of a probe's piece of work, by node.
+    sensitivity : mapping of (str, str) to float
+        By task and node: where the piece of work takes x times as long, the stage takes
+        x**sensitivity times as long. 1 of those that are not there.
+    """
+
+    work_ms: Mapping[str, float] = FrozenDict()
+    sensitivity: Mapping[tuple[str, str], float] = FrozenDict()
+
+    @classmethod
+    def of(cls, told: Mapping[str, Any]) -> Usual:
+        """Read a calibration's report.
+
+        Parameters
+        ----------
+        told : mapping
+            ``work_ms`` by node and ``sensitivity`` by ``task@node``, where they are there.
+        """
+        return cls(
+            {str(node): float(ms) for node, ms in told.get("work_ms", {}).items()},
+            {
+                (task, node): float(value)
+                for name, value in told.get("sensitivity", {}).items()
+                for task, _, node in [str(name).partition("@")]
+            },
+        )
+
+    def factors(self, took_ms: Mapping[str, float]) -> dict[str, float]:
+        """Return how many times as long a probe's piece of work took, by node."""
+        return {
+            node: took_ms[node] / usual_ms
+            for node, usual_ms in self.work_ms.items()
+            if node in took_ms
+        }
+
+    def factor(self, took_ms: Mapping[str, float], task: str, node: str) -> float:
+        """Return how many times as long a stage took as it usually does."""
+        factor = self.factors(took_ms).get(node, 1.0)
+        return float(factor ** self.sensitivity.get((task, node), 1.0))
+
+
+def work_ms(run: Run) -> dict[str, float]:
+    """CPU time of a probe's piece of work on every node's CPUs, the median of windows that count.
+
+    Parameters
+    ----------
+    run : Run
+        Where its meta say no ``testbed``, or not what its probes did, nothing is known.
+    """
+    windows = window_work_ms(run)
+    return {node: median(of.values()) for node, of in windows.items() if of}
+
+
+def window_work_ms(run: Run) -> dict[str, dict[int, float]]:
+    """CPU time of a probe's piece of work on every node's CPUs, by window of those that count."""
+    pressure, testbed = run.meta.get("pressure"), run.meta.get("testbed")
+    if not isinstance(pressure, Mapping) or not isinstance(testbed, Mapping):
+        return {}
+    excluded = set(pressure.get("excluded", ()))
+    warmup = run.problem.warmup_windows
+    rows = {
+        int(row["window"]): row["work_ms"]
+        for row in pressure.get("windows", ())
+        if row.get("work_ms") and row["window"] >= warmup and row["window"] not in excluded
+    }
+    works: dict[str, dict[int, float]] = {}
+    for node, about in testbed.get("nodes", {}).items():
+        cpus = [str(cpu) for cpu in about["cpus"]]
+        works[node] = {
+            window: fmean(row[cpu] for cpu in cpus if cpu in row)
+            for window, row in rows.items()
+            if not row.keys().isdisjoint(cpus)
+        }
+    return works
+
+
+def at_speed_of(run: Run, problem: Problem, usual: Usual) -> Problem:
+    """Return a cell on CPUs as fast as they were in a run.
+
+    Parameters
+    ----------
+    usual : Usual
+        Where the cell was measured.
+    """
+    return slowed(problem, usual.factors(work_ms(run)), usual.sensitivity)
+
+
+def slowed(
+    problem: Problem,
+    factors: Mapping[str, float],
+    sensitivity: Mapping[tuple[str, str], float] = FrozenDict(),
+) -> Problem:
+    """Return a cell on CPUs on which everything takes so many times as long.
+
+    Parameters
+    ----------
+    factors : mapping of str to float
+        By node. What was measured takes longer (execution times that are replayed, backgrounds,
+        what others take); what was not stays as it is.
+    sensitivity : mapping of (str, str) to float
+        By task and node; see `Usual`.
+    """
+    if not factors:
+        return problem
+    tables = _tables(problem, factors, sensitivity)
+
+    def moved(process: Process) -> Process:
+        if isinstance(process, Trace) and id(process.table) in tables:
+            return replace(process, table=tables[id(process.table)])
+        return process
+
+    def execution(of: Execution) -> Execution:
+        return replace(of, exec_ms=moved(of.exec_ms))
+
+    pipeline = problem.pipeline
+    tasks = {
+        name: replace(task, on={node: execution(of) for node, of in task.on.items()})
+        for name, task in pipeline.tasks.items()
+    }
+    nodes = {}
+    for name, node in problem.fabric.nodes.items():
+        factor = min(factors.get(name, 1.0), 0.9 * node.capacity / max(node.background, 1e-9))
+        beside = node.background_beside
+        nodes[name] = replace(
+            node,
+            background=node.background * factor,
+            background_beside=None if beside is None else beside * factor,
+            contention=min(node.contention * factor, CONTENTION.high),
+        )
+    links = {
+        name: replace(link, delay_ms=moved(link.delay_ms))
+        for name, link in problem.fabric.links.items()
+    }
+    return replace(
+        problem,
+        pipeline=replace(pipeline, tasks=tasks),
+        fabric=replace(problem.fabric, nodes=nodes, links=links),
+    )
+
+
+def _tables(
+    problem: Problem,
+    factors: Mapping[str, float],
+    sensitivity: Mapping[tuple[str, str], float],
+) -> dict[int, TraceTable]:
+    """Tables that nodes' execution times are replayed from, with longer ones, by their identity."""
+    longer: dict[int, tuple[TraceTable, dict[str, float]]] = {}
+    for task in problem.pipeline.tasks.values():
+        for node, of in task.on.items():
+            # An accelerator is not slower where CPUs are.
+            if isinstance(of.exec_ms, Trace) and node in factors and of.accelerator is None:
+                table = of.exec_ms.table
+                factor = factors[node] ** sensitivity.get((task.name, node), 1.0)
+                longer.setdefault(id(table), (table, {}))[1][of.exec_ms.column] = factor
+    return {
+        key: replace(
+            table,
+            columns={
+                name: np.asarray(values * columns.get(name, 1.0))
+                for name, values in table.columns.items()
+            },
+        )
+        for key, (table, columns) in longer.items()
+    }

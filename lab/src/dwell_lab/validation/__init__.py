@@ -1,0 +1,1 @@
+"""Predictions of the simulator, compared with measured runs."""

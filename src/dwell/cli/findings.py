@@ -1,0 +1,76 @@
+"""What `dwell doctor` found out, and how it is printed."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import textwrap
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import typer
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Result of looking at one thing.
+
+    Parameters
+    ----------
+    name : str
+        The thing, in a few words.
+    remedy : str
+        Empty if there is nothing to do.
+    needed : bool
+        Whether the part cannot work without.
+    """
+
+    name: str
+    ok: bool
+    found: str
+    remedy: str = ""
+    needed: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Findings under one heading.
+
+    Parameters
+    ----------
+    command : str
+        The command that works if all of `required` is well; empty for none.
+    extra : str
+        The extra that the command needs besides.
+    """
+
+    name: str
+    findings: Sequence[Finding]
+    command: str = ""
+    extra: str = ""
+    required: Sequence[Finding] = ()
+
+
+def optional(name: str, ok: bool, found: str, remedy: str = "") -> Finding:
+    """Return a finding on what Dwell can do without; its remedy is there where it is not well."""
+    return Finding(name, ok, found, "" if ok else remedy, needed=False)
+
+
+def print_findings(findings: Iterable[Finding], *, broken: str, lacking: str) -> None:
+    """Print findings, each with its remedy below; long lines are broken on a terminal.
+
+    Parameters
+    ----------
+    broken, lacking : str
+        Marks of what is needed and not well, and of what is not well and not needed.
+    """
+    columns = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
+    for finding in findings:
+        mark = "ok" if finding.ok else broken if finding.needed else lacking
+        lines = [f"{mark:8} {finding.name}: {finding.found}"]
+        lines += [f"{'':8} {finding.remedy}"] * bool(not finding.ok and finding.remedy)
+        for line in lines:
+            indent = " " * 9
+            typer.echo(
+                textwrap.fill(line, columns, subsequent_indent=indent, break_on_hyphens=False)
+            )

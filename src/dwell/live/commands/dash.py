@@ -1,0 +1,112 @@
+"""`dwell dash`: the page of a live cell, of a recorded run, or of a fleet's runs."""
+
+from __future__ import annotations
+
+import re
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from dwell.cli.options import (
+    Insecure,
+    Keys,
+    argument,
+    flag,
+    option,
+)
+from dwell.live.commands.log_format import LogFormat, Logs, begin_log
+
+if TYPE_CHECKING:
+    from dwell.dash.server import Dash
+
+#: Where a page is served where nobody says.
+PORT = 8780
+CELL = Path("cell.yaml")
+#: At least 128 bits in base64; no sign that a header, a cookie or an address would change.
+TOKEN = re.compile(r"[A-Za-z0-9_-]{22,200}")
+
+
+def dash(
+    shown: Annotated[
+        Path | None,
+        argument(
+            "CELL|RUN|FLEET",
+            "Cell file of a cell that runs, or the folder of a run, or of a fleet's runs; "
+            "./cell.yaml if not given.",
+        ),
+    ] = None,
+    beside: Annotated[
+        Path | None, option("RUN", "Another run, to be shown on the same time line.")
+    ] = None,
+    port: Annotated[int, option("P", "Of loopback; 0 takes a free one.", min=0, max=65_535)] = PORT,
+    no_browser: Annotated[
+        bool, flag("--no-browser", "Print the address only, and open no browser.")
+    ] = False,
+    control: Annotated[
+        bool, flag("--control", "Let the page pin and drain; with keys, it takes an operator's.")
+    ] = False,
+    mcap: Annotated[
+        Path | None,
+        option(
+            "FILE",
+            "Also record the live cell to an MCAP file for Foxglove, PlotJuggler and others.",
+        ),
+    ] = None,
+    token: Annotated[
+        Path | None,
+        option("FILE", "Where the page's token is kept, for Prometheus; made where there is none."),
+    ] = None,
+    keys: Keys = None,
+    insecure: Insecure = False,
+    log_format: Logs = LogFormat.TEXT,
+) -> None:
+    """Show a live cell, or recorded runs, on a page in the browser of this computer."""
+    from dwell.dash.pages import live_page, recorded_page
+    from dwell.live.log import say
+    from dwell.record import is_fleet
+
+    begin_log(log_format, "dash")
+    kept = None if token is None else _kept(token)
+    where = shown or CELL
+    if where.is_dir():
+        fleet = is_fleet(where)
+        if control:
+            raise typer.BadParameter("--control: recorded runs cannot be acted on")
+        if mcap is not None:
+            run = where / "CELL" if fleet else where
+            raise typer.BadParameter(f"--mcap: dwell report {run} --mcap {mcap} writes a run's")
+        if fleet and beside is not None:
+            raise typer.BadParameter(
+                f"--beside: {where} is a fleet, which is shown alone; two of its runs can stand "
+                "beside each other"
+            )
+        page: AbstractContextManager[Dash] = nullcontext(recorded_page(where, beside))
+    elif beside is not None:
+        raise typer.BadParameter("--beside: a run stands beside a run, not beside a live cell")
+    elif shown is None and not where.is_file():
+        raise typer.BadParameter("there is no cell.yaml here; name a cell file, or a run's folder")
+    else:
+        from dwell.live.security import environment
+
+        page = live_page(where, environment(keys, insecure=insecure), control=control, mcap=mcap)
+    from dwell.dash.serving import serve
+
+    with page as served:
+        serve(served, port, browser=not no_browser, say=say, token=kept)
+
+
+def _kept(file: Path) -> str:
+    """Return the token in a file; a new one is made, and kept there, where there is none."""
+    from dwell.dash.gate import new_token
+    from dwell.files import write_whole
+
+    if not file.exists():
+        write_whole(file, new_token(), private=True)
+    token = file.read_text(encoding="utf-8").strip()
+    if file.stat().st_mode & 0o007:
+        raise typer.BadParameter(f"--token: everybody here can read {file}; chmod o-rwx {file}")
+    if not TOKEN.fullmatch(token):
+        raise typer.BadParameter(f"--token: {file} has no token: 22 to 200 letters, digits, - or _")
+    return token

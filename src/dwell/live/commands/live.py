@@ -1,0 +1,544 @@
+"""`dwell agent`, `dwell controller` and `dwell live`: cells of real processes."""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import typer
+
+from dwell.cli.completion import candidates, nodes, scenarios
+from dwell.cli.options import (
+    CellArgument,
+    CellOption,
+    Estimator,
+    Insecure,
+    Json,
+    Keys,
+    Node,
+    Policy,
+    Seed,
+    argument,
+    flag,
+    option,
+    require_held,
+)
+from dwell.cli.output import json_text, print_json, proof
+from dwell.display import milliseconds
+from dwell.errors import ExitCode
+from dwell.live.commands.log_format import LogFormat, Logs, begin_log
+from dwell.live.state_folder import state_root
+
+if TYPE_CHECKING:
+    from dwell.live.operator_client import OperatorClient
+
+#: Time between two looks of ``status --watch``.
+WATCH_S = 1.0
+#: How long a move that was asked for is waited for.
+MOVES_S = 3.0
+
+Cpus = Annotated[
+    str | None, option("LIST", "CPUs to use, as 0,2-3; those of this process if not given.")
+]
+
+Owner = Annotated[int | None, option("PID", "Process that this one ends with.", hidden=True)]
+
+NodeArgument = Annotated[str, typer.Argument(metavar="NODE", autocompletion=nodes)]
+
+live = typer.Typer(
+    no_args_is_help=True, help="Look at live cells, and have a hand in what their controller does."
+)
+
+
+def agent(
+    node: Node,
+    cell: CellOption,
+    state: Annotated[
+        Path | None,
+        option("FOLDER", "Where processes keep their files; by default below ~/.local."),
+    ] = None,
+    cpus: Cpus = None,
+    cpus_of: Annotated[
+        list[str] | None,
+        option("PROCESS=LIST", "CPUs of some processes, as perception@*=2-3; may repeat."),
+    ] = None,
+    realtime: Annotated[
+        list[str] | None,
+        option(
+            "PROCESS=PRIORITY",
+            "Real-time priority (SCHED_FIFO) of some processes, as sink.*=20; may repeat.",
+        ),
+    ] = None,
+    accelerator: Annotated[
+        str | None,
+        option(
+            "MODULE:FUNCTION", "Returns the utilisation of the node's accelerator, from 0 to 1."
+        ),
+    ] = None,
+    keys: Keys = None,
+    insecure: Insecure = False,
+    log_format: Logs = LogFormat.TEXT,
+    owner: Owner = None,
+    renews: Annotated[
+        bool, typer.Option("--renews", help="Restart what it takes over.", hidden=True)
+    ] = False,
+) -> None:
+    """Run a node of a live cell: its workers, and on the right nodes stamper and sinks."""
+    from dwell.live import node_command
+
+    begin_log(log_format, f"agent@{node}")
+    with _bad_parameters():
+        node_command.agent(
+            node,
+            cell,
+            state=state,
+            cpus=cpus,
+            cpus_of=cpus_of or (),
+            realtime=realtime or (),
+            accelerator=accelerator,
+            keys=keys,
+            insecure=insecure,
+            owner=owner,
+            renews=renews,
+        )
+
+
+def controller(
+    cell: Annotated[list[Path], option("FILE", "Cell file; may be repeated.", "--cell")],
+    out: Annotated[Path, option("FOLDER", "Where the runs' folders go.")] = Path("runs"),
+    state: Annotated[
+        Path | None,
+        option("FOLDER", "Where it keeps what it began with; by default below ~/.local."),
+    ] = None,
+    policy: Policy = None,
+    name: Annotated[
+        str | None, typer.Option(help="Of this controller; its process id if not given.")
+    ] = None,
+    jobs: Annotated[
+        bool,
+        typer.Option(
+            envvar="DWELL_JOBS",
+            help="Keep every job, and what each process takes of the CPUs, in the runs, too.",
+        ),
+    ] = False,
+    cpus: Cpus = None,
+    keys: Keys = None,
+    insecure: Insecure = False,
+    log_format: Logs = LogFormat.TEXT,
+    owner: Owner = None,
+    continues: Annotated[str, option("JSON", "Runs that it continues.", hidden=True)] = "{}",
+) -> None:
+    """Decide where the stages of live cells run."""
+    from dwell.live import node_command
+
+    begin_log(log_format, "controller")
+    with _bad_parameters():
+        node_command.controller(
+            cell,
+            out,
+            state=state,
+            policy=policy,
+            name=name,
+            jobs=jobs,
+            cpus=cpus,
+            keys=keys,
+            insecure=insecure,
+            owner=owner,
+            continues=continues,
+        )
+
+
+@contextmanager
+def _bad_parameters() -> Iterator[None]:
+    """Have an option that is wrong told with the command's usage."""
+    from dwell.live.node_command import OptionError
+
+    try:
+        yield
+    except OptionError as error:
+        raise typer.BadParameter(str(error)) from None
+
+
+@live.command()
+def status(
+    cell: CellOption,
+    check: Annotated[bool, flag("--check", "Exit with 1 unless the cell's health is ok.")] = False,
+    watch: Annotated[
+        bool, flag("--watch", "Look again every second; with --json, a line each time.")
+    ] = False,
+    stages: Annotated[
+        bool, flag("--stages", "Show times of stages and counts of flows, too.")
+    ] = False,
+    keys: Keys = None,
+    insecure: Insecure = False,
+    as_json: Json = False,
+) -> None:
+    """Show how a cell is, and first what is wrong with it."""
+    if check and watch:
+        raise typer.BadParameter("--check looks once; leave --watch out")
+    from dwell.live.kept_cell import cell_here
+    from dwell.live.local_addresses import running_elsewhere
+    from dwell.live.operator_client import OperatorClient
+    from dwell.live.security import environment
+
+    problem = cell_here(cell, state_root()).problem()
+    with OperatorClient(problem, environment(keys, insecure=insecure)) as visitor:
+        if watch:
+            _watch(visitor, stages=stages, as_json=as_json)
+        answer = visitor.look()
+    absent = answer["health"] == "absent"
+    if as_json:
+        print_json(answer)
+    elif absent:
+        typer.echo(f"error: {answer['headline']} {running_elsewhere(problem)}".rstrip(), err=True)
+    else:
+        typer.echo("\n".join(status_lines(answer, stages=stages)))
+    if absent or (check and answer["health"] != "ok"):
+        raise typer.Exit(ExitCode.FAILED)
+
+
+def _watch(visitor: OperatorClient, *, stages: bool, as_json: bool) -> NoReturn:
+    """Show how a cell is every second, until interrupted."""
+    screen = sys.stdout.isatty() and not as_json
+    while True:
+        until_s = time.monotonic() + WATCH_S
+        answer = visitor.look(patience_s=WATCH_S)
+        if as_json:
+            typer.echo(json_text(answer, None))
+        elif screen:
+            typer.echo(_drawn(status_lines(answer, stages=stages)), nl=False)
+        else:
+            typer.echo("\n".join((*status_lines(answer, stages=stages), "")))
+        time.sleep(max(until_s - time.monotonic(), 0.0))
+
+
+def _drawn(lines: list[str]) -> str:
+    """Return lines as they replace what a terminal shows, as many as it has room for."""
+    width, height = shutil.get_terminal_size()
+    more = len(lines) - (height - 1)
+    if more > 0:
+        lines = [*lines[: -more - 1], f"  and {more + 1} more lines"]
+    rows = "".join(f"{line[:width]}\x1b[K\n" for line in lines)
+    return f"\x1b[H{rows}\x1b[J"
+
+
+@live.command()
+def pin(
+    candidate: Annotated[str, typer.Argument(metavar="CANDIDATE", autocompletion=candidates)],
+    cell: CellOption,
+    keys: Keys = None,
+    insecure: Insecure = False,
+    as_json: Json = False,
+) -> None:
+    """Have a cell stay on one candidate, whatever its policy would do."""
+    _ask(cell, "pin", candidate, keys, insecure=insecure, as_json=as_json)
+
+
+@live.command()
+def unpin(
+    cell: CellOption, keys: Keys = None, insecure: Insecure = False, as_json: Json = False
+) -> None:
+    """Let the policy decide again."""
+    _ask(cell, "unpin", "", keys, insecure=insecure, as_json=as_json)
+
+
+@live.command()
+def drain(
+    node: NodeArgument,
+    cell: CellOption,
+    keys: Keys = None,
+    insecure: Insecure = False,
+    as_json: Json = False,
+) -> None:
+    """Have no stage run on a node, so that it can be stopped or its code changed."""
+    _ask(cell, "drain", node, keys, insecure=insecure, as_json=as_json)
+
+
+@live.command()
+def undrain(
+    node: NodeArgument,
+    cell: CellOption,
+    keys: Keys = None,
+    insecure: Insecure = False,
+    as_json: Json = False,
+) -> None:
+    """Let stages run on a node again."""
+    _ask(cell, "undrain", node, keys, insecure=insecure, as_json=as_json)
+
+
+@live.command()
+def run(
+    cell: CellArgument,
+    scenario: Annotated[
+        str | None,
+        option(
+            "NAME",
+            "One of the cell's scenarios; its first that disturbs something if not given.",
+            autocompletion=scenarios,
+        ),
+    ] = None,
+    seconds: Annotated[
+        float | None,
+        option(
+            "S",
+            "Length, the warm-up included; as the scenario asks for.",
+            min=5,
+            callback=require_held,
+        ),
+    ] = None,
+    policy: Policy = None,
+    estimator: Estimator = None,
+    seed: Seed = 1,
+    out: Annotated[
+        Path | None,
+        option("FOLDER", "Where logs, the run and its report go; live-out/CELL if not given."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Run a cell on this machine, without root: its stages, links and disturbances; and report."""
+    from dwell.live.commands.live_run import run_live
+
+    run_live(
+        cell,
+        scenario=scenario,
+        seconds=seconds,
+        policy=policy,
+        estimator=estimator,
+        seed=seed,
+        out=out,
+        as_json=as_json,
+    )
+
+
+def processes(context: typer.Context) -> list[str]:
+    """Offer the processes on this computer that have a log."""
+    from dwell.live.state_folder import logs, state_root
+
+    return list(logs(state_root(context.params.get("state"))))
+
+
+Root = Annotated[
+    Path | None,
+    option("FOLDER", "Has a folder for each cell; by default below ~/.local.", "--state"),
+]
+
+
+@live.command()
+def up(
+    cell: CellArgument,
+    node: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Node of the cell that this computer is; may repeat. If not given, those whose "
+            "address is this computer's.",
+            autocompletion=nodes,
+        ),
+    ] = None,
+    policy: Policy = None,
+    out: Annotated[Path, option("FOLDER", "Where the runs' folders go.")] = Path("runs"),
+    again: Annotated[
+        bool, flag("--again", "Have what runs here take over an edited cell file or module.")
+    ] = False,
+    yes: Annotated[
+        bool, flag("--yes", "With --again: end all and start it, if nothing less will do.")
+    ] = False,
+    state: Root = None,
+    keys: Keys = None,
+    insecure: Insecure = False,
+) -> None:
+    """Start a cell's part on this computer in the background: agents, and its controller here."""
+    from dwell.live.commands import background
+    from dwell.live.kept_cell import cell_here
+    from dwell.live.security import environment
+
+    if again:
+        given = environment(keys, insecure=insecure)
+        node = background.again(cell, state_root(state), given, typer.echo, yes=yes)
+        if not node:
+            return
+    kept = cell_here(cell, state_root(state))
+    if kept.folder is not None:
+        kept.install()
+    problem = kept.problem()
+    nodes = background.nodes_here(problem, node or ())
+    if problem.controller_node in nodes:
+        problem = kept.problem(traces=True)
+    if changed := kept.told(", ".join(nodes)):
+        typer.echo(f"warning: {changed}", err=True)
+    folder = state_root(state) / problem.name
+    names = background.up(
+        cell,
+        problem,
+        folder,
+        out.resolve(),
+        nodes=nodes,
+        environment=environment(keys, insecure=insecure),
+        policy=policy,
+    )
+    typer.echo(f"{problem.name} is up: {', '.join(names)}; logs in {folder}")
+
+
+@live.command()
+def down(cell: CellArgument, state: Root = None) -> None:
+    """End what `up` has started, in order: the robot's actuators are told to stop."""
+    from dwell.live.commands import background
+    from dwell.live.kept_cell import cell_here, forget
+
+    root = state_root(state)
+    problem = cell_here(cell, root).problem()
+    names = background.down(problem, root / problem.name)
+    forget(cell, root)
+    ended = f"is down: {', '.join(names)}" if names else "does not run here"
+    typer.echo(f"{problem.name} {ended}")
+
+
+@live.command()
+def log(
+    process: Annotated[
+        str,
+        argument("PROCESS", "As agent@R1, controller@E, perception@E.", autocompletion=processes),
+    ],
+    follow: Annotated[
+        bool, typer.Option("--follow", "-f", help="Go on with what is added, until interrupted.")
+    ] = False,
+    cell: Annotated[
+        Path | None, option("FILE", "Its cell's file, where there are several cells.")
+    ] = None,
+    state: Root = None,
+) -> None:
+    """Print what a process of a cell on this computer has printed."""
+    from dwell.cellfile import load_without_traces
+    from dwell.live.commands import background
+
+    name = None if cell is None else load_without_traces(cell).name
+    background.print_log(background.log_of(state_root(state), process, name), follow=follow)
+
+
+@live.command()
+def units(
+    cell: CellArgument,
+    node: Node,
+    out: Annotated[Path, option("FOLDER", "Where the units go; made where it is missing.")] = Path(
+        "units"
+    ),
+    user: Annotated[
+        str | None, typer.Option(help="User of the services; this one if not given.")
+    ] = None,
+    keys: Keys = None,
+    insecure: Insecure = False,
+) -> None:
+    """Write the systemd units of a node: of its agent, and of the controller where it is there."""
+    from dwell.cellfile import load_without_traces
+    from dwell.live.commands.units import write_units
+
+    problem = load_without_traces(cell)
+    files = write_units(problem, node, cell, out, user=user, keys=keys, insecure=insecure)
+    copied = " ".join(shlex.quote(str(file)) for file in files)
+    names = " ".join(shlex.quote(file.stem) for file in files)
+    typer.echo(
+        f"sudo cp {copied} /etc/systemd/system/\n"
+        "sudo systemctl daemon-reload\n"
+        f"sudo systemctl enable --now {names}"
+    )
+
+
+def _ask(
+    cell: Path, what: str, about: str, keys: Path | None, *, insecure: bool, as_json: bool
+) -> None:
+    from dwell.live.kept_cell import cell_here
+    from dwell.live.operator_client import OperatorClient
+    from dwell.live.security import environment
+
+    problem = cell_here(cell, state_root()).problem()
+    with OperatorClient(problem, environment(keys, insecure=insecure)) as visitor:
+        answer = visitor.ask(what, about)
+        # The answer comes before the move that was asked for.
+        until_s = time.monotonic() + MOVES_S
+        while answer.get("moving_to") and time.monotonic() < until_s:
+            time.sleep(0.1)
+            answer = visitor.ask("status")
+    if as_json:
+        print_json(answer)
+        return
+    for line in status_lines(answer):
+        typer.echo(line)
+
+
+def status_lines(status: dict[str, Any], *, stages: bool = False) -> list[str]:
+    """Return a status as lines of text: first what is wrong, and who is not well.
+
+    Parameters
+    ----------
+    stages : bool
+        Whether times of stages and counts of flows follow.
+    """
+    headline = status["headline"]
+    lines = [f"{status['cell']} is {status['health']}: {headline}"] if headline else []
+    if status["health"] == "absent":
+        return lines
+    where = status["placement"] or "not known yet"
+    extras = [
+        f"{word} {status[key]}"
+        for word, key in (("moving to", "moving_to"), ("pinned to", "pinned"))
+        if status[key]
+    ]
+    if status["fallback"]:
+        extras.append("moved there by the guard")
+    if proving := status["proving"]:
+        extras.append(proof(proving))
+    if status["drained"]:
+        extras.append(f"without {', '.join(status['drained'])}")
+    if status["refused"]:
+        extras.append(f"last order refused: {status['refused']}")
+    lines.append(f"{status['cell']}: {where}{''.join(f'; {extra}' for extra in extras)}")
+    lines.append(
+        f"mode {status['mode']}, term {status['term']}, migrations {status['migrations']}, moves "
+        f"of the guard {status['guard_moves']}"
+    )
+    if window := status["window"]:
+        used = ", ".join(
+            f"{name} {'not measured' if share is None else f'{share:.0%}'}"
+            for name, share in window["utilisation"].items()
+        )
+        ratio = status["release_ratio"]
+        released = "" if ratio is None else f"released {ratio:.0%} of one cycle per period, "
+        lines.append(
+            f"window {window['number']}, {window['age_ms'] / 1e3:.1f} s ago: L95 "
+            f"{milliseconds(window['l95_ms'])} ms, V_D {window['violation_rate']:.1%}, J "
+            f"{window['cost']:.3f}, {window['reason']}; {released}silences {status['silences']}; "
+            f"utilisation {used}"
+        )
+    if status["changed"]:
+        lines.append(f"controller: {status['changed']}")
+    lines += [f"  {who:24} differs    {why}" for who, why in sorted(status["strangers"].items())]
+    lines += [f"  {who:24} not heard" for who in status["silent"]]
+    processes = status["processes"]
+    for who, process in sorted(processes.items(), key=lambda item: (item[1]["ready"], item[0])):
+        state = "ready" if process["ready"] else "not ready" if process["heard"] else "silent"
+        note = f"  {process['note']}" if process["note"] else ""
+        lines.append(f"  {who:24} {state:10} {process['age_ms']:8.0f} ms{note}")
+    return lines + _stage_lines(status) if stages else lines
+
+
+def _stage_lines(status: dict[str, Any]) -> list[str]:
+    """Return tables of stages and flows; without a complete window, that there is none yet."""
+    if not status.get("stages"):
+        return ["stages and flows: no window has been counted yet"]
+    columns: tuple[str, ...] = ("jobs", "replaced", "dropped")
+    lines = [f"{'stage':32}median ms   p95 ms{''.join(f'{name:>10}' for name in columns)}"]
+    for name, one in status["stages"].items():
+        times = (one["exec_median_ms"], one["exec_p95_ms"])
+        shown = "".join(f"{'-' if ms is None else f'{ms:.1f}':>9}" for ms in times)
+        lines.append(f"  {name:30}{shown}{''.join(f'{one[name]:10}' for name in columns)}")
+    columns = "sent", "taken", "replaced", "dropped", "lost", "in_flight"
+    lines.append(f"{'flow':32}{''.join(f'{name:>10}' for name in columns)}      kB/s")
+    for name, one in status["flows"].items():
+        counts = "".join(f"{one[name]:10}" for name in columns)
+        lines.append(f"  {name:30}{counts}{one['bytes_per_s'] / 1e3:10.1f}")
+    return lines

@@ -1,0 +1,29 @@
+"""Option `--log-format` of agents, controllers and the web page."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated
+
+import typer
+
+
+class LogFormat(StrEnum):
+    """Forms of the log on stderr."""
+
+    TEXT = "text"
+    JSON = "json"
+
+
+Logs = Annotated[
+    LogFormat,
+    typer.Option("--log-format", help="Form of the log on stderr: lines of text, or of JSON."),
+]
+
+
+def begin_log(log_format: LogFormat, who: str) -> None:
+    """Have a process print its log in a form."""
+    if log_format is LogFormat.JSON:
+        from dwell.live.log import log_as_json
+
+        log_as_json(who)

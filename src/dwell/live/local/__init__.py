@@ -1,0 +1,1 @@
+"""A live cell on this computer: its processes, emulated links, and disturbances."""

@@ -1,0 +1,146 @@
+"""Agents, controllers and their processes with faults around them: a testbed's entry point.
+
+``python -m dwell.live.local.process [--links FILE] [--clocks FILE] COMMAND ...`` runs what
+``dwell COMMAND ...`` does (``agent`` or ``controller``, with the same options), and what
+``python -m dwell.live.role_command`` does where the command is ``process``. Its messages meet the
+links that a `LinkFile` says, and its clock is wrong by what a `ClockFile` says.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from dwell.errors import ExitCode, line_and_code
+from dwell.live import role_command
+from dwell.live.hosting import Clock, Platform
+from dwell.live.local.clocks import wrong_clock
+from dwell.live.local.linked_transport import LinkedTransport
+from dwell.live.local.message_links import LinkEnds
+from dwell.live.log import say
+from dwell.live.security import INSECURE, Security
+from dwell.live.transport.transport import Transport
+from dwell.model import Problem
+
+
+def program(*, links: Path | None = None, clocks: Path | None = None) -> tuple[str, ...]:
+    """Return the module, and its first arguments, that runs agents and controllers with faults.
+
+    Parameters
+    ----------
+    links, clocks : Path, optional
+        As a `LinkFile` and a `ClockFile` have written them.
+    """
+    given = {"--links": links, "--clocks": clocks}
+    words = [word for name, path in given.items() if path is not None for word in (name, str(path))]
+    return "dwell.live.local.process", *words
+
+
+class FaultyPlatform(Platform):
+    """Clock and transport with faults around them.
+
+    Parameters
+    ----------
+    links, clocks : Path, optional
+        Without, links are what they are, or clocks are right.
+    """
+
+    def __init__(self, *, links: Path | None = None, clocks: Path | None = None) -> None:
+        self.program = (*program(links=links, clocks=clocks), "process")
+        self._links, self._clocks = links, clocks
+
+    def clock(self, problem: Problem, node: str) -> Clock:
+        """Return the clock of a node's processes."""
+        clock = super().clock(problem, node)
+        return clock if self._clocks is None else wrong_clock(clock, self._clocks, node)
+
+    def transport(self, security: Security, who: str, node: str) -> Transport:
+        """Open the sessions of a process on a node."""
+        if self._links is None:
+            return super().transport(security, who, node)
+        ends = LinkEnds(self._links, who, node)
+        return LinkedTransport(super().transport(security, who, node), ends)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command until it is told to end; returns the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--links", type=Path)
+    parser.add_argument("--clocks", type=Path)
+    parser.add_argument("command", choices=("agent", "controller", "process"))
+    parser.add_argument("words", nargs=argparse.REMAINDER)
+    asked = parser.parse_args(arguments)
+    platform = FaultyPlatform(links=asked.links, clocks=asked.clocks)
+    if asked.command == "process":
+        return role_command.main(asked.words, platform)
+    # Pydantic would look for plugins in all that is installed; Dwell uses none.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
+    return _run_node(asked.command, asked.words, platform)
+
+
+def _run_node(command: str, words: Sequence[str], platform: Platform) -> int:
+    """Run an agent or a controller."""
+    from dwell.live import node_command
+
+    run: Callable[..., None] = node_command.agent
+    parser = _agent_parser()
+    if command == "controller":
+        run, parser = node_command.controller, _controller_parser()
+    try:
+        run(**vars(parser.parse_args(words)), platform=platform)
+    except node_command.OptionError as error:
+        parser.error(str(error))
+    except Exception as error:
+        known = line_and_code(error)
+        if known is None:
+            raise
+        line, code = known
+        say(line)
+        return code
+    return ExitCode.DONE
+
+
+def _agent_parser() -> argparse.ArgumentParser:
+    parser = _parser("agent")
+    parser.add_argument("--node", required=True)
+    parser.add_argument("--cell", type=Path, required=True)
+    parser.add_argument("--state", type=Path)
+    parser.add_argument("--cpus-of", action="append", default=[])
+    parser.add_argument("--realtime", action="append", default=[])
+    parser.add_argument("--accelerator")
+    parser.add_argument("--renews", action="store_true")
+    return parser
+
+
+def _controller_parser() -> argparse.ArgumentParser:
+    parser = _parser("controller")
+    parser.add_argument("--cell", dest="cells", action="append", type=Path, required=True)
+    parser.add_argument("--out", type=Path, default=Path("runs"))
+    parser.add_argument("--state", type=Path)
+    parser.add_argument("--policy")
+    parser.add_argument("--continues", default="{}")
+    parser.add_argument("--name")
+    parser.add_argument("--jobs", action=argparse.BooleanOptionalAction, default=_set("DWELL_JOBS"))
+    return parser
+
+
+def _parser(command: str) -> argparse.ArgumentParser:
+    """Return a parser with what an agent and a controller may both be told."""
+    parser = argparse.ArgumentParser(command, allow_abbrev=False)
+    parser.add_argument("--cpus")
+    parser.add_argument("--keys", type=Path)
+    parser.add_argument("--insecure", action="store_true", default=_set(INSECURE))
+    parser.add_argument("--owner", type=int)
+    return parser
+
+
+def _set(variable: str) -> bool:
+    """Whether a variable of the environment says yes, as `dwell` reads it."""
+    return os.environ.get(variable, "").lower() in ("1", "on", "t", "true", "y", "yes")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,185 @@
+"""Timeline: the changes that a scenario's realisation makes to nodes and links.
+
+It is the simulator's: the node changes and link segments that the run's seed draws there, so that
+episodes, ramps and several disturbances at once mean the same on a testbed. Only bursts, which
+belong to nodes and links and not to the scenario, are not played.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from dwell.errors import LiveError
+from dwell.live.local.conditions import Conditions
+from dwell.model import Link, LinkDisturbance, Problem, Scenario
+from dwell.model.instants import NEVER_NS, require_length
+from dwell.model.scenario import RAMP_STEPS, Disturbance
+
+if TYPE_CHECKING:
+    from dwell.sim import LinkSegment
+
+NS_PER_S = 1e9
+
+
+@dataclass(frozen=True, slots=True)
+class NodeState:
+    """State of a node: foreign threads that it has, and whether it is down."""
+
+    threads: int
+    down: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """Change of a node or a link from an instant on.
+
+    Parameters
+    ----------
+    at_ns : int
+        Since the first release.
+    place : str
+        Node, or link (``R1->E``).
+    state : NodeState or Conditions
+        All of what it is like from then on: of a node, or of a link.
+    """
+
+    at_ns: int
+    place: str
+    state: NodeState | Conditions
+
+    @property
+    def at_s(self) -> float:
+        """The instant in seconds."""
+        return self.at_ns / 1e9
+
+
+@dataclass(frozen=True, slots=True)
+class Timeline:
+    """Changes of the nodes and links that a scenario disturbs.
+
+    Parameters
+    ----------
+    items : Scenario
+        The scenario with a disturbance for each of the episodes drawn.
+    changes : tuple of Change
+        In the order of time.
+    """
+
+    items: Scenario = ()
+    changes: tuple[Change, ...] = ()
+
+
+def timeline_of(
+    problem: Problem, scenario: str, *, seed: int, seconds: float, outages: bool = False
+) -> Timeline:
+    """Return the changes of a scenario's realisation, for as long as a cell runs.
+
+    Parameters
+    ----------
+    seed : int
+        At least 0; a simulation of this seed meets the same.
+    seconds : float
+        How long it is played.
+    outages : bool
+        Whether nodes and links can be made to be down.
+
+    Raises
+    ------
+    ProblemError
+        If there is no such scenario, a link would lose everything, or it is too long.
+    LiveError
+        If it has something that real links and CPUs cannot be made to do; all of it at once.
+    """
+    require_playable_scenario(problem, scenario, outages=outages)
+    written = problem.scenario(scenario)
+    if not written:
+        return Timeline()
+    from dwell.sim import draw_changes
+
+    window_s = problem.window_ms / 1e3
+    windows = math.floor(seconds / window_s) + 1
+    period_ms = problem.pipeline.period_ms
+    require_length(windows, problem.window_cycles, period_ms, f"seconds = {seconds:g}")
+    problem = _without_bursts(problem)
+    items, nodes, segments = draw_changes(problem, scenario=scenario, seed=seed, windows=windows)
+    changes = [Change(one.at_ns, one.node, NodeState(one.threads, one.down)) for one in nodes]
+    # A link's first segment is the link as it is, unless something is on from the beginning.
+    at_once = {item.place for item in items if first_ns(item) == 0}
+    changes += [
+        Change(one.at_ns, one.link, _conditions(problem.fabric.links[one.link], one, written))
+        for one in segments
+        if one.at_ns > 0 or one.link in at_once
+    ]
+    return Timeline(items, tuple(sorted(changes, key=lambda change: change.at_ns)))
+
+
+def first_ns(item: Disturbance) -> int:
+    """Instant of the change with which a disturbance begins, since the first release."""
+    return round(item.at_s * NS_PER_S) + step_ns(item)
+
+
+def last_ns(item: Disturbance) -> int:
+    """Instant of the change after which a disturbance is over; beyond all of them if it lasts."""
+    if math.isinf(item.for_s):
+        return NEVER_NS
+    end_ns = round(min(round(item.at_s * NS_PER_S) + item.for_s * NS_PER_S, NEVER_NS))
+    return end_ns - step_ns(item)
+
+
+def step_ns(item: Disturbance) -> int:
+    """Time of one step of a disturbance's ramp; 0 where it has none."""
+    step: int = round(round(item.ramp_s * NS_PER_S) / RAMP_STEPS)
+    return step
+
+
+def require_playable_scenario(problem: Problem, scenario: str, *, outages: bool) -> None:
+    """Refuse a scenario with something that real links and CPUs cannot be made to do.
+
+    Raises
+    ------
+    ProblemError
+        If there is no such scenario.
+    LiveError
+        With all of it.
+    """
+    down = [item.place for item in problem.scenario(scenario) if item.down]
+    if down and not outages:
+        faults = "; ".join(f"{place} cannot be taken down here" for place in down)
+        raise LiveError(f"scenario {scenario!r} cannot be played: {faults}")
+
+
+def _without_bursts(problem: Problem) -> Problem:
+    fabric = problem.fabric
+    nodes = {name: replace(node, bursts=None) for name, node in fabric.nodes.items()}
+    links = {name: replace(link, bursts=None) for name, link in fabric.links.items()}
+    return replace(problem, fabric=replace(fabric, nodes=nodes, links=links))
+
+
+def usual_conditions(link: Link) -> Conditions:
+    """Return the conditions of a link that nothing disturbs."""
+    return Conditions(delay_ms=link.delay_ms, rate_mbps=link.rate_mbps, loss=link.loss)
+
+
+def _conditions(link: Link, segment: LinkSegment, scenario: Scenario) -> Conditions:
+    """Return the conditions of a link in a segment of its realisation."""
+    delays, shares, layer = [], [], 0
+    for item in scenario:
+        if not isinstance(item, LinkDisturbance) or item.link != link.name:
+            continue
+        if item.add_delay_ms is None:
+            continue
+        # Its layers are the digits of its strength.
+        level = sum(1 << (one - layer) for one in segment.layers if 0 <= one - layer < item.layers)
+        delays.append(item.add_delay_ms)
+        shares.append(level / ((1 << item.layers) - 1))
+        layer += item.layers
+    return Conditions(
+        delay_ms=link.delay_ms,
+        add_delays_ms=tuple(delays),
+        shares=tuple(shares),
+        rate_mbps=segment.rate_mbps,
+        loss=segment.loss,
+        down=segment.down,
+    )
