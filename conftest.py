@@ -117,9 +117,9 @@ APART = (
     "tests/live/test_seeded_faults.py",
     "tests/reproduction/test_questions.py",
     "tests/test_docs.py",
-    "tests/live/test_controlled_cell.py",
+    "tests/live/roles/test_controlled_cell.py",
     "tests/live/test_faults.py",
-    "tests/live/test_continuity.py",
+    "tests/live/wire/test_continuity.py",
     "tests/regression/test_runs.py",
 )
 

@@ -35,8 +35,8 @@ from benchmarks.figures import Figure, Goal, Section
 from benchmarks.live_cell import document
 from benchmarks.timing import ROOT
 from dwell import __version__
-from dwell.live.keys import Keys
-from dwell.live.messages import (
+from dwell.live.wire.keys import Keys
+from dwell.live.wire.messages import (
     Accepted,
     Beat,
     Carried,
@@ -49,7 +49,7 @@ from dwell.live.messages import (
     decode,
     encode,
 )
-from dwell.live.wiring import Wiring, roles, wire
+from dwell.live.wire.wiring import Wiring, roles, wire
 from dwell.model import Problem
 from dwell.model.document import digests
 from dwell.record import open_run
@@ -65,7 +65,7 @@ PERIOD_NS = 40_000_000
 GRACE_NS = PERIOD_NS
 LATENCY_NS = 30_000_000
 LOAD_NS = 250_000_000
-#: Periods between two tellings of beats, as `dwell.live.agent` has it.
+#: Periods between two tellings of beats, as `dwell.live.host.agent` has it.
 BEATS = 5
 WINDOW = 25
 FIRST_PORT, PORTS_PER_CELL = 10_000, 90

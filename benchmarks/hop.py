@@ -20,13 +20,13 @@ from statistics import median
 
 from benchmarks.live_cell import document, problem_of
 from benchmarks.timing import ROOT
-from dwell.live.keys import MAIN, Keys
-from dwell.live.messages import Header, Stamp, decode, encode
-from dwell.live.routing import STAMPER
 from dwell.live.stage import Message
-from dwell.live.transport.transport import Arrival
 from dwell.live.transport.zenoh import ZenohTransport
-from dwell.live.wiring import wire
+from dwell.live.wire.keys import MAIN, Keys
+from dwell.live.wire.messages import Header, Stamp, decode, encode
+from dwell.live.wire.routing import STAMPER
+from dwell.live.wire.transport import Arrival
+from dwell.live.wire.wiring import wire
 
 #: Bytes, and messages of a burst of that size.
 SIZES = {1_000: 100, 100_000: 100, 1_000_000: 30}
@@ -112,7 +112,7 @@ def hops() -> Iterator[Hops]:
         last = ZenohTransport(wiring.entry("last@R1"))
         stack.callback(last.close)
         for who in ("first@R1", "second@R1", "second@E"):
-            command = [sys.executable, "-m", "dwell.live.role_command", "--who", who]
+            command = [sys.executable, "-m", "dwell.live.host.role_command", "--who", who]
             child = subprocess.Popen(
                 [
                     *command,

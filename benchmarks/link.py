@@ -13,7 +13,7 @@ from pathlib import Path
 from benchmarks.figures import Figure, Goal, Section
 from dwell.live.local.linked_transport import LinkedTransport
 from dwell.live.local.message_links import LinkEnds, LinkFile
-from dwell.live.transport.transport import Arrival, Lane, Receive
+from dwell.live.wire.transport import Arrival, Lane, Receive
 from dwell.model import Constant
 
 NODES = ("R1", "E")

@@ -20,9 +20,9 @@ from typing import Literal
 
 from dwell.live.local.linked_transport import LinkedTransport
 from dwell.live.local.message_links import LinkEnds
-from dwell.live.transport.transport import Arrival, Lane, Transport
 from dwell.live.transport.zenoh import ZenohTransport
-from dwell.live.wiring import SESSIONS, Locator, Role, Session, WiringEntry
+from dwell.live.wire.transport import Arrival, Lane, Transport
+from dwell.live.wire.wiring import SESSIONS, Locator, Role, Session, WiringEntry
 
 STAMP_BYTES = 8
 # What comes later than that after the last was sent has been lost.

@@ -21,10 +21,10 @@ import dwell
 from benchmarks.timing import ROOT
 from dwell.errors import LiveError
 from dwell.live.local.loopback import Loopback, on_this_machine
-from dwell.live.messages import Header, decode
+from dwell.live.roles.worker import Worker
 from dwell.live.stage import Message
-from dwell.live.transport.transport import Arrival
-from dwell.live.worker import Worker
+from dwell.live.wire.messages import Header, decode
+from dwell.live.wire.transport import Arrival
 from dwell.model import Problem
 
 #: Where the actuator writes, and what: cycle, release, and the instant of the call.

@@ -17,10 +17,10 @@ from benchmarks.figures import Figure, Goal, Section
 from benchmarks.live import cell_of, cpu_s, processes_of
 from benchmarks.live_cell import LightCell, document
 from benchmarks.page import CHROMIUM, browser_of
-from dwell.live.keys import Keys
-from dwell.live.security import Security
-from dwell.live.transport.transport import Arrival
-from dwell.live.wiring import Role
+from dwell.live.host.security import Security
+from dwell.live.wire.keys import Keys
+from dwell.live.wire.transport import Arrival
+from dwell.live.wire.wiring import Role
 
 PERIOD_MS = 1e3 / 30
 PAIRS, SECONDS = 20, 60.0

@@ -24,9 +24,9 @@ from typing import Any
 from benchmarks.figures import Figure, Goal, Section
 from benchmarks.hop import PAUSE_S, SIZES, hops
 from benchmarks.timing import ROOT
-from dwell.live.transport.transport import Arrival
 from dwell.live.transport.zenoh import ZenohTransport
-from dwell.live.wiring import SESSIONS, Locator, Role, WiringEntry
+from dwell.live.wire.transport import Arrival
+from dwell.live.wire.wiring import SESSIONS, Locator, Role, WiringEntry
 
 #: What each message begins with, and each answer is: a number and an instant.
 MARK = struct.Struct("<qq")

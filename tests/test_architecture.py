@@ -34,12 +34,14 @@ def test_every_room_is_in_the_picture() -> None:
     assert set(re.findall(r"[a-z]+", picture)) >= PACKAGES | MODULES
 
 
-NAMED = {name for name in re.findall(r"`(\w+\.\w+)`", PAGE) if name.partition(".")[0] in PACKAGES}
+NAMED = {
+    name for name in re.findall(r"`(\w+(?:\.\w+)+)`", PAGE) if name.partition(".")[0] in PACKAGES
+}
 
 
 @pytest.mark.parametrize("name", sorted(NAMED))
 def test_what_the_page_names_is_there(name: str) -> None:
-    package, _, member = name.partition(".")
+    package, _, member = name.rpartition(".")
     found = find_spec(f"dwell.{package}.{member}")
     if found is None:
         assert hasattr(import_module(f"dwell.{package}"), member), name
@@ -151,6 +153,7 @@ SIMULATOR = (
     *("cost", "kernels", "policies", "estimators", "cellfile", "record", "control", "sim"),
     *("study", "report", "files"),
 )
+LIVE = ("live", "live.transport", "live.wire", "live.trust", "live.roles")
 #: What may import the façade, which may import all.
 COMMANDS = ("cli", "live.commands", "lab")
 #: Packages, each with the packages and modules that its files may import. Besides, all may import
@@ -181,13 +184,18 @@ MAY_IMPORT = {
         "files",
     ),
     "report": ("study", "record", "policies.registry", "estimators.registry", "files"),
-    "live": ("control", "record", "cellfile", "files"),
-    "live.local": ("live", "sim", "record", "cellfile", "files"),
-    "dash": ("live", "record", "cellfile", "study"),
+    "live": (),
+    "live.wire": ("cellfile",),
+    "live.transport": ("live", "live.wire"),
+    "live.trust": ("live.wire", "files"),
+    "live.roles": ("live", "live.transport", "live.wire", "live.trust", "control", "record"),
+    "live.host": (*LIVE, "control", "record", "cellfile", "files"),
+    "live.local": (*LIVE, "live.host", "sim", "record", "cellfile", "files"),
+    "dash": (*LIVE, "live.host", "record", "cellfile", "study"),
     "calibration": ("record", "cellfile", "sim", "files"),
     "cli": SIMULATOR,
-    "live.commands": (*SIMULATOR, "live", "live.local", "dash", "calibration", "cli"),
-    "lab": (*SIMULATOR, "live", "live.local", "calibration", "cli"),
+    "live.commands": (*SIMULATOR, *LIVE, "live.host", "live.local", "dash", "calibration", "cli"),
+    "lab": (*SIMULATOR, *LIVE, "live.host", "live.local", "calibration", "cli"),
 }
 
 
@@ -250,7 +258,7 @@ def test_what_shows_itself_does_after_an_import_of_the_package_alone() -> None:
 
 def test_a_live_process_imports_no_command_and_no_report() -> None:
     script = (
-        "import sys, dwell.live.node_command, dwell.live.role_process; "
+        "import sys, dwell.live.host.node_command, dwell.live.host.role_process; "
         "print([name for name in sys.modules if name.split('.')[:2] in "
         "(['dwell', 'cli'], ['dwell', 'report'], ['dwell', 'testbed'], ['typer'])])"
     )

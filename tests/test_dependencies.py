@@ -150,7 +150,7 @@ def test_a_simulation_without_the_kernel_says_how_to_get_it(command: str, tmp_pa
     [
         (
             "msgspec",
-            "from dwell.live.role_command import main; "
+            "from dwell.live.host.role_command import main; "
             "sys.exit(main(['--cell', 'live/cell.yaml', '--who', 'stamper@R1', '--state', '/']))",
             "live",
         ),

@@ -14,8 +14,9 @@ A controller that wants to leave a fallback says so again and again, and probes 
 that is what it says. Those that are needed take longer than a window, and than an order is waited
 for: where that matters, the controller speaks after each of them.
 
-Nobody lies here. What is damaged or made up is held back where it leaps (`dwell.live.continuity`);
-a true message that is held back is one that was lost or came late, and such the model has.
+No process lies here. A damaged or invented message that leaps is held back
+(`dwell.live.wire.continuity`). A true message that is held back counts as lost or late, and the
+model has such messages.
 """
 
 from __future__ import annotations

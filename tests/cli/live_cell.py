@@ -17,8 +17,8 @@ import yaml
 
 import dwell
 from dwell.errors import LiveError
-from dwell.live.operator_client import OperatorClient
-from dwell.live.wiring import PORTS_PER_ROLE, roles
+from dwell.live.host.operator_client import OperatorClient
+from dwell.live.wire.wiring import PORTS_PER_ROLE, roles
 from dwell.model.document import to_document
 from tests.cli.small_cell import ROOT, call
 from tests.ports import free_ports

@@ -15,10 +15,10 @@ from typing import Any, cast
 
 from dwell.dash.feed import Feed
 from dwell.dash.observer import ObservedCell, ObservedCycle, ObservedWindow, Observer
-from dwell.live.controlled_cell import MOVED_BY
 from dwell.live.failures import start_thread
-from dwell.live.security import Security
-from dwell.live.wiring import roles
+from dwell.live.host.security import Security
+from dwell.live.roles.controlled_cell import MOVED_BY
+from dwell.live.wire.wiring import roles
 from dwell.model import Problem
 from tests.cells.small import make_problem
 

@@ -15,7 +15,7 @@ from prometheus_client.openmetrics.parser import text_string_to_metric_families 
 from prometheus_client.parser import text_string_to_metric_families as plain_text
 
 from dwell.dash.metrics import CellMetrics
-from dwell.live.security import Security
+from dwell.live.host.security import Security
 from dwell.live.trust.authority import Authority
 from tests.dash.stand_in import StandIn
 from tests.waiting import wait_until

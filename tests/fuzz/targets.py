@@ -20,17 +20,25 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 import dwell
 from dwell.errors import LiveError, TrustError
-from dwell.live import messages
-from dwell.live.controlled_cell import ControlledCell
-from dwell.live.keys import TWICE, Keys
-from dwell.live.messages import MAX_HEADER_BYTES, Beat, Carried, Completion, Header, Order, encode
-from dwell.live.payloads import read_payload
+from dwell.live.roles.controlled_cell import ControlledCell
 from dwell.live.stage import Message
-from dwell.live.transport.transport import Arrival
 from dwell.live.trust.authority import Authority
 from dwell.live.trust.keyring import Keyring
 from dwell.live.trust.roster import Roster
 from dwell.live.trust.signing import Seals
+from dwell.live.wire import messages
+from dwell.live.wire.keys import TWICE, Keys
+from dwell.live.wire.messages import (
+    MAX_HEADER_BYTES,
+    Beat,
+    Carried,
+    Completion,
+    Header,
+    Order,
+    encode,
+)
+from dwell.live.wire.payloads import read_payload
+from dwell.live.wire.transport import Arrival
 from tests.cells.once import with_windows
 from tests.live.small_world import Bench, Passing, World
 

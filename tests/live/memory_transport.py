@@ -21,9 +21,9 @@ from typing import Protocol, TypeAlias
 import zenoh
 
 from dwell.errors import LiveError
-from dwell.live.hosting import LONGEST_SLEEP_S
-from dwell.live.transport.transport import Arrival, Lane, Receive, require_expression, require_key
-from dwell.live.wiring import Session, Wiring, session_of
+from dwell.live.host.hosting import LONGEST_SLEEP_S
+from dwell.live.wire.transport import Arrival, Lane, Receive, require_expression, require_key
+from dwell.live.wire.wiring import Session, Wiring, session_of
 
 #: Says who may hear whom: names of sender and receiver, lane, key.
 Reach: TypeAlias = Callable[[str, str, Lane, str], bool]

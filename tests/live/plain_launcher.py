@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from dwell.live.launcher import ForkServer
-from dwell.live.supervision import Supervisor
+from dwell.live.host.launcher import ForkServer
+from dwell.live.host.supervision import Supervisor
 
 
 class PlainLauncher(ForkServer):

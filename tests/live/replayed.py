@@ -14,10 +14,10 @@ import pytest
 import dwell
 from dwell.control import ClosedWindow, Controller, Evidence
 from dwell.estimators import Profile
-from dwell.live.live_windows import LiveWindows
-from dwell.live.messages import Completion, Hop, Load, Stamp
-from dwell.live.offsets import Offsets
-from dwell.live.run_rows import Rows, columns_of
+from dwell.live.roles.live_windows import LiveWindows
+from dwell.live.roles.offsets import Offsets
+from dwell.live.roles.run_rows import Rows, columns_of
+from dwell.live.wire.messages import Completion, Hop, Load, Stamp
 from dwell.model import FrozenDict, Problem, QoS
 from dwell.record import Journal, Run, seal_run
 from dwell.sim import engine

@@ -30,13 +30,13 @@ from typing import Any, Self
 from dwell.cellfile import from_document
 from dwell.control import Controller
 from dwell.errors import UnwritableError, describe_raised
-from dwell.live.controlled_cell import Recorder
-from dwell.live.recording import RunRecorder
-from dwell.live.run_rows import Rows
+from dwell.live.roles.controlled_cell import Recorder
+from dwell.live.roles.recording import RunRecorder
+from dwell.live.roles.run_rows import Rows
+from dwell.live.roles.stamper import StamperState
 from dwell.live.stage import CellActuator, CellStage, Message
-from dwell.live.stamper import StamperState
-from dwell.live.transport.transport import Arrival
-from dwell.live.wiring import Role
+from dwell.live.wire.transport import Arrival
+from dwell.live.wire.wiring import Role
 from dwell.model import Problem, QoS
 from dwell_lab.chaos.actuations import Seen, out_of_order
 from dwell_lab.chaos.faults import Fault, PlannedFault, bound_of, faults_of, planned, struck

@@ -10,23 +10,23 @@ from typing import Any
 
 import dwell
 from dwell.control import Controller
-from dwell.live import role as role_module
-from dwell.live.agent import Agent
-from dwell.live.controlled_cell import ControlledCell, Recorder
-from dwell.live.keys import CONTROLLER, Keys
-from dwell.live.messages import Ask, Order, StageCounts, encode
-from dwell.live.recording import RunRecorder
-from dwell.live.role import RolePlace
-from dwell.live.run_rows import Resume, Rows, columns_of
-from dwell.live.sink import Sink
+from dwell.live.host.agent import Agent
+from dwell.live.host.supervision import Supervisor
+from dwell.live.roles import role as role_module
+from dwell.live.roles.controlled_cell import ControlledCell, Recorder
+from dwell.live.roles.recording import RunRecorder
+from dwell.live.roles.role import RolePlace
+from dwell.live.roles.run_rows import Resume, Rows, columns_of
+from dwell.live.roles.sink import Sink
+from dwell.live.roles.stage_counts import StageBook
+from dwell.live.roles.stamper import Stamper, StamperState
+from dwell.live.roles.worker import Chore, Job, Worker
 from dwell.live.stage import CellActuator, CellStage, Message
-from dwell.live.stage_counts import StageBook
-from dwell.live.stamper import Stamper, StamperState
-from dwell.live.supervision import Supervisor
-from dwell.live.transport.transport import Arrival
 from dwell.live.trust.signing import Seals
-from dwell.live.wiring import Role, roles, wire
-from dwell.live.worker import Chore, Job, Worker
+from dwell.live.wire.keys import CONTROLLER, Keys
+from dwell.live.wire.messages import Ask, Order, StageCounts, encode
+from dwell.live.wire.transport import Arrival
+from dwell.live.wire.wiring import Role, roles, wire
 from dwell.model import Host, Problem, QoS
 from dwell.policies import MinimalPolicy
 from tests.live.memory_transport import Clock, MemoryTransport, Network, NetworkConditions, hears

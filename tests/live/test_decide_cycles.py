@@ -14,7 +14,7 @@ import pytest
 import dwell
 from dwell.control.windows import missed_cycles, seen_l95_ms
 from dwell.cost import cost, hamming
-from dwell.live.health import PATIENCE_NS
+from dwell.live.roles.health import PATIENCE_NS
 from dwell.model import FrozenDict, Problem, QoS
 from dwell.model.instants import NEVER_NS
 from tests.live.memory_transport import NetworkConditions

@@ -10,9 +10,9 @@ import pytest
 #: A worker of a cell in memory; what is appended makes something of it fail.
 WORKER = """
 import sys, threading, time
-from dwell.live.hosting import Hosted, work
-from dwell.live.role import Pulse
-from dwell.live.transport.transport import Arrival
+from dwell.live.host.hosting import Hosted, work
+from dwell.live.roles.role import Pulse
+from dwell.live.wire.transport import Arrival
 from tests.live.small_world import Passing, World, canonical
 
 world = World(canonical())

@@ -13,10 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dwell.live.messages import Completion, Order, Stamp, State, encode
+from dwell.live.roles.worker import Chore
 from dwell.live.stage import Message
-from dwell.live.transport.transport import Arrival
-from dwell.live.worker import Chore
+from dwell.live.wire.messages import Completion, Order, Stamp, State, encode
+from dwell.live.wire.transport import Arrival
 from dwell.model import Problem
 from tests.live.memory_transport import Clock, NetworkConditions
 from tests.live.small_world import MS, Counting, Passing, World, canonical, on, stateful

@@ -12,13 +12,13 @@ from typing import Any
 import pytest
 
 import dwell
-from dwell.live.agent import Agent
-from dwell.live.loads import MOST_PROCESSES, ProcessLoads
-from dwell.live.messages import MAX_CONTROL_BYTES, Carried, Stamped, decode, encode
-from dwell.live.relay_batch import LONGEST_MESSAGE, MOST_MESSAGES, RelayBatch
-from dwell.live.role import MAX_COMPLAINTS
-from dwell.live.transport.transport import Arrival
-from dwell.live.worker import MAX_JOINS
+from dwell.live.host.agent import Agent
+from dwell.live.roles.loads import MOST_PROCESSES, ProcessLoads
+from dwell.live.roles.role import MAX_COMPLAINTS
+from dwell.live.roles.worker import MAX_JOINS
+from dwell.live.wire.messages import MAX_CONTROL_BYTES, Carried, Stamped, decode, encode
+from dwell.live.wire.relay_batch import LONGEST_MESSAGE, MOST_MESSAGES, RelayBatch
+from dwell.live.wire.transport import Arrival
 from dwell.model import Problem
 from tests.fuzz.targets import seeds
 from tests.live.small_world import EXEC_MS, Bench, World

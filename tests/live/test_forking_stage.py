@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from dwell.live.host.supervision import survivor
 from dwell.live.local.processes import without_keys
-from dwell.live.supervision import survivor
 from tests.cli.live_cell import RealCell
 from tests.processes import lives
 from tests.waiting import PATIENCE_S, wait_until

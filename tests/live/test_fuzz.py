@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dwell.errors import LiveError
-from dwell.live.messages import MAX_CONTROL_BYTES, MAX_HEADER_BYTES
-from dwell.live.payloads import read_payload
+from dwell.live.wire.messages import MAX_CONTROL_BYTES, MAX_HEADER_BYTES
+from dwell.live.wire.payloads import read_payload
 from tests.fuzz.targets import TARGETS, seeds
 
 #: What reading may take: an empty map is one byte on the wire, and 64 and a pointer in memory.

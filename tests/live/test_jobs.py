@@ -10,11 +10,11 @@ import polars as pl
 import pytest
 
 import dwell
-from dwell.live import payloads
-from dwell.live.control_group import Counts
-from dwell.live.controlled_cell import ControlledCell
-from dwell.live.run_rows import Rows, columns_of
-from dwell.live.sink import Sink
+from dwell.live.roles.control_group import Counts
+from dwell.live.roles.controlled_cell import ControlledCell
+from dwell.live.roles.run_rows import Rows, columns_of
+from dwell.live.roles.sink import Sink
+from dwell.live.wire import payloads
 from dwell.model import Problem
 from dwell.record import column_types
 from tests.cells.once import with_windows
@@ -126,7 +126,7 @@ def test_reading_its_inputs_is_part_of_a_jobs_cpu_time(
         spent_ns[0] += CPU_NS
         return payloads.read_payload(*arguments)
 
-    monkeypatch.setattr("dwell.live.worker.read_payload", reading)
+    monkeypatch.setattr("dwell.live.roles.worker.read_payload", reading)
     world = world_of(problem, "LOC")
     for role in world.roles.values():
         if hasattr(role, "worker"):

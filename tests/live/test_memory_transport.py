@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dwell.errors import LiveError
-from dwell.live.transport.transport import Arrival, Lane
+from dwell.live.wire.transport import Arrival, Lane
 from tests.live.memory_transport import Clock, MemoryTransport, Network, NetworkConditions
 
 MS = 1_000_000

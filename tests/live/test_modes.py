@@ -8,9 +8,9 @@ from itertools import pairwise
 
 import pytest
 
-from dwell.live.messages import Ask, encode
-from dwell.live.transport.transport import Arrival
-from dwell.live.wiring import roles
+from dwell.live.wire.messages import Ask, encode
+from dwell.live.wire.transport import Arrival
+from dwell.live.wire.wiring import roles
 from dwell.model import Problem
 from tests.live.small_world import EXEC_MS, World, canonical
 

@@ -217,7 +217,7 @@ def test_the_record_has_no_move_that_was_none() -> None:
     world.ask("pin", "SO")
     cycles_until(world, "SO", 60)
     world.run(3_000)
-    from dwell.live.run_rows import columns_of
+    from dwell.live.roles.run_rows import columns_of
 
     names = list(columns_of(world.cell.controller)["decisions"])
     rows = [dict(zip(names, row, strict=True)) for row in world.recorder.rows["decisions"]]

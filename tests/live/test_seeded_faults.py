@@ -15,16 +15,16 @@ import pytest
 from msgspec.structs import replace as replaced
 
 from dwell.control import Guard, Probation
-from dwell.live import health, stamper, worker
-from dwell.live.continuity import RESERVED, RunClaims
-from dwell.live.controlled_cell import ControlledCell
-from dwell.live.cycle_ledger import LiveCycle
-from dwell.live.messages import ACTUATED, Accepted, Hop, Order, Stamped
-from dwell.live.role import RolePlace
-from dwell.live.routing import Routes
-from dwell.live.sink import Sink
-from dwell.live.stamper import Stamper
-from dwell.live.worker import Worker
+from dwell.live.roles import health, stamper, worker
+from dwell.live.roles.controlled_cell import ControlledCell
+from dwell.live.roles.cycle_ledger import LiveCycle
+from dwell.live.roles.role import RolePlace
+from dwell.live.roles.sink import Sink
+from dwell.live.roles.stamper import Stamper
+from dwell.live.roles.worker import Worker
+from dwell.live.wire.continuity import RESERVED, RunClaims
+from dwell.live.wire.messages import ACTUATED, Accepted, Hop, Order, Stamped
+from dwell.live.wire.routing import Routes
 from dwell_lab.chaos.faults import PlannedFault
 from dwell_lab.chaos.light_cell import CANDIDATES
 from tests.live.seeded_faults import (

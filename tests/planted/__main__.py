@@ -95,7 +95,7 @@ class Copy:
         try:
             if fault.is_compiled and self.python("-c", BUILD).returncode:
                 return "does not apply: the kernel cannot be built with it", ""
-            code, failed = self.test(fault.ids, "-x")
+            code, failed = self.test(fault.tests, "-x")
         except subprocess.TimeoutExpired:
             return f"its tests take more than {PATIENCE_S} s", ""
         finally:
@@ -116,7 +116,10 @@ def _run(
     return subprocess.run(
         command,
         cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(folder / "src")},
+        env={
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(str(folder / name) for name in ("src", "lab/src")),
+        },
         capture_output=True,
         text=True,
         check=False,

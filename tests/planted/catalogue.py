@@ -10,7 +10,6 @@ import yaml
 
 ROOT = Path(__file__).parents[2]
 FILE = Path(__file__).with_name("faults.yaml")
-SOURCES, TESTS = Path("src/dwell"), Path("tests")
 
 #: A heading, or words in bold at the beginning of a paragraph or an item of a list.
 HEADING = re.compile(r"(?:#{1,3} (?P<heading>.+)|(?:\d+\. |[*-] )?\*\*(?P<bold>.+?)\*\*)")
@@ -26,11 +25,11 @@ class Fault(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     promise : str
         Words of a page that are true no more where it is planted.
     file : str
-        Below `src/dwell`.
+        Path of the source.
     text, planted : str
         What stands once in the file, and what is planted in its place.
     tests : list of str
-        Files below `tests`, or ids of single tests.
+        Paths of files, or ids of single tests.
     """
 
     fault: str
@@ -43,12 +42,7 @@ class Fault(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def path(self) -> Path:
         """The file below the root of the tree."""
-        return SOURCES / self.file
-
-    @property
-    def ids(self) -> list[str]:
-        """Tests as pytest takes them at the root of the tree."""
-        return [str(TESTS / name) for name in self.tests]
+        return Path(self.file)
 
     @property
     def is_compiled(self) -> bool:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from dwell.errors import LiveError
-from dwell.live.payloads import read_payload, write_payload
 from dwell.live.stage import Message
+from dwell.live.wire.payloads import read_payload, write_payload
 from examples.visual_servoing.servoing.arm import Arm
 from examples.visual_servoing.servoing.control import Control, velocities
 from examples.visual_servoing.servoing.messages import Command, Plan

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dwell.live.payloads import read_payload, write_payload
 from dwell.live.stage import Message, load_actuator, load_stage
+from dwell.live.wire.payloads import read_payload, write_payload
 from examples.visual_servoing.servoing.horizon import HorizonSettings
 from examples.visual_servoing.servoing.messages import Plan, Pose
 from examples.visual_servoing.servoing.planning import Planning

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from dwell.errors import LiveError
-from dwell.live.state_files import make_folder
+from dwell.live.host.state_files import make_folder
 from dwell_lab.chaos.disk import DiskHog, SmallDisk, limit_file_size, may_mount
 
 WRITER = """

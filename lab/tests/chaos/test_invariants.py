@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from dwell.cellfile import from_document
-from dwell.live.keys import Keys
-from dwell.live.messages import (
+from dwell.live.wire.keys import Keys
+from dwell.live.wire.messages import (
     Accepted,
     Completion,
     Header,

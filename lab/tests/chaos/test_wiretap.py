@@ -9,7 +9,7 @@ import yaml
 
 import dwell
 from dwell.live.local.loopback import on_this_machine
-from dwell.live.wiring import wire
+from dwell.live.wire.wiring import wire
 from dwell.model import Problem
 from dwell_lab.chaos.light_cell import document
 from dwell_lab.chaos.wiretap import Records, entry_for

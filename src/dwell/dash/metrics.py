@@ -16,11 +16,11 @@ from prometheus_client.exposition import choose_encoder
 from prometheus_client.registry import Collector
 
 from dwell.dash.observer import OUTCOMES, Observer
-from dwell.live.controlled_cell import MOVED_BY
 from dwell.live.failures import start_thread
-from dwell.live.health import Health
-from dwell.live.keys import CONTROLLER
-from dwell.live.wiring import roles
+from dwell.live.roles.controlled_cell import MOVED_BY
+from dwell.live.roles.health import Health
+from dwell.live.wire.keys import CONTROLLER
+from dwell.live.wire.wiring import roles
 
 Kind: TypeAlias = Literal["counter", "gauge", "info", "summary"]
 

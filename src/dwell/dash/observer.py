@@ -6,8 +6,8 @@ completions, answers, loads). Beside that it asks the controller for its status,
 `dwell live status` does. With keys it takes those of an operator or an observer, and believes what
 is signed alone.
 
-Instants are put on the stamper's clock, as the controller does it (`dwell.live.offsets`,
-`dwell.live.cycle_ledger`), and count from the first release of the run.
+Instants are put on the stamper's clock, as the controller does it (`dwell.live.roles.offsets`,
+`dwell.live.roles.cycle_ledger`), and count from the first release of the run.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 
 from dwell.dash.feed import Feed
 from dwell.errors import LiveError
-from dwell.live.cycle_ledger import Ledger, LiveCycle
 from dwell.live.failures import start_thread
-from dwell.live.local_addresses import running_elsewhere
+from dwell.live.host.operator_client import OperatorClient
+from dwell.live.host.security import Security
 from dwell.live.log import printable
-from dwell.live.messages import Accepted, Stamped, decode
-from dwell.live.operator_client import OperatorClient
-from dwell.live.role import Pulse
-from dwell.live.security import Security
-from dwell.live.transport.transport import Arrival
-from dwell.live.wiring import Role
+from dwell.live.roles.cycle_ledger import Ledger, LiveCycle
+from dwell.live.roles.role import Pulse
+from dwell.live.wire.local_addresses import running_elsewhere
+from dwell.live.wire.messages import Accepted, Stamped, decode
+from dwell.live.wire.transport import Arrival
+from dwell.live.wire.wiring import Role
 from dwell.model import Problem
 from dwell.model.instants import NEVER_NS
 
@@ -93,7 +93,7 @@ class ObservedWindow:
     at_s : float
         Its close, in seconds since the first release of the run; as exact as the status is young.
     said : mapping
-        ``window`` of `dwell.live.controlled_cell.ControlledCell.status`.
+        ``window`` of `dwell.live.roles.controlled_cell.ControlledCell.status`.
     """
 
     number: int
@@ -164,7 +164,7 @@ class Observer:
     Parameters
     ----------
     environment : mapping of str to str, optional
-        With the variables of `dwell.live.security`; this process's own if left out.
+        With the variables of `dwell.live.host.security`; this process's own if left out.
 
     Attributes
     ----------

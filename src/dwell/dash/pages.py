@@ -89,7 +89,7 @@ def live_page(
     Parameters
     ----------
     environment : mapping of str to str
-        With the variables of `dwell.live.security`.
+        With the variables of `dwell.live.host.security`.
     control : bool
         Whether the page may act.
     mcap : Path, optional
@@ -124,7 +124,7 @@ def live_page(
 
 def _require_operator(observer: Observer) -> None:
     """Refuse to act with the keys of somebody who may only look, or without keys on a network."""
-    from dwell.live.security import exposed
+    from dwell.live.host.security import exposed
 
     keyring = observer.security.keyring
     if keyring is None:

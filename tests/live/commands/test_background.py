@@ -15,9 +15,9 @@ import psutil
 import pytest
 import yaml
 
-from dwell.live.local_addresses import taken_ports
-from dwell.live.supervision import survivor
-from dwell.live.wiring import wire
+from dwell.live.host.supervision import survivor
+from dwell.live.wire.local_addresses import taken_ports
+from dwell.live.wire.wiring import wire
 from dwell.record import open_run
 from tests.cli.live_cell import MOODY, RealCell, invoke
 from tests.cli.small_cell import environment

@@ -17,8 +17,8 @@ import yaml
 import dwell
 from dwell.errors import LiveError
 from dwell.live.commands import live
-from dwell.live.operator_client import OperatorClient
-from dwell.live.wiring import roles
+from dwell.live.host.operator_client import OperatorClient
+from dwell.live.wire.wiring import roles
 from dwell_lab.chaos.disk import SmallDisk, may_mount
 from tests.cli.live_cell import EXAMPLE, MOODY, RealCell, in_window, invoke
 from tests.cli.small_cell import ROOT

@@ -19,12 +19,12 @@ import msgspec
 import pytest
 
 import dwell
-from dwell.live.keys import Keys
-from dwell.live.messages import Order, Stamped, encode
-from dwell.live.security import INSECURE, Security, environment
-from dwell.live.wiring import Role, wire
+from dwell.live.host.security import INSECURE, Security, environment
+from dwell.live.wire.keys import Keys
+from dwell.live.wire.messages import Order, Stamped, encode
+from dwell.live.wire.wiring import Role, wire
 from tests.cli.live_cell import EXAMPLE, RealCell, in_window, invoke
-from tests.live.test_security import Intruder, tls
+from tests.live.host.test_security import Intruder, tls
 from tests.waiting import PATIENCE_S
 
 PIN = ("live", "pin", "SO")

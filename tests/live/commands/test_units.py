@@ -13,7 +13,7 @@ import pytest
 
 import dwell
 from dwell.live.commands.units import escaped_name, unit_texts, verify
-from dwell.live.wiring import wire
+from dwell.live.wire.wiring import wire
 from tests.cli.live_cell import RealCell
 from tests.cli.small_cell import ROOT, SMALL, assert_refused, call
 from tests.waiting import PATIENCE_S

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from dwell.live.keys import Keys
 from dwell.live.local.linked_transport import LinkedTransport, target_of, without_source
 from dwell.live.local.message_links import LinkEnds, LinkFile
-from dwell.live.transport.transport import Arrival, Lane, Receive
+from dwell.live.wire.keys import Keys
+from dwell.live.wire.transport import Arrival, Lane, Receive
 from dwell.model import Constant, Link, Normal
 from tests.live.transport.meshes import ZenohMesh, introduce
 from tests.waiting import wait_until

@@ -11,18 +11,18 @@ import pytest
 
 import dwell
 from dwell.cellfile import from_document
-from dwell.live.hosting import clock_of
-from dwell.live.keys import Keys
+from dwell.live.host.hosting import clock_of
 from dwell.live.local.clocks import ClockFile
 from dwell.live.local.linked_transport import without_source
 from dwell.live.local.loopback import on_this_machine
 from dwell.live.local.message_links import LinkFile
 from dwell.live.local.process import FaultyPlatform, main, program
 from dwell.live.local.processes import Processes
-from dwell.live.messages import Beat, decode
-from dwell.live.transport.transport import Arrival
 from dwell.live.transport.zenoh import ZenohTransport
-from dwell.live.wiring import wire
+from dwell.live.wire.keys import Keys
+from dwell.live.wire.messages import Beat, decode
+from dwell.live.wire.transport import Arrival
+from dwell.live.wire.wiring import wire
 from dwell_lab.chaos.wiretap import entry_for
 from tests.cells.light import document
 

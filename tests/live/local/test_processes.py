@@ -18,10 +18,10 @@ import pytest
 import dwell
 from dwell.cellfile import from_document
 from dwell.errors import TrustError
+from dwell.live.host.security import INSECURE, Security
 from dwell.live.local.processes import Processes, expected, without_keys
-from dwell.live.security import INSECURE, Security
 from dwell.live.trust import KEYS
-from dwell.live.wiring import Role
+from dwell.live.wire.wiring import Role
 from dwell.model import Problem
 from tests.cells.light import document, write_cell
 from tests.waiting import wait_until

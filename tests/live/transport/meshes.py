@@ -10,9 +10,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol
 
-from dwell.live.transport.transport import Arrival, Lane, Transport
 from dwell.live.transport.zenoh import ZenohSettings, ZenohTransport
-from dwell.live.wiring import SESSIONS, Locator, Role, WiringEntry
+from dwell.live.wire.transport import Arrival, Lane, Transport
+from dwell.live.wire.wiring import SESSIONS, Locator, Role, WiringEntry
 from tests.live.memory_transport import Network
 from tests.ports import free_ports
 from tests.waiting import PATIENCE_S

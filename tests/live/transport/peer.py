@@ -10,8 +10,8 @@ import json
 import signal
 import sys
 
-from dwell.live.transport.transport import Arrival, Lane
 from dwell.live.transport.zenoh import ZenohTransport
+from dwell.live.wire.transport import Arrival, Lane
 from tests.live.transport.meshes import full_entry
 
 

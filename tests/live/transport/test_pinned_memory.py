@@ -15,12 +15,12 @@ import psutil
 import pytest
 import zenoh
 
-from dwell.live.keys import Keys
-from dwell.live.security import VISITORS_AT_ONCE
-from dwell.live.wiring import Session, longest_message_bytes, wire
+from dwell.live.host.security import VISITORS_AT_ONCE
+from dwell.live.wire.keys import Keys
+from dwell.live.wire.wiring import Session, longest_message_bytes, wire
 from dwell.model import Host, Problem
-from tests.live.test_security import issued, tls
-from tests.live.test_wiring import cell, housed
+from tests.live.host.test_security import issued, tls
+from tests.live.wire.test_wiring import cell, housed
 from tests.ports import free_ports
 from tests.waiting import PATIENCE_S
 
@@ -33,9 +33,9 @@ MARGIN_BYTES = 100 * MB
 #: The sessions of a process of a cell, which keeps its memory as those do.
 VICTIM = """
 import sys
-from dwell.live.security import KEYS, Security
-from dwell.live.wiring import wire
-from dwell.live.memory import keep_memory
+from dwell.live.host.security import KEYS, Security
+from dwell.live.wire.wiring import wire
+from dwell.live.host.memory import keep_memory
 from tests.live.transport.test_pinned_memory import housed_at
 
 keep_memory()

@@ -16,7 +16,6 @@ from queue import Queue
 import pytest
 
 from dwell.errors import LiveError
-from dwell.live.transport.transport import Arrival, Lane, Transport
 from dwell.live.transport.zenoh import (
     POOL_BYTES,
     ZenohSettings,
@@ -26,7 +25,8 @@ from dwell.live.transport.zenoh import (
     _Route,
     _Sender,
 )
-from dwell.live.wiring import Locator, Role, WiringEntry
+from dwell.live.wire.transport import Arrival, Lane, Transport
+from dwell.live.wire.wiring import Locator, Role, WiringEntry
 from tests.live.transport.meshes import Inbox, ZenohMesh, introduce
 from tests.live.transport.peer import digest
 from tests.waiting import PATIENCE_S

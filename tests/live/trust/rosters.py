@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dwell.live.keys import CONTROLLER
 from dwell.live.trust.roster import Roster, Subject
+from dwell.live.wire.keys import CONTROLLER
 from dwell.model import Problem
 
 PEOPLE = {"operator": "operator", "observer": "observer"}

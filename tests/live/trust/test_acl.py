@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import dwell
-from dwell.live.keys import CONTROLLER, Keys
-from dwell.live.permissions import subjects
 from dwell.live.trust.acl import access_control
+from dwell.live.trust.permissions import subjects
 from dwell.live.trust.roster import Roster, Subject
-from dwell.live.wiring import roles
+from dwell.live.wire.keys import CONTROLLER, Keys
+from dwell.live.wire.wiring import roles
 from dwell.model import Problem
 from tests.cells.generated import random_problem
 from tests.cells.once import with_windows

@@ -12,8 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dwell.errors import TrustError
-from dwell.live.keys import CONTROLLER, Keys
-from dwell.live.messages import (
+from dwell.live.roles.role import RolePlace
+from dwell.live.trust import signing
+from dwell.live.trust.authority import Authority
+from dwell.live.trust.keyring import Keyring
+from dwell.live.trust.signing import Seals
+from dwell.live.wire.keys import CONTROLLER, Keys
+from dwell.live.wire.messages import (
     SIGNATURE_BYTES,
     Accepted,
     Beat,
@@ -28,12 +33,7 @@ from dwell.live.messages import (
     decode,
     encode,
 )
-from dwell.live.role import RolePlace
-from dwell.live.transport.transport import Arrival
-from dwell.live.trust import signing
-from dwell.live.trust.authority import Authority
-from dwell.live.trust.keyring import Keyring
-from dwell.live.trust.signing import Seals
+from dwell.live.wire.transport import Arrival
 from dwell.model import Problem
 from dwell.model.document import digests
 from tests.live.memory_transport import MemoryTransport

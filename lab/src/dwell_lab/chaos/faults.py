@@ -9,7 +9,7 @@ from itertools import combinations
 from typing import Literal, TypeAlias
 
 from dwell.control.guard import parts_of
-from dwell.live.wiring import lane_of, roles
+from dwell.live.wire.wiring import lane_of, roles
 from dwell.model import Problem
 
 How: TypeAlias = Literal[

@@ -14,7 +14,8 @@ from typing import Any
 
 from dwell.errors import LiveError
 from dwell.files import write_whole
-from dwell.live.hosting import clock_of
+from dwell.live.host.hosting import clock_of
+from dwell.live.host.supervision import survivor
 from dwell.live.local.burner import Burner
 from dwell.live.local.child import Started
 from dwell.live.local.clocks import ClockFile
@@ -22,7 +23,6 @@ from dwell.live.local.conditions import Conditions
 from dwell.live.local.processes import expected
 from dwell.live.local.testbed import LocalTestbed
 from dwell.live.local.timeline import Change, NodeState
-from dwell.live.supervision import survivor
 from dwell.model import Problem
 from dwell_lab.chaos.actuations import Actuations, Seen
 from dwell_lab.chaos.disk import DiskHog, SmallDisk, limit_file_size

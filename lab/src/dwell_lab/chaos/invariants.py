@@ -13,8 +13,8 @@ from typing import Any, TypeVar
 
 from dwell.errors import LiveError
 from dwell.estimators.registry import resolved
-from dwell.live.keys import MAIN, Keys
-from dwell.live.messages import (
+from dwell.live.wire.keys import MAIN, Keys
+from dwell.live.wire.messages import (
     HANDED_OVER,
     MAX_HEADER_BYTES,
     Accepted,

@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from dwell.errors import LiveError
-from dwell.live.keys import Keys
 from dwell.live.local.child import Child, Parent, Started
 from dwell.live.local.testbed import LocalTestbed
-from dwell.live.transport.transport import Arrival
-from dwell.live.wiring import SESSIONS, Role, Session, Wiring, WiringEntry
+from dwell.live.wire.keys import Keys
+from dwell.live.wire.transport import Arrival
+from dwell.live.wire.wiring import SESSIONS, Role, Session, Wiring, WiringEntry
 from dwell_lab.chaos.invariants import Judge
 
 _HEAD = struct.Struct("<QIII")
@@ -121,10 +121,10 @@ class ActuatorObserver(Started):
 def main() -> None:
     """Listen until the parent ends, or wants this to."""
     from dwell.cellfile import load
+    from dwell.live.host.security import INSECURE
     from dwell.live.local.linked_transport import without_source
-    from dwell.live.security import INSECURE
     from dwell.live.transport.zenoh import ZenohTransport
-    from dwell.live.wiring import wire
+    from dwell.live.wire.wiring import wire
 
     with ExitStack() as stack:
 

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dwell.errors import LiveError
-from dwell.live.control_group import COUNTERS, ControlGroup
 from dwell.live.local.cgroups import Cgroups, find_cgroups
 from dwell.live.local.child import Started
+from dwell.live.roles.control_group import COUNTERS, ControlGroup
 from dwell.model import Quota
 
 #: What the kernel takes (kernel/sched/core.c: min_cfs_quota_period, max_cfs_quota_period).

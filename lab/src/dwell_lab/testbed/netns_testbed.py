@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from dwell.errors import LiveError
+from dwell.live.host.security import INSECURE
 from dwell.live.local.burner import Burner, stress
 from dwell.live.local.conditions import Conditions, fields_of
 from dwell.live.local.message_links import LinkFile
@@ -24,7 +25,6 @@ from dwell.live.local.process import program
 from dwell.live.local.processes import Processes, with_hosts
 from dwell.live.local.testbed import LocalTestbed
 from dwell.live.local.timeline import NodeState, usual_conditions
-from dwell.live.security import INSECURE
 from dwell.live.transport.orphans import remove_orphans
 from dwell.model import Node, Problem
 from dwell_lab.testbed.allotment import allot

@@ -9,7 +9,7 @@ from typing import Any
 
 from dwell.errors import LiveError
 from dwell.estimators import registry as estimators
-from dwell.live.hosting import clock_of
+from dwell.live.host.hosting import clock_of
 from dwell.live.local.playing import (
     Played,
     begun,

@@ -45,9 +45,9 @@ class Watcher(Child):
 def main() -> None:
     """Answer until the parent ends, or wants this to."""
     from dwell.cellfile import load
+    from dwell.live.host.operator_client import OperatorClient
+    from dwell.live.host.security import INSECURE
     from dwell.live.local.processes import without_keys
-    from dwell.live.operator_client import OperatorClient
-    from dwell.live.security import INSECURE
 
     with ExitStack() as stack:
 

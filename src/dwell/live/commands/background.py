@@ -26,18 +26,18 @@ import psutil
 import typer
 
 from dwell.errors import LiveError, ProblemError
-from dwell.live.kept_cell import Change, KeptCell, cell_here, change, forget
-from dwell.live.local_addresses import is_here, listening_ports, taken_ports, why_not_listen
+from dwell.live.host.kept_cell import Change, KeptCell, cell_here, change, forget
+from dwell.live.host.operator_client import OperatorClient
+from dwell.live.host.process_group import ProcessGroup
+from dwell.live.host.security import Security
+from dwell.live.host.stage_modules import require_stages
+from dwell.live.host.state_files import make_folder, open_own
+from dwell.live.host.state_folder import logs
+from dwell.live.host.supervision import LOG_BYTES, survivor, write_mark
 from dwell.live.log import printable
-from dwell.live.operator_client import OperatorClient
-from dwell.live.process_group import ProcessGroup
-from dwell.live.security import Security
-from dwell.live.stage_modules import require_stages
-from dwell.live.state_files import make_folder, open_own
-from dwell.live.state_folder import logs
-from dwell.live.supervision import LOG_BYTES, survivor, write_mark
 from dwell.live.transport.orphans import remove_orphans
-from dwell.live.wiring import Role, Wiring, roles, wire
+from dwell.live.wire.local_addresses import is_here, listening_ports, taken_ports, why_not_listen
+from dwell.live.wire.wiring import Role, Wiring, roles, wire
 from dwell.model import Problem
 
 #: How long a process has to listen, and to end after it was told to: an actuator is told to stop

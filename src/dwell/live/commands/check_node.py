@@ -13,10 +13,10 @@ import typer
 
 from dwell.cli.output import aligned, print_json
 from dwell.errors import Fault, LiveError, TrustError, installing
+from dwell.live.host.security import Security, environment, exposed
 from dwell.live.lint import lint
-from dwell.live.security import Security, environment, exposed
 from dwell.live.stage import CellStage, load_actuator, load_stage
-from dwell.live.wiring import PORTS_PER_ROLE, Role, Wiring, roles, wire
+from dwell.live.wire.wiring import PORTS_PER_ROLE, Role, Wiring, roles, wire
 from dwell.model import Problem
 from dwell.model.bounds import counted
 

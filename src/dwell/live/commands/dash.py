@@ -88,7 +88,7 @@ def dash(
     elif shown is None and not where.is_file():
         raise typer.BadParameter("there is no cell.yaml here; name a cell file, or a run's folder")
     else:
-        from dwell.live.security import environment
+        from dwell.live.host.security import environment
 
         page = live_page(where, environment(keys, insecure=insecure), control=control, mcap=mcap)
     from dwell.dash.serving import serve

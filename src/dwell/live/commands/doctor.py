@@ -13,7 +13,7 @@ from dwell.calibration.machine_conditions import STOLEN_MOST, MachineCounters, p
 from dwell.cli.findings import Finding, Part, optional
 from dwell.errors import LiveError, TrustError, installing
 from dwell.live.local.cgroups import find_cgroups
-from dwell.live.local_addresses import is_here, taken_ports
+from dwell.live.wire.local_addresses import is_here, taken_ports
 from dwell.model import Host, Problem
 
 #: How many ports are looked at where no cell says which.
@@ -147,7 +147,7 @@ def _ports_here(problem: Problem | None) -> set[int]:
         first = Host().port
         return set(range(first, first + DEFAULT_PORTS))
     try:
-        from dwell.live.wiring import PORTS_PER_ROLE, wire
+        from dwell.live.wire.wiring import PORTS_PER_ROLE, wire
     except ImportError:
         return {host.port for host in problem.live.hosts.values() if is_here(host.address)}
     ports: set[int] = set()

@@ -33,10 +33,10 @@ from dwell.cli.output import json_text, print_json, proof
 from dwell.display import milliseconds
 from dwell.errors import ExitCode
 from dwell.live.commands.log_format import LogFormat, Logs, begin_log
-from dwell.live.state_folder import state_root
+from dwell.live.host.state_folder import state_root
 
 if TYPE_CHECKING:
-    from dwell.live.operator_client import OperatorClient
+    from dwell.live.host.operator_client import OperatorClient
 
 #: Time between two looks of ``status --watch``.
 WATCH_S = 1.0
@@ -90,7 +90,7 @@ def agent(
     ] = False,
 ) -> None:
     """Run a node of a live cell: its workers, and on the right nodes stamper and sinks."""
-    from dwell.live import node_command
+    from dwell.live.host import node_command
 
     begin_log(log_format, f"agent@{node}")
     with _bad_parameters():
@@ -135,7 +135,7 @@ def controller(
     continues: Annotated[str, option("JSON", "Runs that it continues.", hidden=True)] = "{}",
 ) -> None:
     """Decide where the stages of live cells run."""
-    from dwell.live import node_command
+    from dwell.live.host import node_command
 
     begin_log(log_format, "controller")
     with _bad_parameters():
@@ -157,7 +157,7 @@ def controller(
 @contextmanager
 def _bad_parameters() -> Iterator[None]:
     """Have an option that is wrong told with the command's usage."""
-    from dwell.live.node_command import OptionError
+    from dwell.live.host.node_command import OptionError
 
     try:
         yield
@@ -182,10 +182,10 @@ def status(
     """Show how a cell is, and first what is wrong with it."""
     if check and watch:
         raise typer.BadParameter("--check looks once; leave --watch out")
-    from dwell.live.kept_cell import cell_here
-    from dwell.live.local_addresses import running_elsewhere
-    from dwell.live.operator_client import OperatorClient
-    from dwell.live.security import environment
+    from dwell.live.host.kept_cell import cell_here
+    from dwell.live.host.operator_client import OperatorClient
+    from dwell.live.host.security import environment
+    from dwell.live.wire.local_addresses import running_elsewhere
 
     problem = cell_here(cell, state_root()).problem()
     with OperatorClient(problem, environment(keys, insecure=insecure)) as visitor:
@@ -318,7 +318,7 @@ def run(
 
 def processes(context: typer.Context) -> list[str]:
     """Offer the processes on this computer that have a log."""
-    from dwell.live.state_folder import logs, state_root
+    from dwell.live.host.state_folder import logs, state_root
 
     return list(logs(state_root(context.params.get("state"))))
 
@@ -354,8 +354,8 @@ def up(
 ) -> None:
     """Start a cell's part on this computer in the background: agents, and its controller here."""
     from dwell.live.commands import background
-    from dwell.live.kept_cell import cell_here
-    from dwell.live.security import environment
+    from dwell.live.host.kept_cell import cell_here
+    from dwell.live.host.security import environment
 
     if again:
         given = environment(keys, insecure=insecure)
@@ -388,7 +388,7 @@ def up(
 def down(cell: CellArgument, state: Root = None) -> None:
     """End what `up` has started, in order: the robot's actuators are told to stop."""
     from dwell.live.commands import background
-    from dwell.live.kept_cell import cell_here, forget
+    from dwell.live.host.kept_cell import cell_here, forget
 
     root = state_root(state)
     problem = cell_here(cell, root).problem()
@@ -451,9 +451,9 @@ def units(
 def _ask(
     cell: Path, what: str, about: str, keys: Path | None, *, insecure: bool, as_json: bool
 ) -> None:
-    from dwell.live.kept_cell import cell_here
-    from dwell.live.operator_client import OperatorClient
-    from dwell.live.security import environment
+    from dwell.live.host.kept_cell import cell_here
+    from dwell.live.host.operator_client import OperatorClient
+    from dwell.live.host.security import environment
 
     problem = cell_here(cell, state_root()).problem()
     with OperatorClient(problem, environment(keys, insecure=insecure)) as visitor:

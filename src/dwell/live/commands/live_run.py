@@ -17,6 +17,7 @@ from dwell.cli.check import class_faults
 from dwell.cli.output import mark_of_run, print_json, working, write_file
 from dwell.errors import ExitCode, LiveError, ProblemError, installing, not_installed
 from dwell.live.commands.live_view import CellState, View, live_view
+from dwell.live.host.stage_modules import require_stages
 from dwell.live.local.cell_observer import CellObserver, load_observer
 from dwell.live.local.loopback import Loopback, on_this_machine
 from dwell.live.local.playing import (
@@ -31,7 +32,6 @@ from dwell.live.local.playing import (
     play_on,
 )
 from dwell.live.local.timeline import timeline_of
-from dwell.live.stage_modules import require_stages
 from dwell.model import Problem
 from dwell.model.bounds import counted
 from dwell.model.disturbed import Disturbed, disturbed

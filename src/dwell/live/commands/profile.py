@@ -80,7 +80,7 @@ def measure(
     with pinned(choose_cores(core)), redirect_stdout(sys.stderr):
         from dwell.calibration.measure import Settings
         from dwell.calibration.profile_file import require_free, task_name, write_profile
-        from dwell.live.memory import keep_memory
+        from dwell.live.host.memory import keep_memory
 
         require_free(path, [task_name(name, node) for name in sources])
         keep_memory()  # as the processes of a live cell do

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dwell.errors import LiveError
-from dwell.live.control_group import cgroup_mounts
+from dwell.live.roles.control_group import cgroup_mounts
 
 #: What v1 needs, and what it uses beside where it is mounted.
 NEEDED = ("cpu", "cpuacct")

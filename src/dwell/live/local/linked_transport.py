@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 from dwell.live.failures import start_thread
 from dwell.live.local.message_links import HELD, LOST, LinkEnds, Way
-from dwell.live.transport.transport import Arrival, Lane, Receive, Transport
+from dwell.live.wire.transport import Arrival, Lane, Receive, Transport
 
 #: Begins a header that says where its message comes from; MessagePack never uses this byte.
 _SOURCE = b"\xc1"

@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from dwell.errors import LiveError
-from dwell.live.hosting import clock_of
+from dwell.live.host.hosting import clock_of
+from dwell.live.host.operator_client import OperatorClient
 from dwell.live.local.burner import Burner
 from dwell.live.local.conditions import Conditions, fields_of
 from dwell.live.local.message_links import LinkFile
@@ -22,8 +23,7 @@ from dwell.live.local.process import program
 from dwell.live.local.processes import Processes, with_hosts, without_keys
 from dwell.live.local.testbed import LocalTestbed
 from dwell.live.local.timeline import NodeState, usual_conditions
-from dwell.live.operator_client import OperatorClient
-from dwell.live.wiring import PORTS_PER_ROLE, roles
+from dwell.live.wire.wiring import PORTS_PER_ROLE, roles
 from dwell.model import Problem
 
 ADDRESS = "127.0.0.1"

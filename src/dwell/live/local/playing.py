@@ -14,7 +14,7 @@ from types import FrameType
 from typing import Any, NoReturn
 
 from dwell.errors import DwellError, LiveError
-from dwell.live.hosting import clock_of
+from dwell.live.host.hosting import clock_of
 from dwell.live.local.conditions import Conditions
 from dwell.live.local.testbed import Testbed
 from dwell.live.local.timeline import Change, Timeline, first_ns, last_ns, step_ns

@@ -2,8 +2,8 @@
 
 ``python -m dwell.live.local.process [--links FILE] [--clocks FILE] COMMAND ...`` runs what
 ``dwell COMMAND ...`` does (``agent`` or ``controller``, with the same options), and what
-``python -m dwell.live.role_command`` does where the command is ``process``. Its messages meet the
-links that a `LinkFile` says, and its clock is wrong by what a `ClockFile` says.
+``python -m dwell.live.host.role_command`` does where the command is ``process``. Its messages meet
+the links of a `LinkFile`, and its clock has the error that a `ClockFile` gives.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from dwell.errors import ExitCode, line_and_code
-from dwell.live import role_command
-from dwell.live.hosting import Clock, Platform
+from dwell.live.host import role_command
+from dwell.live.host.hosting import Clock, Platform
+from dwell.live.host.security import INSECURE, Security
 from dwell.live.local.clocks import wrong_clock
 from dwell.live.local.linked_transport import LinkedTransport
 from dwell.live.local.message_links import LinkEnds
 from dwell.live.log import say
-from dwell.live.security import INSECURE, Security
-from dwell.live.transport.transport import Transport
+from dwell.live.wire.transport import Transport
 from dwell.model import Problem
 
 
@@ -83,7 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run_node(command: str, words: Sequence[str], platform: Platform) -> int:
     """Run an agent or a controller."""
-    from dwell.live import node_command
+    from dwell.live.host import node_command
 
     run: Callable[..., None] = node_command.agent
     parser = _agent_parser()

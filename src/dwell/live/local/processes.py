@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import TypeAlias
 
 from dwell.cellfile.yaml_text import yaml_of
+from dwell.live.host.parent_death import OPTION, end_those_of, start_sweeper
 from dwell.live.local.trace_names import move_traces
-from dwell.live.parent_death import OPTION, end_those_of, start_sweeper
 from dwell.live.transport.orphans import remove_orphans
 from dwell.live.trust import KEYS
-from dwell.live.wiring import PORTS_PER_ROLE, roles
+from dwell.live.wire.wiring import PORTS_PER_ROLE, roles
 from dwell.model import Host, Problem
 from dwell.model.document import to_document
 

@@ -16,7 +16,7 @@ from contextlib import suppress
 from dwell.live.failures import start_thread
 from dwell.live.transport.no_linger import OPEN, internet_stream
 from dwell.live.transport.orphans import is_shared_memory
-from dwell.live.wiring import Locator, WiringEntry
+from dwell.live.wire.wiring import Locator, WiringEntry
 
 
 class SessionDescriptors:

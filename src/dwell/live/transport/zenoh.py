@@ -26,13 +26,13 @@ from typing import TYPE_CHECKING, Any
 
 from dwell.errors import LiveError, describe_raised, installing
 from dwell.live.failures import start_thread
-from dwell.live.local_addresses import why_not_listen
 from dwell.live.transport.abandoned import AbandonedConnections
 from dwell.live.transport.forked import SessionDescriptors
 from dwell.live.transport.no_linger import Connections
 from dwell.live.transport.orphans import SHARED_MEMORY
-from dwell.live.transport.transport import Arrival, Lane, Receive, require_expression, require_key
-from dwell.live.wiring import Session, WiringEntry, session_of
+from dwell.live.wire.local_addresses import why_not_listen
+from dwell.live.wire.transport import Arrival, Lane, Receive, require_expression, require_key
+from dwell.live.wire.wiring import Session, WiringEntry, session_of
 from dwell.model import FrozenDict
 
 if TYPE_CHECKING:

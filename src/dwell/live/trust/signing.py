@@ -11,8 +11,8 @@ from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 from dwell.errors import TrustError
-from dwell.live.messages import SIGNATURE_BYTES
 from dwell.live.trust.keyring import Keyring
+from dwell.live.wire.messages import SIGNATURE_BYTES
 
 #: Sealed messages that are known to be good, so that the second copy of each costs nothing.
 REMEMBERED = 512

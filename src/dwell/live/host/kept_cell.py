@@ -1,0 +1,381 @@
+"""Kept cell: the bytes of a cell file, and of the modules next to it, that a node began with.
+
+Every process of the node reads these bytes, whenever it starts: an edited file changes nothing
+until `dwell live up --again` takes it over, or the node has ended in order.
+"""
+
+from __future__ import annotations
+
+import importlib.abc
+import importlib.machinery
+import importlib.util
+import re
+import shutil
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import ModuleType
+from typing import Literal, TypeAlias
+
+import msgspec
+
+from dwell.cellfile import load, load_without_traces
+from dwell.errors import DwellError, LiveError
+from dwell.files import write_whole
+from dwell.live.failures import start_thread
+from dwell.live.host.state_files import boot_id, make_folder
+from dwell.model import FrozenDict, Problem
+from dwell.model.document import digests
+from dwell.version import __version__
+
+#: Nothing but the text, keys of the controller's alone, a node's code, or all processes.
+Change: TypeAlias = Literal["text", "decision", "code", "wiring"]
+#: In a state folder: where the bytes are, and the file that says what they are.
+FOLDER, INDEX = "cell", "cell.json"
+#: Time between two comparisons with the files.
+COMPARE_S = 2.0
+#: Modules that a cell file names, as ``package.module:Name``.
+NAMED = re.compile(rb"(\w+)(?:\.\w+)*:\w")
+
+
+def installed_version() -> str:
+    """Return the version of Dwell that a process gets which starts now."""
+    text = Path(__file__).parents[1].joinpath("version.py").read_text(encoding="utf-8")
+    found = re.search(r'__version__ = "(.+)"', text)
+    return found[1] if found else __version__
+
+
+class _Index(msgspec.Struct, frozen=True):
+    """What is kept: cell file, since when (Unix time), Dwell, and the boot in which it ended."""
+
+    file: str
+    since_s: float
+    version: str
+    ended: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class KeptCell:
+    """See the module.
+
+    Parameters
+    ----------
+    file : Path
+        The cell file, which may have changed since.
+    contents : mapping of str to bytes
+        By name, relative to the folder of the cell file.
+    since_s : float
+        When they were read, Unix time.
+    folder : Path, optional
+        State folder that they are kept in; None where they are the present ones.
+    version : str
+        Version of Dwell that is installed with them.
+    """
+
+    file: Path
+    contents: Mapping[str, bytes]
+    since_s: float
+    folder: Path | None = None
+    version: str = field(default_factory=installed_version)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "contents", FrozenDict(self.contents))
+
+    @classmethod
+    def of(cls, file: Path, folders: Iterable[Path] = ()) -> KeptCell:
+        """Return what a node that has not ended in order began with, else the present bytes.
+
+        Parameters
+        ----------
+        folders : iterable of Path
+            State folders to look into.
+        """
+        file = file.resolve()
+        for folder in folders:
+            with suppress(OSError, msgspec.MsgspecError):
+                index = msgspec.json.decode((folder / INDEX).read_bytes(), type=_Index)
+                if index.file == str(file) and index.ended != _this_boot():
+                    kept = folder / FOLDER
+                    paths = [path for path in sorted(kept.rglob("*")) if path.is_file()]
+                    contents = {str(path.relative_to(kept)): path.read_bytes() for path in paths}
+                    return cls(file, contents, index.since_s, folder, index.version)
+        return cls(file, _contents(file), time.time())
+
+    def write(self, folder: Path) -> None:
+        """Keep the bytes in a state folder.
+
+        Raises
+        ------
+        OSError, LiveError
+            If that fails; then nothing is kept.
+        """
+        make_folder(folder)
+        (folder / INDEX).unlink(missing_ok=True)
+        kept = folder / FOLDER
+        if kept.exists():
+            shutil.rmtree(kept)
+        for name, content in self.contents.items():
+            make_folder((kept / name).parent)
+            write_whole(kept / name, content)
+        self._write_index(folder)
+
+    def end(self, folder: Path) -> None:
+        """Note that the node has ended in order: a start in the same boot reads the files again.
+
+        A computer that is shut down ends its nodes in order, too.
+        """
+        with suppress(OSError):
+            self._write_index(folder, ended=_this_boot())
+
+    def _write_index(self, folder: Path, *, ended: str = "") -> None:
+        index = _Index(str(self.file), self.since_s, self.version, ended)
+        write_whole(folder / INDEX, msgspec.json.encode(index))
+
+    def problem(self, *, traces: bool = False) -> Problem:
+        """Return the cell.
+
+        Parameters
+        ----------
+        traces : bool
+            Whether to read the traces, too, which are not kept.
+
+        Raises
+        ------
+        DwellError
+            If it is at fault.
+        """
+        file, home = self.file, self.file.parent
+        if self.folder is not None:
+            file = self.folder / FOLDER / file.name
+        problem = load(file, traces=home) if traces else load_without_traces(file)
+        return replace(problem, folder=str(home))
+
+    def install(self) -> None:
+        """Have this process import the kept modules, and others from next to the cell file."""
+        sys.path.insert(0, str(self.file.parent))
+        sys.meta_path.insert(0, _KeptModules(self))
+
+    def changed(self) -> list[str]:
+        """Return the names of the files that are other ones now."""
+        now = _contents(self.file)
+        return [name for name, content in self.contents.items() if now.get(name) != content]
+
+    def told(self, where: str) -> str:
+        """Return that files have changed; empty where none has."""
+        if not (changed := self.changed()):
+            return ""
+        began = time.localtime(self.since_s)
+        today = began[:3] == time.localtime()[:3]
+        since = time.strftime("%H:%M" if today else "%Y-%m-%d %H:%M", began)
+        one = len(changed) == 1
+        return (
+            f"{', '.join(changed[:3])}{', ...' if len(changed) > 3 else ''} on {where} "
+            f"{'has' if one else 'have'} changed since {since}; `dwell live up --again` takes "
+            f"{'it' if one else 'them'} over"
+        )
+
+
+def change(old: KeptCell, new: KeptCell) -> Change:
+    """Return the most that a change of a cell's files asks for.
+
+    Raises
+    ------
+    DwellError
+        If one of the cell files is at fault.
+    """
+    problems = old.problem(), new.problem()
+    before, after = map(digests, problems)
+    differ = {part for part in before if before[part] != after[part]}
+    series = {kept.version.rpartition(".")[0] for kept in (old, new)}
+    is_renamed = problems[0].name != problems[1].name
+    if is_renamed or differ & {"wiring", "hosts"} or len(series) > 1:
+        return "wiring"
+    modules = [{**kept.contents, kept.file.name: b""} for kept in (old, new)]
+    if modules[0] != modules[1] or "code" in differ or old.version != new.version:
+        return "code"
+    return "decision" if differ else "text"
+
+
+def cell_here(file: Path, root: Path) -> KeptCell:
+    """Return what runs on this computer by a cell file, else the present bytes of the file.
+
+    Parameters
+    ----------
+    root : Path
+        With a folder per cell, and in it one per node.
+    """
+    return KeptCell.of(file, sorted(root.glob("*/*")))
+
+
+def forget(file: Path, root: Path) -> None:
+    """Have nodes and controllers on this computer read the files when they start next."""
+    for folder in root.glob("*/*"):
+        if KeptCell.of(file, [folder]).folder is not None:
+            (folder / INDEX).unlink(missing_ok=True)
+
+
+class CellKeeper:
+    """Keeps a cell's bytes while a node runs, and looks whether the files have changed.
+
+    Parameters
+    ----------
+    folder : Path
+        State folder of the node, or of the controller.
+    where : str
+        Node, for messages.
+    """
+
+    def __init__(
+        self, kept: KeptCell, folder: Path, where: str, say: Callable[[str], None]
+    ) -> None:
+        self.kept, self.folder = kept, folder
+        self._where, self._say = where, say
+        self._lock = threading.Lock()
+        #: Restarts the processes of a node.
+        self.renew: Callable[[], object] = str
+        #: Whether the agent has to replace itself, as another version of Dwell is installed.
+        self.replaced = False
+        self._sentence = self._trouble = ""
+
+    def told(self) -> str:
+        """Return which files have changed, or are not kept; empty where all is well."""
+        return self._trouble or self._sentence
+
+    def begin(self, stopped: threading.Event) -> None:
+        """Keep the bytes, and compare them with the files until the node is told to stop."""
+        self.look()
+        start_thread("cell file", self._look_again, stopped)
+
+    def _look_again(self, stopped: threading.Event) -> None:
+        while not stopped.wait(COMPARE_S):
+            self.look()
+
+    def take_over(self, check: Callable[[KeptCell], object] = str) -> Change | None:
+        """Keep the present bytes from now on, unless their wiring is another.
+
+        Parameters
+        ----------
+        check : callable
+            Raises a DwellError if the new cell cannot run.
+
+        Returns
+        -------
+        str or None
+            None where the files stay as they were kept; the log says why.
+        """
+        name, new = self.kept.file.name, KeptCell.of(self.kept.file)
+        try:
+            found = change(self.kept, new)
+            if found == "wiring":
+                raise LiveError("its wiring is another; end the cell on all nodes, and start it")
+            check(new)
+            with self._lock:
+                self._keep(new)
+        except (DwellError, OSError) as error:
+            self._say(f"error: {name}: is not taken over: {error}")
+            return None
+        self._say(f"{name}: is taken over ({found})")
+        self.look()
+        self.replaced = new.version != __version__
+        if found == "code" and not self.replaced:
+            self.renew()
+        return found
+
+    def _keep(self, kept: KeptCell) -> None:
+        kept.write(self.folder)
+        self.kept = replace(kept, folder=self.folder)
+
+    def look(self) -> None:
+        """Keep the bytes where they are not kept yet, or no more; see what has changed."""
+        with self._lock:
+            self._look()
+
+    def _look(self) -> None:
+        trouble, sentence = "", self._sentence
+        try:
+            if self.kept.folder is None or not (self.folder / INDEX).exists():
+                self._keep(self.kept)
+        except (OSError, LiveError) as error:
+            trouble = f"{self.kept.file.name} cannot be kept: {error}"
+        # What cannot be read now may be what it was.
+        with suppress(OSError):
+            sentence = self.kept.told(self._where)
+        for line, before in ((trouble, self._trouble), (sentence, self._sentence)):
+            if line and line != before:
+                self._say(f"warning: {line}")
+        self._trouble, self._sentence = trouble, sentence
+
+    def end(self) -> None:
+        """Note that the node has ended in order."""
+        self.kept.end(self.folder)
+
+
+class _KeptModules(importlib.abc.MetaPathFinder):
+    """Finds kept modules before all others, under the names of their files."""
+
+    def __init__(self, kept: KeptCell) -> None:
+        self._kept, self._home = kept, kept.file.parent
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> importlib.machinery.ModuleSpec | None:
+        """Return where a module is, if it is kept (see `importlib`)."""
+        place = Path(*fullname.split("."))
+        if path is not None and str(self._home / place.parent) not in path:
+            return None
+        for name in (place / "__init__.py", place.with_suffix(".py")):
+            content = self._kept.contents.get(str(name))
+            if content is not None:
+                file = self._home / name
+                inside = [str(file.parent)] if file.name == "__init__.py" else None
+                return importlib.util.spec_from_file_location(
+                    fullname,
+                    file,
+                    loader=_KeptSource(str(file), content),
+                    submodule_search_locations=inside,
+                )
+        return None
+
+
+class _KeptSource(importlib.abc.SourceLoader):
+    """A kept module: data files next to it are found by its ``__file__``, as ever."""
+
+    def __init__(self, file: str, content: bytes) -> None:
+        self._file, self._content = file, content
+
+    def get_filename(self, fullname: str) -> str:
+        """Return the module's own file."""
+        return self._file
+
+    def get_data(self, path: str | bytes) -> bytes:
+        """Return the kept source, and other data from where they are."""
+        return self._content if path == self._file else Path(str(path)).read_bytes()
+
+
+def _contents(file: Path) -> dict[str, bytes]:
+    """Return the bytes of a cell file and of the modules next to it that can be read.
+
+    These are the modules in its folder, packages with an ``__init__.py``, and packages that the
+    cell file names.
+    """
+    home = file.parent
+    contents: dict[str, bytes] = {}
+    if file.is_file():
+        with suppress(FileNotFoundError, PermissionError):
+            contents[file.name] = file.read_bytes()
+    packages = {path.parent for path in home.glob("*/__init__.py")}
+    packages |= {home / name.decode() for name in NAMED.findall(contents.get(file.name, b""))}
+    modules = {*home.glob("*.py"), *(path for one in packages for path in one.rglob("*.py"))}
+    for path in sorted(one for one in modules if one.is_file()):
+        with suppress(FileNotFoundError, PermissionError):
+            contents[str(path.relative_to(home))] = path.read_bytes()
+    return contents
+
+
+def _this_boot() -> str:
+    """Return the id of the kernel's boot; never empty, which stands for a node that runs."""
+    return boot_id() or "unknown"

@@ -1,0 +1,260 @@
+"""An agent, and a controller of some cells, from what a command line says of them."""
+
+from __future__ import annotations
+
+import fnmatch
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import msgspec
+
+from dwell.errors import ExitCode
+from dwell.live.host.ending import end_when_told
+from dwell.live.host.hosting import PLAIN, Platform
+from dwell.live.host.kept_cell import CellKeeper, KeptCell
+from dwell.live.host.node import Continued, controller_of, run_agent, run_controller
+from dwell.live.host.parent_death import end_with_owner
+from dwell.live.host.role_command import server, words
+from dwell.live.host.security import environment
+from dwell.live.host.state_folder import state_root
+from dwell.live.lint import lint
+from dwell.live.log import say
+from dwell.live.stage import load_function
+from dwell.live.wire.wiring import roles
+from dwell.model import Problem
+
+T = TypeVar("T")
+
+
+class OptionError(ValueError):
+    """An option of a command is wrong; the text names it, and what was given."""
+
+
+def agent(
+    node: str,
+    cell: Path,
+    *,
+    state: Path | None = None,
+    cpus: str | None = None,
+    cpus_of: Sequence[str] = (),
+    realtime: Sequence[str] = (),
+    accelerator: str | None = None,
+    keys: Path | None = None,
+    insecure: bool = False,
+    owner: int | None = None,
+    renews: bool = False,
+    platform: Platform = PLAIN,
+) -> None:
+    """Run a node of a live cell until told to end (see `run_agent`).
+
+    Parameters
+    ----------
+    state : Path, optional
+        Where processes keep their files; below `state_root` if not given.
+    cpus : str, optional
+        CPUs to use, as ``0,2-3``; those of this process if not given.
+    cpus_of, realtime : sequence of str
+        CPUs, and real-time priorities, of some processes, as ``perception@*=2-3``; of those that
+        name one process the last counts.
+    accelerator : str, optional
+        Function that returns the utilisation of the node's accelerator, as ``module:function``.
+    keys : Path, optional
+        Keyring; that of the environment if not given.
+    owner : int, optional
+        Id of the process that this one ends with.
+    renews : bool
+        As in `run_agent`.
+    platform : Platform, optional
+        Clock and transport; without faults if not given.
+
+    Raises
+    ------
+    OptionError
+        If what an option says cannot be.
+    DwellError
+        If the cell cannot be read, or the agent cannot run.
+    """
+    kept = KeptCell.of(cell, state_root().glob(f"*/{node}") if state is None else [state])
+    problem = kept.problem()
+    for caution in lint(problem):
+        say(f"warning: {caution}")
+    folder = state or kept.folder or state_root() / problem.name / node
+    kept.install()
+    read = None if accelerator is None else load_function(accelerator, "--accelerator")
+    wanted = _cpus(cpus)
+    there = sorted(role.who for role in roles(problem) if role.node == node)
+    of = _by_process("--cpus-of", cpus_of, there, lambda text: _cpus(text, "--cpus-of", wanted))
+    priorities = _by_process("--realtime", realtime, there, _priority)
+    hurried, keeper = threading.Event(), CellKeeper(kept, folder, node, say)
+
+    def take_over() -> None:
+        keeper.take_over()
+        if keeper.replaced:
+            stopped.set()
+
+    stopped = _until_told(owner, hurried.set, take_over)
+    run_agent(
+        problem,
+        node,
+        folder,
+        server(cell.resolve(), platform.program, owner, folder),
+        lambda who: words(cell.resolve(), who, folder, of.get(who), priorities.get(who)),
+        stopped,
+        hurried=hurried,
+        keeper=keeper,
+        renews=renews,
+        cpus=wanted,
+        accelerator=read,
+        environment=environment(keys, insecure=insecure),
+        platform=platform,
+        say=say,
+    )
+    if keeper.replaced:
+        _replace_process("--renews")
+
+
+def controller(
+    cells: Sequence[Path],
+    out: Path,
+    *,
+    state: Path | None = None,
+    policy: str | None = None,
+    name: str | None = None,
+    jobs: bool = False,
+    cpus: str | None = None,
+    keys: Path | None = None,
+    insecure: bool = False,
+    owner: int | None = None,
+    continues: str = "{}",
+    platform: Platform = PLAIN,
+) -> None:
+    """Decide where the stages of live cells run until told to end (see `run_controller`).
+
+    Parameters
+    ----------
+    out : Path
+        Where the runs' folders go.
+    state : Path, optional
+        With a folder per cell, where the controller keeps what it began with; `state_root` if not
+        given.
+    cpus, keys, owner, platform : optional
+        As those of an `agent`.
+    continues : str
+        As in `run_controller`, in JSON.
+
+    Raises
+    ------
+    OptionError
+        If the CPUs cannot be had.
+    DwellError
+        If a cell cannot be read, or the controller cannot run.
+    """
+    wanted = _cpus(cpus)
+    if wanted is not None:
+        os.sched_setaffinity(0, wanted)
+    root = state_root(state)
+    problems: list[Problem] = []
+    keepers: dict[str, CellKeeper] = {}
+    for file in cells:
+        kept = KeptCell.of(file, root.glob("*/controller@*"))
+        kept.install()
+        problem = kept.problem(traces=True)
+        node = problem.controller_node
+        folder = kept.folder or root / problem.name / f"controller@{node}"
+        problems.append(problem)
+        keepers[problem.name] = CellKeeper(kept, folder, node, say)
+    renewed = threading.Event()
+
+    def take_over() -> None:
+        found = [
+            keeper.take_over(lambda new: controller_of(new.problem(traces=True), policy, say))
+            for keeper in keepers.values()
+        ]
+        if {"decision", "code"} & {*found}:
+            renewed.set()
+            stopped.set()
+
+    stopped = _until_told(owner, lambda: os._exit(ExitCode.FAILED), take_over)
+    ended = run_controller(
+        *(problems, out, stopped),
+        keepers=keepers,
+        continues=msgspec.json.decode(continues, type=dict[str, Continued]),
+        policy=policy,
+        name=name,
+        jobs=jobs,
+        environment=environment(keys, insecure=insecure),
+        platform=platform,
+        say=say,
+    )
+    for one in ended.values():
+        if one.folder:
+            say(f"run: {one.folder}")
+    if renewed.is_set():
+        _replace_process("--continues", msgspec.json.encode(ended).decode())
+    for keeper in keepers.values():
+        keeper.end()
+
+
+def _replace_process(*more: str) -> None:
+    """Begin again as the same process, which imports its modules again."""
+    # Until it listens to signals, a further one must not end it.
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    words = sys.orig_argv[1:]
+    if more[0] in words:
+        words = words[: words.index(more[0])]
+    os.execv(sys.executable, [sys.executable, *words, *more])  # noqa: S606 - our own command
+
+
+def _by_process(
+    option: str, given: Sequence[str], there: Sequence[str], read: Callable[[str], T]
+) -> dict[str, T]:
+    """Read options of the form PROCESS=VALUE, where PROCESS may have a ``*``; the last counts."""
+    values: dict[str, T] = {}
+    for text in given:
+        pattern, equals, value = text.partition("=")
+        names = fnmatch.filter(there, pattern)
+        if not equals or not names:
+            known = ", ".join(there)
+            raise OptionError(f"{option}: {text!r} is for no process of the node: {known}")
+        values.update(dict.fromkeys(names, read(value)))
+    return values
+
+
+def _priority(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= 99:
+        raise OptionError(f"--realtime: {text!r} is no priority from 1 to 99")
+    return int(text)
+
+
+def _cpus(
+    text: str | None, option: str = "--cpus", among: set[int] | None = None
+) -> set[int] | None:
+    """Read a list of CPUs, each of which has to be available."""
+    if text is None:
+        return None
+    cpus: set[int] = set()
+    try:
+        for part in text.split(","):
+            first, _, last = part.partition("-")
+            cpus.update(range(int(first), int(last or first) + 1))
+    except ValueError:
+        raise OptionError(f"{option}: {text!r} is no list of CPUs, as 0,2-3") from None
+    available = among or os.sched_getaffinity(0)
+    if not cpus or not cpus <= available:
+        raise OptionError(f"{option}: {text} cannot be had; there are {sorted(available)}")
+    return cpus
+
+
+def _until_told(
+    owner: int | None, at_once: Callable[[], None], again: Callable[[], object]
+) -> threading.Event:
+    """Return an event that is set when this process is told to end, or its owner has ended."""
+    stopped = threading.Event()
+    end_with_owner(stopped, owner)
+    end_when_told(stopped, at_once, again)
+    return stopped

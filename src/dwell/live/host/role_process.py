@@ -1,0 +1,232 @@
+"""The process of a stamper, worker or sink: what an agent starts."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from functools import partial
+from pathlib import Path
+
+import msgspec
+
+from dwell.errors import LiveError
+from dwell.live.failures import start_thread
+from dwell.live.host.hosting import (
+    LONGEST_SLEEP_S,
+    PLAIN,
+    Clock,
+    Hosted,
+    Platform,
+    keep_collections_short,
+    work,
+)
+from dwell.live.host.lowest_class import take_lowest_class
+from dwell.live.host.security import Security
+from dwell.live.host.state_files import (
+    BookFile,
+    HighestFile,
+    InFlight,
+    boot_id,
+    kept_memory,
+    make_folder,
+)
+from dwell.live.log import Log
+from dwell.live.roles.control_group import ControlGroup, own_group
+from dwell.live.roles.role import Pulse, RoleLogic, RolePlace
+from dwell.live.roles.sink import Rest, Sink
+from dwell.live.roles.stage_counts import StageBook, book_path
+from dwell.live.roles.stamper import Stamper
+from dwell.live.roles.worker import Job, Worker
+from dwell.live.stage import CellActuator, load_actuator, load_stage
+from dwell.live.wire.messages import Header
+from dwell.live.wire.transport import Arrival
+from dwell.live.wire.wiring import Role as Named
+from dwell.live.wire.wiring import wire
+from dwell.model import Problem
+
+#: What an actuator is told at its process's orderly end, and for how long it is told again.
+ENDING: tuple[Rest, ...] = ("zero", "stop")
+ENDING_S = 2.0
+
+
+def run_process(
+    problem: Problem,
+    who: str,
+    folder: Path,
+    stopped: threading.Event,
+    platform: Platform = PLAIN,
+) -> bool:
+    """Run one process of a cell until it is told to end; returns whether it has ended in order.
+
+    A sink tells its actuator to stop; where that raises to the last, the end is not in order.
+
+    Parameters
+    ----------
+    who : str
+        As in `wiring.roles`: a stamper, worker, shadow, standby or sink.
+    platform : Platform, optional
+        Its clock and transport; without faults if left out.
+
+    Raises
+    ------
+    LiveError
+        If there is no such process, or it cannot listen, or must not.
+    TrustError
+        If the keys that it has been given are not its.
+    """
+    entry = wire(problem).entry(who)
+    node = entry.role.node
+    security = Security.of(problem, entry.role)
+    clock = platform.clock(problem, node)
+    transport = platform.transport(security, who, node)
+    place = security.place(who, node, transport, Log(_print))
+    try:
+        return _run(entry.role, place, make_folder(folder), stopped, clock)
+    finally:
+        transport.close()
+
+
+def _run(
+    role: Named, place: RolePlace, folder: Path, stopped: threading.Event, clock: Clock
+) -> bool:
+    problem = place.problem
+    # A stage that computes must not keep a beat waiting for long.
+    sys.setswitchinterval(0.0005)
+    # What counts the CPU time of a node with a quota.
+    group = own_group() if problem.fabric.nodes[role.node].quota is not None else None
+    if role.kind not in ("stamper", "sink"):
+        _work(role, place, folder, stopped, clock, group)
+        return True
+    (folder / f"{role.who}.ready").touch()
+    if role.kind == "stamper":
+        book = BookFile(folder / f"{role.who}.book")
+        stamper = Stamper(place, book, time.time_ns(), clock(), boot_id())
+        if group is not None:
+            stamper.group_clock = group.taken_ns
+        _host(stamper, place, stopped, clock)
+        return True
+    actuator = _actuator(problem, role.task)
+    highest = HighestFile(folder / f"{role.who}.highest")
+    sink = Sink(place, role.task, actuator, highest)
+    if group is not None:
+        sink.group_clock = group.taken_ns
+    start_thread("actuator", _watch, sink, clock, stopped)
+    hosted = _host(sink, place, stopped, clock)
+    # A command that is being applied comes first; the role takes no other one.
+    with hosted.lock:
+        return bring_to_rest(sink)
+
+
+def _host(role: RoleLogic, place: RolePlace, stopped: threading.Event, clock: Clock) -> Hosted:
+    """Run a role in this thread until the process is told to end."""
+    hosted = Hosted(role, place.transport, clock, stopped=stopped, complain=place.complain)
+    keep_collections_short()
+    hosted.run()
+    return hosted
+
+
+def _watch(sink: Sink, clock: Clock, stopped: threading.Event) -> None:
+    while not stopped.wait(LONGEST_SLEEP_S):
+        sink.watch(clock())
+
+
+def bring_to_rest(sink: Sink, patience_s: float = ENDING_S) -> bool:
+    """Have an actuator stop for good: `zero`, then `stop`; returns whether neither raised at last.
+
+    What raises is called again every `max_age_ms` until patience ends.
+    """
+    until_s = time.monotonic() + patience_s
+    rests = True
+    for how in ENDING:
+        while not (told := sink.rest(how)):
+            left_s = until_s - time.monotonic()
+            if left_s <= 0:
+                break
+            time.sleep(min(sink.max_age_ns / 1e9, left_s))
+        rests &= told
+    return rests
+
+
+def _actuator(problem: Problem, task: str) -> CellActuator:
+    name = problem.live.actuators.get(task)
+    if name is None:
+        raise LiveError(
+            f"live.actuators.{task}: missing; name what applies its commands, as module:Name"
+        )
+    return load_actuator(name, f"live.actuators.{task}")
+
+
+def _work(
+    role: Named,
+    place: RolePlace,
+    folder: Path,
+    stopped: threading.Event,
+    clock: Clock,
+    group: ControlGroup | None,
+) -> None:
+    problem = place.problem
+    name = problem.pipeline.tasks[role.task].run
+    try:
+        if name is None:
+            raise LiveError(f"tasks.{role.task}.run: missing; name its stage, as module:Name")
+        stage = load_stage(name, f"tasks.{role.task}.run")
+    except LiveError as error:
+        # It stays, and says in its beats what is wrong: a crash loop would say it less well.
+        print(error, file=sys.stderr, flush=True)
+        broken = False, f"{role.who}: {error}"
+        _host(_Broken(place, lambda: broken), place, stopped, clock)
+        return
+    memory = partial(kept_memory, book_path(folder, role.who))
+    worker = Worker(
+        place,
+        role.task,
+        stage,
+        shadow=role.kind == "shadow",
+        stands_by=f"{role.task}@{role.node}" if role.kind == "standby" else "",
+        book=StageBook(problem, role.task, role.node, memory),
+    )
+    if group is not None:
+        worker.group_clock = group.counts
+    inflight = InFlight(folder / f"{role.who}.inflight")
+    _retry_suspect(worker, folder / f"{role.who}.again", clock)
+
+    def note(job: Job | None) -> None:
+        if job is None:
+            inflight.end()
+        else:
+            # So that another process can try the job's inputs again.
+            inputs = [(header, bytes(payload)) for header, payload, _ in job.inputs.values()]
+            inflight.begin(msgspec.msgpack.encode([job.shadow, inputs]))
+
+    work(
+        *(worker, place.transport),
+        stopped=stopped,
+        note=note,
+        clock=clock,
+        begin=partial(take_lowest_class, role.who, _print) if worker.shadow else lambda: None,
+        ready=(folder / f"{role.who}.ready").touch,
+    )
+
+
+def _print(line: str) -> None:
+    print(f"{time.strftime('%Y-%m-%dT%H:%M:%S%z')} {line}", file=sys.stderr, flush=True)
+
+
+class _Broken(Pulse):
+    """Stands for a worker whose stage cannot be had, and says so."""
+
+    def receive(self, sample: Arrival, now_ns: int) -> None:
+        super().receive(sample, now_ns)
+
+
+def _retry_suspect(worker: Worker, path: Path, clock: Clock) -> None:
+    """Try first what the process before died of, to see whether it was the message."""
+    try:
+        shadow, inputs = msgspec.msgpack.decode(
+            path.read_bytes(), type=tuple[bool, list[tuple[Header, bytes]]]
+        )
+        path.unlink()
+    except (OSError, msgspec.MsgspecError):
+        return
+    worker.retry(shadow, inputs, clock())

@@ -1,0 +1,247 @@
+"""Files in which a process of a live cell keeps its state across its own death."""
+
+from __future__ import annotations
+
+import errno
+import mmap
+import os
+import shlex
+import stat
+import struct
+import zlib
+from contextlib import suppress
+from pathlib import Path
+
+import msgspec
+
+from dwell.errors import LiveError
+from dwell.live.roles.stamper import StamperState
+
+_CYCLE = struct.Struct("<qq")
+_LENGTH = struct.Struct("<QI")
+# Number of writes, length of the content, and a checksum of both.
+_SLOT = struct.Struct("<QII")
+_BOOK_BYTES = 2_048
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+#: Bits of a folder's mode by which its group, or everybody, may change what is in it.
+OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
+
+
+def boot_id() -> str:
+    """Return the id of the kernel's present boot; nothing if the system has none."""
+    try:
+        return BOOT_ID.read_text(encoding="ascii").strip()
+    except OSError:
+        return ""
+
+
+def make_folder(path: Path) -> Path:
+    """Make a folder for a node's files; nobody else may change what is in it.
+
+    Raises
+    ------
+    LiveError
+        If it cannot be made or written to, or belongs to another user, or others may write to it.
+    """
+    try:
+        # `parents=True` would leave those above open to the group where the umask is 002.
+        for folder in reversed(path.parents):
+            if not folder.exists():
+                folder.mkdir(exist_ok=True, mode=0o700)
+        path.mkdir(exist_ok=True, mode=0o700)
+    except OSError as error:
+        raise LiveError(f"{path}: cannot be made ({error.strerror})") from None
+    if not os.access(path, os.W_OK):
+        raise LiveError(f"{path}: cannot be written to")
+    status, own = path.stat(), os.geteuid()
+    if status.st_uid != own:
+        raise LiveError(
+            f"{path}: belongs to user {status.st_uid}, and this process is user {own}'s: who has "
+            "the folder can change what the node relies on; name another one"
+        )
+    if status.st_mode & OTHERS_WRITE:
+        raise LiveError(
+            f"{path}: others may write to it (mode {stat.S_IMODE(status.st_mode):o}), and change "
+            f"what the node relies on; see what it holds, then chmod go-w {shlex.quote(str(path))}"
+        )
+    return path
+
+
+def open_own(path: str | os.PathLike[str], flags: int) -> int:
+    """Open a file of a node's folder as `open` does, and no symbolic link to one elsewhere.
+
+    Raises
+    ------
+    OSError
+        If it is a link (ELOOP), or cannot be opened.
+    """
+    return os.open(path, flags | os.O_NOFOLLOW, 0o666)
+
+
+def _mapped(path: Path, size: int) -> mmap.mmap:
+    """Map a file of a fixed length, which is made where it is missing or has another one.
+
+    Its place on the disk is taken at once: who writes to it later needs none that might not be
+    there, and would be killed for that.
+
+    Raises
+    ------
+    OSError
+        If the disk is full, or it is a symbolic link.
+    """
+    with open(path, "a+b", opener=open_own) as file:
+        if file.seek(0, os.SEEK_END) != size:
+            file.truncate(0)
+        os.posix_fallocate(file.fileno(), 0, size)
+        return mmap.mmap(file.fileno(), size)
+
+
+def _required(path: Path, size: int) -> mmap.mmap:
+    """Map a file that its process cannot do without.
+
+    Raises
+    ------
+    LiveError
+        If it is not there yet, and the disk is full; or it is a symbolic link.
+    """
+    try:
+        return _mapped(path, size)
+    except OSError as error:
+        link = error.errno == errno.ELOOP
+        why = "is a symbolic link; remove it" if link else f"cannot be made ({error.strerror})"
+        raise LiveError(f"{path}: {why}") from None
+
+
+def kept_memory(path: Path, size: int) -> mmap.mmap | bytearray:
+    """Map a file for counts; memory of the process's own where the disk has no room."""
+    try:
+        return _mapped(path, size)
+    except OSError:
+        return bytearray(size)
+
+
+class _Slots:
+    """Two slots of mapped memory, written in turn.
+
+    Mapped memory outlives its process, and a full disk does not stop a write. A process that dies
+    during a write spoils only the slot that was not the last. A file that was removed is made again
+    by the next write.
+    """
+
+    def __init__(self, path: Path, size: int) -> None:
+        self._path, self._size = path, _SLOT.size + size
+        self._map = _required(path, 2 * self._size)
+        self._file = _identity(path)
+        self._number = 0
+        self.content = b""
+        for begin in (0, self._size):
+            number, length, check = _SLOT.unpack_from(self._map, begin)
+            content = self._map[begin + _SLOT.size : begin + _SLOT.size + length]
+            if number > self._number and zlib.crc32(content, number & 0xFFFFFFFF) == check:
+                self._number, self.content = number, content
+
+    def write(self, content: bytes) -> None:
+        """Write the slot that was not the last."""
+        if _identity(self._path) != self._file:
+            # Until it can be made again, the writes go to the file that was removed.
+            with suppress(OSError):
+                self._map = _mapped(self._path, 2 * self._size)
+                self._file = _identity(self._path)
+        self._number, self.content = self._number + 1, content
+        begin = self._number % 2 * self._size
+        place = begin + _SLOT.size
+        self._map[place : place + len(content)] = content
+        check = zlib.crc32(content, self._number & 0xFFFFFFFF)
+        _SLOT.pack_into(self._map, begin, self._number, len(content), check)
+
+
+def _identity(path: Path) -> tuple[int, int]:
+    """Return device and number of a file; (-1, -1) if there is none."""
+    try:
+        status = os.lstat(path)
+    except OSError:
+        return -1, -1
+    return status.st_dev, status.st_ino
+
+
+class BookFile:
+    """A stamper's `StamperState`."""
+
+    def __init__(self, path: Path) -> None:
+        self._slots = _Slots(path, _BOOK_BYTES)
+
+    def read(self) -> StamperState | None:
+        """Return what was written last; None where nothing was, or it cannot be read."""
+        try:
+            return msgspec.json.decode(self._slots.content, type=StamperState)
+        except msgspec.MsgspecError:
+            return None
+
+    def write(self, entry: StamperState) -> None:
+        """Write it."""
+        text = msgspec.json.encode(entry)
+        if len(text) > _BOOK_BYTES:
+            raise LiveError(f"the placement's name is too long: {entry.placement[:40]}...")
+        self._slots.write(text)
+
+
+class HighestFile:
+    """The highest cycle actuated."""
+
+    def __init__(self, path: Path) -> None:
+        self._slots = _Slots(path, _CYCLE.size)
+
+    def load(self) -> tuple[int, int]:
+        """Return its run and number; (-1, -1) where none is known."""
+        content = self._slots.content
+        run, cycle = _CYCLE.unpack(content) if content else (-1, -1)
+        return run, cycle
+
+    def store(self, run: int, cycle: int) -> None:
+        """Write them."""
+        self._slots.write(_CYCLE.pack(run, cycle))
+
+
+class InFlight:
+    """Inputs of a worker's present job, in mapped memory: it died of them, if it dies."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._size = 0
+        self._map: mmap.mmap | None = None
+
+    def begin(self, content: bytes) -> None:
+        """Note the inputs of the job that begins."""
+        needed = _LENGTH.size + len(content)
+        if self._map is None or needed > self._size:
+            self._grow(needed)
+        if self._map is not None:
+            self._map[_LENGTH.size : needed] = content
+            _LENGTH.pack_into(self._map, 0, len(content), 1)
+
+    def end(self) -> None:
+        """Note that the job is over."""
+        if self._map is not None:
+            _LENGTH.pack_into(self._map, 0, 0, 0)
+
+    def _grow(self, needed: int) -> None:
+        """Make room; where the disk has none, nothing is noted, and the work goes on."""
+        size = 1 << (needed - 1).bit_length()
+        try:
+            self._map, self._size = _mapped(self._path, size), size
+        except OSError:
+            self._map, self._size = None, 0
+
+    @staticmethod
+    def read(path: Path) -> bytes | None:
+        """Return the inputs of the job that a dead worker was at; None if it was at none."""
+        try:
+            data = path.read_bytes()
+        except OSError:
+            return None
+        if len(data) < _LENGTH.size:
+            return None
+        length, at_work = _LENGTH.unpack_from(data)
+        if not at_work or _LENGTH.size + length > len(data):
+            return None
+        return data[_LENGTH.size : _LENGTH.size + length]

@@ -1,0 +1,530 @@
+"""Supervision: keeps the processes of a node running, and finds out why they die."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import shutil
+import signal
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import psutil
+
+from dwell.errors import LiveError
+from dwell.files import write_whole
+from dwell.live.host.launcher import UNKNOWN_CODE, ForkServer, Running, Survivor
+from dwell.live.host.process_group import ProcessGroup
+from dwell.live.host.state_files import InFlight, make_folder, open_own
+from dwell.live.log import printable
+
+#: Waits between two starts of a process that keeps dying.
+FIRST_WAIT_S, LONGEST_WAIT_S = 0.05, 5.0
+#: Time in which processes end by themselves when told to: an actuator may take two seconds of it.
+STOP_S = 3.5
+#: Time after which the next process is restarted, whether the one before it is ready or not.
+TURN_S = 30.0
+#: Time between two looks whether they have, or whether they shall end at once.
+LOOK_S = 0.1
+#: A process that lived so long has recovered.
+HEALTHY_S = 10.0
+#: Deaths of one message before it is put aside.
+POISONOUS = 2
+#: A process has warmed up after this time; it is reported when it has gained this much since, and
+#: has more than twice what it had then.
+WARM_S, GROWTH_BYTES = 30.0, 128 << 20
+#: Memory above its largest so far from which on a process still grows.
+GROWS_BYTES = 1 << 20
+#: Time for which notes repeat that a process has died for want of memory, that a message has been
+#: put aside, or, since the last growth, that memory grows.
+TOLD_S = 60.0
+#: An agent is not ready while a process of its node has died so often, one start after another.
+MOST_TRIES = 10
+#: Of a process that an agent before has started, nobody knows what it died of.
+ENDED = "has ended"
+#: Where the kernel counts the processes that it has killed because there was no memory left.
+EVENTS, OOM_KILL = Path("/proc/vmstat"), "oom_kill"
+#: A log that is longer becomes the older one, which is dropped.
+LOG_BYTES = 8 << 20
+
+
+@dataclass(slots=True)
+class SupervisedProcess:
+    """A process that is kept running."""
+
+    who: str
+    command: Sequence[str]
+    folder: Path
+    process: Running | None = None
+    starts: int = 0
+    failures: int = 0
+    started_s: float = 0.0
+    next_s: float = 0.0
+    note: str = ""
+    deaths: Counter[str] = field(default_factory=Counter)
+    #: What is told of it for a while though it may run again, and since when.
+    told: str = ""
+    told_s: float = -math.inf
+    #: Where the output of its present life begins in its log.
+    log_begins: int = 0
+    group: ProcessGroup | None = None
+    #: Helpers that have outlived it and are not gone yet.
+    helpers: int = 0
+    has_bytes: int = 0
+    watched: psutil.Process | None = None
+    warm_bytes: int | None = None
+    #: Its largest memory so far, the instant of that, and the note about its growth.
+    peak_bytes: int = 0
+    peak_s: float = -math.inf
+    growth: str = ""
+
+    @property
+    def pid(self) -> int | None:
+        """Id of the running process; None where none runs."""
+        return self.process.pid if self.process is not None else None
+
+    @property
+    def ails(self) -> bool:
+        """Whether it has died more than once, and not lived long enough since."""
+        lives_s = time.monotonic() - self.started_s if self.process is not None else 0.0
+        return self.failures > 1 and lives_s < HEALTHY_S
+
+    def file(self, kind: str) -> Path:
+        """Return a file of its: its output (`log`), inputs of its present job (`inflight`), ...
+
+        ``pid`` tells the next agent of a process that outlives this one, what is in ``again`` is
+        worked on first by a worker that is started, and ``ready`` is there once it can work.
+        """
+        return self.folder / f"{self.who}.{kind}"
+
+
+class Supervisor:
+    """Starts processes, starts them again when they die, and adopts those of an agent before.
+
+    Parameters
+    ----------
+    folder : Path
+        The node's.
+    say : callable
+        Takes a line for the log of the agent.
+    warm_s, growth_bytes, log_bytes
+        From when on, and from what on, memory that grows is reported; length of a log.
+    launcher : ForkServer
+        Starts the processes.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        say: Callable[[str], None],
+        launcher: ForkServer,
+        *,
+        warm_s: float = WARM_S,
+        growth_bytes: int = GROWTH_BYTES,
+        log_bytes: int = LOG_BYTES,
+    ) -> None:
+        self.folder = folder
+        self._warm_s, self._growth_bytes, self._log_bytes = warm_s, growth_bytes, log_bytes
+        self.children: list[SupervisedProcess] = []
+        self._say = say
+        self._oom_kills = _oom_kills()
+        self._launcher = launcher
+        # Processes that are to be restarted, the next one last; who is, since when, and after how
+        # many starts.
+        self._turns: list[SupervisedProcess] = []
+        self._turn: tuple[SupervisedProcess, float, int] | None = None
+        # What has become of the folder, if it was removed, and when.
+        self._lost, self._lost_s = "", -math.inf
+
+    def keep(self, who: str, command: Sequence[str]) -> SupervisedProcess:
+        """Have a process run from now on."""
+        child = SupervisedProcess(who, command, self.folder)
+        child.group = marked_group(child.file("pid"))
+        if not self._adopts(child):
+            self._end_group(child)
+        self.children.append(child)
+        return child
+
+    def _adopts(self, child: SupervisedProcess) -> bool:
+        """Take a process over that somebody before has started, if it runs."""
+        if (process := survivor(child.file("pid"))) is None:
+            return False
+        child.process, child.group = Survivor(process.pid), marked_group(child.file("pid"))
+        self._say(f"{child.who}: goes on (process {process.pid})")
+        child.started_s = time.monotonic()
+        return True
+
+    def _end_group(self, child: SupervisedProcess) -> bool:
+        """End what a process that has died has left of its group; whether nothing is left."""
+        left = 0 if child.group is None else child.group.kill()
+        if left > child.helpers:
+            self._say(f"{child.who}: {left} of its helpers have outlived it, and are ended")
+        child.helpers = left
+        if not left:
+            child.group = None
+        return not left
+
+    def step(self) -> None:
+        """Look after every process once."""
+        ready = self._launcher.ready()
+        for child in self.children:
+            if self._alive(child) or not self._end_group(child):
+                continue
+            if ready and time.monotonic() >= child.next_s and not self._adopts(child):
+                self._start(child)
+
+        self._take_turn()
+
+    @property
+    def restarting(self) -> bool:
+        """Whether processes are being restarted in turn."""
+        return self._turn is not None or bool(self._turns)
+
+    def restart_in_turn(self) -> None:
+        """Have every process end and start again, each when the one before it is ready.
+
+        Those that were kept last are the first: workers before sinks, and the stamper at the end.
+        """
+        self._turns = list(self.children)
+
+    def _take_turn(self) -> None:
+        now_s = time.monotonic()
+        if self._turn is not None:
+            child, since_s, starts = self._turn
+            if child.starts == starts and child.pid is not None and now_s > since_s + STOP_S:
+                _send(child.pid, signal.SIGKILL)
+            ready = child.starts > starts and child.file("ready").exists()
+            if not ready and now_s < since_s + TURN_S:
+                return
+            self._turn = None
+        if self._turns:
+            child = self._turns.pop()
+            self._turn = child, now_s, child.starts
+            child.failures = 0
+            self._say(f"{child.who}: is restarted")
+            if child.pid is not None:
+                for number in (signal.SIGTERM, signal.SIGCONT):
+                    _send(child.pid, number)
+
+    def _alive(self, child: SupervisedProcess) -> bool:
+        if child.process is None:
+            return False
+        code = child.process.poll()
+        if code is not None:
+            child.process = None
+            self._died(child, _reason(code))
+        return code is None
+
+    def _died(self, child: SupervisedProcess, reason: str) -> None:
+        now_s = time.monotonic()
+        lived_s = now_s - child.started_s
+        last = _last_line(child.file("log"), child.log_begins)
+        if starved := self._starved(child, reason, last):
+            reason = starved
+            child.told, child.told_s = f"{child.who} {starved}", now_s
+        child.failures = 1 if lived_s > HEALTHY_S else child.failures + 1
+        wait_s = min(FIRST_WAIT_S * 2 ** (child.failures - 1), LONGEST_WAIT_S)
+        child.next_s = now_s + (wait_s if child.failures > 1 else 0.0)
+        child.note = f"{child.who} {reason}{f': {last}' if last else ''}"
+        again = f"; start {child.starts + 1} in {wait_s:.1f} s" if child.failures > 1 else ""
+        self._say(f"{child.note}{again}")
+        try:
+            self._hand_on_suspect(child, reason)
+        except OSError as error:
+            self._say(f"{child.who}: what it died of cannot be kept ({error.strerror})")
+
+    def _starved(self, child: SupervisedProcess, reason: str, last: str) -> str:
+        """Return that a process died for want of memory, and how; empty where it did not.
+
+        The kernel counts the processes that it has killed for that, of the whole machine.
+        """
+        killed = self._oom_kills < (kills := _oom_kills())
+        self._oom_kills = kills
+        had = f"; it had {child.has_bytes >> 20} MB" if child.has_bytes else ""
+        if killed and reason in (_reason(-signal.SIGKILL), ENDED):
+            return f"was killed by the kernel, which had no memory left{had}"
+        if "MemoryError" in last:
+            return f"{reason} for want of memory{had}"
+        return ""
+
+    def _hand_on_suspect(self, child: SupervisedProcess, reason: str) -> None:
+        """Give the message that a worker died of to the next one, but not twice."""
+        content = InFlight.read(child.file("inflight"))
+        again = child.file("again")
+        again.unlink(missing_ok=True)
+        if content is None:
+            return
+        child.file("inflight").unlink(missing_ok=True)
+        name = hashlib.sha256(content).hexdigest()[:16]
+        child.deaths[name] += 1
+        if child.deaths[name] < POISONOUS:
+            again.write_bytes(content)
+            return
+        quarantine = child.folder / "quarantine"
+        quarantine.mkdir(exist_ok=True)
+        kept = quarantine / f"{child.who}-{name}.bin"
+        kept.write_bytes(content)
+        child.note = f"{child.who}: a message has killed it twice ({reason}); it is kept in {kept}"
+        child.told, child.told_s = child.note, time.monotonic()
+        self._say(child.note)
+
+    def _start(self, child: SupervisedProcess) -> None:
+        """Start a process; a disk that is full must not end the agent, and with it the node."""
+        child.starts += 1
+        child.started_s = time.monotonic()
+        with suppress(OSError):
+            child.file("ready").unlink(missing_ok=True)
+        try:
+            with open(child.file("log"), "ab", opener=open_own) as log:
+                child.log_begins = log.tell()
+                child.process = self._launcher.start(child.command, log)
+                child.group = ProcessGroup.of(child.process.pid)
+        except OSError as error:
+            self._died(child, f"could not be started ({error.strerror})")
+            return
+        child.warm_bytes, child.peak_bytes, child.growth = None, 0, ""
+        self._write_mark(child)
+
+    def _write_mark(self, child: SupervisedProcess) -> None:
+        """Write who runs; the mark of somebody before it must not stay."""
+        try:
+            child.file("pid").unlink(missing_ok=True)
+            write_mark(child.file("pid"), child.group)
+        except OSError as error:
+            self._say(f"{child.who}: its mark cannot be written ({error.strerror})")
+
+    def tend(self) -> None:
+        """Look how much memory the processes have taken, and how much they have printed."""
+        self._oom_kills = _oom_kills()
+        if self.children and not self.folder.is_dir():
+            self._make_folder()
+        for child in self.children:
+            if shorten_log(child.file("log"), self._log_bytes):
+                child.log_begins = 0
+            if child.process is not None and not child.file("pid").exists():
+                self._write_mark(child)  # there was no room for it
+            self._weigh(child)
+
+    def _make_folder(self) -> None:
+        """Make the state folder again; a disk that is gone must not end the agent."""
+        lost = f"{self.folder}: was removed, and is made again"
+        try:
+            make_folder(self.folder)
+        except LiveError as error:
+            if (lost := str(error)) == self._lost:
+                return
+        self._lost, self._lost_s = lost, time.monotonic()
+        self._say(lost)
+
+    def _weigh(self, child: SupervisedProcess) -> None:
+        """Report a process whose memory has doubled since it had warmed up, at every doubling."""
+        if child.pid is None:
+            return
+        try:
+            memory = psutil.Process(child.pid).memory_info()
+        except psutil.Error:
+            return
+        # Without what it shares with others: the payloads in shared memory.
+        child.has_bytes = has_bytes = memory.rss - memory.shared
+        now_s = time.monotonic()
+        if has_bytes > child.peak_bytes + GROWS_BYTES:
+            child.peak_bytes, child.peak_s = has_bytes, now_s
+        if now_s - child.started_s < self._warm_s:
+            return
+        before = child.warm_bytes
+        if before is None:
+            child.warm_bytes = has_bytes
+        elif has_bytes > max(2 * before, before + self._growth_bytes):
+            child.warm_bytes = has_bytes
+            child.growth = (
+                f"{child.who}: its memory has grown from {before >> 20} to {has_bytes >> 20} MB; "
+                "does its stage leak?"
+            )
+            self._say(child.growth)
+
+    def cpu_seconds(self) -> dict[str, float]:
+        """CPU time of every process that runs, since it was started."""
+        seconds: dict[str, float] = {}
+        for child in self.children:
+            if child.pid is None:
+                continue
+            try:
+                if child.watched is None or child.watched.pid != child.pid:
+                    child.watched = psutil.Process(child.pid)
+                times = child.watched.cpu_times()
+            except psutil.Error:
+                continue
+            seconds[child.who] = times.user + times.system
+        return seconds
+
+    def stuck(self) -> bool:
+        """Return whether a process has died at so many starts that somebody has to look."""
+        return any(child.failures >= MOST_TRIES and child.ails for child in self.children)
+
+    def notes(self) -> str:
+        """Return the last troubles of processes that keep dying or growing, or died for memory."""
+        since_s = time.monotonic() - TOLD_S
+        ailing = [child for child in self.children if child.ails]
+        ailing.sort(key=lambda child: -child.failures)
+        notes = [self._lost] if self._lost_s > since_s else []
+        notes += [child.note for child in ailing]
+        notes += [child.told for child in self.children if child.told_s > since_s]
+        notes += [child.growth for child in self.children if child.peak_s > since_s]
+        return "; ".join(dict.fromkeys(filter(None, notes)))[:2000]
+
+    def stop(
+        self, patience_s: float = STOP_S, *, hurried: threading.Event | None = None
+    ) -> dict[str, str]:
+        """End all processes; those that do not listen are killed.
+
+        Parameters
+        ----------
+        hurried : Event, optional
+            Has them killed at once.
+
+        Returns
+        -------
+        dict of str to str
+            How processes ended that did not end in order.
+        """
+        running = [
+            psutil.Process(c.pid) for c in self.children if c.pid and psutil.pid_exists(c.pid)
+        ]
+        for process in running:
+            _signal(process, signal.SIGTERM)
+            _signal(process, signal.SIGCONT)
+        deadline_s = time.monotonic() + patience_s
+        alive = running
+        while alive and time.monotonic() < deadline_s and not (hurried and hurried.is_set()):
+            _, alive = psutil.wait_procs(alive, timeout=min(LOOK_S, patience_s))
+        for process in alive:
+            _signal(process, signal.SIGKILL)
+        psutil.wait_procs(alive, timeout=patience_s)
+        failed = {}
+        for child in self.children:
+            if child.process is not None:
+                code = child.process.wait()
+                if code not in (0, UNKNOWN_CODE):
+                    last = _last_line(child.file("log"), child.log_begins)
+                    failed[child.who] = f"{_reason(code)}{f': {last}' if last else ''}"
+            child.process = None
+        self._end_groups(patience_s)
+        for child in self.children:
+            child.file("pid").unlink(missing_ok=True)
+        self._launcher.stop()
+        return failed
+
+    def _end_groups(self, patience_s: float) -> None:
+        """End what the processes have left; a helper that the kernel keeps is not waited for."""
+        deadline = time.monotonic() + patience_s
+        left = [child for child in self.children if not self._end_group(child)]
+        while left and time.monotonic() < deadline:
+            time.sleep(0.01)
+            left = [child for child in left if not self._end_group(child)]
+
+
+def _send(pid: int, number: int) -> None:
+    with suppress(ProcessLookupError):
+        os.kill(pid, number)
+
+
+def _signal(process: psutil.Process, number: int) -> None:
+    with suppress(psutil.Error):
+        process.send_signal(number)
+
+
+def write_mark(mark: Path, group: ProcessGroup | None) -> None:
+    """Write who runs, for the next agent.
+
+    Raises
+    ------
+    OSError
+        If there is no room.
+    """
+    if group is not None:
+        # Nobody waits for a slow disk: after a loss of power no process runs.
+        write_whole(mark, json.dumps(asdict(group)), durable=False)
+
+
+def claim(folder: Path, who: str) -> None:
+    """Mark this process as the one of its name on its node: its agent may be dead by now.
+
+    Raises
+    ------
+    LiveError
+        If another one runs.
+    """
+    mark = folder / f"{who}.pid"
+    other = survivor(mark)
+    if other is not None and other.pid != os.getpid():
+        raise LiveError(f"{who}: runs already (process {other.pid})")
+    # Where there is no room, its agent will try again.
+    with suppress(OSError):
+        write_mark(mark, ProcessGroup.of(os.getpid()))
+
+
+def marked_group(mark: Path) -> ProcessGroup | None:
+    """Return the group of the process that a mark tells of, whether that runs or not."""
+    try:
+        content = json.loads(mark.read_text())
+        pid, started = int(content["pid"]), float(content["started"])
+        return ProcessGroup(pid, started, int(content.get("session", -1)))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+
+
+def survivor(mark: Path) -> psutil.Process | None:
+    """Return the process that a mark tells of, if it is still that one."""
+    group = marked_group(mark)
+    return None if group is None else group.leader()
+
+
+def _reason(code: int) -> str:
+    if code == UNKNOWN_CODE:
+        return ENDED
+    if code < 0:
+        try:
+            return f"was killed by {signal.Signals(-code).name}"
+        except ValueError:
+            return f"was killed by signal {-code}"
+    return f"ended with exit code {code}"
+
+
+def _oom_kills() -> int:
+    """Return how many processes the kernel has killed for memory; 0 where it does not count."""
+    try:
+        counts = dict(line.split() for line in EVENTS.read_text().splitlines())
+        return int(counts.get(OOM_KILL, 0))
+    except (OSError, ValueError):
+        return 0
+
+
+def shorten_log(path: Path, longest: int) -> bool:
+    """Begin a log anew that is too long; its process goes on appending to the same file."""
+    try:
+        if path.stat().st_size <= longest:
+            return False
+        older = path.with_suffix(".log.1")
+        write_whole(older, lambda draft: shutil.copyfile(path, draft), durable=False)
+        os.truncate(path, 0)
+    except OSError:
+        return False
+    return True
+
+
+def _last_line(path: Path, begins: int) -> str:
+    """Return the last line of a log behind a place."""
+    try:
+        with path.open("rb") as file:
+            file.seek(max(file.seek(0, os.SEEK_END) - 2_000, begins))
+            lines = file.read().decode(errors="replace").strip().split("\n")
+    except OSError:
+        return ""
+    return printable(lines[-1])[:300] if lines else ""

@@ -1,0 +1,837 @@
+"""ControlledCell: one live cell as its controller sees it: windows in, orders out.
+
+The decisions are those of `dwell.control.Controller`, the object that the simulator runs.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any, Literal, Protocol, TypeAlias
+
+from dwell.control import Controller, Proposal
+from dwell.errors import LiveError
+from dwell.live.roles.health import PATIENCE_NS, diagnose, silent_after_ns
+from dwell.live.roles.live_windows import LiveWindows
+from dwell.live.roles.role import AGENT_BEAT, REPEATED_NS, Pulse, RolePlace
+from dwell.live.roles.run_rows import Resume, Rows
+from dwell.live.wire.continuity import Continuity, SetbackDetector
+from dwell.live.wire.keys import CONTROLLER
+from dwell.live.wire.messages import (
+    OTHER,
+    Accepted,
+    Answer,
+    Ask,
+    Beat,
+    Order,
+    Restored,
+    Snapshot,
+    Stamp,
+    Stamped,
+    decode,
+    encode,
+)
+from dwell.live.wire.transport import Arrival
+from dwell.live.wire.wiring import roles
+
+#: Time between two looks at the stamper, and two sendings of an order that is not answered.
+ASK_NS = 250_000_000
+RESEND_NS = 40_000_000
+#: Stamps in a row that say that the cell has been moved, where no answer says so.
+CONFIRMATIONS = 3
+
+#: A state on its way has this share of its link, as 1 / share.
+TRANSFER_SHARE = 2
+
+#: Why a cell is moved: the policy's reasons, the guard, a person's wish, an unknown order.
+MOVED_BY = ("migrate", "capped", "infeasible", "guard", "pinned", "drained", "ordered")
+
+Phase: TypeAlias = Literal["fork", "state", "order"]
+
+
+class Recorder(Protocol):
+    """Keeps the rows of a run."""
+
+    @property
+    def trouble(self) -> str:
+        """Why the rows cannot be written; empty where they can."""
+        ...
+
+    def open(self, run: int) -> Resume:
+        """Begin to keep a run, or go on; returns where."""
+        ...
+
+    def append(self, rows: Rows, **meta: object) -> None:
+        """Keep rows that belong together, and the run's metadata from now on."""
+        ...
+
+
+@dataclass(slots=True)
+class _Move:
+    """A migration on its way.
+
+    A task with a state goes first: its inputs are forked to where it will run, its state follows,
+    and only when all have said that they are ready is the placement ordered.
+    """
+
+    name: str
+    reason: str
+    since_ns: int
+    phase: Phase
+    forks: tuple[tuple[str, str], ...] = ()
+    awaited: dict[int, str] = field(default_factory=dict)
+    patience_ns: int = PATIENCE_NS
+    order: Order | None = None
+    sent_ns: int = 0
+    refused: str = ""
+    # Whether its order has been refused for now, and is to be asked for anew.
+    anew: bool = False
+    # What it carries out, where the policy has decided it.
+    proposal: Proposal | None = None
+
+
+class ControlledCell:
+    """See the module.
+
+    Parameters
+    ----------
+    name : str
+        Name of this controller, by which others that would take charge tell it apart.
+    changed : callable
+        Returns which files have changed since it began; empty for none.
+    """
+
+    def __init__(
+        self,
+        place: RolePlace,
+        controller: Controller,
+        recorder: Recorder,
+        name: str,
+        now_ns: int,
+        changed: Callable[[], str] = str,
+    ) -> None:
+        self.place, self.controller, self.name = place, controller, name
+        self._recorder, self._changed = recorder, changed
+        self.offsets = place.offsets()
+        self.windows: LiveWindows | None = None
+        # Of the others the relay's agent tells it now and then. What beats say of the clocks is
+        # what they have heard themselves: it is as good when it comes late, by way of others.
+        relay = place.problem.relay_node
+        agent = relay, f"agent@{relay}"
+        self.pulse = Pulse(place, lambda: (True, recorder.trouble), hears=[agent], every=AGENT_BEAT)
+        self._keys = place.keys
+        # Where the cell is, by the stamper's answers and stamps; and its last answer in this term.
+        self.course = controller.course
+        self._told: Accepted | None = None
+        # The cycles that are believed; and the numbers of the last orders that were sent before the
+        # newest cycle, and before the term that holds, were heard of.
+        self.continuity = Continuity(place.period_ns)
+        self._cycle_asked = self._term_asked = 0
+        # What a stamp says of a term that nobody has confirmed, whether the order under way asks
+        # for it, and how many stamps in a row say so.
+        self._unconfirmed: tuple[tuple[int, int, str], bool, int] | None = None
+        self._doubted_until_ns: int | None = None
+        self.refused = ""
+        self.pinned = ""
+        self.drained: set[str] = set()
+        self._move: _Move | None = None
+        self._number = now_ns
+        self._setback = SetbackDetector()
+        self._began_ns: int | None = None
+        self._ask_ns = 0
+        # How often the cell has been moved, by reason (see `MOVED_BY`).
+        self.moves = Counter(dict.fromkeys(MOVED_BY, 0))
+        self._window: dict[str, Any] = {}
+        self._window_ns = 0
+        # Whether a window has closed that is not recorded.
+        self._unwritten = False
+
+    @property
+    def guard_moves(self) -> int:
+        """How often the guard has moved the cell."""
+        return self.moves["guard"]
+
+    @property
+    def migrations(self) -> int:
+        """How often it has been moved by order."""
+        return self.moves.total() - self.guard_moves
+
+    # ------------------------------------------------------------------------ hearing
+
+    def subscriptions(self) -> Iterable[str]:
+        """Key expressions that it wants to hear."""
+        keys = self.place.keys
+        yield from self.pulse.subscriptions()
+        yield from (keys.done("*"), keys.ended(), keys.accepted(), keys.load("*"))
+        yield from (keys.gathered(), keys.stamped())
+        yield keys.restored()
+        yield from (keys.ask(), keys.look())
+
+    def receive(self, sample: Arrival, now_ns: int) -> int:
+        """Take a message in; returns what is due next."""
+        self._follow_clock(now_ns)
+        self._take(sample, now_ns)
+        return self._due_ns(now_ns)
+
+    def _due_ns(self, now_ns: int) -> int:
+        """Return when a window closes, an order is sent again, or the stamper is asked."""
+        due_ns = self._ask_ns
+        if self._move is not None:
+            due_ns = min(due_ns, self._move.sent_ns + RESEND_NS)
+        close_ns = None if self.windows is None else self.windows.due_ns(now_ns)
+        return due_ns if close_ns is None else min(due_ns, close_ns)
+
+    def _follow_clock(self, now_ns: int) -> None:
+        """Put what is due, and what was heard, back with a clock that has been set back."""
+        back_ns = self._setback.back_ns(now_ns)
+        if not back_ns:
+            return
+        self._ask_ns -= back_ns
+        self._window_ns -= back_ns
+        if self._began_ns is not None:
+            self._began_ns -= back_ns
+        if self._move is not None:
+            self._move.since_ns -= back_ns
+            self._move.sent_ns -= back_ns
+        if self.windows is not None:
+            self.windows.set_back(back_ns)
+
+    def _take(self, sample: Arrival, now_ns: int) -> None:
+        keys = self._keys
+        word = keys.word(sample.key)
+        if word == "gathered":
+            for arrival in self.place.around(sample):
+                self._take(arrival, now_ns)
+            return
+        if self.pulse.hears(sample):
+            beat = self.pulse.receive(sample, now_ns)
+            if beat is not None:
+                self._compare_clocks(beat, now_ns, direct=keys.came_directly(sample.key))
+                if beat.moving and self._move is not None:
+                    # Its stage writes or reads the state.
+                    self._move.since_ns = now_ns
+            return
+        windows = self.windows
+        try:
+            match word:
+                case "stamped":
+                    self._stamped(decode(sample.payload, Stamped), now_ns)
+                case "done" | "ended" if windows is not None:
+                    done = self.place.completion(sample)
+                    who = f"{done.sink}@{done.node}"
+                    # A source's guess counts where the stamper has released such a cycle.
+                    guess = not done.stamp.term
+                    if guess or self._goes_on(done.stamp, who, now_ns, alone=True):
+                        windows.completed(done, now_ns)
+                case "load" if windows is not None:
+                    windows.loaded(self.place.load(sample), now_ns)
+                case "accepted":
+                    answer = self.place.read(sample, Accepted, lambda _: self.place.stamper[0])
+                    self._answered(answer, now_ns)
+                case "restored":
+                    restored = self.place.read(sample, Restored, lambda told: told.node)
+                    self._restored(restored, now_ns)
+                case "ask":
+                    self._asked(decode(sample.payload, Ask), now_ns)
+                case "look":
+                    looks = Ask(decode(sample.payload, Ask).number, "status")
+                    self._asked(looks, now_ns)
+        except LiveError as error:
+            self.place.complain(error)
+
+    def _compare_clocks(self, beat: Beat, now_ns: int, *, direct: bool) -> None:
+        """Learn what a beat tells of the clocks; over the detour, of others than this node's."""
+        if direct:
+            self.offsets.hear(beat, now_ns)
+        else:
+            for heard in beat.heard:
+                self.offsets.sample(heard.node, beat.node, heard.beat_ns, heard.at_ns)
+
+    def _require_candidate(self, placement: str) -> None:
+        """Raise a LiveError unless the stamper can have said that a placement holds."""
+        known = self.place.problem.candidates
+        if placement not in known:
+            raise LiveError(
+                f"the stamper says {placement[:60]!r} holds, which is no candidate here "
+                f"({', '.join(known)}); the nodes' cell files differ"
+            )
+
+    def _goes_on(self, stamp: Stamp, who: str, now_ns: int, *, alone: bool = False) -> bool:
+        """Whether a cycle goes on from those before it; complains of the first that does not."""
+        continuity, cycle = self.continuity, stamp.key
+        newest, ahead = continuity.newest, continuity.ahead(now_ns)
+        course = self.course
+        terms = stamp.term - course.term if course.run == stamp.run else 0
+        if terms <= ahead and continuity.takes(cycle, now_ns, alone=alone):
+            if continuity.newest == cycle != newest:
+                self._cycle_asked = self._number
+            return True
+        if terms > ahead:
+            continuity.leaps += 1
+        if self._doubted_until_ns is None or now_ns >= self._doubted_until_ns:
+            self.place.complain(
+                LiveError(
+                    f"{who} speaks of run {stamp.run}, cycle {stamp.cycle}, term {stamp.term}, "
+                    f"after {newest} and term {course.term}; at most {ahead} more are believed "
+                    "(damaged, or made up)"
+                )
+            )
+        self._doubted_until_ns = now_ns + REPEATED_NS
+        return False
+
+    def _stamped(self, stamp: Stamped, now_ns: int) -> None:
+        self._require_candidate(stamp.placement)
+        windows, course = self.windows, self.course
+        if windows is None or not self._goes_on(stamp, self.place.stamper[1], now_ns):
+            return
+        windows.stamped(stamp, now_ns)
+        windows.measured(stamp.run, stamp.intervals)
+        if (stamp.run, stamp.term) <= (course.run, course.term):
+            self._unconfirmed = None
+            return
+        reported = stamp.run, stamp.term, stamp.placement
+        known, ordered, count = self._unconfirmed or (None, False, 0)
+        if known != reported:
+            # An order that is sent later has not brought it about.
+            ordered, count = self._has_ordered(stamp), 0
+            # The answer says who has moved the cell, too.
+            self._ask_ns = now_ns
+        count += 1
+        self._unconfirmed = reported, ordered, count
+        if count == CONFIRMATIONS:
+            self._now_at(*reported, by_guard=not ordered)
+
+    def _has_ordered(self, stamp: Stamp) -> bool:
+        """Whether a stamp's term is what the order that has no answer yet asks for."""
+        move = self._move
+        return (
+            move is not None
+            and move.order is not None
+            and (stamp.run, stamp.term) == (self.course.run, move.order.term + 1)
+            and stamp.placement == move.name
+        )
+
+    def _now_at(self, run: int, term: int, placement: str, *, by_guard: bool) -> None:
+        """Take note of the placement that holds since a term began."""
+        controller, course, move = self.controller, self.course, self._move
+        left = course.placement
+        self._unconfirmed = self._told = None
+        self._term_asked = self._number
+        self.refused = ""
+        if move is not None and move.name == placement and not by_guard:
+            self._move, self._unwritten = None, True
+            self.moves[move.reason] += 1
+            if move.proposal is not None:
+                controller.commit(move.proposal)
+        else:
+            self._stay(f"the placement became {placement} meanwhile")
+            self.moves["guard" if by_guard else "ordered"] += 1
+            if by_guard and move is not None:
+                # It may be where the move led, but no state has come along.
+                self.refused = (
+                    f"the guard moved the cell to {placement} before the move to {move.name}"
+                )
+        if by_guard:
+            if self.windows is not None:
+                controller.looked = self.windows.fell(run, term)
+            controller.adopt(placement, left=left)
+        else:
+            if placement != course.placement:
+                # A person's choice, not the policy's.
+                controller.resume(placement)
+            course.credit(by_guard=False)
+        course.enter(run, term)
+
+    def _begin_run(self, answer: Accepted) -> None:
+        """Begin where the stamper says that the cell is."""
+        self._term_asked = self._number
+        resume = self._recorder.open(answer.run)
+        self._follow(answer)
+        self.windows = LiveWindows(self.place.problem, self.offsets, self.controller, resume=resume)
+
+    def _follow(self, answer: Accepted) -> None:
+        """Be where the stamper says."""
+        self.controller.resume(answer.placement, fallback=answer.fallback)
+        self.course.enter(answer.run, answer.term)
+        self._told = answer
+
+    @property
+    def _proven(self) -> str:
+        """Candidate that the stamper has said is proven; none where empty."""
+        return "" if self._told is None else self._told.proven
+
+    # ------------------------------------------------------------------------- orders
+
+    def _answered(self, answer: Accepted, now_ns: int) -> None:
+        if answer.controller != self.name:
+            return
+        self._require_candidate(answer.placement)
+        if answer.number > self._number:
+            raise LiveError(f"an answer to order {answer.number}, which was never sent")
+        begins = self.windows is None
+        if begins:
+            self._begin_run(answer)
+        elif not self._corrected(answer, now_ns):
+            return
+        # One that asked before had a clock that is ahead of this one.
+        self._number = max(self._number, answer.newest)
+        if begins:
+            return
+        course, move, proven = self.course, self._move, self._proven
+        of_move = move is not None and move.order is not None and answer.number == move.order.number
+        if (answer.run, answer.term) > (course.run, course.term):
+            # What was accepted may be an order before the one that waits for its answer.
+            self._now_at(answer.run, answer.term, answer.placement, by_guard=answer.fallback)
+        else:
+            # A stamp says where the cell is, and not who has moved it.
+            course.credit(by_guard=answer.fallback)
+        self._told = answer
+        if self._move is None and answer.proven and answer.proven != proven:
+            self._follow_operators(now_ns)
+        if not of_move or move is None or move is not self._move:
+            return
+        self.refused = answer.refused
+        if answer.refused:
+            move.refused, move.anew = answer.refused, True
+            if not answer.refused.startswith("not ready"):
+                self._give_up(now_ns)
+        elif move.phase == "fork":
+            self._ask_for_states(move, answer)
+
+    def _corrected(self, answer: Accepted, now_ns: int) -> bool:
+        """Believe the stamper's own word over what was heard before; False where it is an old one.
+
+        An answer to an order that was sent after something was heard is later than that: where it
+        says less, what was heard was wrong.
+        """
+        if (answer.run, answer.term) < (self.course.run, self.course.term):
+            if answer.number <= self._term_asked:
+                return False
+            self._take_back(answer)
+        self._unconfirmed = None
+        continuity, windows = self.continuity, self.windows
+        newest, upcoming = continuity.newest, (answer.run, answer.cycle)
+        ahead = continuity.ahead(now_ns)
+        if newest is None or newest[0] < answer.run or answer.cycle > newest[1] + ahead:
+            continuity.believe((answer.run, answer.cycle - 1), now_ns)
+            self._cycle_asked = self._number
+        elif upcoming <= newest and answer.number > self._cycle_asked:
+            self.place.complain(
+                LiveError(f"the stamper has not stamped cycle {newest[1]}; {answer.cycle} is next")
+            )
+            continuity.believe((answer.run, answer.cycle - 1), now_ns)
+            self._cycle_asked = self._number
+            if windows is not None:
+                windows.forget(answer.run, answer.cycle)
+        return True
+
+    def _take_back(self, answer: Accepted) -> None:
+        """Go back to the placement that the stamper says: the term that was believed was false."""
+        self.place.complain(
+            LiveError(
+                f"the stamper is in term {answer.term}, at {answer.placement}; so it was not moved"
+            )
+        )
+        self._term_asked = self._number
+        self._stay(f"the stamper says that {answer.placement} holds")
+        self._follow(answer)
+
+    def _stay(self, why: str) -> None:
+        """Go on with the placement that holds: no migration has come about."""
+        move, self._move = self._move, None
+        if move is not None and move.proposal is not None:
+            self.controller.reject(move.proposal, why)
+        self._unwritten = True
+        if self.windows is not None:
+            self.windows.refused()
+
+    def _send(self, order: Order) -> None:
+        if self.place.stamper[1] in self.pulse.strangers:
+            # Its candidates may be others, of the same names.
+            return
+        self.place.put(self.place.keys.order(), order)
+
+    def _next_number(self) -> int:
+        self._number += 1
+        return self._number
+
+    def _order(self, placement: str, now_ns: int) -> Order:
+        """Return an order; whatever it is for, it says what is forked, and what is to be proven."""
+        course, move = self.course, self._move
+        where = course.run, course.term
+        fraction = self.controller.shadow_fractions[placement or course.placement]
+        forks = () if move is None else move.forks
+        want = self._desired(now_ns) if move is None else move.name
+        return Order(self._next_number(), self.name, *where, placement, fraction, forks, want)
+
+    def _desired(self, now_ns: int) -> str:
+        """Return what the guard's fallback shall be left for: people's choice, else the policy's.
+
+        It lasts until the cell is there, whatever windows close and orders are given up meanwhile:
+        without it the stamper counts its probes anew.
+        """
+        here, wanted = self.course.placement, self.course.wanted
+        if not self.course.by_guard:
+            return ""
+        chosen = self._allowed(here, now_ns)
+        if self.pinned or chosen != here:
+            return "" if chosen == here else chosen
+        return wanted if wanted is not None and self._clear(wanted) else ""
+
+    def _begin(self, name: str, now_ns: int, proposal: Proposal | None = None) -> None:
+        """Begin a migration that the policy has proposed or a person has asked for."""
+        if self._move is not None:
+            self._stay(self._overruled())
+        problem = self.place.problem
+        old, new = problem.candidates[self.course.placement], problem.candidates[name]
+        forks = tuple(
+            (task.name, new[task.name])
+            for task in problem.pipeline.tasks.values()
+            if task.state_bytes and old[task.name] != new[task.name]
+        )
+        phase: Phase = "fork" if forks else "order"
+        wish = "pinned" if self.pinned else "drained"
+        reason = wish if proposal is None else proposal.decision.reason
+        patience_ns = PATIENCE_NS + self._transfer_ns(forks)
+        self._move = _Move(
+            *(name, reason, now_ns, phase, forks), patience_ns=patience_ns, proposal=proposal
+        )
+        self.refused = ""
+        if self.windows is not None:
+            self.windows.ordered(self.course.run, self.course.term)
+        self._push(self._move, now_ns)
+
+    def _transfer_ns(self, forks: tuple[tuple[str, str], ...]) -> int:
+        """Return the time that states on their way take, which share their links."""
+        problem = self.place.problem
+        here, transfer_s = problem.candidates[self.course.placement], 0.0
+        for task, to in forks:
+            link = problem.fabric.links.get(f"{here[task]}->{to}")
+            if link is not None:
+                bits = 8 * problem.pipeline.tasks[task].state_bytes
+                transfer_s += TRANSFER_SHARE * bits / (link.rate_mbps * 1e6)
+        return round(transfer_s * 1e9)
+
+    def _push(self, move: _Move, now_ns: int) -> None:
+        """Send what the present phase of a migration asks for."""
+        move.sent_ns = now_ns
+        if move.phase == "state":
+            return
+        if move.order is None:
+            placement = move.name if move.phase == "order" else ""
+            move.order = self._order(placement, now_ns)
+        elif move.anew:
+            # An order that was refused for now is asked for anew; one without answer, again.
+            move.order = self._order(move.order.placement, now_ns)
+            move.anew = False
+        self._send(move.order)
+
+    def _ask_for_states(self, move: _Move, answer: Accepted) -> None:
+        """Have the states follow the inputs, which are forked."""
+        move.phase = "state"
+        keys = self.place.keys
+        old = self.place.problem.candidates[answer.placement]
+        for task, to in move.forks:
+            number = self._next_number()
+            move.awaited[number] = task
+            asked = Snapshot(number, task, old[task], to, answer.run, answer.cycle)
+            # Where it goes, a state is taken for what is known to have been asked for alone.
+            for node in (to, old[task]):
+                self.place.put(keys.snapshot(task, node), asked)
+
+    def _restored(self, restored: Restored, now_ns: int) -> None:
+        move = self._move
+        if move is None or restored.number not in move.awaited:
+            return
+        del move.awaited[restored.number]
+        if restored.failed:
+            self.place.complain(LiveError(restored.failed))
+            move.refused = restored.failed
+            self._give_up(now_ns)
+        elif not move.awaited:
+            move.phase, move.order = "order", None
+            self._push(move, now_ns)
+
+    def _give_up(self, now_ns: int) -> None:
+        """End a migration that has not come about: the cell is where it was."""
+        move = self._move
+        if move is None:
+            return
+        self._stay(move.refused or "no answer")
+        if move.forks:
+            self._send(self._order("", now_ns))
+
+    # ------------------------------------------------------------------------- windows
+
+    def wake(self, now_ns: int) -> int:
+        """Make the decisions that are due, push a migration on, beat; returns what is due next."""
+        self._follow_clock(now_ns)
+        if self._began_ns is None:
+            self._began_ns = now_ns
+        windows, unwritten = self.windows, self._unwritten
+        while windows is not None:
+            due_ns = windows.due_ns(now_ns)
+            if due_ns is None or due_ns > now_ns:
+                break
+            self._close(windows, now_ns)
+        if unwritten:
+            self.write()
+        move = self._move
+        if move is not None:
+            if now_ns - move.since_ns > move.patience_ns:
+                self._give_up(now_ns)
+            elif now_ns - move.sent_ns >= RESEND_NS:
+                self._push(move, now_ns)
+        if now_ns >= self._ask_ns:
+            self._ask_ns = now_ns + ASK_NS
+            # Also says that this controller is there, and what it would have proven.
+            self._send(self._order("", now_ns))
+        due_ns = min(self.pulse.wake(now_ns), self._due_ns(now_ns))
+        # At once, but after all that has been due before: no order waits for a disk.
+        return min(due_ns, now_ns) if self._unwritten else due_ns
+
+    def _close(self, windows: LiveWindows, now_ns: int) -> None:
+        """Make the decision that is due, and act on it."""
+        before = windows.last
+        closed = windows.close(unix_ns=time.time_ns())
+        self._unwritten = self._unwritten or windows.last is not before
+        windows.spent(self.place.node, now_ns, self.place.who, time.process_time_ns())
+        # The order before has not come about within a whole window.
+        self._give_up(now_ns)
+        # Less than half of the cycles say little. A decision is late if the next one is due, too.
+        next_ns = windows.due_ns(now_ns) if windows.often else None
+        late = next_ns is not None and next_ns <= now_ns
+        looked = windows.looked
+        if late or looked is None or 2 * windows.heard < self.place.problem.decide_cycles:
+            self.controller.miss()
+            return
+        course, proven = self.course, self._proven
+        proposal = self.controller.propose(closed)
+        looked.seen = proposal.seen
+        wanted = proposal.decision.name
+        unproven = course.leaves_unproven(wanted, proven)
+        permitted = course.placement if unproven else wanted
+        target = self._allowed(permitted, now_ns)
+        if course.leaves_unproven(target, proven):
+            target = course.placement
+        overruled = target != permitted and self.place.problem.live.mode == "control"
+        why = self._overruled() if overruled else None
+        if unproven:
+            self.controller.hold(proposal, why)
+        elif target != permitted:
+            self.controller.reject(proposal, why)
+        elif target == course.placement:
+            self.controller.commit(proposal)
+        if windows.last is not None:
+            self._window, self._window_ns = looked.shown(proposal, self.controller), now_ns
+        if target != course.placement:
+            self._begin(target, now_ns, proposal if target == wanted else None)
+
+    def write(self) -> None:
+        """Record the windows that have closed since the last time."""
+        self._unwritten = False
+        if self.windows is not None:
+            self._recorder.append(self.windows.record.rows(), origin_ns=self.windows.origin_ns)
+
+    def finish(self) -> Rows | None:
+        """Return the rows that are left; an order without answer counts as carried out."""
+        if self.windows is None:
+            return None
+        if self._move is not None and self._move.proposal is not None:
+            self.controller.commit(self._move.proposal)
+        self.windows.finish()
+        return self.windows.record.rows(last=True)
+
+    def _allowed(self, wanted: str, now_ns: int) -> str:
+        """Return what people let the policy have."""
+        here, problem = self.course.placement, self.place.problem
+        if self.pinned:
+            return self.pinned
+        if problem.live.mode == "advise":
+            wanted = here
+        if self._clear(wanted):
+            return wanted
+        if self._clear(here):
+            return here
+        probed = (self._told.probed,) if self._told is not None and self._told.probed else ()
+        order = (*probed, *problem.controller.fallbacks, *problem.candidates)
+        clear: list[str] = [name for name in order if self._clear(name)]
+        return next((name for name in clear if self._workers_ready(name, now_ns)), clear[0])
+
+    def _clear(self, name: str) -> bool:
+        """Whether a candidate needs no node that is drained."""
+        return not self.drained.intersection(self.place.problem.candidates[name].values())
+
+    def _workers_ready(self, name: str, now_ns: int) -> bool:
+        """Whether all workers of a candidate were heard lately, and ready."""
+        detector, silent_ns = self.pulse.detector, silent_after_ns(self.place.problem)
+        workers = [f"{task}@{node}" for task, node in self.place.problem.candidates[name].items()]
+        beats = [detector.last(who) for who in workers if detector.fresh(who, now_ns, silent_ns)]
+        return len(beats) == len(workers) and all(beat is not None and beat.ready for beat in beats)
+
+    def _overruled(self) -> str:
+        """Return why a decision is not followed."""
+        if self.pinned:
+            return f"pinned to {self.pinned}"
+        return f"{', '.join(sorted(self.drained))} drained" if self.drained else "not proven"
+
+    # -------------------------------------------------------------------------- people
+
+    def _asked(self, ask: Ask, now_ns: int) -> None:
+        refused = self._do(ask, now_ns)
+        answer = Answer(ask.number, refused, self.status(now_ns))
+        self.place.transport.put(self.place.keys.answer(ask.number), encode(answer))
+
+    def _do(self, ask: Ask, now_ns: int) -> str:
+        problem, told = self.place.problem, self._told
+        if ask.what != "status" and told is not None and told.refused.startswith(OTHER):
+            return told.refused
+        match ask.what:
+            case "status":
+                return ""
+            case "pin":
+                if ask.about not in problem.candidates:
+                    return f"no candidate {ask.about!r}; there are {', '.join(problem.candidates)}"
+                if needed := self.drained.intersection(problem.candidates[ask.about].values()):
+                    return f"{ask.about} needs {', '.join(sorted(needed))}, which is drained"
+                self.pinned = ask.about
+            case "unpin":
+                self.pinned = ""
+            case "drain":
+                if refused := self._drain(ask.about):
+                    return refused
+            case "undrain":
+                if ask.about not in problem.fabric.nodes:
+                    return f"no node {ask.about!r}; there are {', '.join(problem.fabric.nodes)}"
+                self.drained.discard(ask.about)
+            case _:
+                return f"unknown question {ask.what!r}"
+        self._follow_operators(now_ns)
+        return ""
+
+    def _follow_operators(self, now_ns: int) -> None:
+        """Begin to move where people want the cell; from a fallback, once that is proven."""
+        if self.windows is None:
+            return
+        here = self.course.placement
+        target = self._allowed(here, now_ns)
+        under_way = None if self._move is None else self._move.name
+        if self.course.leaves_unproven(target, self._proven):
+            return
+        if target not in (here, under_way):
+            self._begin(target, now_ns)
+
+    def _drain(self, node: str) -> str:
+        problem = self.place.problem
+        if node not in problem.fabric.nodes:
+            return f"no node {node!r}; there are {', '.join(problem.fabric.nodes)}"
+        drained = {*self.drained, node}
+        if all(drained.intersection(p.values()) for p in problem.candidates.values()):
+            return f"every candidate needs {node}; nothing could run"
+        if self.pinned and node in problem.candidates[self.pinned].values():
+            return f"the cell is pinned to {self.pinned}, which needs {node}; unpin it first"
+        self.drained = drained
+        return ""
+
+    def status(self, now_ns: int) -> dict[str, Any]:
+        """Return how the cell is, as plain values."""
+        known, course, told, move = self.windows is not None, self.course, self._told, self._move
+        began_ns = now_ns if self._began_ns is None else self._began_ns
+        age_ms = round((now_ns - self._window_ns) / 1e6, 1)
+        joined_ns = self.pulse.detector.joined_age_ns(now_ns)
+        status = {
+            "cell": self.place.problem.name,
+            "controller": self.name,
+            "up_ms": round((now_ns - began_ns) / 1e6, 1),
+            "joined_ms": round((now_ns - began_ns if joined_ns is None else joined_ns) / 1e6, 1),
+            "mode": self.place.problem.live.mode,
+            "run": course.run if known else None,
+            "term": course.term if known else None,
+            "placement": course.placement if known else None,
+            "fallback": course.by_guard,
+            "resting": course.by_guard if told is None else told.resting,
+            "wanted": course.wanted,
+            "pinned": self.pinned or None,
+            "drained": sorted(self.drained),
+            "proving": self._proving(now_ns),
+            "moving_to": move.name if move is not None and not move.refused else None,
+            "refused": self.refused or None,
+            "migrations": self.migrations,
+            "guard_moves": self.guard_moves,
+            "moves": dict(self.moves),
+            "disbelieved": self.continuity.leaps,
+            "window": {**self._window, "age_ms": age_ms} if self._window else {},
+            "stages": {},
+            "flows": {},
+            **(self.windows.status() if self.windows is not None else {}),
+            **(self.windows.symptoms(now_ns) if self.windows is not None else {}),
+            "processes": self._processes(now_ns),
+            "certificates": self._certificates(now_ns),
+            **self._missing(now_ns),
+            "complaints": dict(list(self.place.complaints.items())[-10:]),
+            "record": self._recorder.trouble or None,
+            "changed": self._changed() or None,
+        }
+        health, headline = diagnose(self.place.problem, status)
+        return {"health": health, "headline": headline, **status}
+
+    def _proving(self, now_ns: int) -> dict[str, Any] | None:
+        """Return how far the proof is that the guard's fallback is waiting for."""
+        told, desired = self._told, self._desired(now_ns)
+        if not desired or self._move is not None:
+            return None
+        needed = (told and told.needed) or self.place.problem.controller.probe_cycles
+        done = told.probes if told is not None and told.probed == desired else 0
+        return {"candidate": desired, "done": done, "needed": needed}
+
+    def _processes(self, now_ns: int) -> dict[str, dict[str, Any]]:
+        """Return what is known of everybody that was ever heard."""
+        silent_ns = silent_after_ns(self.place.problem)
+        return {
+            who: {
+                "age_ms": round(age_ns / 1e6, 1),
+                "heard": age_ns <= silent_ns,
+                "ready": beat.ready and age_ns <= silent_ns,
+                "note": beat.note,
+            }
+            for who, beat, age_ns in self.pulse.detector.everybody(now_ns)
+        }
+
+    def _certificates(self, now_ns: int) -> dict[str, dict[str, Any]]:
+        """Return until when the certificates hold that the nodes and this controller use."""
+        if self.place.seals is None:
+            return {}
+        keyring, silent_ns = self.place.seals.keyring, silent_after_ns(self.place.problem)
+        # The oldest that a process of the node uses; processes that are heard come first.
+        used = {CONTROLLER: (False, keyring.own.generation)}
+        for _, beat, age_ns in self.pulse.detector.everybody(now_ns):
+            found = age_ns > silent_ns, beat.generation
+            used[beat.node] = min(used.get(beat.node, found), found)
+        now, certificates = datetime.now(UTC), {}
+        for name in (*self.place.problem.fabric.nodes, CONTROLLER):
+            known = {one.generation: one for one in reversed(keyring.roster.of(name))}
+            newest = max(known, default=0)
+            if one := known.get(used.get(name, (True, newest))[1], known.get(newest)):
+                certificates[name] = {
+                    "expires": one.expires,
+                    "days": round((one.ends - now).total_seconds() / 86_400, 6),
+                    "soon": now >= one.warns_from,
+                }
+        return certificates
+
+    def _missing(self, now_ns: int) -> dict[str, Any]:
+        """Return who is not heard: those that differ, with why, and those that say nothing."""
+        strangers = self.pulse.strangers
+        differ = {
+            who: why for who, (why, at_ns) in strangers.items() if now_ns - at_ns < REPEATED_NS
+        }
+        heard = {who for who, _, _ in self.pulse.detector.everybody(now_ns)}
+        silent = [
+            role.who
+            for role in roles(self.place.problem)
+            if role.who not in heard | differ.keys() and role.who != self.place.who
+        ]
+        return {"strangers": differ, "silent": silent}

@@ -1,0 +1,309 @@
+"""Health of a live cell: what is wrong with it, in a word and a line, from a controller's status.
+
+============  ====================================================================================
+``health``    what it means
+============  ====================================================================================
+``ok``        all processes are heard and ready, windows close, and cycles are completed; the
+              headline may warn of certificates that end
+``degraded``  windows close, but a process is silent, not ready, or has another cell file or
+              version, too many cycles miss, a sink applies nothing, a candidate's shadows fail, or
+              a certificate has ended or does so within an hour
+``stalled``   no window has closed for too long, or no cycle of the last one was completed
+``silent``    the controller hears no process of the cell
+``absent``    no controller answers; only who asks can tell (`dwell.live.host.operator_client`)
+============  ====================================================================================
+
+Processes on a node that is drained may be silent, or differ: an operator has taken it out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Literal, TypeAlias
+
+from dwell.live.roles.role import AGENT_BEAT
+from dwell.live.wire.messages import STALE
+from dwell.live.wire.wiring import Role, lane_of, roles
+from dwell.model import Problem
+from dwell.model.bounds import counted
+
+Health: TypeAlias = Literal["ok", "degraded", "stalled", "silent", "absent"]
+
+#: Nobody is called silent sooner: a machine that is busy is no fault.
+LEAST_NS = 1_000_000_000
+#: Time after which a migration that does not come about is given up; it delays a window as long.
+PATIENCE_NS = 2_000_000_000
+#: Faults of single processes that the headline names.
+NAMED = 3
+#: Time before a certificate's end from which a cell is degraded.
+LAST_MS = 3_600e3
+#: Number of the last windows with a silence or too few commands that degrades a cell.
+BAD_WINDOWS = 2
+
+
+def silent_after_ns(problem: Problem) -> int:
+    """Return the age from which a process that was heard is silent.
+
+    The guard's g periods, and what the controller is behind by: who beats seldom does so every
+    `AGENT_BEAT` periods, and the relay's agent tells of beats as often.
+    """
+    periods = problem.controller.guard_cycles + 2 * AGENT_BEAT
+    return max(round(periods * problem.pipeline.period_ms * 1e6), LEAST_NS)
+
+
+def window_late_ns(problem: Problem, release_ratio: float | None = None) -> int:
+    """Return the age from which the last window is too old, at a ratio of releases.
+
+    A window that a move interrupts begins anew.
+    """
+    windows_ms = 2 * problem.window_ms / min(release_ratio or 1.0, 1.0)
+    return round((windows_ms + problem.controller.close_grace_ms) * 1e6) + PATIENCE_NS
+
+
+def diagnose(problem: Problem, status: Mapping[str, Any]) -> tuple[Health, str | None]:
+    """Return a cell's health, and the headline that says what is wrong.
+
+    Parameters
+    ----------
+    status : mapping
+        As `dwell.live.roles.controlled_cell.ControlledCell.status` returns it.
+
+    Returns
+    -------
+    str
+    str or None
+        None where nothing is wrong, and no certificate ends soon.
+    """
+    members = [
+        role
+        for role in roles(problem)
+        if role.kind != "controller" and role.who not in status["strangers"]
+    ]
+    ended, ending = _certificates(status)
+    deaf = _hears_nobody(problem, status, members)
+    stalled = _no_window(problem, status) or _no_cycle(status)
+    faults = [*ended, *([] if deaf else _faults(status, members))]
+    faults += [
+        why
+        for who, why in status["strangers"].items()
+        if who.partition("@")[2].partition(".")[0] not in status["drained"]
+    ]
+    if not deaf and _window_was_due(problem, status):
+        faults += _symptoms(problem, status, members)
+    if status["record"]:
+        faults.append(f"the run is not kept: {status['record']}")
+    more = len(faults) - NAMED
+    found = [*filter(None, (deaf, stalled)), *faults[:NAMED]]
+    if more > 0:
+        found.append(f"and {more} more")
+    if not found:
+        return "ok", "; ".join(ending) or None
+    found += ending
+    return "silent" if deaf else "stalled" if stalled else "degraded", "; ".join(found)
+
+
+def _certificates(status: Mapping[str, Any]) -> tuple[list[str], list[str]]:
+    """Return which certificates have ended or do so within `LAST_MS`, and which end soon."""
+    named: tuple[dict[str, list[str]], dict[str, list[str]]] = {}, {}
+    for name, certificate in status["certificates"].items():
+        left_ms = certificate["days"] * 86_400e3
+        if left_ms >= LAST_MS and not certificate["soon"]:
+            continue
+        when = f"ended {_time(-left_ms)} ago" if left_ms <= 0 else f"ends in {_time(left_ms)}"
+        named[left_ms >= LAST_MS].setdefault(when, []).append(name)
+    ended, ending = (
+        ["'s, ".join(names) + f"'s certificate {when}" for when, names in of.items()]
+        for of in named
+    )
+    return ended, ending
+
+
+def _hears_nobody(
+    problem: Problem, status: Mapping[str, Any], members: Sequence[Role]
+) -> str | None:
+    heard = status["processes"]
+    if not members or any(_heard(status, role) for role in members):
+        return None
+    ages_ms = [heard[role.who]["age_ms"] for role in members if role.who in heard]
+    relay = problem.relay_node
+    why = f": the relay, agent {relay}, is silent"
+    if not ages_ms:
+        return f"the controller has heard nobody since it began {_time(status['up_ms'])} ago{why}"
+    return f"the controller hears nobody since {_time(min(ages_ms))}{why}"
+
+
+def _no_window(problem: Problem, status: Mapping[str, Any]) -> str | None:
+    window, begun_ms = status["window"], status.get("begun_ms")
+    if window:
+        age_ms = window["age_ms"]
+    else:
+        # A cell that starts has as long from its first cycle on, and to that from its last process.
+        age_ms = status["joined_ms"] if begun_ms is None else begun_ms
+    if age_ms * 1e6 <= window_late_ns(problem, status.get("release_ratio")):
+        return None
+    return f"no window since {_time(age_ms)}"
+
+
+def _window_was_due(problem: Problem, status: Mapping[str, Any]) -> bool:
+    """Whether the first window has closed, or ought to have."""
+    if status["window"]:
+        return True
+    due_ms = problem.window_ms + problem.controller.close_grace_ms
+    return bool((status.get("begun_ms") or 0.0) > due_ms)
+
+
+def _no_cycle(status: Mapping[str, Any]) -> str | None:
+    if not status["window"] or status["done_cycles"] or not status["heard_cycles"]:
+        return None
+    heard = [(who, one) for who, one in status["processes"].items() if one["heard"] and one["note"]]
+    # First those that cannot work; an agent's note is about its node.
+    heard.sort(key=lambda item: (item[1]["ready"], item[0].startswith("agent@")))
+    notes = [one["note"] for _, one in heard[:1]]
+    return f"no cycle of the last window was completed{_because(notes)}"
+
+
+def _symptoms(
+    problem: Problem, status: Mapping[str, Any], members: Sequence[Role]
+) -> Iterator[str]:
+    """Yield what the cell's cycles say, though its processes may be well."""
+    sinks = [role for role in members if role.kind == "sink"]
+    patience_ms = (problem.controller.guard_cycles + 1) * problem.pipeline.period_ms
+    limit_ms = max(patience_ms, problem.max_age_ms)
+    slow = list(_slow(problem, status))
+    for role in sinks:
+        sink = status["sinks"][role.task]
+        age_ms = status["begun_ms"] if sink["applied_age_ms"] is None else sink["applied_age_ms"]
+        if _heard(status, role) and age_ms > limit_ms:
+            # By its last outcome, the gate lets no command through.
+            late = [*slow, _stale(problem, sink["stale_ms"])] if sink["outcome"] == STALE else []
+            why = [*late, *_notes(status, [role.who])]
+            yield f"{role.who} has applied nothing since {_time(age_ms)}{_because(why)}"
+    recent = status["recent"]
+    rates = recent["violation_rates"]
+    placed = problem.candidates[status["placement"]].items()
+    names = [*(f"{task}@{node}" for task, node in placed), *(role.who for role in sinks)]
+    unreached = [] if slow else _unreached(problem, status, recent["unreached"])
+    why = [*slow, *unreached, *_notes(status, names)]
+    yield from _uneven(problem, status, why)
+    if problem.live.degraded_by(rates):
+        rate = sum(rates) / len(rates)
+        yield f"V_D is {rate:.0%} in the last {counted(len(rates), 'window')}{_because(why)}"
+    for name, found in status["failing"].items():
+        placed = problem.candidates[name].items()
+        if not {node for _, node in placed}.isdisjoint(status["drained"]):
+            continue
+        why = [
+            *_unreached(problem, status, found["unreached"]),
+            *_notes(status, [f"{task}@{node}.shadow" for task, node in placed]),
+        ]
+        yield f"the last {found['shadows']} shadows through {name} have failed{_because(why)}"
+
+
+def _slow(problem: Problem, status: Mapping[str, Any]) -> Iterator[str]:
+    """Yield which stages take longer than a period, and what this costs."""
+    for one in status["slow"]:
+        lost = f": {one['replaced']} of {one['inputs']} inputs were replaced"
+        takes = f"{one['stage']} takes {one['exec_ms']:.0f} ms of {problem.pipeline.period_ms:.0f}"
+        yield f"{takes}{lost if one['replaced'] else ''}"
+
+
+def _stale(problem: Problem, age_ms: float | None) -> str:
+    """Say whether commands are old, or only the clocks say so.
+
+    Parameters
+    ----------
+    age_ms : float or None
+        Age of the last stale command by the controller's clock alone, if known.
+    """
+    limit = f"max_age_ms ({problem.max_age_ms:g})"
+    if age_ms is None or age_ms <= problem.max_age_ms:
+        return f"by the clocks, commands are older than {limit} when they come"
+    return f"commands are {age_ms:.0f} ms old when they come, more than {limit}"
+
+
+def _uneven(problem: Problem, status: Mapping[str, Any], why: list[str]) -> Iterator[str]:
+    """Yield how releases differ from one per period, and which commands the actuators lacked."""
+    live, recent, ratio = problem.live, status["recent"], status["release_ratio"]
+    period_ms = problem.pipeline.period_ms
+    if ratio is not None and abs(ratio - 1) > live.degraded_at:
+        every_ms = period_ms / ratio
+        rates = f"{1e3 / every_ms:.3g} cycles a second of {1e3 / period_ms:.3g}"
+        if every_ms > problem.max_age_ms:
+            why = [f"cycles come every {every_ms:.0f} ms, max_age_ms is {problem.max_age_ms:g}"]
+            yield f"{rates}{_because(why)}"
+        else:
+            yield rates
+    silences, applied = recent["silences"], recent["applied"]
+    least = 1 - live.degraded_at
+    bad = [count > 0 or share < least for count, share in zip(silences, applied, strict=True)]
+    if sum(bad) < BAD_WINDOWS:
+        return
+    windows = f"in the last {counted(len(bad), 'window')}"
+    if any(silences):
+        times = counted(sum(silences), "time")
+        yield f"{live.silence}() was called {times} {windows}{_because(why)}"
+    elif not live.degraded_by(recent["violation_rates"]):
+        known = f"{sum(applied) / len(applied):.0%} of the commands are known to have been applied"
+        yield f"{known} {windows}{_because(why)}"
+
+
+def _notes(status: Mapping[str, Any], names: Sequence[str]) -> list[str]:
+    """Return what some processes say of themselves, of those that are heard."""
+    known = [status["processes"][who] for who in names if who in status["processes"]]
+    return [one["note"] for one in known if one["heard"] and one["note"]]
+
+
+def _unreached(
+    problem: Problem, status: Mapping[str, Any], ways: tuple[str, str] | None
+) -> Iterator[str]:
+    """Yield which messages do not arrive; where an end is not heard, its own fault says so."""
+    heard = status["processes"]
+    if ways is None or not all(who in heard and heard[who]["heard"] for who in ways):
+        return
+    source, target = (who.partition("@")[0] for who in ways)
+    (flow,) = (one for one in problem.pipeline.inputs(target) if one.source == source)
+    what = "images" if lane_of(flow.payload_bytes) == "images" else "messages"
+    yield f"{what} of {ways[0]} do not reach {ways[1]}"
+
+
+def _faults(status: Mapping[str, Any], members: Sequence[Role]) -> Iterator[str]:
+    """Yield what is wrong with processes; of a node that is not heard at all, once."""
+    heard = status["processes"]
+    for node in dict.fromkeys(role.node for role in members):
+        there = [role for role in members if role.node == node]
+        missing = [] if node in status["drained"] else [r for r in there if not _heard(status, r)]
+        ages_ms = [heard[role.who]["age_ms"] for role in missing if role.who in heard]
+        if missing and len(missing) == len(there):
+            since = f" since {_time(min(ages_ms))}" if ages_ms else ""
+            yield f"nothing is heard of {node}{since}"
+            continue
+        for role in missing:
+            known = heard.get(role.who)
+            silent = f"is silent since {_time(known['age_ms'])}" if known else "was never heard"
+            yield f"{role.who} {silent}"
+        for role in there:
+            if _heard(status, role) and not heard[role.who]["ready"]:
+                yield f"{role.who} is not ready{_because([heard[role.who]['note']])}"
+
+
+def _heard(status: Mapping[str, Any], role: Role) -> bool:
+    known = status["processes"].get(role.who)
+    return known is not None and bool(known["heard"])
+
+
+def _because(notes: Sequence[str]) -> str:
+    """Return the first lines of the first two notes, as a reason."""
+    lines = [note.splitlines()[0][:200] for note in notes if note.strip()]
+    return f": {', '.join(lines[:2])}" if lines else ""
+
+
+def _time(ms: float) -> str:
+    """Return a time in words, to two digits or so."""
+    seconds = ms / 1e3
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    if seconds < 7_200:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3_600:.0f} h" if seconds < 172_800 else f"{seconds / 86_400:.0f} days"

@@ -1,0 +1,344 @@
+"""Rows of a live run's tables (`dwell.record.schema` says what their columns are).
+
+Cycles and windows count from 0 without gaps, as in any run; what the stamps say stands beside it.
+``jobs`` and ``processes`` are kept on request. A cycle that never reached a sink tells of none of
+its jobs, unless a newer one took its place on the way; a job that was replaced has no instants but
+that of its readiness.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import takewhile
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.control import Controller, Proposal, final_l95_ms
+from dwell.live.roles.cycle_ledger import Ledger, LiveCycle, told, violation_rate
+from dwell.live.roles.loads import ProcessLoads
+from dwell.live.roles.offsets import UNBOUNDED_NS
+from dwell.live.wire.messages import NOT_APPLIED
+from dwell.model.instants import NEVER_NS
+from dwell.record import Columns, Feature, Row, Values, column_types, row_of
+
+Rows: TypeAlias = dict[str, list[Row]]
+
+
+@dataclass(frozen=True, slots=True)
+class Resume:
+    """Where a run is gone on with, after its controller has been restarted.
+
+    Parameters
+    ----------
+    window, cycle : int
+        Numbers of the first window and cycle that will be recorded.
+    origin_ns : int, optional
+        First release of the run, on the stamper's clock; that of the first stamp heard where None.
+    jobs : bool
+        Whether the jobs, and what each process took of the CPUs, are recorded, too.
+    """
+
+    window: int = 0
+    cycle: int = 0
+    origin_ns: int | None = None
+    jobs: bool = False
+
+
+@dataclass(eq=False, slots=True)
+class LiveWindow:
+    """A closed window as it is recorded, or the cycles that a decision has looked at.
+
+    Parameters
+    ----------
+    span_ns : int
+        Time from its first release to the first release beyond it.
+    close_ns : int
+        Since the origin.
+    lead : int
+        Cycles between the window before and this one.
+    heard : int
+        Cycles of which anything was heard. Of a window with none nothing is known, and it is none
+        to decide on (`Controller.miss`).
+    bound_ns : int
+        Bound of the error of its latencies, by the clocks; `UNBOUNDED_NS` where it is not known.
+    unproven : bool
+        Whether that is more than 20 % of D, or nobody knows of a cycle whether it has completed.
+    rate_at_close : float
+        V_D by what was known when it closed.
+    used : float64 array, shape (3, nodes)
+        Busy, own and shadow share of the cores.
+    seen : tuple of float or None
+        What was decided on: L95 (ms), violation rate and cost; None where nobody has looked.
+    """
+
+    number: int
+    cycles: list[LiveCycle]
+    span_ns: int
+    close_ns: int
+    lead: int
+    heard: int
+    bound_ns: int
+    unproven: bool
+    rate_at_close: float
+    used: NDArray[np.float64]
+    closed_unix_ns: int | None
+    seen: tuple[float | None, ...] = (None, None, None)
+
+    def shown(self, proposal: Proposal, controller: Controller) -> dict[str, Any]:
+        """Return a proposal and its cycles as the status shows them."""
+        decision, names = proposal.decision, controller.problem.candidates
+        l95_ms, _, cost = proposal.seen
+        columns = controller.decision_columns[-len(proposal.priced) :]
+        priced = dict(zip(columns, proposal.priced, strict=True))
+        return {
+            "number": self.number,
+            "last_cycle": proposal.looked.last_cycle,
+            "cycles": proposal.looked.cycles,
+            "placement": self.cycles[0].placement,
+            "l95_ms": l95_ms,
+            "violation_rate": self.rate_at_close,
+            "cost": cost,
+            "reason": decision.reason,
+            "decided": decision.name,
+            "estimates": {name: decision.costs.get(name) for name in names},
+            "predicted": {
+                name: {of: priced[f"est_{of}_{name}"] for of in ("l95_ms", "violation_rate")}
+                for name in names
+            },
+            "utilisation": {
+                name: _known(share)
+                for name, share in zip(controller.resources, self.used[0].tolist(), strict=True)
+            },
+        }
+
+    def violation_rate(self, deadline_ns: int) -> float:
+        """V_D: share of its cycles that missed, of those whose end is known by now."""
+        return violation_rate(told(self.cycles), deadline_ns)
+
+
+def sends_shadows(controller: Controller) -> bool:
+    """Whether cycles may be sent through alternatives: to measure them, or to prove them."""
+    return controller.sends_shadows or bool(controller.problem.controller.fallbacks)
+
+
+def columns_of(controller: Controller, *, jobs: bool = False) -> Columns:
+    """Type of every column of the tables that a live run under this controller has.
+
+    Parameters
+    ----------
+    jobs : bool
+        Whether it keeps those that are kept on request.
+    """
+    features: list[Feature] = ["live", *controller.features]
+    if sends_shadows(controller):
+        features.append("shadows")
+    tables = ["cycles", "windows", "decisions", *(("jobs", "processes") if jobs else ())]
+    return {name: column_types(name, controller.problem, features) for name in tables}
+
+
+class RunRows:
+    """Keeps what is to be recorded of a run, and tells which rows are new or have changed.
+
+    Parameters
+    ----------
+    kept : int
+        Cycles that are remembered, so that late completions may change their rows.
+    """
+
+    def __init__(
+        self,
+        controller: Controller,
+        ledger: Ledger,
+        processes: ProcessLoads,
+        *,
+        resume: Resume,
+        kept: int,
+    ) -> None:
+        self._controller, self._ledger, self._processes = controller, ledger, processes
+        problem = controller.problem
+        self._nodes, self._size = tuple(problem.fabric.nodes), problem.window_cycles
+        self._warmup_windows, self._kept = problem.warmup_windows, kept
+        self._deadline_ns = problem.pipeline.deadline_ns
+        self._sends_shadows = sends_shadows(controller)
+        self._jobs = resume.jobs
+        self._columns = columns_of(controller, jobs=resume.jobs)
+        #: Row of the next cycle, and last cycle that is known to have completed.
+        self.next_row, self.newest_done = resume.cycle, (-1, -1)
+        # First cycle whose jobs are not recorded yet, and windows whose processes are not.
+        self._next_jobs = resume.cycle
+        self._unwritten: deque[LiveWindow] = deque()
+        self._recorded: deque[LiveCycle] = deque()
+        self._windows: dict[int, LiveWindow] = {}
+        self._changed: dict[int, LiveCycle] = {}
+        self._changed_windows: set[int] = set()
+        self._in_flight: dict[int, LiveCycle] = {}
+
+    def add(self, cycles: Iterable[LiveCycle]) -> Iterator[LiveCycle]:
+        """Record cycles; yields those of long ago, which are forgotten."""
+        for cycle in cycles:
+            cycle.row = self.next_row
+            self.next_row += 1
+            self._changed[cycle.row] = cycle
+            self._recorded.append(cycle)
+        while len(self._recorded) > self._kept:
+            old = self._recorded.popleft()
+            self._in_flight.pop(old.row, None)
+            if old.window is not None:
+                self._windows.pop(old.window, None)
+            yield old
+
+    def close(self, window: LiveWindow) -> None:
+        """Record a window."""
+        self._windows[window.number] = window
+        self._changed_windows.add(window.number)
+        if self._jobs:
+            self._unwritten.append(window)
+
+    def touch(self, cycle: LiveCycle) -> None:
+        """Take note that more is known of a cycle; its row changes where it has one."""
+        if cycle.row >= 0:
+            self._changed[cycle.row] = cycle
+            if cycle.window is not None:
+                self._changed_windows.add(cycle.window)
+
+    def rows(self, *, last: bool = False) -> Rows:
+        """Return the rows that are new, or have changed since the last call.
+
+        Parameters
+        ----------
+        last : bool
+            Whether no more will be asked for. Jobs, and what processes took, are told a window
+            late: of some it is not known earlier.
+        """
+        for row, cycle in self._in_flight.items():
+            if self._outcome(cycle) != cycle.outcome:
+                self._changed[row] = cycle
+        decided = (decision_values(self._controller, row) for row in self._controller.decisions)
+        values: dict[str, Iterable[Values]] = {
+            "cycles": [self._cycle_values(self._changed[row]) for row in sorted(self._changed)],
+            "windows": [
+                self._window_values(self._windows[number])
+                for number in sorted(self._changed_windows)
+                if number in self._windows
+            ],
+            "decisions": list(decided if last else takewhile(self._is_recorded, decided)),
+            **(self._job_values(last=last) if self._jobs else {}),
+        }
+        rows = {name: [row_of(self._columns[name], of) for of in values[name]] for name in values}
+        # What is recorded is not kept: a controller runs for months.
+        del self._controller.decisions[: len(rows["decisions"])]
+        self._changed.clear()
+        self._changed_windows.clear()
+        return rows
+
+    def _is_recorded(self, decision: Values) -> bool:
+        """Whether the record has the cycles of a decision."""
+        last = decision["last_cycle"]
+        return isinstance(last, int) and last < self.next_row
+
+    def _outcome(self, cycle: LiveCycle) -> str:
+        if cycle.came_to(NOT_APPLIED):
+            return NOT_APPLIED
+        if self._ledger.complete(cycle) or cycle.told:
+            return "done"
+        if cycle.replaced:
+            return "replaced"
+        return "dropped" if cycle.key < self.newest_done else "in_flight"
+
+    def _cycle_values(self, cycle: LiveCycle) -> Values:
+        cycle.outcome = self._outcome(cycle)
+        if cycle.outcome == "in_flight":
+            self._in_flight[cycle.row] = cycle
+        else:
+            self._in_flight.pop(cycle.row, None)
+        compute_ns, queue_ns, network_ns = cycle.parts_ns or (None, None, None)
+        return {
+            "cycle": cycle.row,
+            "release_ns": cycle.at_ns,
+            "placement": cycle.placement,
+            "latency_ns": None if cycle.latency_ns >= NEVER_NS else cycle.latency_ns,
+            "missed": cycle.missed(self._deadline_ns),
+            "outcome": cycle.outcome,
+            "compute_ns": compute_ns,
+            "queue_ns": queue_ns,
+            "network_ns": network_ns,
+            "run": cycle.run,
+            "number": cycle.number,
+            "term": cycle.term,
+            "lead": cycle.window is None,
+            "heard": cycle.heard,
+            "actuated": cycle.actuated,
+            "interval_ns": cycle.interval_ns,
+            "stamper_interval_ns": cycle.stamper_interval_ns,
+            "bound_ns": None if cycle.bound_ns >= UNBOUNDED_NS else cycle.bound_ns,
+        }
+
+    def _window_values(self, window: LiveWindow) -> Values:
+        cycles, names = window.cycles, self._controller.resources
+        busy, _, by_shadows = window.used.tolist()
+        seen_l95_ms, seen_violation_rate, cost = map(_known, window.seen)
+        latency_ns = np.array([cycle.latency_ns for cycle in told(cycles)], np.int64)
+        values: dict[str, object] = {
+            "window": window.number,
+            "first_cycle": cycles[0].row,
+            "warmup": window.number < self._warmup_windows,
+            "placement": cycles[0].placement,
+            "mixed": any(cycle.placement != cycles[0].placement for cycle in cycles),
+            "l95_ms": float(final_l95_ms(latency_ns)),
+            "violation_rate": window.violation_rate(self._deadline_ns),
+            "seen_l95_ms": seen_l95_ms,
+            "seen_violation_rate": seen_violation_rate,
+            **{f"u_{name}": _known(share) for name, share in zip(names, busy, strict=True)},
+            "cost": cost,
+            "term": cycles[-1].term,
+            "lead": window.lead,
+            "heard": window.heard,
+            "bound_ms": None if window.bound_ns >= UNBOUNDED_NS else window.bound_ns / 1e6,
+            "unproven": window.unproven,
+            "closed_unix_ns": window.closed_unix_ns,
+        }
+        if self._sends_shadows:
+            sent, sent_bytes = self._ledger.shadow_bytes(cycles)
+            values |= {"shadow_cycles": sent, "shadow_bytes": sent_bytes}
+            values |= {
+                f"shadow_{name}": _known(share)
+                for name, share in zip(names, by_shadows, strict=True)
+            }
+        return values
+
+    def _job_values(self, *, last: bool) -> Mapping[str, Iterable[Values]]:
+        end = self.next_row if last else self.next_row - self._size
+        ready = [cycle for cycle in self._recorded if self._next_jobs <= cycle.row < end]
+        self._next_jobs = max(self._next_jobs, end)
+        processes: list[Values] = []
+        while self._unwritten and (last or self._unwritten[0].cycles[-1].row < end):
+            processes += self._process_values(self._unwritten.popleft())
+        jobs = [values for cycle in ready for values in self._ledger.jobs(cycle)]
+        return {"jobs": jobs, "processes": processes}
+
+    def _process_values(self, window: LiveWindow) -> Iterable[Values]:
+        for node in self._nodes:
+            span_ns = self._ledger.span_ns(node, window.cycles[0], window.close_ns)
+            for who, cpu_ns in sorted(self._processes.between(node, *span_ns).items()):
+                yield {
+                    "window": window.number,
+                    "process": who,
+                    "node": node,
+                    "cpu_ns": round(cpu_ns),
+                }
+
+
+def decision_values(controller: Controller, row: Sequence[object]) -> Values:
+    """Return a row of ``decisions``, with why it was not carried out."""
+    columns = *controller.decision_columns, "refused"
+    return dict(zip(columns, map(_known, row), strict=True))
+
+
+def _known(value: object) -> object:
+    """Return None for what is not a number."""
+    return None if isinstance(value, float) and math.isnan(value) else value

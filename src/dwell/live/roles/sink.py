@@ -1,0 +1,181 @@
+"""Sink: the gate before the actuator, and its watchdog."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Literal, Protocol, TypeAlias
+
+from dwell.errors import LiveError
+from dwell.live.roles.control_group import UNKNOWN
+from dwell.live.roles.role import BeatState, Pulse, RolePlace
+from dwell.live.stage import CellActuator, Message
+from dwell.live.wire.messages import ACTUATED, NOT_APPLIED, STALE, Completion, Header
+from dwell.live.wire.payloads import read_payload
+from dwell.live.wire.transport import Arrival
+from dwell.live.wire.wiring import longest_bytes
+
+#: Methods of an actuator that bring it to rest.
+Rest: TypeAlias = Literal["hold", "zero", "stop"]
+
+
+class Highest(Protocol):
+    """Remembers, across restarts, the highest cycle that was actuated."""
+
+    def load(self) -> tuple[int, int]:
+        """Return run and cycle; (-1, -1) if there is none."""
+
+    def store(self, run: int, cycle: int) -> None:
+        """Remember them before the actuator is called."""
+
+
+class Sink:
+    """Lets each command through once, in order and fresh; tells the actuator when none comes.
+
+    Nothing of the user's runs before the gate has decided and remembered.
+    """
+
+    def __init__(
+        self,
+        place: RolePlace,
+        task: str,
+        actuator: CellActuator,
+        highest: Highest,
+    ) -> None:
+        self.place, self.task, self.actuator = place, task, actuator
+        self._highest = highest
+        self.max_age_ns = round(place.problem.max_age_ms * 1e6)
+        self.newest = highest.load()
+        self.offsets = place.offsets()
+        #: What its node has taken, where something counts it.
+        self.group_clock: Callable[[], int] = lambda: UNKNOWN
+        self.pulse = Pulse(place, self._state, self._passed)
+        self.counts = {ACTUATED: 0, NOT_APPLIED: 0, "behind": 0, STALE: 0, "silences": 0}
+        # Of the last command, and of the last silence: what the actuator has raised.
+        self.trouble = self._restless = ""
+        self._alarm_ns: int | None = None
+        # Whether `hold` or `zero` was called since the last command.
+        self._rests = False
+        # The call of the actuator that has not returned yet, and its begin.
+        self._call: tuple[str, int] | None = None
+        # One that takes over from another is as impatient for the next command as that one was.
+        self._takes_over = self.newest >= (0, 0)
+
+    def subscriptions(self) -> Iterable[str]:
+        """Key expressions that it wants to hear."""
+        yield from self.pulse.subscriptions()
+        yield self.place.keys.command(self.task)
+
+    def receive(self, sample: Arrival, now_ns: int) -> None:
+        """Take a command or a beat in."""
+        if self.pulse.hears(sample):
+            self.pulse.compare_clocks(sample, now_ns, self.offsets)
+            return
+        header = self.place.header(sample)
+        if header is None or header.source != self.task:
+            return
+        length, longest = len(sample.payload), longest_bytes(0)
+        if length > longest:
+            reason = f"{sample.key}: a command of {length} bytes; at most {longest} are taken"
+            self.place.complain(LiveError(reason))
+            return
+        group_ns = self.group_clock()
+        outcome, rested = self._gate(header, now_ns), self._rests
+        if outcome == ACTUATED and not self._apply(header, sample.payload, now_ns):
+            outcome = NOT_APPLIED
+        self.counts[outcome] += 1
+        ways = header.hops, self.place.node, group_ns, rested
+        done = Completion(header.stamp, self.task, now_ns, outcome, *ways)
+        self.place.put_twice(self.place.keys.done(self.task), done)
+
+    def age_ns(self, header: Header, now_ns: int) -> int:
+        """Longest time that can have passed since a cycle's release, for all the clocks say."""
+        here_ns, bound_ns = self.offsets.to_reference(self.place.node, now_ns)
+        return here_ns + bound_ns - header.stamp.released_ns
+
+    def _gate(self, header: Header, now_ns: int) -> str:
+        cycle = header.stamp.key
+        if cycle <= self.newest:
+            return "behind"
+        if self.age_ns(header, now_ns) > self.max_age_ns:
+            return STALE
+        self.newest = cycle
+        self._highest.store(*cycle)
+        return ACTUATED
+
+    def _apply(self, header: Header, payload: bytes, now_ns: int) -> bool:
+        """Hand a command to the actuator; returns whether it took it.
+
+        One that it did not take is no command to the watchdog, which begins with the first.
+        """
+        stamp = header.stamp
+        alarm_ns = now_ns + self.max_age_ns
+        self._alarm_ns = self._alarm_ns or alarm_ns
+        age_ms = self.age_ns(header, now_ns) / 1e6
+        try:
+            expected = self.actuator.inputs.get(self.task)
+            command = read_payload(header.kind, payload, expected)
+            released_ns, _ = self.offsets.from_reference(self.place.node, stamp.released_ns)
+            self._call = f"cycle {stamp.cycle}: apply()", now_ns
+            self.actuator.apply(Message(command, stamp.cycle, released_ns, age_ms))
+        except Exception as error:  # the user's code
+            self.trouble = self._complain(f"cycle {stamp.cycle}: apply()", error)
+            return False
+        finally:
+            self._call = None
+        self.trouble = self._restless = ""
+        self._alarm_ns, self._rests = alarm_ns, False
+        return True
+
+    def rest(self, how: Rest) -> bool:
+        """Tell the actuator to hold, or to stop; returns whether it did not raise."""
+        try:
+            getattr(self.actuator, how)()
+        except (Exception, SystemExit) as error:  # the user's code
+            self._restless = self._complain(f"{how}()", error)
+            return False
+        self._restless = ""
+        return True
+
+    @property
+    def _where(self) -> str:
+        return f"sink of {self.task} on {self.place.node}"
+
+    def watch(self, now_ns: int) -> None:
+        """Beat while the actuator does not return; called by a thread of its own."""
+        call = self._call
+        if call is None or (waits_ns := now_ns - call[1]) < self.place.period_ns:
+            return
+        hangs = waits_ns > self.place.hang_ns
+        note = f"{self._where}: {call[0]} has not returned for {waits_ns / 1e9:.0f} s"
+        self.pulse.send_alone(now_ns, ready=not hangs, note=note if hangs else "")
+
+    def _complain(self, what: str, error: BaseException) -> str:
+        trouble = f"{self._where}: {what} raised {type(error).__name__}: {error}"
+        self.place.complain(LiveError(trouble))
+        return trouble
+
+    def _state(self) -> tuple[bool, str]:
+        return True, "; ".join(filter(None, (self._restless, self.trouble)))
+
+    def _passed(self) -> BeatState:
+        return BeatState(run=max(self.newest[0], 0))
+
+    def wake(self, now_ns: int) -> int:
+        """Beat, and call the watchdog where no command came; returns when something is due.
+
+        An actuator that raises is told again after the same time, until the next command.
+        """
+        if self._takes_over:
+            self._takes_over = False
+            self._alarm_ns = self._alarm_ns or now_ns + self.max_age_ns
+        # An alarm further off than it was ever set: the clock has been set back.
+        back = self._alarm_ns is not None and self._alarm_ns > now_ns + self.max_age_ns
+        if self._alarm_ns is not None and (back or now_ns >= self._alarm_ns):
+            self.counts["silences"] += not self._restless
+            how = self.place.problem.live.silence
+            self._call, self._rests = (f"{how}()", now_ns), True
+            rests = self.rest(how)
+            self._call = None
+            self._alarm_ns = None if rests else now_ns + self.max_age_ns
+        due_ns = self.pulse.wake(now_ns)
+        return due_ns if self._alarm_ns is None else min(due_ns, self._alarm_ns)

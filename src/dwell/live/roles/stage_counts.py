@@ -1,0 +1,329 @@
+"""Times and counts of stages: workers write them, agents read them, a controller adds them up.
+
+A worker keeps a row per cycle in mapped memory, which outlives it: the state of each input, and the
+bytes of each output; and the times of its last jobs. Once a second its agent adds up the last two
+blocks of cycles and sends the sums. A block begins at a multiple of its length, so both ends of a
+flow count the same messages, and no clocks are compared.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.live.wire.messages import Header, InputCounts, Load, OutputCounts, StageCounts, Stamp
+from dwell.live.wire.wiring import Role, roles
+from dwell.model import Placement, Problem
+
+Ints: TypeAlias = NDArray[np.int64]
+#: Run and number of a cycle or of a block.
+Key: TypeAlias = tuple[int, int]
+
+#: States of an input: not there, waiting for a job, and the ends that it may come to.
+ABSENT, WAITING, TAKEN, REPLACED, DROPPED = range(5)
+#: What the status calls the last three.
+ENDS = "taken", "replaced", "dropped"
+#: Time between two reports of an agent.
+REPORT_NS = 1_000_000_000
+#: Blocks that a worker keeps the rows of, and a controller the sums of.
+BLOCKS, KEPT_BLOCKS = 4, 6
+#: Jobs from which on their median is the reason of a headline.
+LEAST_JOBS = 3
+#: Numbers before all others: run and newest cycle, how many inputs came to each end (at the places
+#: of these states), and how many jobs have run.
+RUN, NEWEST, *_, JOBS, HEAD = range(7)
+#: Column of the cycle; those of outputs and inputs follow.
+CYCLE = 0
+
+
+def block_cycles(problem: Problem) -> int:
+    """Return the length of a block: a window, but no less than the cycles between two reports."""
+    return max(problem.window_cycles, math.ceil(REPORT_NS / problem.pipeline.period_ns))
+
+
+def book_path(folder: Path, who: str) -> Path:
+    """Return the file of a worker's book."""
+    return folder / f"{who}.stages"
+
+
+def _stages(problem: Problem, tasks: Iterable[str]) -> list[str]:
+    """Return ``TASK@NODE`` of some tasks, wherever they may run."""
+    return [f"{task}@{node}" for task in tasks for node in problem.pipeline.tasks[task].on]
+
+
+class StageBook:
+    """Rows of one worker; see the module.
+
+    Parameters
+    ----------
+    memory : callable
+        Returns the buffer of a given size that has the rows.
+
+    Raises
+    ------
+    ValueError
+        If the buffer has another size.
+    """
+
+    def __init__(
+        self, problem: Problem, task: str, node: str, memory: Callable[[int], Any] = bytearray
+    ) -> None:
+        self._block = block_cycles(problem)
+        begins = _stages(problem, (flow.source for flow in problem.pipeline.inputs(task)))
+        ends = _stages(problem, (flow.target for flow in problem.pipeline.outputs(task)))
+        self._outputs = {name: 1 + place for place, name in enumerate(ends)}
+        self._first_input = 1 + len(ends)
+        self._inputs = {name: self._first_input + place for place, name in enumerate(begins)}
+        count, width = BLOCKS * self._block, self._first_input + len(begins)
+        sizes = HEAD, len(ends), 2 * count, count * width
+        numbers = np.frombuffer(memory(8 * sum(sizes)), np.int64)
+        self._head, self._sent_bytes, jobs, rows = np.split(numbers, np.cumsum(sizes[:3]))
+        #: Of the last jobs: the newest cycle that was known when they ended, and their times.
+        self._jobs: Ints = jobs.reshape(count, 2)
+        self._rows: Ints = rows.reshape(count, width)
+
+    def begin(self) -> None:
+        """Give up the inputs that waited for a worker that has died."""
+        states = self._rows[:, self._first_input :]
+        states[states == WAITING] = ABSENT
+
+    def _row(self, stamp: Stamp) -> Ints | None:
+        """Return the row of a cycle; None if a later cycle has it."""
+        head, (run, cycle) = self._head, stamp.key
+        if head[RUN] != run:
+            head[RUN], head[NEWEST], self._rows[:], self._jobs[:] = run, 0, 0, 0
+        row: Ints = self._rows[cycle % len(self._rows)]
+        if row[CYCLE] != cycle:
+            if cycle < row[CYCLE] <= head[NEWEST]:
+                return None
+            row[:] = 0
+            row[CYCLE] = cycle
+        return row
+
+    def arrived(self, header: Header) -> None:
+        """Count an input that is there; a copy of it changes nothing."""
+        column, row = self._inputs.get(f"{header.source}@{header.node}"), self._row(header.stamp)
+        if column is not None and row is not None:
+            self._head[NEWEST] = header.stamp.cycle
+            if row[column] == ABSENT:
+                row[column] = WAITING
+
+    def ended(self, headers: Iterable[Header], state: int) -> None:
+        """Count inputs that have been taken, or of those that wait the replaced and dropped."""
+        for header in headers:
+            column = self._inputs.get(f"{header.source}@{header.node}")
+            if column is None:
+                continue
+            row = self._row(header.stamp)
+            if row is not None:
+                if row[column] != WAITING and (state != TAKEN or row[column] == TAKEN):
+                    continue
+                row[column] = state
+            self._head[state] += 1
+
+    def ran(self, stamp: Stamp, exec_ns: int) -> None:
+        """Count a job that has run."""
+        head = self._head
+        self._row(stamp)
+        head[NEWEST] = max(head[NEWEST], stamp.cycle)
+        self._jobs[head[JOBS] % len(self._jobs)] = head[NEWEST], max(exec_ns, 1)
+        head[JOBS] += 1
+
+    def sent(self, stamp: Stamp, target: str, payload_bytes: int) -> None:
+        """Count an output to ``TASK@NODE``."""
+        column = self._outputs[target]
+        if (row := self._row(stamp)) is not None:
+            row[column] = 1 + payload_bytes
+        self._sent_bytes[column - 1] += payload_bytes
+
+    def report(self, who: str) -> Iterator[StageCounts]:
+        """Yield the sums of the block before the newest one, and of the newest."""
+        run, newest = self._head[RUN].item(), self._head[NEWEST].item()
+        blocks, of_jobs = self._rows[:, CYCLE] // self._block, self._jobs[:, 0] // self._block
+        for block in range(max(newest // self._block - 1, 0), newest // self._block + 1):
+            rows = self._rows[blocks == block]
+            exec_ns = np.sort(self._jobs[(of_jobs == block) & (self._jobs[:, 1] > 0), 1]).tolist()
+            jobs, states = len(exec_ns), rows[:, self._first_input :]
+            replaced, dropped = ((states == end).any(axis=1) for end in (REPLACED, DROPPED))
+            yield StageCounts(
+                *(who, run, block),
+                jobs=jobs,
+                median_ns=exec_ns[jobs // 2] if jobs else 0,
+                p95_ns=exec_ns[(95 * jobs - 1) // 100] if jobs else 0,
+                replaced=replaced.sum().item(),
+                dropped=dropped.sum().item(),
+                inputs=tuple(self._input(rows, name) for name in self._inputs),
+                outputs=tuple(self._output(rows, name) for name in self._outputs),
+                totals=tuple(self._head[TAKEN : DROPPED + 1].tolist()),
+            )
+
+    def _input(self, rows: Ints, name: str) -> InputCounts:
+        states = rows[:, self._inputs[name]].tolist()
+        return InputCounts(name, *map(states.count, (TAKEN, REPLACED, DROPPED, WAITING)))
+
+    def _output(self, rows: Ints, name: str) -> OutputCounts:
+        column = self._outputs[name]
+        sizes = rows[:, column][rows[:, column] > 0]
+        total = self._sent_bytes[column - 1].item()
+        return OutputCounts(name, len(sizes), (sizes - 1).sum().item(), total)
+
+
+def read_books(problem: Problem, there: Iterable[Role], folder: Path) -> Iterator[StageCounts]:
+    """Yield the sums of the workers among a node's processes, by the files in its state folder."""
+    for role in there:
+        if role.kind in ("worker", "standby"):
+            memory = _reads(book_path(folder, role.who))
+            # The file may not be there yet, or be that of another cell file.
+            with suppress(OSError, ValueError):
+                yield from StageBook(problem, role.task, role.node, memory).report(role.who)
+
+
+def _reads(path: Path) -> Callable[[int], bytes]:
+    return lambda _: path.read_bytes()
+
+
+class StageTable:
+    """Sums of all workers of a cell, by block, as their agents have sent them.
+
+    A worker and its standbys count together. The newest cycle is given as run and number.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self._size, self._period_ns = block_cycles(problem), problem.pipeline.period_ns
+        #: Time after the report of a message from which on it is lost if the other end lacks it: D,
+        #: and until that end has reported again.
+        self._settled_ns = problem.pipeline.deadline_ns + 5 * REPORT_NS // 4
+        #: Node of each worker, and where it may send its outputs.
+        self._known: dict[str, tuple[str, list[str]]] = {}
+        self._workers: dict[str, list[str]] = defaultdict(list)
+        for role in roles(problem):
+            if role.kind in ("worker", "standby"):
+                outputs = (flow.target for flow in problem.pipeline.outputs(role.task))
+                self._known[role.who] = role.node, _stages(problem, outputs)
+                self._workers[f"{role.task}@{role.node}"].append(role.who)
+        self._of: dict[Key, dict[str, StageCounts]] = {}
+        # When the outputs of a worker in a block changed last.
+        self._sent_ns: dict[tuple[Key, str], int] = {}
+
+    def take(self, load: Load, newest: Key, at_ns: int) -> None:
+        """Take the sums of a node's workers; those far from the newest cycle are left out."""
+        run, latest = newest[0], newest[1] // self._size
+        for one in load.stages:
+            key = one.run, one.block
+            near = one.run == run and latest - KEPT_BLOCKS < one.block <= latest + 1
+            said = load.node, [output.target for output in one.outputs]
+            if not near or self._known.get(one.who) != said:
+                continue
+            of = self._of.setdefault(key, {})
+            if one.who not in of or of[one.who].outputs != one.outputs:
+                self._sent_ns[key, one.who] = at_ns
+            of[one.who] = one
+        for key in [key for key in self._of if key[0] != run or key[1] <= latest - KEPT_BLOCKS]:
+            for who in self._of.pop(key):
+                del self._sent_ns[key, who]
+
+    def slow(self, placement: Placement, newest: Key) -> Iterator[dict[str, Any]]:
+        """Yield the stages of a placement whose jobs take longer than a period."""
+        for name in (f"{task}@{node}" for task, node in placement.items()):
+            one = next(self._recent(name, newest), None)
+            if one is not None and one.median_ns > self._period_ns:
+                inputs = one.jobs + one.replaced + one.dropped
+                took = {"stage": name, "exec_ms": one.median_ns / 1e6}
+                yield {**took, "replaced": one.replaced, "inputs": inputs}
+
+    def withholds(self, source: str, target: str, newest: Key) -> bool:
+        """Whether jobs of ``TASK@NODE`` have ended lately without an output to a task."""
+        for one in self._recent(source, newest):
+            outputs = (end for end in one.outputs if end.target.partition("@")[0] == target)
+            # The agent may have read between a job's end and its output.
+            if one.jobs > 1 + sum(end.sent for end in outputs):
+                return True
+        return False
+
+    def _recent(self, name: str, newest: Key) -> Iterator[StageCounts]:
+        """Yield the sums of ``TASK@NODE`` of the last blocks, the newest first."""
+        run, latest = newest[0], newest[1] // self._size
+        for block in range(latest + 1, latest - 2, -1):
+            of = self._of.get((run, block), {})
+            known = (of[who] for who in self._workers[name] if who in of)
+            yield from (one for one in known if one.jobs >= LEAST_JOBS)
+
+    def status(
+        self, newest: Key, now_ns: int, span_ns: Callable[[int, int], int]
+    ) -> dict[str, Any]:
+        """Return times and counts of the last block that all agents have reported.
+
+        Parameters
+        ----------
+        span_ns : callable
+            Returns the time from the release of a cycle to that of another one.
+        """
+        lag = math.ceil((REPORT_NS + self._settled_ns) / self._period_ns)
+        key = newest[0], (newest[1] - lag) // self._size - 1
+        of = self._of.get(key, {})
+        first = key[1] * self._size
+        seconds = span_ns(first, first + self._size) / 1e9 if of else 1.0
+        stages: dict[str, list[StageCounts]] = {}
+        for name, workers in self._workers.items():
+            if sums := [of[who] for who in workers if who in of]:
+                stages[name] = sums
+        flows: dict[str, Any] = {}
+        for source, sums in stages.items():
+            settled = all(now_ns - self._sent_ns[key, one.who] >= self._settled_ns for one in sums)
+            for outputs in zip(*(one.outputs for one in sums), strict=True):
+                target = outputs[0].target
+                ends = [end for one in stages.get(target, ()) for end in one.inputs]
+                inputs = [end for end in ends if end.source == source]
+                flow = _flow(outputs, inputs, settled=settled)
+                if flow["sent"] or flow["bytes_total"]:
+                    payload_bytes = sum(one.payload_bytes for one in outputs)
+                    flows[f"{source}->{target}"] = {**flow, "bytes_per_s": payload_bytes / seconds}
+        return {
+            "stages": {name: _stage(sums) for name, sums in stages.items()},
+            "flows": flows,
+            "counted_cycles": (first, first + self._size - 1) if of else None,
+        }
+
+
+def _stage(sums: Sequence[StageCounts]) -> dict[str, Any]:
+    """Return a stage as the status shows it; its times are those of the worker with most jobs."""
+    most = max(sums, key=lambda one: one.jobs)
+    totals = np.sum([one.totals for one in sums], axis=0).tolist()
+    return {
+        "exec_median_ms": most.median_ns / 1e6 if most.jobs else None,
+        "exec_p95_ms": most.p95_ns / 1e6 if most.jobs else None,
+        "jobs": sum(one.jobs for one in sums),
+        "replaced": sum(one.replaced for one in sums),
+        "dropped": sum(one.dropped for one in sums),
+        "inputs_total": dict(zip(ENDS, totals, strict=True)),
+    }
+
+
+def _flow(
+    outputs: Sequence[OutputCounts], inputs: Sequence[InputCounts], *, settled: bool
+) -> dict[str, int]:
+    """Return what came of the messages of a flow: what is not there is lost once it is settled."""
+    ends = {
+        "taken": sum(one.taken for one in inputs),
+        "replaced": sum(one.replaced for one in inputs),
+        "dropped": sum(one.dropped for one in inputs),
+    }
+    waiting = sum(one.waiting for one in inputs)
+    there = sum(ends.values()) + waiting
+    # The other end may have reported later than the sender.
+    sent = max(sum(one.sent for one in outputs), there)
+    missing = sent - there
+    return {
+        "sent": sent,
+        **ends,
+        "lost": missing if settled else 0,
+        "in_flight": waiting if settled else waiting + missing,
+        "bytes_total": sum(one.total_bytes for one in outputs),
+    }

@@ -1,0 +1,492 @@
+"""Stamper: releases the cycles of a cell, each with its placement, and hosts the guard."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+from msgspec.structs import asdict
+
+from dwell.control import CellGuard, shadow_stamps
+from dwell.errors import LiveError
+from dwell.live.roles.control_group import UNKNOWN
+from dwell.live.roles.latencies import Intervals
+from dwell.live.roles.role import BeatState, Pulse, RolePlace
+from dwell.live.wire.continuity import CLAIMS, RESERVED, RunClaims, SetbackDetector
+from dwell.live.wire.keys import CONTROLLER
+from dwell.live.wire.messages import (
+    ACTUATED,
+    HANDED_OVER,
+    OTHER,
+    Accepted,
+    Beat,
+    Completion,
+    Count,
+    Header,
+    Order,
+    Stamp,
+    Stamped,
+    encode,
+)
+from dwell.live.wire.routing import STAMPER, Destination, Routes
+from dwell.live.wire.transport import Arrival
+
+#: Time after which a controller that is silent is in charge no more.
+LEASE_NS = 1_000_000_000
+#: Time that a new run waits for its placement; then it begins on any fallback that is whole.
+START_NS = 10_000_000_000
+#: Completions of a cycle by some sinks that are kept until the others come.
+MAX_PARTIAL = 1_024
+
+
+@dataclass(frozen=True, slots=True)
+class StamperState:
+    """State of the stamper that outlives its process.
+
+    Parameters
+    ----------
+    reserved : int
+        No cycle from this number on has been stamped.
+    on_fallback : bool
+        Whether the placement is the guard's.
+    boot : str
+        Kernel's boot in which it was written. After a loss of power the disk may have an old one.
+    """
+
+    run: Count
+    reserved: Count
+    term: Count
+    placement: str
+    on_fallback: bool
+    boot: str = ""
+
+
+class Book(Protocol):
+    """Keeps the `StamperState` of a cell."""
+
+    def read(self) -> StamperState | None:
+        """Return it; None if there is none."""
+        ...
+
+    def write(self, entry: StamperState) -> None:
+        """Keep it, before anything that it says happens."""
+        ...
+
+
+class Stamper:
+    """Owns run, term and placement of a cell.
+
+    Parameters
+    ----------
+    run : int
+        Time of day: number of a new run, unless a later run is known.
+    boot : str
+        Id of the kernel's present boot.
+    """
+
+    def __init__(self, place: RolePlace, book: Book, run: int, now_ns: int, boot: str = "") -> None:
+        self.place, self._book, self._boot = place, book, boot
+        problem = place.problem
+        entry = book.read()
+        # Without a book of this boot, other processes may know a later run.
+        self._unsure = entry is None or entry.boot != boot
+        self._claims = RunClaims(CLAIMS if place.seals is None else 1)
+        if entry is None or entry.placement not in problem.candidates:
+            later = run if entry is None else max(run, entry.run + 1)
+            entry = StamperState(later, 0, 1, problem.initial, False)
+        elif self._unsure:
+            placed = entry.placement, entry.on_fallback
+            entry = StamperState(max(run, entry.run + 1), 0, 1, *placed)
+        self.cycle = entry.reserved
+        self._reserved = entry.reserved
+        self.routes = Routes(problem)
+        self.guard = CellGuard(problem, entry.placement)
+        if entry.on_fallback:
+            self.guard.adopt(entry.placement, fallback=True)
+        #: Where the cell is.
+        self.course = self.guard.course
+        self.course.enter(entry.run, entry.term)
+        self.pulse = Pulse(place, self._ready, self._holds, hears=[("*", "*")])
+        self.timer = problem.live.release == "timer"
+        self._next_ns = now_ns + place.period_ns
+        self._framed_ns = now_ns - place.period_ns
+        self._setback = SetbackDetector()
+        # A run that goes on does so at once; a new one waits until its placement is there.
+        self._begun, self._since_ns = entry.reserved > 0, now_ns
+        # Sources on other nodes get their stamps a cycle early.
+        self._early = any(node != place.node for _, node, _ in self._sources())
+        self._ahead: Stamp | None = None
+        self._names = tuple(problem.candidates)
+        self._sinks = frozenset(
+            name for name in problem.pipeline.tasks if not problem.pipeline.outputs(name)
+        )
+        self.intervals = Intervals(place.who, self._sinks)
+        self._partial: dict[int, set[str]] = {}
+        self._fraction = 0.0
+        self._forks: tuple[tuple[str, str], ...] = ()
+        self._charge = ""
+        self._charged_ns = 0
+        self._answered: tuple[str, int, Accepted] | None = None
+        #: Highest number of an order that was carried out; numbers grow from controller to
+        #: controller, as they begin with the time of day.
+        self._newest = 0
+        #: CPU time that the node's control group has taken, where something counts it.
+        self.group_clock: Callable[[], int] = lambda: UNKNOWN
+        self.skipped = 0
+        self.moves: list[tuple[int, str, str]] = []
+
+    @property
+    def run(self) -> int:
+        """The run."""
+        return self.course.run
+
+    @property
+    def term(self) -> int:
+        """The term that holds."""
+        return self.course.term
+
+    @property
+    def placement(self) -> str:
+        """The candidate that holds."""
+        return self.course.placement
+
+    # ------------------------------------------------------------------------ hearing
+
+    def subscriptions(self) -> Iterable[str]:
+        """Key expressions that it wants to hear."""
+        keys = self.place.keys
+        yield from self.pulse.subscriptions()
+        yield from (keys.done("*"), keys.ended(), keys.carried())
+        yield keys.order()
+        yield keys.frame()
+
+    def receive(self, sample: Arrival, now_ns: int) -> None:
+        """Take a message in."""
+        if sample.key == self.place.keys.carried():
+            for arrival in self.place.around(sample):
+                self.receive(arrival, now_ns)
+            return
+        if self.pulse.hears(sample):
+            beat = self.pulse.receive(sample, now_ns)
+            if beat is not None:
+                self._heard(beat, now_ns, self.place.keys.came_directly(sample.key))
+            return
+        try:
+            match word := self.place.keys.word(sample.key):
+                case "order":
+                    self._order(self.place.read(sample, Order, lambda _: CONTROLLER), now_ns)
+                case "frame":
+                    self._frame(now_ns)
+                case "done" | "ended":
+                    done = self.place.completion(sample)
+                    self._completed(done, now_ns)
+                    applied = word == "done" and done.outcome == ACTUATED
+                    if applied and done.stamp.run == self.run:
+                        direct = self.place.keys.came_directly(sample.key)
+                        self.intervals.completed(done, now_ns, newest=self.cycle, direct=direct)
+        except LiveError as error:
+            self.place.complain(error)
+
+    def _frame(self, now_ns: int) -> None:
+        """Release a cycle, because the source has a frame; of a flood of them, two a period."""
+        if self.timer or not self._begun:
+            return
+        if now_ns - self._framed_ns < self.place.period_ns // 2:
+            self.skipped += 1
+            return
+        self._framed_ns = now_ns
+        self._release(now_ns, now_ns)
+
+    def _heard(self, beat: Beat, now_ns: int, direct: bool) -> None:
+        presence = self.guard.presence
+        presence.heard(beat.node, now_ns)
+        if direct:
+            presence.heard(f"{beat.node}->{self.place.node}", now_ns)
+            self.intervals.hear(beat, now_ns)
+        if beat.who.startswith("sink."):
+            self._claimed(beat.who, beat.run)
+        for heard in beat.heard:
+            age_ns = max(beat.sent_ns - heard.at_ns, 0)
+            presence.heard(f"{heard.node}->{beat.node}", now_ns - age_ns)
+        worker, _, extra = beat.who.partition(".")
+        if beat.moving and self._forks and beat.who in self._workers():
+            # An order asked for its state, so its cycles wait.
+            self.guard.restart()
+        if extra in ("", "1") and "@" in worker:
+            if beat.ready:
+                presence.heard(worker, now_ns)
+            elif not extra:
+                presence.gone(worker)
+
+    def _claimed(self, who: str, run: int) -> None:
+        """Begin a run beyond one that another process names, unless the book is whole."""
+        if not self._unsure or not self._claims.believed(who, run) or run <= self.run:
+            return
+        self._ahead, self._answered = None, None
+        self._partial.clear()
+        # Cycles of the run before never complete: processes downstream know a later one.
+        self.guard.restart()
+        self.guard.failures.restart()
+        self.course.enter(run + 1, self.term + 1)
+        self._write()
+
+    def _completed(self, done: Completion, now_ns: int) -> None:
+        stamp = done.stamp
+        if stamp.run != self.run:
+            return
+        if done.outcome == "shadow":
+            if done.sink in self._sinks and stamp.shadow in self._names:
+                self.guard.shadow_arrived(stamp.cycle, now_ns, stamp.shadow)
+            return
+        # What the actuator refused has come as far as under any other placement.
+        handed_over = done.outcome in HANDED_OVER and done.sink in self._sinks
+        if not handed_over or stamp.cycle < self.guard.newest:
+            return
+        sinks = self._partial.setdefault(stamp.cycle, set())
+        if done.sink in sinks:
+            return
+        sinks.add(done.sink)
+        if sinks == self._sinks:
+            self._complete(stamp, now_ns)
+        if len(self._partial) > MAX_PARTIAL:
+            for cycle in sorted(self._partial)[: MAX_PARTIAL // 2]:
+                del self._partial[cycle]
+
+    def _complete(self, stamp: Stamp, now_ns: int) -> None:
+        """All sinks have had a cycle's command."""
+        if stamp.placement in self._names:
+            self.guard.arrived(stamp.cycle, now_ns, stamp.placement)
+        if stamp.placement == self.placement:
+            self.guard.probation.healthy()
+
+    # ------------------------------------------------------------------------- orders
+
+    def _order(self, order: Order, now_ns: int) -> None:
+        """Answer an order; the same one twice gets the same answer."""
+        self._claimed(CONTROLLER, order.run)
+        answered = self._answered
+        if answered is not None and answered[:2] == (order.controller, order.number):
+            answer = answered[2]
+        else:
+            refused = self._refusal(order, now_ns)
+            if not refused:
+                self._accept(order)
+            answer = self._answer(order, refused, now_ns)
+            self._answered = order.controller, order.number, answer
+        self.place.put_twice(self.place.keys.accepted(), answer)
+
+    @property
+    def _next(self) -> int:
+        """The next cycle to be stamped: one that other nodes know already is."""
+        return self.cycle + (self._ahead is not None)
+
+    def _answer(self, order: Order, refused: str, now_ns: int) -> Accepted:
+        probation = self.guard.probation
+        probed = (probation.wanted if self.course.by_guard else None) or ""
+        return Accepted(
+            order.number,
+            order.controller,
+            refused,
+            self.run,
+            self.term,
+            self.placement,
+            self._next,
+            self.course.by_guard,
+            probed if probation.proven(probed, now_ns) else "",
+            self._newest,
+            self.guard.resting,
+            probed,
+            probation.done(now_ns) if probed else 0,
+            probation.needed,
+        )
+
+    def _refusal(self, order: Order, now_ns: int) -> str:
+        """Return why an order is not accepted, or nothing."""
+        other = self._charge not in ("", order.controller)
+        if other and now_ns - self._charged_ns < LEASE_NS:
+            return f"{OTHER}: {self._charge} is in charge"
+        self._charge, self._charged_ns = order.controller, now_ns
+        if order.run == 0 and order.term == 0 and not order.placement:
+            return ""
+        if order.run != self.run:
+            return f"stale run: {order.run}, now {self.run}"
+        if order.term != self.term:
+            return f"stale term: {order.term}, now {self.term}"
+        if not order.placement:
+            return self._fork_refusal(order)
+        if order.placement not in self.place.problem.candidates:
+            return f"infeasible: {order.placement!r} is no candidate ({', '.join(self._names)})"
+        if order.placement == self.placement:
+            return ""
+        if order.number < self._newest:
+            return f"stale order: {order.number}, after {self._newest}"
+        missing = self.guard.presence.missing(order.placement, now_ns)
+        if missing:
+            return f"not ready: {', '.join(sorted(missing))} not heard"
+        probation = self.guard.probation
+        if self.course.by_guard and not probation.proven(order.placement, now_ns):
+            probation.want(order.placement)
+            done, needed = probation.done(now_ns), probation.needed
+            return f"not proven: {done} of {needed} cycles through {order.placement}"
+        return ""
+
+    def _fork_refusal(self, order: Order) -> str:
+        tasks = self.place.problem.pipeline.tasks
+        for task, node in order.forks:
+            if task not in tasks or node not in tasks[task].on:
+                return f"infeasible: {task} cannot run on {node}"
+        return ""
+
+    def _accept(self, order: Order) -> None:
+        if order.run == 0 and order.term == 0:
+            return
+        if order.number > self._newest:
+            self._newest = order.number
+            self._settle(order)
+        if order.placement and (order.placement != self.placement or self.course.by_guard):
+            self._move(order.placement, by_guard=False)
+
+    def _settle(self, order: Order) -> None:
+        """Take over what an order says beside the placement; an earlier one changes none of it."""
+        self._fraction = order.shadow_fraction
+        self._forks = order.forks
+        if self.course.by_guard:
+            known = order.want in self.place.problem.candidates
+            self.guard.probation.want(order.want if known else None)
+
+    def _move(self, placement: str, *, by_guard: bool) -> None:
+        """Change the placement: a new term, known to the book before any cycle has it."""
+        if by_guard:
+            self._ahead = None
+            self._forks = ()
+            # Only the controller knows the share of the fallback; its next order has it.
+            self._fraction = 0.0
+        self.moves.append((self._next, placement, "guard" if by_guard else "order"))
+        del self.moves[:-1_000]
+        self._partial.clear()
+        self.guard.adopt(placement, fallback=by_guard)
+        self.course.enter(self.run, self.term + 1)
+        self._write()
+
+    def _write(self) -> None:
+        course = self.course
+        holds = course.term, course.placement, course.by_guard
+        self._book.write(StamperState(course.run, self._reserved, *holds, self._boot))
+
+    # -------------------------------------------------------------------------- cycles
+
+    def wake(self, now_ns: int) -> int:
+        """Release the cycle that is due, let the guard look, beat; returns what is due next."""
+        if not self._begun and not self._begin(now_ns):
+            return min(self.pulse.wake(now_ns), now_ns + self.place.period_ns)
+        if self._setback.back_ns(now_ns) > self.place.period_ns // 4:
+            self._begin_anew(now_ns)
+        fallback = self.guard.look(now_ns)
+        if fallback is not None:
+            self._move(fallback, by_guard=True)
+            self.pulse.send(now_ns)
+        if self.timer and now_ns >= self._next_ns:
+            behind = (now_ns - self._next_ns) // self.place.period_ns
+            self.skipped += behind
+            self._next_ns += behind * self.place.period_ns
+            self._release(self._next_ns, now_ns)
+            self._next_ns += self.place.period_ns
+        due_ns = self.pulse.wake(now_ns)
+        if self.timer:
+            due_ns = min(due_ns, self._next_ns)
+        guard_ns = self.guard.due_ns
+        # Where no fallback is whole, the guard looks again every quarter of a period.
+        again_ns = now_ns + self.place.period_ns // 4
+        return due_ns if guard_ns is None else min(due_ns, max(guard_ns, again_ns))
+
+    def _begin_anew(self, now_ns: int) -> None:
+        """The clock has been set back: instants noted so far mean nothing any more."""
+        self._next_ns, self._framed_ns = now_ns, now_ns - self.place.period_ns
+        for noted in (self.guard.presence, self.guard.failures, self.guard):
+            noted.restart()
+
+    def _begin(self, now_ns: int) -> bool:
+        """Look whether the first cycle can be released."""
+        whole = [self.placement]
+        if now_ns - self._since_ns > START_NS:
+            whole += self.place.problem.controller.fallbacks
+        elif self._unsure and not all(self._claims.below(self.run, who) for who in self._gates()):
+            return False
+        presence = self.guard.presence
+        name = next((name for name in whole if presence.whole(name, now_ns)), None)
+        if name is None:
+            return False
+        if name != self.placement:
+            self._move(name, by_guard=True)
+        self._begun, self._next_ns = True, now_ns
+        return True
+
+    def _workers(self) -> Iterator[str]:
+        """Names of the workers under the placement that holds."""
+        placed = self.place.problem.candidates[self.placement]
+        return (f"{task}@{node}" for task, node in placed.items())
+
+    def _gates(self) -> Iterator[str]:
+        """Names of the sinks' processes under the placement that holds."""
+        placed = self.place.problem.candidates[self.placement]
+        return (f"sink.{task}@{placed[task]}" for task in self._sinks)
+
+    def _release(self, released_ns: int, now_ns: int) -> None:
+        """Stamp a cycle and send it to the source tasks."""
+        group_ns = self.group_clock()
+        if self.cycle + 1 >= self._reserved:
+            self._reserved = self.cycle + RESERVED
+        # At every cycle: a state folder that was removed and made again has no book.
+        self._write()
+        early, self._ahead = self._ahead, None
+        stamp = early or self._stamp(self.cycle, released_ns)
+        self.cycle += 1
+        self.guard.sent(stamp.cycle, released_ns, stamp.placement)
+        if stamp.shadow:
+            self.guard.shadow_sent(stamp.cycle, released_ns, stamp.shadow)
+        self._send(stamp, here=True, elsewhere=early is None)
+        # A beat wakes every process, and would take the source's turn.
+        self.pulse.put_off(released_ns + self.place.period_ns // 2)
+        intervals = self.intervals.take_unreported()
+        stamped = Stamped(**asdict(stamp), intervals=intervals, group_ns=group_ns)
+        self.place.transport.put(self.place.keys.stamped(), encode(stamped))
+        if self._early and self.timer:
+            self._ahead = self._stamp(self.cycle, released_ns + self.place.period_ns)
+            self._send(self._ahead, here=False, elsewhere=True)
+
+    def _sources(self) -> Iterator[Destination]:
+        """Source tasks wherever some candidate has them."""
+        for name in self.place.problem.candidates:
+            yield from self.routes.destinations(STAMPER, Stamp(0, 0, 1, name, 0))
+
+    def _send(self, stamp: Stamp, *, here: bool, elsewhere: bool) -> None:
+        """Send a stamp to the sources on this node, or on the others."""
+        place = self.place
+        header = encode(Header(stamp, STAMPER, place.node, "none", seal=place.stamped(stamp)))
+        for task, node, kind in self.routes.destinations(STAMPER, stamp):
+            if here if node == place.node else elsewhere:
+                place.transport.put(place.keys.inputs(task, node, kind), b"", header)
+
+    def _stamp(self, cycle: int, released_ns: int) -> Stamp:
+        wanted = self.guard.probation.wanted if self.course.by_guard else None
+        shadow = wanted or self._shadowed(cycle)
+        if shadow == self.placement:
+            shadow = ""
+        return Stamp(self.run, cycle, self.term, self.placement, released_ns, shadow, self._forks)
+
+    def _shadowed(self, cycle: int) -> str:
+        """Return the candidate that the estimator's plan sends this cycle through, too."""
+        if not self._fraction:
+            return ""
+        code = self._names.index(self.placement)
+        plan = shadow_stamps(cycle, cycle + 1, code, len(self._names), self._fraction)
+        return self._names[int(plan[0])] if plan[0] >= 0 else ""
+
+    # --------------------------------------------------------------------------- beats
+
+    def _ready(self) -> tuple[bool, str]:
+        return True, ""
+
+    def _holds(self) -> BeatState:
+        return BeatState(self.course.term, self.course.placement)

@@ -1,0 +1,1 @@
+"""The protocol: messages, keys, and who connects to whom."""
