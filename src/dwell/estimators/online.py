@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Collection, Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple, TypeAlias
 
@@ -190,14 +191,28 @@ class Online(CellEstimator):
                     break
                 self._playing.go_on(self._playing.present, unsure, STEPS)
                 estimates = self._priced(names, foreign)
+        for name in names:
+            estimates[name] = replace(estimates[name], error=self._stated_error(name))
         return estimates
+
+    def _stated_error(self, name: str) -> tuple[float, float]:
+        """Return standard errors of a candidate's L95 (ms) and V_D, by the play and its samples."""
+        price = self._playing.played(name)
+        known = self._known_error(name, price.violation_rate)
+        return (
+            math.hypot(price.l95_error_ms, known[0]),
+            math.hypot(price.violation_error, known[1]),
+        )
 
     def deviations(self, name: str) -> tuple[float, float]:
         """Return standard deviations of one window under a candidate (see `CellEstimator`)."""
         return self._playing.deviations(name)
 
     def _priced(self, names: list[str], foreign: Foreign) -> dict[str, QoS]:
-        """Every candidate's metrics; of those that are played by what they have come to."""
+        """Every candidate's metrics; of those that are played by what they have come to.
+
+        Errors of the latter are stated once all has been played.
+        """
         played = {name: self._playing.played(name) for name in names}
         if not self._declared:
             self._declared = {name: self._as_declared(name) for name in self.problem.candidates}
@@ -212,13 +227,8 @@ class Online(CellEstimator):
                 estimates[name] = unchecked_qos(*one.latency, shares[name], *one.others)
                 continue
             price = played[name]
-            known = self._known_error(name, price.violation_rate)
-            error = (
-                math.hypot(price.l95_error_ms, known[0]),
-                math.hypot(price.violation_error, known[1]),
-            )
             l95_ms, rate, uncut_ms = price.l95_ms, price.violation_rate, price.uncut_l95_ms
-            estimates[name] = QoS(l95_ms, rate, shares[name], uncut_ms, error)
+            estimates[name] = QoS(l95_ms, rate, shares[name], uncut_ms)
         return estimates
 
     def _as_declared(self, name: str) -> _Declared:

@@ -176,7 +176,7 @@ class Pool:
         Whether what disturbs the part adds to its values (a message) or multiplies them (a job).
     """
 
-    __slots__ = ("_alone", "_before", "_doubt", "additive", "reference", "rows")
+    __slots__ = ("_alone", "_before", "_doubt", "_summary", "additive", "reference", "rows")
 
     #: The first job of all, if no other was measured in its window; else 0.
     _alone: float
@@ -189,6 +189,7 @@ class Pool:
         #: What is held; the kernel adds to it.
         self.rows = reference.holds_nothing()
         self._alone, self.rows.row.asks = 0.0, not additive
+        self._summary = _Summary(np.empty(0), 0.0, 0.0)
         self.reset()
 
     def __repr__(self) -> str:
@@ -197,7 +198,7 @@ class Pool:
 
     @property
     def held(self) -> Floats:
-        """Values of the present regime, in the order in which they came."""
+        """Values of the present regime, in the order in which they came; one array per change."""
         return self.rows.values
 
     @property
@@ -228,14 +229,24 @@ class Pool:
     @property
     def lost(self) -> float:
         """Share of the values that are lost."""
-        if self.is_declared:
-            return self.reference.lost
-        return float(np.isinf(self.held).mean()) if len(self.held) else 0.0
+        return self.reference.lost if self.is_declared else self._summarised().lost
 
     @property
     def error_ms(self) -> float:
         """Standard error of the values' 95th percentile, and no less than of their mean."""
-        known = np.sort(self.held[np.isfinite(self.held)])
+        return self._summarised().error_ms
+
+    def _summarised(self) -> _Summary:
+        """Return figures of the held values, computed once per change of these."""
+        held = self.held
+        if self._summary.of is not held:
+            finite = np.isfinite(held)
+            known = np.sort(held[finite])
+            lost = (len(held) - len(known)) / max(len(held), 1)
+            self._summary = _Summary(held, lost, self._error_ms(known))
+        return self._summary
+
+    def _error_ms(self, known: Floats) -> float:
         if len(known) < 2:
             return 0.0
         count = max(self.measured, 2)
@@ -531,6 +542,22 @@ def _mean_log(size: int, deviations: float) -> float:
     part = 1.0 / (9.0 * size)
     root = 1.0 - part + deviations * math.sqrt(part)
     return float(root * root * root)
+
+
+class _Summary(NamedTuple):
+    """Figures of the values that a pool holds.
+
+    Parameters
+    ----------
+    of : float64 array
+        The values.
+    lost, error_ms : float
+        See `Pool`.
+    """
+
+    of: Floats
+    lost: float
+    error_ms: float
 
 
 class _Doubt(NamedTuple):

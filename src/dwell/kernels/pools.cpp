@@ -111,6 +111,7 @@ void add(Pool& pool, const f64* values, const PlaceSums& shift, i64 window, f64 
   std::copy(values, values + shift.size, pool.held + pool.first + kept);
   pool.measured = std::min(pool.measured + shift.size, total.size);
   pool.size = total.size;
+  ++pool.changes;
   pool.larger = total.larger;
   pool.smaller = total.smaller;
   pool.places = total.places;

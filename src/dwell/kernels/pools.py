@@ -38,6 +38,7 @@ class HeldValues:
     def __init__(self, known: Floats, patience_ms: float, likeness: float, block: int) -> None:
         self.row = structs()["Pool"](0, len(known), patience_ms, likeness, block)
         self._known, self._held = known, np.empty(ROOM)
+        self._values: tuple[int, Floats] = -1, np.empty(0)
         self._chunks = (structs()["Chunk"] * ROOM)()
         self._set_addresses()
 
@@ -47,6 +48,7 @@ class HeldValues:
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         # A copy has addresses of its own.
         row, self._known, self._held, chunks = state
+        self._values = -1, np.empty(0)
         self.row = structs()["Pool"].from_buffer_copy(row)
         self._chunks = (structs()["Chunk"] * ROOM).from_buffer_copy(chunks)
         self._set_addresses()
@@ -57,8 +59,13 @@ class HeldValues:
 
     @property
     def values(self) -> Floats:
-        """A copy of the values, in the order in which they came."""
-        return self._held[self.row.first : self.row.first + self.row.size].copy()
+        """The values in the order in which they came: the same array until they change."""
+        row, (changes, values) = self.row, self._values
+        if changes != row.changes:
+            values = self._held[row.first : row.first + row.size].copy()
+            values.flags.writeable = False
+            self._values = row.changes, values
+        return values
 
     def begin(self, values: Floats, sums: tuple[float, float, float], window: int) -> None:
         """Hold some values, none of which was measured, in the place of all others."""
@@ -67,6 +74,7 @@ class HeldValues:
             self._held = np.empty(len(values))
             self._set_addresses()
         self._held[: len(values)] = values
+        row.changes += 1
         row.first, row.size, (row.larger, row.smaller, row.places) = 0, len(values), sums
         self._chunks[0] = structs()["Chunk"](window, 0, len(values), *sums)
         row.first_chunk, row.n_chunks, row.touched = 0, 1, window
