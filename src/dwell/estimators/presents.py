@@ -184,6 +184,8 @@ class Playing:
         }
         self.cycles = 0
         self._twins: dict[str, _Twin] = {}
+        #: Demands that cycles have been filled with.
+        self._filled: Mapping[Part, Floats] = {}
 
     def __reduce__(self) -> tuple[type[Playing], tuple[Problem, int, ShadowFraction]]:
         # The kernel's tables have addresses; a copy begins anew.
@@ -198,7 +200,8 @@ class Playing:
         self._restore()
         changes = self._changes(present)
         self._first.replace(changes=changes)
-        self._fill_links(present)
+        self._set_links(present)
+        self._set_losses(present)
         for twin in self._twins.values():
             twin.steps.clear()
             twin.arrays.replace(changes=changes)
@@ -216,7 +219,7 @@ class Playing:
         """
         self.present = present
         if has_grown:
-            self._fill_links(present)
+            self._set_losses(present)
             self._fill(max(twin.cursor for twin in self._twins.values()))
             for name in names:
                 while len(self._twins[name].steps) >= RECENT:
@@ -353,6 +356,8 @@ class Playing:
             Site(*site): _stretched(self.problem, Site(*site)) for site in self._real.sites
         }
         self._hops = {Message(*hop): number for number, hop in enumerate(self._real.hops)}
+        rows = zip(problem.fabric.links, tables.links.tolist(), strict=False)
+        self._segments = {link: slice(*row[-2:]) for link, row in rows}
         self._twins = {name: _Twin(self._first, i, shadows) for i, name in enumerate(self._names)}
 
     def _restore(self) -> None:
@@ -367,36 +372,41 @@ class Playing:
     def _fill(self, since: int) -> None:
         """Let the cycles from one on meet the present's demands."""
         begin = since + BEYOND if since else 0
-        places = np.arange(begin, self._real.cycles) + self._offset
+        count = max(self._real.cycles - begin, 0)
         for part, values in self.present.demands.items():
+            # The same values have been filled in before, up to the last cycle.
+            if since and self._filled.get(part) is values:
+                continue
             rows = self._rows.get(part, ())
             if rows:
-                drawn = _drawn(values, self._stretched.get(part, 1.0), places)
+                stretched = self._stretched.get(part, 1.0)
+                drawn = _drawn(values, stretched, begin + self._offset, count)
                 if drawn is not None:
                     for row in rows:
                         row[begin:] = drawn
+        self._filled = self.present.demands
 
-    def _fill_links(self, present: Present) -> None:
-        """Set what links lose, and that measured delays are all that there is."""
-        tables, links = self._first.tables, self.problem.fabric.links
+    def _set_links(self, present: Present) -> None:
+        """Set the rates of links, and that measured delays are all that there is."""
+        tables = self._first.tables
         for part in present.demands:
             if part in self._hops:
                 layers = tables.layers[self._hops[part] :: len(self._hops)]  # shadows' come after
                 layers[layers != 0] = self._nothing_ns.ctypes.data
         for link, mbps in present.rates_mbps.items():
-            tables.rates["rate_mbps"][self._segments_of(link)] = mbps
+            tables.rates["rate_mbps"][self._segments[link]] = mbps
+
+    def _set_losses(self, present: Present) -> None:
+        """Set what links lose."""
+        tables, links = self._first.tables, self.problem.fabric.links
         for link, share in _lost(present).items():
-            mine = self._segments_of(link)
+            mine = self._segments[link]
             if links[link].retransmit_ms is None:
                 tables.rates["loss"][mine] = share
             else:
                 # Attempts that were lost are in the delays, and what never came was held back.
                 tables.rates["loss"][mine] = 0.0
                 tables.segments["is_down"][mine] = share >= 0.5
-
-    def _segments_of(self, link: str) -> slice:
-        row = self._first.tables.links[list(self.problem.fabric.links).index(link)]
-        return slice(row["segment"], row["segment_end"])
 
     def _changes(self, present: Present) -> Rows:
         """Return the changes of nodes with the present's foreign threads."""
@@ -424,7 +434,8 @@ def _lost(present: Present) -> dict[str, float]:
     lost: dict[str, list[float]] = {}
     for part, values in present.demands.items():
         if isinstance(part, Message):
-            lost.setdefault(part.link, []).append(float(np.isinf(values).mean()))
+            share = np.count_nonzero(np.isinf(values)) / len(values)
+            lost.setdefault(part.link, []).append(share)
     return {link: sum(shares) / len(shares) for link, shares in lost.items()}
 
 
@@ -528,13 +539,13 @@ def _with_own_demands(real: Realisation) -> Realisation:
     return replace(real, exec_ns=real.exec_ns.copy(), delay_ns=real.delay_ns.copy())
 
 
-def _drawn(values: Floats, stretched: float, places: Ints) -> Ints | None:
-    """Demands of cycles as a realisation has them, nanoseconds, from those that a present has."""
+def _drawn(values: Floats, stretched: float, first: int, count: int) -> Ints | None:
+    """Return demands of cycles, nanoseconds: those of a present in turn, from the `first` on."""
     known = values[np.isfinite(values)]
     if not len(known):
         return None
-    demands: Ints = np.rint(known * 1e6 / stretched).astype(np.int64)[places % len(known)]
-    return demands
+    demands = np.rint(known * 1e6 / stretched).astype(np.int64)
+    return np.resize(np.roll(demands, -first), count)
 
 
 def _most_threads(node: Node) -> int:
@@ -562,7 +573,6 @@ def realised(problem: Problem, real: Realisation, present: Present) -> Realisati
     if present == Present():
         return real
     exec_ns, delay_ns, extra_ns = real.exec_ns.copy(), real.delay_ns.copy(), real.extra_ns.copy()
-    places = np.arange(real.cycles)
     segments = LinkSegments.of(real.link_segments)
     state, rates = segments.table.copy(), segments.table_f.copy()
     for part, values in present.demands.items():
@@ -573,7 +583,7 @@ def realised(problem: Problem, real: Realisation, present: Present) -> Realisati
         else:
             known, times = real.hops, delay_ns
             extra_ns[[real.hops[hop] == part for hop, _ in real.layers]] = 0
-        demands = _drawn(values, stretched, places)
+        demands = _drawn(values, stretched, 0, real.cycles)
         if part in known and demands is not None:
             times[known.index(part)] = demands
     for name, mbps in present.rates_mbps.items():
