@@ -29,6 +29,7 @@ from dwell.kernels.advance import logged_window, play
 from dwell.kernels.arrays import Arrays, CellArrays, flow_rows, lay_out
 from dwell.kernels.codes import LAST_NS
 from dwell.kernels.elementary import moments
+from dwell.kernels.pools import fill
 from dwell.kernels.random_draws import Drawing
 from dwell.kernels.realisation import LinkSegments, NodeChange, NodeChanges, Realisation
 from dwell.kernels.rows import Rows, row_types
@@ -173,7 +174,7 @@ class Playing:
         self.prices = prices_of(problem, shadow_fraction=shadow_fraction)
         self._window = min(problem.window_cycles, LONGEST_WINDOW)
         self._names = tuple(problem.candidates)
-        self._step = max(STEP // self._window, 1)
+        self._step, self._censor_ms = max(STEP // self._window, 1), problem.censor_ms
         #: Standard deviations of what steps show as declared: L95 (ms) and V_D.
         self._usual = {
             name: [
@@ -285,7 +286,7 @@ class Playing:
     def tail_error_ms(self, name: str, off: float) -> float:
         """Return the error of a candidate's L95 by the error of the share of lost cycles."""
         latency_ns = np.concatenate([step.latency_ns for step in self._twins[name].steps])
-        return quantile_error(np.sort(np.minimum(latency_ns / 1e6, self.problem.censor_ms)), off)
+        return quantile_error(np.sort(np.minimum(latency_ns / 1e6, self._censor_ms)), off)
 
     def _price(self, name: str, steps: Collection[_Step]) -> PlayedPrice:
         l95, declared_l95, uncut, rates, declared_rates, own, _ = zip(*steps, strict=True)
@@ -306,7 +307,7 @@ class Playing:
             usual=self._usual[name][1],
             cycles=count * self._step * self._window,
         )
-        l95_ms, shares = min(l95_ms, self.problem.censor_ms), sum(own) / count
+        l95_ms, shares = min(l95_ms, self._censor_ms), sum(own) / count
         return PlayedPrice(
             l95_ms,
             l95_error_ms,
@@ -372,18 +373,12 @@ class Playing:
     def _fill(self, since: int) -> None:
         """Let the cycles from one on meet the present's demands."""
         begin = since + BEYOND if since else 0
-        count = max(self._real.cycles - begin, 0)
         for part, values in self.present.demands.items():
             # The same values have been filled in before, up to the last cycle.
             if since and self._filled.get(part) is values:
                 continue
-            rows = self._rows.get(part, ())
-            if rows:
-                stretched = self._stretched.get(part, 1.0)
-                drawn = _drawn(values, stretched, begin + self._offset, count)
-                if drawn is not None:
-                    for row in rows:
-                        row[begin:] = drawn
+            stretched = self._stretched.get(part, 1.0)
+            fill(self._rows.get(part, ()), values, stretched, begin, self._offset)
         self._filled = self.present.demands
 
     def _set_links(self, present: Present) -> None:
@@ -539,15 +534,6 @@ def _with_own_demands(real: Realisation) -> Realisation:
     return replace(real, exec_ns=real.exec_ns.copy(), delay_ns=real.delay_ns.copy())
 
 
-def _drawn(values: Floats, stretched: float, first: int, count: int) -> Ints | None:
-    """Return demands of cycles, nanoseconds: those of a present in turn, from the `first` on."""
-    known = values[np.isfinite(values)]
-    if not len(known):
-        return None
-    demands = np.rint(known * 1e6 / stretched).astype(np.int64)
-    return np.resize(np.roll(demands, -first), count)
-
-
 def _most_threads(node: Node) -> int:
     return MOST_THREADS + (node.bursts.threads if node.bursts is not None else 0)
 
@@ -583,9 +569,8 @@ def realised(problem: Problem, real: Realisation, present: Present) -> Realisati
         else:
             known, times = real.hops, delay_ns
             extra_ns[[real.hops[hop] == part for hop, _ in real.layers]] = 0
-        demands = _drawn(values, stretched, 0, real.cycles)
-        if part in known and demands is not None:
-            times[known.index(part)] = demands
+        if part in known:
+            fill([times[known.index(part)]], values, stretched, 0, 0)
     for name, mbps in present.rates_mbps.items():
         rates[state[:, 1] == segments.links.index(name), 0] = mbps
     for name, share in _lost(present).items():

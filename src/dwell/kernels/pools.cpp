@@ -26,6 +26,18 @@ constexpr i64 kRoom = 408;
 // Why a pool needs another look: what a window brought has not been added, or it has been.
 constexpr i64 kNotAdded = 1, kAdded = 2;
 
+// The first of ascending values that is not below another one. Which half comes next is computed
+// and not branched on: it cannot be foreseen.
+const f64* first_not_below(const f64* known, i64 n, f64 value) {
+  if (n == 0) return known;
+  while (n > 1) {
+    const i64 half = n / 2;
+    known += known[half - 1] < value ? half : 0;
+    n -= half;
+  }
+  return known + (*known < value ? 1 : 0);
+}
+
 void add_places(const f64* known, i64 n_known, const f64* values, i64 n, f64 patience_ms,
                 PlaceSums& out) {
   // Of so many places the product is far from the least number, and has one logarithm.
@@ -34,7 +46,7 @@ void add_places(const f64* known, i64 n_known, const f64* values, i64 n, f64 pat
   f64 beyond = 1.0, below = 1.0;
   for (i64 i = 0; i < n; ++i) {
     const f64 value = values[i] > patience_ms ? std::numeric_limits<f64>::infinity() : values[i];
-    const f64* first = std::lower_bound(known, known + n_known, value);
+    const f64* first = first_not_below(known, n_known, value);
     const f64* last = first;
     if (first != known + n_known && *first == value) {
       last = std::upper_bound(first, known + n_known, value);
@@ -203,4 +215,21 @@ DWELL_EXPORT void dwell_weakest(const Pool* const* pools, const i64* parts, i64 
       out[1] = std::min(out[1], pools[part]->last);
     }
   }
+}
+
+// Writes the times of cycles, nanoseconds: those of `values` that are finite, in turn, as from the
+// cycle `first` on. Returns how many these are.
+DWELL_EXPORT i64 dwell_fill(const f64* values, i64 n, f64 stretched, i64 first, i64 count,
+                            i64* out) noexcept {
+  const i64 known = std::count_if(values, values + n, [](f64 ms) { return std::isfinite(ms); });
+  if (known == 0) return 0;
+  // From each known value the cycle that it is first met in.
+  i64 at = (known - first % known) % known;
+  for (i64 i = 0; i < n; ++i) {
+    if (!std::isfinite(values[i])) continue;
+    if (at < count) out[at] = static_cast<i64>(std::rint(values[i] * 1e6 / stretched));
+    at = at + 1 == known ? 0 : at + 1;
+  }
+  for (i64 i = known; i < count; ++i) out[i] = out[i - known];
+  return known;
 }

@@ -178,7 +178,31 @@ def places(
     return out[0], out[1], out[2]
 
 
+def fill(rows: Sequence[Ints], values: Floats, stretched: float, begin: int, offset: int) -> None:
+    """Let cycles meet known values in turn (see `dwell.estimators.presents`).
+
+    Parameters
+    ----------
+    rows : sequence of int64 array, shape (cycles,)
+        Nanoseconds; as they were if all values are lost.
+    values : float64 array
+        Milliseconds; what is infinite is left out.
+    stretched : float
+        What the values are divided by.
+    begin, offset : int
+        First cycle that is filled, and which cycle the first of a row stands for.
+    """
+    values = np.ascontiguousarray(values)
+    where = values.ctypes.data, len(values), stretched, begin + offset
+    for row in rows:
+        later = row[begin:]
+        _fill()(*where, len(later), later.ctypes.data)
+
+
 _places = foreign("dwell_places", None, c_void_p, c_int64, c_void_p, c_int64, c_double, c_void_p)
+_fill = foreign(
+    "dwell_fill", c_int64, c_void_p, c_int64, c_double, c_int64, c_int64, c_void_p
+)
 _pool_add = foreign(
     "dwell_pool_add",
     None,
