@@ -32,7 +32,7 @@ const f64* first_not_below(const f64* known, i64 n, f64 value) {
   if (n == 0) return known;
   while (n > 1) {
     const i64 half = n / 2;
-    known += known[half - 1] < value ? half : 0;
+    known += half * static_cast<i64>(known[half - 1] < value);
     n -= half;
   }
   return known + (*known < value ? 1 : 0);
