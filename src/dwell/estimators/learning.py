@@ -18,7 +18,7 @@ from dwell.estimators.prices import SEED
 from dwell.estimators.protocol import Support
 from dwell.estimators.shadow_price import fraction_of
 from dwell.estimators.slow_processes import unseen_error
-from dwell.kernels.pools import ADDED, PoolRows
+from dwell.kernels.pools import ADDED, GROWN, PoolRows
 from dwell.model.controller_settings import HALF_LIFE_WINDOWS
 from dwell.model.problem import Problem
 
@@ -135,6 +135,9 @@ class Learning(Online):
         looks = self._rows.learn(self._meter.found, parts, *when, least)
         for (part, values), why in zip(demands.items(), looks, strict=False):
             if not why:
+                continue
+            if why == GROWN:
+                self._has_grown = True
                 continue
             pool = self._pools[part]
             if why == ADDED:

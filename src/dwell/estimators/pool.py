@@ -176,11 +176,11 @@ class Pool:
         Whether what disturbs the part adds to its values (a message) or multiplies them (a job).
     """
 
-    __slots__ = ("_alone", "_before", "_doubt", "_summary", "additive", "reference", "rows")
+    __slots__ = ("_alone", "_before", "_doubts", "_summary", "additive", "reference", "rows")
 
     #: The first job of all, if no other was measured in its window; else 0.
     _alone: float
-    _doubt: _Doubt | None
+    _doubts: _Doubt | None
     #: The values, ascending, before the run of decisions (see `_run`); the declared ones if None.
     _before: Floats | None
 
@@ -200,6 +200,15 @@ class Pool:
     def held(self) -> Floats:
         """Values of the present regime, in the order in which they came; one array per change."""
         return self.rows.values
+
+    @property
+    def _doubt(self) -> _Doubt | None:
+        """Decisions since which the regime may be over."""
+        return self._doubts
+
+    @_doubt.setter
+    def _doubt(self, doubt: _Doubt | None) -> None:
+        self._doubts, self.rows.row.doubts = doubt, doubt is not None
 
     @property
     def is_declared(self) -> bool:

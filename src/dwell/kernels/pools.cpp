@@ -1,6 +1,7 @@
 // Pools: what is held of each part of a cycle, next to what it is as declared (pool.py).
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <limits>
 
@@ -20,11 +21,12 @@ namespace {
 
 // As in pool.py.
 constexpr i64 kLargest = 200, kEnough = 12;
-constexpr f64 kMoved = 0.75;
+constexpr f64 kMoved = 0.75, kAlike = 2.0;
 // Room for values and for chunks, of which the newest are held (pools.py).
 constexpr i64 kRoom = 408;
 // Why a pool needs another look: what a window brought has not been added, or it has been.
-constexpr i64 kNotAdded = 1, kAdded = 2;
+// The third: it has been added to a pool that is not as declared.
+constexpr i64 kNotAdded = 1, kAdded = 2, kGrown = 3;
 
 // The first of ascending values that is not below another one. Which half comes next is computed
 // and not branched on: it cannot be foreseen.
@@ -130,11 +132,39 @@ void add(Pool& pool, const f64* values, const PlaceSums& shift, i64 window, f64 
   if (pool.is_declared == 0) pool.touched = window;
 }
 
+void set_run(Pool& pool, const PlaceSums& run, i64 cycles) {
+  pool.run_cycles = is_large(run) ? cycles : 0;
+  pool.run_size = run.size;
+  pool.run_larger = run.larger;
+  pool.run_smaller = run.smaller;
+  pool.run_places = run.places;
+}
+
+// Adds what a window brought to a pool that is not as declared, if it is neither near what is
+// declared, nor larger, nor smaller, than most that is held.
+i64 learn_otherwise(Pool& pool, const f64* values, i64 n, i64 window, f64 memory, i64 cycles) {
+  const bool goes_on = pool.run_cycles > 0 && pool.run_cycles + cycles <= pool.block;
+  if (pool.doubts != 0 || goes_on || pool.size > kLargest) return kNotAdded;
+  PlaceSums declared, among;
+  add_places(pool.known, pool.n_known, values, n, pool.patience_ms, declared);
+  if (deviations(pool, declared, cycles) < kAlike) return kNotAdded;
+  std::array<f64, kLargest> before;
+  const f64* held = pool.held + pool.first;
+  f64* end = std::copy(held, held + pool.size, before.data());
+  std::sort(before.data(), end, [](f64 one, f64 other) { return one < other; });
+  add_places(before.data(), pool.size, values, n, std::numeric_limits<f64>::infinity(), among);
+  if (is_large(among)) return kNotAdded;
+  set_run(pool, among, cycles);
+  pool.last = window;
+  add(pool, values, declared, window, memory, cycles);
+  return kGrown;
+}
+
 // Adds what a window brought to a pool that is as declared, if that is nothing to look at; returns
 // 0 then, else why another look is needed.
 i64 learn(Pool& pool, const f64* values, i64 n, i64 window, f64 memory, i64 cycles, f64 least) {
-  if (pool.is_declared == 0 || pool.n_known == 0 || pool.asks != 0 || n > kLargest)
-    return kNotAdded;
+  if (pool.n_known == 0 || pool.asks != 0 || n > kLargest) return kNotAdded;
+  if (pool.is_declared == 0) return learn_otherwise(pool, values, n, window, memory, cycles);
   PlaceSums declared;
   add_places(pool.known, pool.n_known, values, n, pool.patience_ms, declared);
   // Windows that are larger, or smaller, are a run, up to a stretch.
@@ -145,11 +175,7 @@ i64 learn(Pool& pool, const f64* values, i64 n, i64 window, f64 memory, i64 cycl
     run_cycles += pool.run_cycles;
   }
   if (is_large(run) && deviations(pool, run, run_cycles) >= least) return kNotAdded;
-  pool.run_cycles = is_large(run) ? run_cycles : 0;
-  pool.run_size = run.size;
-  pool.run_larger = run.larger;
-  pool.run_smaller = run.smaller;
-  pool.run_places = run.places;
+  set_run(pool, run, run_cycles);
   pool.last = window;
   add(pool, values, declared, window, memory, cycles);
   const PlaceSums held = {pool.size, pool.larger, pool.smaller, pool.places};
@@ -174,8 +200,8 @@ DWELL_EXPORT void dwell_places(const f64* known, i64 n_known, const f64* values,
   out[2] = sums.places;
 }
 
-// Adds what a window brought of some parts to their pools; writes of each part why another look is
-// needed, 0 where none is, and returns how many need one.
+// Adds what a window brought of some parts to their pools; writes of each part why Python has to
+// look at it, 0 where it need not, and returns how many it has to look at.
 DWELL_EXPORT i64 dwell_learn(Pool* const* pools, const Found* found, const i64* parts, i64 n_parts,
                              i64 window, f64 memory, i64 cycles, f64 least, i64* out) noexcept {
   i64 n = 0;

@@ -15,8 +15,9 @@ from dwell.kernels.rows import Floats, Ints, structs
 
 #: Room for values, and for windows.
 ROOM = 408
-#: Why a pool needs another look: what a window brought has not been added, or it has been.
-NOT_ADDED, ADDED = 1, 2
+#: Why a pool needs another look: what a window brought has not been added, or it has been; or it
+#: has been added to a pool that is not as declared, and nothing has changed.
+NOT_ADDED, ADDED, GROWN = 1, 2, 3
 
 
 class HeldValues:
@@ -134,7 +135,7 @@ class PoolRows:
     def learn(
         self, found: PartTimes, parts: Ints, window: int, memory: float, cycles: int, least: float
     ) -> list[int]:
-        """Add what a window brought to the pools that are as declared.
+        """Add what a window brought to the pools that stay as they are, declared or not.
 
         Parameters
         ----------
@@ -146,7 +147,7 @@ class PoolRows:
         Returns
         -------
         list of int
-            Of each part, why another look is needed (`NOT_ADDED`, `ADDED`), else 0.
+            Of each part, why another look is needed (`NOT_ADDED`, `ADDED`, `GROWN`), else 0.
         """
         pools, why = self._addresses
         asked = parts.ctypes.data, len(parts), window, memory, cycles, least

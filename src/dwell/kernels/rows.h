@@ -276,7 +276,7 @@ struct Crossing;  // of meter.cpp
 // places; the windows that they are from, and all cycles of those; for how many cycles they have not
 // been as declared; how many were measured; and the windows of the last of them, and in which it
 // last ceased to be as declared, or got another value since; whether Python asks for the next window;
-// how often the held values have changed;
+// how often the held values have changed; whether Python doubts that they still hold;
 // and the cycles and sums of a run of windows that are larger, or smaller, 0 for none.
 #define DWELL_POOL(field)                                                                        \
   field(const f64*, known) field(i64, n_known) field(f64, patience_ms) field(f64, likeness)      \
@@ -285,7 +285,7 @@ struct Crossing;  // of meter.cpp
   field(Chunk*, chunks) field(i64, first_chunk) field(i64, n_chunks)                             \
   field(i64, cycles) field(i64, lasting) field(i64, measured) field(i64, last)                   \
   field(i64, touched) field(i64, is_declared) field(i64, asks) field(i64, changes)                \
-  field(i64, run_cycles) field(i64, run_size)                                                    \
+  field(i64, doubts) field(i64, run_cycles) field(i64, run_size)                                                    \
   field(f64, run_larger) field(f64, run_smaller) field(f64, run_places)
 
 #define DWELL_ROWS(row)                                                                          \
