@@ -242,14 +242,16 @@ class Learning(Online):
         parts = self._parts[name]
         sent_ms = [
             sending_ns(self.problem, part, found.mbps) / 1e6 * found.error
-            for part in parts
+            for part in (parts if self._rates else ())
             if isinstance(part, Message) and (found := self._rates.get(part.link)) is not None
         ]
         measured = [pool for part in parts if not (pool := self._pools[part]).is_declared]
         if not measured:
             return math.hypot(*sent_ms), 0.0
         l95_ms = math.hypot(*(pool.error_ms for pool in measured), *sent_ms)
-        lost = [share_error(pool.lost, max(pool.measured, 1)) for pool in measured if pool.lost]
+        lost = [
+            share_error(share, max(pool.measured, 1)) for pool in measured if (share := pool.lost)
+        ]
         if lost:
             l95_ms = math.hypot(l95_ms, self._playing.tail_error_ms(name, math.hypot(*lost)))
         widened = max(map(self._widening, measured)) * self._playing.played(name).l95_ms

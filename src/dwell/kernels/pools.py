@@ -201,9 +201,7 @@ def fill(rows: Sequence[Ints], values: Floats, stretched: float, begin: int, off
 
 
 _places = foreign("dwell_places", None, c_void_p, c_int64, c_void_p, c_int64, c_double, c_void_p)
-_fill = foreign(
-    "dwell_fill", c_int64, c_void_p, c_int64, c_double, c_int64, c_int64, c_void_p
-)
+_fill = foreign("dwell_fill", c_int64, c_void_p, c_int64, c_double, c_int64, c_int64, c_void_p)
 _pool_add = foreign(
     "dwell_pool_add",
     None,
