@@ -108,7 +108,8 @@ def test_a_window_of_all_parts_leaves_pools_as_each_by_itself_does(seed: int) ->
             has_changed = alone[part].learn(times[part], window, 6.0, 60, TESTS)
             grown += why == GROWN
             if why == GROWN:
-                assert not has_changed and not together[part].is_declared
+                assert not has_changed
+                assert not together[part].is_declared
             elif why == ADDED:
                 assert together[part].has_left(window, 60, least) == has_changed
             elif why:
@@ -139,7 +140,8 @@ def test_figures_are_of_the_values_that_are_held_now() -> None:
     assert one.held is before
     one.rows.add(rng.gamma(9.0, size=30) + 50.0, (0.0, 0.0, 0.0), 2, np.inf, 30)
     assert len(one.held) == len(before) + 30 == 61
-    assert one.lost == lost * 31 / 61 and one.error_ms > error_ms
+    assert one.lost == lost * 31 / 61
+    assert one.error_ms > error_ms
     with pytest.raises(ValueError, match="read-only"):
         one.held[0] = 0.0
 
