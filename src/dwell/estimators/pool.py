@@ -176,13 +176,11 @@ class Pool:
         Whether what disturbs the part adds to its values (a message) or multiplies them (a job).
     """
 
-    __slots__ = ("_alone", "_before", "_doubts", "_summary", "additive", "reference", "rows")
+    __slots__ = ("_alone", "_doubts", "_summary", "additive", "reference", "rows")
 
     #: The first job of all, if no other was measured in its window; else 0.
     _alone: float
     _doubts: _Doubt | None
-    #: The values, ascending, before the run of decisions (see `_run`); the declared ones if None.
-    _before: Floats | None
 
     def __init__(self, reference: Reference, additive: bool) -> None:
         self.reference, self.additive = reference, additive
@@ -340,11 +338,11 @@ class Pool:
     @property
     def _run(self) -> _Doubt | None:
         """Successive decisions whose values are larger, or smaller, than most known before."""
-        row, before = self.rows.row, self._before
+        row = self.rows.row
         if not row.run_cycles:
             return None
         apart = PlaceSums(row.run_size, row.run_larger, row.run_smaller, row.run_places)
-        return _Doubt(self.reference.ordered if before is None else before, apart, row.run_cycles)
+        return _Doubt(self.rows.before, apart, row.run_cycles)
 
     def _run_before(self, cycles: int) -> _Doubt | None:
         """Return the run of the decisions before; None if a stretch ends before this decision."""
@@ -354,7 +352,7 @@ class Pool:
     def _run_on(self, run: _Doubt, apart: PlaceSums, cycles: int) -> _Doubt:
         """Add values to a run, which goes on as long as most are larger, or smaller."""
         run = _Doubt(run.before, run.apart + apart, run.cycles + cycles)
-        row, self._before = self.rows.row, run.before
+        row, self.rows.before = self.rows.row, run.before
         row.run_size, (row.run_larger, row.run_smaller, row.run_places) = (
             *(run.apart.size, run.apart.sums),
         )
@@ -471,7 +469,7 @@ class Pool:
 
     def _begin(self, values: Floats, window: int) -> None:
         self.rows.begin(values, self.reference.places(values).sums, window)
-        self._doubt, self._before = None, None
+        self._doubt = None
 
     def _add(
         self, values: Floats, shift: PlaceSums, window: int, memory: float, cycles: int

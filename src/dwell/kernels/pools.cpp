@@ -1,7 +1,6 @@
 // Pools: what is held of each part of a cycle, next to what it is as declared (pool.py).
 
 #include <algorithm>
-#include <array>
 #include <cmath>
 #include <limits>
 
@@ -21,7 +20,7 @@ namespace {
 
 // As in pool.py.
 constexpr i64 kLargest = 200, kEnough = 12;
-constexpr f64 kMoved = 0.75, kAlike = 2.0;
+constexpr f64 kMoved = 0.75, kShifted = 4.0, kAlike = 2.0;
 // Room for values and for chunks, of which the newest are held (pools.py).
 constexpr i64 kRoom = 408;
 // Why a pool needs another look: what a window brought has not been added, or it has been.
@@ -140,21 +139,37 @@ void set_run(Pool& pool, const PlaceSums& run, i64 cycles) {
   pool.run_places = run.places;
 }
 
+PlaceSums run_of(const Pool& pool) {
+  return {pool.run_size, pool.run_larger, pool.run_smaller, pool.run_places};
+}
+
+// Whether windows that are larger, or smaller, are a run with those before: up to a stretch.
+bool run_goes_on(const Pool& pool, i64 cycles) {
+  return pool.run_cycles > 0 && pool.run_cycles + cycles <= pool.block;
+}
+
 // Adds what a window brought to a pool that is not as declared, if it is neither near what is
-// declared, nor larger, nor smaller, than most that is held.
+// declared, nor of another regime.
 i64 learn_otherwise(Pool& pool, const f64* values, i64 n, i64 window, f64 memory, i64 cycles) {
-  const bool goes_on = pool.run_cycles > 0 && pool.run_cycles + cycles <= pool.block;
-  if (pool.doubts != 0 || goes_on || pool.size > kLargest) return kNotAdded;
-  PlaceSums declared, among;
+  if (pool.doubts != 0 || pool.size > kLargest) return kNotAdded;
+  PlaceSums declared, run;
   add_places(pool.known, pool.n_known, values, n, pool.patience_ms, declared);
   if (deviations(pool, declared, cycles) < kAlike) return kNotAdded;
-  std::array<f64, kLargest> before;
-  const f64* held = pool.held + pool.first;
-  f64* end = std::copy(held, held + pool.size, before.data());
-  std::sort(before.data(), end, [](f64 one, f64 other) { return one < other; });
-  add_places(before.data(), pool.size, values, n, std::numeric_limits<f64>::infinity(), among);
-  if (is_large(among)) return kNotAdded;
-  set_run(pool, among, cycles);
+  const bool goes_on = run_goes_on(pool, cycles);
+  if (!goes_on) {
+    const f64* held = pool.held + pool.first;
+    f64* end = std::copy(held, held + pool.size, pool.before);
+    std::sort(pool.before, end, [](f64 one, f64 other) { return one < other; });
+    pool.n_before = pool.size;
+  }
+  const bool is_after_declared = pool.n_before == 0;
+  add_places(is_after_declared ? pool.known : pool.before,
+             is_after_declared ? pool.n_known : pool.n_before, values, n,
+             std::numeric_limits<f64>::infinity(), run);
+  if (goes_on) run = plus(run_of(pool), run, 1);
+  const i64 run_cycles = cycles + (goes_on ? pool.run_cycles : 0);
+  if (is_large(run) && deviations(pool, run, run_cycles) >= kShifted) return kNotAdded;
+  set_run(pool, run, run_cycles);
   pool.last = window;
   add(pool, values, declared, window, memory, cycles);
   return kGrown;
@@ -167,15 +182,12 @@ i64 learn(Pool& pool, const f64* values, i64 n, i64 window, f64 memory, i64 cycl
   if (pool.is_declared == 0) return learn_otherwise(pool, values, n, window, memory, cycles);
   PlaceSums declared;
   add_places(pool.known, pool.n_known, values, n, pool.patience_ms, declared);
-  // Windows that are larger, or smaller, are a run, up to a stretch.
-  PlaceSums run = declared;
-  i64 run_cycles = cycles;
-  if (pool.run_cycles > 0 && pool.run_cycles + cycles <= pool.block) {
-    run = plus({pool.run_size, pool.run_larger, pool.run_smaller, pool.run_places}, declared, 1);
-    run_cycles += pool.run_cycles;
-  }
+  const bool goes_on = run_goes_on(pool, cycles);
+  const PlaceSums run = goes_on ? plus(run_of(pool), declared, 1) : declared;
+  const i64 run_cycles = cycles + (goes_on ? pool.run_cycles : 0);
   if (is_large(run) && deviations(pool, run, run_cycles) >= least) return kNotAdded;
   set_run(pool, run, run_cycles);
+  pool.n_before = 0;
   pool.last = window;
   add(pool, values, declared, window, memory, cycles);
   const PlaceSums held = {pool.size, pool.larger, pool.smaller, pool.places};

@@ -39,16 +39,16 @@ class HeldValues:
     def __init__(self, known: Floats, patience_ms: float, likeness: float, block: int) -> None:
         self.row = structs()["Pool"](0, len(known), patience_ms, likeness, block)
         self._known, self._held = known, np.empty(ROOM)
-        self._values: tuple[int, Floats] = -1, np.empty(0)
+        self._before, self._values = np.empty(ROOM), (-1, np.empty(0))
         self._chunks = (structs()["Chunk"] * ROOM)()
         self._set_addresses()
 
     def __getstate__(self) -> tuple[Any, ...]:
-        return bytes(self.row), self._known, self._held, bytes(self._chunks)
+        return bytes(self.row), self._known, self._held, self._before, bytes(self._chunks)
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         # A copy has addresses of its own.
-        row, self._known, self._held, chunks = state
+        row, self._known, self._held, self._before, chunks = state
         self._values = -1, np.empty(0)
         self.row = structs()["Pool"].from_buffer_copy(row)
         self._chunks = (structs()["Chunk"] * ROOM).from_buffer_copy(chunks)
@@ -56,7 +56,7 @@ class HeldValues:
 
     def _set_addresses(self) -> None:
         self.row.known, self.row.held = self._known.ctypes.data, self._held.ctypes.data
-        self.row.chunks = addressof(self._chunks)
+        self.row.before, self.row.chunks = self._before.ctypes.data, addressof(self._chunks)
 
     @property
     def values(self) -> Floats:
@@ -67,6 +67,19 @@ class HeldValues:
             values.flags.writeable = False
             self._values = row.changes, values
         return values
+
+    @property
+    def before(self) -> Floats:
+        """The values, ascending, before the run of windows that is going on; see `Pool`."""
+        return self._before[: self.row.n_before].copy() if self.row.n_before else self._known
+
+    @before.setter
+    def before(self, values: Floats) -> None:
+        if len(values) > len(self._before):
+            self._before = np.empty(len(values))
+            self._set_addresses()
+        self.row.n_before = 0 if values is self._known else len(values)
+        self._before[: self.row.n_before] = values[: self.row.n_before]
 
     def begin(self, values: Floats, sums: tuple[float, float, float], window: int) -> None:
         """Hold some values, none of which was measured, in the place of all others."""
@@ -79,7 +92,7 @@ class HeldValues:
         row.first, row.size, (row.larger, row.smaller, row.places) = 0, len(values), sums
         self._chunks[0] = structs()["Chunk"](window, 0, len(values), *sums)
         row.first_chunk, row.n_chunks, row.touched = 0, 1, window
-        row.measured = row.cycles = row.lasting = row.run_cycles = 0
+        row.measured = row.cycles = row.lasting = row.run_cycles = row.n_before = 0
 
     def add(
         self,
