@@ -600,10 +600,9 @@ def quantile_error(ordered: Floats, off: float) -> float:
     the distance to the farther one is the error.
     """
     last = len(ordered) - 1
-    low, usual, high = (
-        float(ordered[min(max(round(place * last), 0), last)])
-        for place in (0.95 - 2 * off, 0.95, 0.95 + 2 * off)
-    )
+    usual: float = ordered.item(round(0.95 * last))
+    low: float = ordered.item(max(round((0.95 - 2 * off) * last), 0))
+    high: float = ordered.item(min(round((0.95 + 2 * off) * last), last))
     return max(high - usual, usual - low) / 2
 
 
