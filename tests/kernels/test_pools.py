@@ -159,7 +159,7 @@ def test_cycles_meet_finite_values_in_turn(seed: int) -> None:
         expected[:, begin:] = demands[(np.arange(begin, max(begin, 100)) + offset) % len(known)][
             : max(100 - begin, 0)
         ]
-    fill(rows, values, 0.7, begin, offset)
+    fill(list(rows), values, 0.7, begin, offset)
     np.testing.assert_array_equal(rows, expected)
 
 
