@@ -413,15 +413,15 @@ class Playing:
 
 def _changed(rows: Rows, nodes: Sequence[str], present: Present, release_ns: Ints) -> Rows:
     """Return changes of nodes with the foreign threads and the outages of a present."""
-    others = [i for i, name in enumerate(nodes) if name in present.threads or name in present.down]
-    pieces = [rows[~np.isin(rows["node"], others)]]
-    for i in others:
+    is_other = np.array([name in present.threads or name in present.down for name in nodes])
+    pieces = [rows[~is_other[rows["node"]]]]
+    for i in np.flatnonzero(is_other).tolist():
         threads = present.threads.get(nodes[i], 0.0)
         pieces.append(with_threads(rows[rows["node"] == i], threads, release_ns))
         if nodes[i] in present.down:
             pieces[-1]["is_down"] = 1
     changes = np.concatenate(pieces)
-    return np.ascontiguousarray(changes[np.argsort(changes["at_ns"], kind="stable")])
+    return changes[np.argsort(changes["at_ns"], kind="stable")]
 
 
 def _lost(present: Present) -> dict[str, float]:
@@ -451,7 +451,9 @@ def with_threads(rows: Rows, threads: float, release_ns: Ints) -> Rows:
         changed["stress"] += whole
         return changed
     release_ns = release_ns[:-1]
-    all_ns = np.unique(np.concatenate((at_ns, release_ns[release_ns > at_ns[0]])))
+    all_ns = np.sort(np.concatenate((at_ns, release_ns[release_ns > at_ns[0]])))
+    # Both ascend, so that this takes a tenth of the time of `np.unique`, which hashes.
+    all_ns = all_ns[np.append(True, all_ns[1:] != all_ns[:-1])]
     cycle = np.searchsorted(release_ns, all_ns, side="right")
     more = np.floor((cycle + 1) * rest) - np.floor(cycle * rest)
     changed = np.zeros(len(all_ns), rows.dtype)
