@@ -256,7 +256,7 @@ class Playing:
                     _mean(seen["uncut_ms"]),
                     _mean(seen["missed"]) / self._window,
                     _mean(self.declared.violation_rate[name][stretch]),
-                    tables.shares[0, stretch, 1].mean(axis=0),
+                    _mean_shares(tables.shares[0, stretch, 1]),
                     tables.latency_ns[0, first * self._window : twin.cursor].copy(),
                 )
             )
@@ -506,6 +506,10 @@ def _estimated(
 def _mean(windows: Floats | Ints) -> float:
     # Windows of a usual length are played one by one.
     return float(windows.item() if len(windows) == 1 else windows.mean())
+
+
+def _mean_shares(windows: Floats) -> Floats:
+    return windows[0].copy() if len(windows) == 1 else windows.mean(axis=0)
 
 
 def _mean_and_error(values: Sequence[float], usual: float = 0.0) -> tuple[float, float]:
