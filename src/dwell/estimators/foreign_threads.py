@@ -64,7 +64,7 @@ class ForeignThreads:
 
     @property
     def threads(self) -> float:
-        """All of them, in the mean."""
+        """Average number, declared ones included."""
         return max(self._burst_threads + self.beyond, 0.0)
 
     def see(

@@ -209,10 +209,7 @@ class Online(CellEstimator):
         return self._playing.deviations(name)
 
     def _priced(self, names: list[str], foreign: Foreign) -> dict[str, QoS]:
-        """Every candidate's metrics; of those that are played by what they have come to.
-
-        Errors of the latter are stated once all has been played.
-        """
+        """Return the metrics of all candidates; `estimate` adds the errors of played ones."""
         played = {name: self._playing.played(name) for name in names}
         if not self._declared:
             self._declared = {name: self._as_declared(name) for name in self.problem.candidates}

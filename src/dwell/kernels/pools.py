@@ -15,8 +15,8 @@ from dwell.kernels.rows import Floats, Ints, structs
 
 #: Room for values, and for windows.
 ROOM = 408
-#: Why a pool needs another look: what a window brought has not been added, or it has been; or it
-#: has been added to a pool that is not as declared, and nothing has changed.
+#: What `PoolRows.learn` did with the values of a part where Python has to look at the pool: it left
+#: them out; it added them; it added them to a pool that is not as declared and has not changed.
 NOT_ADDED, ADDED, GROWN = 1, 2, 3
 
 
