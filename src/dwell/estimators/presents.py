@@ -509,7 +509,8 @@ def _mean(windows: Floats | Ints) -> float:
 
 
 def _mean_shares(windows: Floats) -> Floats:
-    return windows[0].copy() if len(windows) == 1 else windows.mean(axis=0)
+    mean: Floats = windows[0].copy() if len(windows) == 1 else windows.mean(axis=0)
+    return mean
 
 
 def _mean_and_error(values: Sequence[float], usual: float = 0.0) -> tuple[float, float]:
