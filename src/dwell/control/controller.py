@@ -466,8 +466,11 @@ class Controller:
         """Compare the incumbent's window with its estimate, if it can be compared."""
         incumbent, (_, last_cycle, cycles) = self.course.placement, self.looked
         seen = SeenWindow(observed.l95_ms, observed.violation_rate, last_cycle, cycles)
-        estimate, deviations = estimates.get(incumbent), self._estimator.deviations(incumbent)
-        if not isinstance(estimate, QoS) or deviations is None or not self._watchdog.is_due(seen):
+        estimate = estimates.get(incumbent)
+        if not isinstance(estimate, QoS) or not self._watchdog.is_due(seen):
+            return
+        deviations = self._estimator.deviations(incumbent)
+        if deviations is None:
             return
         played = Expected.of_estimate(estimate, deviations, self.problem.window_cycles)
         if self._watchdog.compare(seen, played):

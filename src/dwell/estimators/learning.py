@@ -18,7 +18,7 @@ from dwell.estimators.prices import SEED
 from dwell.estimators.protocol import Support
 from dwell.estimators.shadow_price import fraction_of
 from dwell.estimators.slow_processes import unseen_error
-from dwell.kernels.pools import ADDED, PoolRows
+from dwell.kernels.pools import ADDED, GROWN, PoolRows
 from dwell.model.controller_settings import HALF_LIFE_WINDOWS
 from dwell.model.problem import Problem
 
@@ -136,6 +136,9 @@ class Learning(Online):
         for (part, values), why in zip(demands.items(), looks, strict=False):
             if not why:
                 continue
+            if why == GROWN:
+                self._has_grown = True
+                continue
             pool = self._pools[part]
             if why == ADDED:
                 has_changed = pool.has_left(self._window, cycles, least)
@@ -239,14 +242,16 @@ class Learning(Online):
         parts = self._parts[name]
         sent_ms = [
             sending_ns(self.problem, part, found.mbps) / 1e6 * found.error
-            for part in parts
+            for part in (parts if self._rates else ())
             if isinstance(part, Message) and (found := self._rates.get(part.link)) is not None
         ]
         measured = [pool for part in parts if not (pool := self._pools[part]).is_declared]
         if not measured:
             return math.hypot(*sent_ms), 0.0
         l95_ms = math.hypot(*(pool.error_ms for pool in measured), *sent_ms)
-        lost = [share_error(pool.lost, max(pool.measured, 1)) for pool in measured if pool.lost]
+        lost = [
+            share_error(share, max(pool.measured, 1)) for pool in measured if (share := pool.lost)
+        ]
         if lost:
             l95_ms = math.hypot(l95_ms, self._playing.tail_error_ms(name, math.hypot(*lost)))
         widened = max(map(self._widening, measured)) * self._playing.played(name).l95_ms

@@ -326,7 +326,7 @@ def sending_ns(problem: Problem, message: Message, rate_mbps: float | None = Non
 def groups(codes: NDArray[np.integer]) -> Iterator[tuple[int, Rows]]:
     """Yield every code with the rows that have it; all rows as a slice where there is but one."""
     first = int(codes[0])
-    if (codes == first).all():
+    if not np.count_nonzero(codes != first):
         yield first, EVERY
         return
     for code in sorted(set(codes.tolist())):

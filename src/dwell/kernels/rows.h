@@ -276,16 +276,19 @@ struct Crossing;  // of meter.cpp
 // places; the windows that they are from, and all cycles of those; for how many cycles they have not
 // been as declared; how many were measured; and the windows of the last of them, and in which it
 // last ceased to be as declared, or got another value since; whether Python asks for the next window;
-// and the cycles and sums of a run of windows that are larger, or smaller, 0 for none.
+// how often the held values have changed; whether Python doubts that they still hold;
+// the cycles and sums of a run of windows that are larger, or smaller, 0 for none; and the values,
+// ascending, that were held before it, 0 where these are the declared ones.
 #define DWELL_POOL(field)                                                                        \
   field(const f64*, known) field(i64, n_known) field(f64, patience_ms) field(f64, likeness)      \
   field(i64, block) field(f64*, held) field(i64, first) field(i64, size)                         \
   field(f64, larger) field(f64, smaller) field(f64, places)                                      \
   field(Chunk*, chunks) field(i64, first_chunk) field(i64, n_chunks)                             \
   field(i64, cycles) field(i64, lasting) field(i64, measured) field(i64, last)                   \
-  field(i64, touched) field(i64, is_declared) field(i64, asks)                                   \
-  field(i64, run_cycles) field(i64, run_size)                                                    \
-  field(f64, run_larger) field(f64, run_smaller) field(f64, run_places)
+  field(i64, touched) field(i64, is_declared) field(i64, asks) field(i64, changes)                \
+  field(i64, doubts) field(i64, run_cycles) field(i64, run_size)                                                    \
+  field(f64, run_larger) field(f64, run_smaller) field(f64, run_places)                          \
+  field(f64*, before) field(i64, n_before)
 
 #define DWELL_ROWS(row)                                                                          \
   row(Clock, DWELL_CLOCK) row(Cell, DWELL_CELL) row(Task, DWELL_TASK) row(Flow, DWELL_FLOW)      \
