@@ -192,15 +192,15 @@ def _parsed(path: Path, text: str) -> dict[str, dict[str, Any]]:
     try:
         found = json.loads(text)
         version, measurements = int(found["format"]), dict(found["measurements"])
-        sound = version > FORMAT or all(
+        sound = version != FORMAT or all(
             name in list(entry["columns"]) for name, entry in measurements.items()
         )
     except (ValueError, KeyError, TypeError):
         sound = False
     if not sound:
         raise ProfileError(f"{path}: its metadata cannot be understood; measure again")
-    if version > FORMAT:
-        raise ProfileError(f"{path}: format {version}; this version reads up to {FORMAT}")
+    if version != FORMAT:
+        raise ProfileError(f"{path}: format {version}; this version reads {FORMAT} only")
     return measurements
 
 
