@@ -1,7 +1,7 @@
 """Prices: what windows of a candidate come to where the cell stays on it.
 
 The kernel plays every candidate alone, as `simulate` does with a policy that never moves: with
-contention, queues, links and cycles that overlap. All candidates meet the same draws, so that they
+queues, links and cycles that overlap. All candidates meet the same draws, so that they
 differ by where their tasks run and not by luck. More is simulated until the means are known well
 enough (`L95_SHARE`, `RATE`) and every slow process has shown all that it does
 (`dwell.estimators.slow_processes`), or until `MOST_CYCLES` or `MOST_EVENTS` are reached. How much

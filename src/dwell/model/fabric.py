@@ -9,7 +9,6 @@ from typing import Literal, NamedTuple, TypeAlias
 from dwell.model.bounds import (
     BACKGROUND_HZ,
     BURST_MEAN,
-    CONTENTION,
     FOREIGN_THREADS,
     LARGEST,
     RATE_MBPS,
@@ -124,13 +123,6 @@ class Node:
         default=1.0,
         is_rare=True,
     )
-    contention: float = key(
-        "Share of a CPU's time that others take from what runs there, and that the node's quota "
-        "does not count. Only of a node with a quota.",
-        CONTENTION,
-        default=0.0,
-        is_rare=True,
-    )
 
     def __post_init__(self) -> None:
         if self.bursts is not None and self.bursts.add_delay_ms != Constant(0.0):
@@ -147,9 +139,6 @@ class Node:
             ticks = self.quota is not None and self.quota.tick_ms > 0
             bound = "0 where there is no `quota` with `tick_ms`; elsewhere it is looked at any time"
             require(ticks, "background_hz", self.background_hz, bound)
-        bound = "0 where there is no quota; elsewhere it is `background`"
-        has_quota = self.quota is not None
-        require(has_quota or self.contention == 0.0, "contention", self.contention, bound)
         if self.quota is not None and self.quota.tick_ms > 0:
             tick_ms, bound = self.quota.tick_ms, "0 where a node has several cores, or is not fair"
             require(self.cores == 1 and self.scheduler == "fair", "quota.tick_ms", tick_ms, bound)
@@ -168,15 +157,6 @@ class Node:
     def spare(self) -> float:
         """Cores that jobs and foreign threads share; a quota is what the background takes from."""
         return float(self.cores) if self.quota is not None else self.cores - self.background
-
-    @property
-    def pace(self) -> float:
-        """Core time that what runs on a core receives of its time."""
-        return 1.0 - self.contention
-
-    def wall_ns(self, core_ms: float) -> int:
-        """Time in which what runs on a core receives so much core time."""
-        return round(core_ms * 1e6 / self.pace)
 
     @property
     def budget_ms(self) -> float:

@@ -14,7 +14,6 @@ from dwell.model.process import Constant, Process
 #: Of a task on a node, where it says nothing, and of each of its nodes.
 WORKERS = Bound(1, MAX_COUNT, whole=True)
 STANDBY = Bound(0, 1, whole=True)
-HANDED_MS = Bound(0, 1e6)
 
 
 @declared()
@@ -39,19 +38,6 @@ class Execution:
         "Further workers that a live node keeps, to take over when the first is silent.",
         STANDBY,
         default=0,
-        is_rare=True,
-    )
-    before_ms: float = key(
-        "What of `exec_ms` another thread of its worker does before it, ms; it waits for its own "
-        "turn where threads take turns (`quota.tick_ms`).",
-        HANDED_MS,
-        default=0.0,
-        is_rare=True,
-    )
-    after_ms: float = key(
-        "What of `exec_ms` another thread of its worker does after it, ms.",
-        HANDED_MS,
-        default=0.0,
         is_rare=True,
     )
 
