@@ -12,16 +12,14 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.errors import ProfileError
 from dwell.files import write_whole
+from dwell.model.number_arrays import Floats
 from dwell.model.semantics import bad_name
-
-Floats: TypeAlias = NDArray[np.float64]
 
 KEY = "dwell.profile"
 FORMAT = 1

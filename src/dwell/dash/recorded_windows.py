@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.dash.paged_cell import Plain, health_by
-from dwell.dash.strip import Floats, plain
+from dwell.dash.strip import plain
 from dwell.model import Problem
 from dwell.model.live import RECENT_WINDOWS
+from dwell.model.number_arrays import Floats
 from dwell.record import Names, Run
 
 #: What is both estimated and seen of a window, and the columns that say what was seen.

@@ -13,10 +13,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Collection, Iterator, Mapping
 from functools import partial
-from typing import NamedTuple, TypeAlias
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import NamedTuple
 
 from dwell.cost import cost, cost_error, hamming
 from dwell.estimators.evidence import Evidence
@@ -29,11 +26,10 @@ from dwell.estimators.profile import Foreign, Profile, mean_ms
 from dwell.estimators.protocol import CellEstimator
 from dwell.estimators.spans import patience_ns
 from dwell.model.frozen import FrozenDict
+from dwell.model.number_arrays import Floats
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS, unchecked_qos
 from dwell.model.shadow_plan import by_candidate
-
-Floats: TypeAlias = NDArray[np.float64]
 
 #: Steps that are played when the present changes, the first of which settles queues.
 FIRST_STEPS = 6

@@ -14,9 +14,10 @@ from dwell.errors import SimulationError
 from dwell.kernels import codes
 from dwell.kernels.codes import LAST_NS, EventKind, Scheduler, ShadowPart, make_key
 from dwell.kernels.realisation import LinkSegments, NodeChanges, Phase, Realisation
-from dwell.kernels.rows import Ints, Rows, Tables, row_types
+from dwell.kernels.rows import Rows, Tables, row_types
 from dwell.model import Flow, Node, Pipeline, Placement, Problem, Quota
 from dwell.model.instants import NEVER_NS
+from dwell.model.number_arrays import Ints
 from dwell.model.window_close import close_after_ns, window_close_ns
 
 SCHEDULERS = {"fair": Scheduler.FAIR, "fifo": Scheduler.FIFO, "priority": Scheduler.PRIORITY}

@@ -8,10 +8,11 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from dwell.model.disturbed import Disturbed
+from dwell.model.order_statistic import percentile
 from dwell.report.formatting import FINAL_L95, RATE, Measure
 from dwell.report.palette import Palette
 from dwell.report.table import Columns, Table, Text
-from dwell.study.summary import latency_ms, order_statistic
+from dwell.study.summary import latency_ms
 
 if TYPE_CHECKING:
     import polars as pl
@@ -116,7 +117,7 @@ def phase_rows(run: Run, header: RunHeader) -> list[PhaseRow]:
                 *phase,
                 mine.height,
                 float(mine["missed"].to_numpy().mean()),
-                float(order_statistic(latency_ms(mine), 95)),
+                percentile(latency_ms(mine), 95),
                 int(mine["latency_ns"].is_null().sum()),
                 {name: count / mine.height for name, count in counts.rows()},
                 max(moves - guards, 0),

@@ -32,6 +32,8 @@ from dwell.control.windows import busiest
 from dwell.errors import SimulationError
 from dwell.model import FrozenDict, Problem
 from dwell.model.instants import NEVER_NS
+from dwell.model.number_arrays import Floats, Ints, Mask
+from dwell.model.order_statistic import rank_of
 from dwell.model.table_columns import SHARE_OF, USE_OF
 from dwell.study.quality import actuations, age_of_information, misses_in, track
 
@@ -40,9 +42,6 @@ if TYPE_CHECKING:
 
     from dwell.record import Names, Run, TableArrays
 
-Floats: TypeAlias = NDArray[np.float64]
-Ints: TypeAlias = NDArray[np.int64]
-Mask: TypeAlias = NDArray[np.bool_]
 Row: TypeAlias = dict[str, float | int | str]
 
 #: Points of the latency distributions: so many to a deadline, up to four deadlines.
@@ -135,7 +134,7 @@ class Latencies:
 
     def percentile_ms(self, percent: int) -> float:
         """Return the ceil(percent n / 100)-th smallest; infinite of one that never finished."""
-        rank = -(-percent * len(self.latency_ns) // 100)
+        rank = rank_of(percent, len(self.latency_ns))
         at = int(np.searchsorted(self.within, rank))
         rank -= int(self.within[at - 1]) if at else 0
         ns = int(np.partition(self.latency_ns[self.place == at], rank - 1)[rank - 1])
@@ -325,12 +324,6 @@ def latency_ms(cycles: pl.DataFrame) -> Floats:
     """Final latencies, infinite where the cycle never finished."""
     final_ms: Floats = (cycles["latency_ns"].cast(float) / 1e6).fill_null(np.inf).to_numpy()
     return final_ms
-
-
-def order_statistic(values: Floats, percent: int) -> float:
-    """Return the ceil(percent n / 100)-th smallest: a percentile, never interpolated."""
-    rank = -(-percent * len(values) // 100)
-    return float(np.partition(values, rank - 1)[rank - 1])
 
 
 def _percentiles(latencies: Latencies) -> dict[str, float]:

@@ -24,7 +24,9 @@ from dwell.estimators.registry import name_in_run
 from dwell.files import write_whole
 from dwell.live.local.trace_names import move_traces
 from dwell.model import Problem, Trace
-from dwell_lab.testbed.measured import Floats, Measured, SiteName, cycles_in, look_at, usable
+from dwell.model.number_arrays import Floats
+from dwell.model.order_statistic import percentile
+from dwell_lab.testbed.measured import Measured, SiteName, cycles_in, look_at, usable
 from dwell_lab.testbed.message_costs import OnTheWay, floors, hops, own_delays
 from dwell_lab.testbed.node_loads import (
     backgrounds,
@@ -395,7 +397,7 @@ def _check(one: Measured, problem: Problem, usual: Usual) -> dict[str, Any] | No
         cycles = run.cycles.with_columns(pl.col("cycle").cast(pl.Int64))
         cycles = cycles.join(cycles_in(windows, problem), on="cycle", how="semi")
         latency_ms = cycles["latency_ns"].fill_null(np.iinfo(np.int64).max).to_numpy() / 1e6
-        l95_ms = float(np.quantile(latency_ms, 0.95, method="inverted_cdf"))
+        l95_ms = percentile(latency_ms, 95)
         means = {name: windows[name].to_numpy().mean() for name in shares}
         row[what] = {
             "l95_ms": _short(l95_ms) if l95_ms < 1e9 else None,

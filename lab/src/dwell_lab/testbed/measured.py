@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dwell.errors import RunError
 from dwell.model import LinkDisturbance, Problem
+from dwell.model.number_arrays import Floats
 from dwell.model.scenario import is_always_on
 from dwell_lab.testbed.speeds import work_ms
 
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
 
     from dwell.record import Run
 
-Floats: TypeAlias = NDArray[np.float64]
 SiteName: TypeAlias = tuple[str, str]
 
 #: Least number of jobs from which anything is taken.
