@@ -35,6 +35,7 @@ from dwell.model.instants import NEVER_NS
 from dwell.model.number_arrays import Floats, Ints, Mask
 from dwell.model.order_statistic import rank_of
 from dwell.model.table_columns import SHARE_OF, USE_OF
+from dwell.record.moves import by_guard
 from dwell.study.quality import actuations, age_of_information, misses_in, track
 
 if TYPE_CHECKING:
@@ -351,9 +352,9 @@ def _utilisation(used: Mapping[str, Floats], problem: Problem) -> dict[str, floa
 def _migrations(decisions: TableArrays, decided: Mask) -> dict[str, int]:
     """Count migrations, those that undo the one before, and the guard's moves, which are apart."""
     migrated = decided & decisions["migrated"]
-    by_guard = decisions.names("reason").equal("guard")
-    ends = (decisions.names(end)[migrated & ~by_guard] for end in ("incumbent", "placement"))
+    guarded = by_guard(decisions)
+    ends = (decisions.names(end)[migrated & ~guarded] for end in ("incumbent", "placement"))
     pairs = list(zip(*(end.to_list() for end in ends), strict=True))
     undone = sum(now == before[::-1] for before, now in itertools.pairwise(pairs))
-    guard_moves = int((migrated & by_guard).sum())
+    guard_moves = int((migrated & guarded).sum())
     return {"migrations": len(pairs), "returns": undone, "guard_moves": guard_moves}

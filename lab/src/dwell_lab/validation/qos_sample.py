@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from dwell.errors import SimulationError
 from dwell.model.number_arrays import Floats, Ints
 from dwell.model.order_statistic import percentile
-from dwell.record import arrays_of
+from dwell.record import arrays_of, moves_in
 from dwell.study.summary import PARTS, count_in, latency_ms, mean_of
 
 if TYPE_CHECKING:
@@ -80,13 +80,11 @@ def piece_of(run: Run, problem: Problem, excluded: Collection[int] = ()) -> Piec
     if not keep.any():
         raise SimulationError("every window after the warm-up is excluded")
     renumbered = np.cumsum(keep) - 1
-    moved = counted.decisions.filter(
-        counted.decisions["migrated"] & (counted.decisions["reason"].cast(str) != "guard")
-    )
+    moved = sum(not move.by_guard for move in moves_in(counted.decisions))
     cycles = counted.cycles.select(*CYCLES).with_columns(
         place=pl.Series(renumbered[place], dtype=pl.Int64)
     )
-    return Piece(counted.windows.filter(keep), cycles.filter(keep[place]), moved.height)
+    return Piece(counted.windows.filter(keep), cycles.filter(keep[place]), moved)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

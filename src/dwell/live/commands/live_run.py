@@ -35,7 +35,7 @@ from dwell.live.local.timeline import timeline_of
 from dwell.model import Problem
 from dwell.model.bounds import counted
 from dwell.model.disturbed import Disturbed, disturbed
-from dwell.record import Run, open_run, seal_run
+from dwell.record import Run, moves_in, open_run, seal_run
 from dwell.record.journal import note_in_journal, read_plain_journal
 from dwell.report import run_html
 from dwell.report.formatting import listed
@@ -208,7 +208,7 @@ def _watch(cell: Loopback, seconds: float, played: _ObservedRun) -> None:
 class _Table(Protocol):
     """Columns of a run's table, whoever keeps them."""
 
-    def __getitem__(self, column: str, /) -> Iterable[Any]: ...
+    def __getitem__(self, column: str, /) -> Sequence[Any] | Any: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,15 +228,14 @@ class _Outcome:
     @classmethod
     def of(cls, meta: Mapping[str, Any], cycles: _Table, decisions: _Table) -> _Outcome:
         """Count what was missed, lost and moved."""
-        missed, moved = list(cycles["missed"]), list(decisions["migrated"])
-        by_guard = [reason == "guard" for reason in decisions["reason"]]
-        guard_moves = sum(map(all, zip(moved, by_guard, strict=True)))
+        missed, moved = list(cycles["missed"]), moves_in(decisions)
+        guard_moves = sum(move.by_guard for move in moved)
         return cls(
             meta,
             cycles=len(missed),
             missed=sum(map(bool, missed)) / len(missed) if missed else math.nan,
             lost=sum(latency is None for latency in cycles["latency_ns"]),
-            migrations=sum(map(bool, moved)) - guard_moves,
+            migrations=len(moved) - guard_moves,
             guard_moves=guard_moves,
         )
 
