@@ -63,6 +63,7 @@ class Quota:
         Bound(0, 1000),
         default=0.0,
         is_rare=True,
+        tier="measured",
     )
     tick_ms: float = key(
         "Time between the ticks at which a used-up budget is noticed and threads take turns, ms; "
@@ -70,6 +71,7 @@ class Quota:
         Bound(0, 1000),
         default=0.0,
         is_rare=True,
+        tier="measured",
     )
 
     def __post_init__(self) -> None:
@@ -82,8 +84,8 @@ class Node:
     """A computer."""
 
     name: str
-    tier: Tier = key("Kind of computer: robot, edge or cloud.")
-    cores: int = key("Cores of its CPU.", Bound(1, 4096, whole=True), default=1)
+    tier: Tier = key("Kind of computer: robot, edge or cloud.", tier="first")
+    cores: int = key("Cores of its CPU.", Bound(1, 4096, whole=True), default=1, tier="first")
     scheduler: Scheduler = key(
         "How jobs share the cores: `fair` (processor sharing), `fifo` (one after another) or "
         "`priority` (preemptive, by the tasks' `priority`).",
@@ -94,13 +96,16 @@ class Node:
         Bound(1, 4096, whole=True),
         default_factory=FrozenDict,
     )
-    bursts: Bursts | None = key("Foreign work of other tenants, in every scenario.", default=None)
+    bursts: Bursts | None = key(
+        "Foreign work of other tenants, in every scenario.", default=None, tier="measured"
+    )
     quota: Quota | None = key("CPU bandwidth limit on everything that runs there.", default=None)
     background: float = key(
         "Cores that others than the jobs always take, in small pieces; less than the node can do.",
         Bound(0, 4096),
         default=0.0,
         is_rare=True,
+        tier="measured",
     )
     background_beside: float | None = key(
         "What of `background` is taken while jobs run and no foreign thread does, on a node with "
@@ -108,6 +113,7 @@ class Node:
         Bound(0, 4096),
         default=None,
         usual="all of it",
+        tier="measured",
     )
     background_hz: float = key(
         "How often in a second something of `background` wakes, in the mean, on a node whose "
@@ -115,6 +121,7 @@ class Node:
         BACKGROUND_HZ,
         default=0.0,
         is_rare=True,
+        tier="measured",
     )
     interference: float = key(
         "How many times as much core time jobs take while foreign threads run, whose data take "
@@ -122,6 +129,7 @@ class Node:
         Bound(1, 100),
         default=1.0,
         is_rare=True,
+        tier="measured",
     )
 
     def __post_init__(self) -> None:
@@ -234,19 +242,21 @@ def accelerator_name(node: str, kind: str) -> str:
 class Link:
     """A directed connection between two nodes."""
 
-    source: str = key("Node that sends.", named="from")
-    target: str = key("Node that receives.", named="to")
-    delay_ms: Process = key("Propagation delay of a message, ms.")
+    source: str = key("Node that sends.", named="from", tier="first")
+    target: str = key("Node that receives.", named="to", tier="first")
+    delay_ms: Process = key("Propagation delay of a message, ms.", tier="first")
     rate_mbps: float = key(
         "Serialisation rate, megabits a second; messages do not queue where there is none.",
         RATE_MBPS,
         default=math.inf,
         usual="unlimited",
+        tier="first",
     )
     loss: float = key(
         "Probability that an attempt to send a message is lost.",
         Bound(0, 1, below=True),
         default=0.0,
+        tier="first",
     )
     retransmit_ms: float | None = key(
         "Time after which a lost message is sent again, ms; dropped where there is none.",
@@ -259,7 +269,9 @@ class Link:
         "message that is sent again.",
         default=False,
     )
-    bursts: Bursts | None = key("Episodes of extra delay, in every scenario.", default=None)
+    bursts: Bursts | None = key(
+        "Episodes of extra delay, in every scenario.", default=None, tier="measured"
+    )
 
     def __post_init__(self) -> None:
         require(self.source != self.target, "to", self.target, "another node than `from`")
@@ -277,8 +289,10 @@ class Link:
 class Fabric:
     """Nodes and links."""
 
-    nodes: Mapping[str, Node] = key("Computers by name.")
-    links: Mapping[str, Link] = key("Connections between nodes.", default_factory=FrozenDict)
+    nodes: Mapping[str, Node] = key("Computers by name.", tier="first")
+    links: Mapping[str, Link] = key(
+        "Connections between nodes.", default_factory=FrozenDict, tier="first"
+    )
 
     def __post_init__(self) -> None:
         require(len(self.nodes) > 0, "nodes", dict(self.nodes), "at least one node")
