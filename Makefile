@@ -85,10 +85,11 @@ test-all: env ## Run the tests that `make test` leaves out (conftest.py)
 	$(TESTS) -m "exhaustive and alone" $(ARGS) || [ $$? -eq 5 ]
 
 # What takes longest runs side by side. clang-tidy reads the headers of the system's own C++ library.
-check: env ## Lint, formatting, types and the borders between packages
+check: env ## Lint, formatting, types, the borders between packages and lines of code
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-logo
+	$(BIN)/python -m tests.code_lines
 	$(BIN)/clang-format --dry-run -Werror $(filter %.cpp %.h,$(SOURCES)) tests/kernels/*.cpp
 	@$(MAKE) --no-print-directory --jobs --output-sync types tidy
 
