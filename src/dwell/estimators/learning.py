@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, Self, TypeAlias
+from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.link_rates import Rate, better_rate
@@ -20,9 +19,8 @@ from dwell.estimators.shadow_price import fraction_of
 from dwell.estimators.slow_processes import unseen_error
 from dwell.kernels.pools import ADDED, GROWN, PoolRows
 from dwell.model.controller_settings import HALF_LIFE_WINDOWS
+from dwell.model.number_arrays import Floats
 from dwell.model.problem import Problem
-
-Floats: TypeAlias = NDArray[np.float64]
 
 #: Deviation of the logarithm of a price one window after a part was measured that is not as
 #: declared.

@@ -16,12 +16,11 @@ from dwell.estimators.spans import patience_ns
 from dwell.kernels.jobs import NodeJobs, WaitingJobs
 from dwell.kernels.meter import CyclesLayout, PartTimes, WindowRows
 from dwell.model.fabric import Node
+from dwell.model.number_arrays import Floats, Ints
 from dwell.model.pipeline import Execution, Pipeline
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 
-Floats: TypeAlias = NDArray[np.float64]
-Ints: TypeAlias = NDArray[np.int64]
 Rows: TypeAlias = slice | Ints
 
 EVERY = slice(None)

@@ -14,10 +14,7 @@ from abc import abstractmethod
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple, TypeAlias
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import NamedTuple
 
 from dwell.cost import cost_error, hamming, price, tier_nodes
 from dwell.estimators.evidence import Evidence
@@ -30,11 +27,10 @@ from dwell.estimators.profile import Foreign, Profile, mean_ms
 from dwell.estimators.protocol import CellEstimator
 from dwell.estimators.spans import patience_ns
 from dwell.model.frozen import FrozenDict
+from dwell.model.number_arrays import Floats
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS, unchecked_qos
 from dwell.model.shadow_plan import by_candidate
-
-Floats: TypeAlias = NDArray[np.float64]
 
 #: Steps that are played when the present changes, the first of which settles queues.
 FIRST_STEPS = 6

@@ -12,15 +12,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.kernels.elementary import cube_root, logarithms
 from dwell.kernels.pools import HeldValues, places
-
-Floats: TypeAlias = NDArray[np.float64]
+from dwell.model.number_arrays import Floats
 
 #: Most values that a pool holds, and fewest that it keeps however old they are.
 LARGEST = 200

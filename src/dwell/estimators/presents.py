@@ -13,10 +13,9 @@ from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import sub
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.measured import Message, Meter, Part, Site, cores_of, parts_of
@@ -35,11 +34,9 @@ from dwell.kernels.realisation import LinkSegments, NodeChange, NodeChanges, Rea
 from dwell.kernels.rows import Rows, row_types
 from dwell.model.fabric import Node
 from dwell.model.frozen import FrozenDict
+from dwell.model.number_arrays import Floats, Ints
 from dwell.model.problem import Problem
 from dwell.model.shadow_plan import ShadowFraction
-
-Floats: TypeAlias = NDArray[np.float64]
-Ints: TypeAlias = NDArray[np.int64]
 
 #: Longer windows are played as windows of so many cycles, and shorter ones some at a time.
 LONGEST_WINDOW, STEP = 1000, 100

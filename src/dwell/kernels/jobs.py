@@ -10,7 +10,8 @@ import numpy as np
 
 from dwell.kernels.library import foreign
 from dwell.kernels.meter import WindowRows
-from dwell.kernels.rows import Floats, structs
+from dwell.kernels.rows import structs
+from dwell.model.number_arrays import Floats
 
 #: Numbers of scratch for each job of a window, own jobs and shadow jobs.
 SCRATCH = 40

@@ -11,7 +11,8 @@ import numpy as np
 
 from dwell.kernels.library import foreign
 from dwell.kernels.meter import PartTimes
-from dwell.kernels.rows import Floats, Ints, structs
+from dwell.kernels.rows import structs
+from dwell.model.number_arrays import Floats, Ints
 
 #: Room for values, and for windows.
 ROOM = 408

@@ -92,7 +92,7 @@ struct Crossing;  // of meter.cpp
   field(i64, ready_at_ns)                                                                        \
   field(i32, cell) field(i32, task) field(i32, server) field(i32, node) field(i32, own)          \
   field(i32, rank)                                                                               \
-  field(i64, workers) field(i64, start_ns) field(i64, before_ns) field(i64, after_ns)            \
+  field(i64, workers) field(i64, start_ns)                                                       \
   field(i64, mean_ns) /* of `exec_ns`, as the file states it */
 
 // `busy_ns` is in core-nanoseconds, of which 64 bits may not hold those of all cores. `quota` is a
@@ -109,15 +109,14 @@ struct Crossing;  // of meter.cpp
   field(i8, scheduler) field(i8, is_down) field(i8, is_dirty) field(i8, is_cpu)                  \
   field(i8, is_stopped) /* by its quota */                                                       \
   field(f64, busy_ns) field(f64, behind_ns) field(f64, spare) field(f64, background)             \
-  field(f64, beside) field(f64, pace) field(f64, used_ns) /* integral of `used` */
+  field(f64, beside) field(f64, used_ns) /* integral of `used` */
 
 // `tick_ns` is the time between ticks, 0 for a quota that is noticed at once; at time 0 the last
 // tick was `tick_ago_ns` and the last begin of a period `period_ago_ns` ago. `has_turn` says
 // whether a thread has the turn, `turn_begun_ns` what it had received before, and `turn_ns` what
 // since; a turn lasts `least_ns` at least. `drawn_ns` is what is drawn on a pool at a time.
 // `wakes_ns` is when something of the background wakes next, for the `wakes`-th time, and
-// `wake_gap_ns` the mean time between two. All that a quota counts is in time of the core: of that,
-// what runs receives the share `pace`.
+// `wake_gap_ns` the mean time between two. All that a quota counts is in time of the core.
 #define DWELL_QUOTA(field)                                                                       \
   field(i64, looks_ns)                                                                           \
   field(i64, period_ns) field(i64, period) field(i64, quota_ns) field(i64, stressed_ns)          \
@@ -158,12 +157,11 @@ struct Crossing;  // of meter.cpp
 #define DWELL_WAITING(field)                                                                     \
   field(i64, rank) field(i64, ready_ns) field(i64, key) field(f64, left_ns)
 
-// A job in flight. `missing` counts the inputs that have not arrived; `rest_ns` is the work of the
-// threads that the one at work hands its job over to. `beside_ns` is what it did beside foreign
-// threads, by the `beside_ns` of its server; less that clock while it runs.
+// A job in flight. `missing` counts the inputs that have not arrived. `beside_ns` is what it did
+// beside foreign threads, by the `beside_ns` of its server; less that clock while it runs.
 #define DWELL_JOB(field)                                                                         \
   field(i64, ready_ns) field(i64, started_ns) field(i64, compute_ns) field(i64, network_ns)      \
-  field(i64, rest_ns) field(i64, next) field(f64, beside_ns) field(i32, site)                    \
+  field(i64, next) field(f64, beside_ns) field(i32, site)                    \
   field(i32, missing)
 
 // A cycle in flight. `live` counts its jobs and messages that are under way.
