@@ -169,6 +169,7 @@ class FleetLedger:
 
     def _change(self) -> None:
         """Drop the set, and begin a change."""
+        self.round += bool(self._set)
         self._set.clear()
         self._search.change()
 
@@ -245,6 +246,7 @@ class FleetLedger:
             return self._refused(index, wished)
         del self._set[index]
         self._put(index, name)
+        self.round += not self._set
         return Verdict(name, None, self._asked)
 
     def _of_one(
@@ -314,7 +316,8 @@ class FleetLedger:
         if self._objection(best, before, after) is None:
             self._set = {i: name for i, name in enumerate(best) if name != here[i]}
             self._asked = self._phi(before), self._phi(after), self.round
-        self.round += 1
+        else:
+            self.round += 1
 
     def _led(self, index: int, names: Sequence[str], wished: str) -> list[str]:
         """Return those of some candidates that lead to the table's best placements.
