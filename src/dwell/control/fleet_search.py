@@ -90,12 +90,21 @@ class FleetSearch:
         """Whether every cell has decided since the change."""
         return self._decided is not None and len(self._decided) == len(self._free)
 
+    @property
+    def _most(self) -> int:
+        """Plays of a change outside its search."""
+        if self.is_open:
+            return 0 if self._spent else self._before
+        return PLAYS
+
+    @property
+    def has_plays(self) -> bool:
+        """Whether the fleet may be played outside a search."""
+        return self._plays < self._most
+
     def play(self, placements: Names) -> FleetPrice | None:
         """Play the fleet outside a search; None if the plays for it are used up."""
-        most = PLAYS
-        if self.is_open:
-            most = 0 if self._spent else self._before
-        return self._play(placements, most)
+        return self._play(placements, self._most)
 
     def _play(self, placements: Names, most: int) -> FleetPrice | None:
         if not self._prices.knows(placements):

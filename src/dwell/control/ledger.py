@@ -324,7 +324,7 @@ class FleetLedger:
 
         The table knows no caps, so the candidate that the policy wishes follows.
         """
-        if not names:
+        if not names or not self._search.has_plays:
             return []
         owed = [self._owed(i, costs) for i, costs in enumerate(self.alone)]
         jump = self._search.jump(tuple(self.placements), self.alone, owed)[index]
