@@ -17,9 +17,7 @@ A cell whose windows are not what was played for it leaves Φ until they are aga
 `dwell.control.watchdog`). Its load stays where it is; the proof holds from one such change to the
 next.
 
-What is lowered is the sum of the cells' costs; or the worst of them: costs are rounded up to
-multiples of the least Δ_min and sorted from the largest, the smaller list is the better one, and
-of equal lists that with the smaller sum.
+The objective decides which of two prices is better (see `dwell.control.fleet_rank`).
 """
 
 from __future__ import annotations
@@ -30,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.control.coordination import Coordination, Verdict, Wish
-from dwell.control.fleet_rank import FleetRank
+from dwell.control.fleet_rank import fleet_rank
 from dwell.control.table_loads import Loads, moved
 from dwell.control.watchdog import (
     NOT_AS_PLAYED,
@@ -64,7 +62,7 @@ class FleetLedger:
     cells : sequence of PricedCell
     shared : sequence of str
         Nodes that are one computer for all cells.
-    objective : {"sum", "worst"}
+    objective : {"sum", "worst", "served"}
     table : LoadTable, optional
         Proposes moves; made of `tabled` where None.
     tabled : sequence of PricedCell, optional
@@ -73,6 +71,8 @@ class FleetLedger:
         What plays.
     progress : callable, optional
         Told how many of how many levels of the table have been played.
+    limit : float, optional
+        Largest V_D of a cell that is served, with the objective ``served``.
 
     Attributes
     ----------
@@ -100,23 +100,27 @@ class FleetLedger:
         tabled: Sequence[PricedCell] | None = None,
         prices: FleetPrices | None = None,
         progress: Progress | None = None,
+        limit: float | None = None,
     ) -> None:
         self.cells, self.shared, self.objective = tuple(cells), tuple(shared), objective
         problems = [cell.problem for cell in cells]
         self.table = table or load_table(tabled or cells, shared, progress)
         self.prices = prices or FleetPrices(cells, shared)
         self.loads = Loads(self.table)
+        self.rank = fleet_rank(objective, cells, limit)
+        self._aimed = Loads(self.table, self.rank.limit)
         self._terms = [CellTerms(problem, shared) for problem in problems]
         self.placements = [problem.initial for problem in problems]
         self._at = self.loads.at(self.placements)
-        self.alone = [
-            {name: terms.cost(price.qos) for name, price in prices_of(problem).items()}
-            for problem, terms in zip(problems, self._terms, strict=True)
-        ]
+        self._declared = [prices_of(problem) for problem in problems]
+        self.alone: list[dict[str, float]] = [{} for _ in problems]
+        #: The same, as the objective has it in a search.
+        self._aims: list[dict[str, float]] = [{} for _ in problems]
+        for i, prices_alone in enumerate(self._declared):
+            self._note_alone(i, {name: price.qos for name, price in prices_alone.items()})
         self.presents = [Present()] * len(self.cells)
         self._revisions = [-1] * len(self.cells)
         self._has_caps = any(problem.objective.caps != Caps() for problem in problems)
-        self.rank = FleetRank(objective, cells)
         names = sorted(cell.name for cell in cells)
         #: Place of each cell where they take turns, and how long one is.
         self.order = [names.index(cell.name) for cell in cells]
@@ -125,7 +129,6 @@ class FleetLedger:
         self._watchdogs = [Watchdog(problem.window_cycles) for problem in problems]
         #: Candidates of each cell that are doubted at its last close.
         self._doubted: list[set[str]] = [set()] * len(self.cells)
-        self._declared = [prices_of(problem) for problem in problems]
         #: How often Φ has become another function; and of each cell what it was when it was last
         #: looked at.
         self._changes = 0
@@ -179,9 +182,16 @@ class FleetLedger:
         if revision == self._revisions[index]:
             return
         self._revisions[index] = revision
-        self.alone[index] = {name: self._terms[index].cost(qos) for name, qos in estimates.items()}
+        self._note_alone(index, estimates)
         if estimator.present is not None:
             self.presents[index] = estimator.present
+
+    def _note_alone(self, index: int, estimates: Mapping[str, QoS]) -> None:
+        costs = {name: self._terms[index].cost(qos) for name, qos in estimates.items()}
+        self.alone[index] = costs
+        self._aims[index] = {
+            name: self.rank.aim(costs[name], qos.violation_rate) for name, qos in estimates.items()
+        }
 
     def consider(self, index: int, decision: Decision, *, by_price: bool) -> Verdict:
         """Say where a cell is to be that its policy has decided on (see `Wish`)."""
@@ -212,6 +222,7 @@ class FleetLedger:
             why = self._objection(index, name, before, after)
             if why is None:
                 verdict = Verdict(name, None, (*asked, self.round))
+                self.rank.settle(after)
                 self.round += 1
                 self.place(index, name)
                 return verdict
@@ -246,9 +257,10 @@ class FleetLedger:
             if name != here:
                 rise = self.loads.rise(self._at, index, here, name)
                 rise += self.alone[index][name] - at_stake
-                if exceeds(-rise, self.owed(index, name)) or self._helps_the_worst(index, name):
-                    found.append((rise, name))
-        return [name for _, name in sorted(found)[:LOOKS]]
+                helps = self._helps_first(index, name)
+                if helps or exceeds(-rise, self.owed(index, name)):
+                    found.append((not (helps and self.rank.limit), rise, name))
+        return [name for *_, name in sorted(found)[:LOOKS]]
 
     def _beyond_table(self, index: int) -> float:
         """J of a cell as played, less what the table says, where foreign load is on shared nodes.
@@ -264,13 +276,13 @@ class FleetLedger:
         says = self.alone[index][here] + self.loads.wait(index, here, load)
         return 0.0 if cell is None else cell.cost - says
 
-    def _helps_the_worst(self, index: int, name: str) -> bool:
-        """Whether the table thinks so."""
-        if self.objective != "worst":
+    def _helps_first(self, index: int, name: str) -> bool:
+        """Whether the table expects a better rank before the sum counts."""
+        if self.objective == "sum":
             return False
-        before = self.loads.costs(self.placements, self.alone)
-        after = self.loads.costs(moved(self.placements, index, name), self.alone)
-        return self.rank.first(after, self.absent) < self.rank.first(before, self.absent)
+        before = self._aimed.costs(self.placements, self._aims)
+        after = self._aimed.costs(moved(self.placements, index, name), self._aims)
+        return self.rank.is_promising(before, after, self.absent)
 
     def owed(self, index: int, name: str) -> float:
         """What Φ has to fall by at least for a cell to move: Δ_min + α_S·S."""
@@ -282,18 +294,16 @@ class FleetLedger:
     def _played(self, index: int, name: str) -> tuple[FleetPrice, FleetPrice]:
         self._begin()
         before = self.prices.price(tuple(self.placements))
+        self.rank.settle(before)
         return before, self.prices.price(moved(self.placements, index, name))
 
     def _objection(
         self, index: int, name: str, before: FleetPrice, after: FleetPrice
     ) -> str | None:
         """Why a cell must not move, by what has been played."""
-        costs = before.parts, after.parts
-        if not self.rank.is_better(*costs, self.owed(index, name), self.absent):
-            rises = self._phi(after) - self._phi(before)
-            if rises > 0:
-                return f"ledger: Φ would rise by {rises:.3g}"
-            return f"ledger: Φ would fall by {-rises:.3g}, {self.owed(index, name):.3g} is owed"
+        why = self.rank.objection(before, after, self.owed(index, name), self.absent)
+        if why is not None:
+            return why
         if self._has_caps:
             for i, cell in enumerate(self.cells):
                 if i in self.absent:
@@ -305,7 +315,7 @@ class FleetLedger:
 
     def _phi(self, played: FleetPrice) -> float:
         """Φ of the cells that are in it."""
-        return self.rank.phi(played.parts, self.absent)
+        return self.rank.phi(played, self.absent)
 
 
 class Seat(Coordination):
