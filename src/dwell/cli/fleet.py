@@ -27,7 +27,6 @@ from dwell.cli.output import (
 )
 from dwell.cli.run import default_folder
 from dwell.display import milliseconds
-from dwell.errors import Fault
 from dwell.model.bounds import counted
 
 if TYPE_CHECKING:
@@ -147,7 +146,12 @@ def plan(
     seed: Seed = 1,
     phases: Phases = None,
     limit: Annotated[
-        float | None, option("SHARE", "Also name the cells whose V_D stays above this, as 0.05.")
+        float | None,
+        option(
+            "SHARE",
+            "Also name the cells whose V_D stays above this, as 0.05; with `objective: served` the "
+            "limit of the file if not given.",
+        ),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -160,6 +164,8 @@ def plan(
     if limit is not None:
         _require_limit(limit)
     planned = _read(file, phases)
+    if limit is None and planned.objective == "served":
+        limit = planned.limit
     with progress(f"playing loads of {counted(len(planned.cells), 'cell')}") as shown:
         found = plan_fleet(planned, seed=seed, progress=shown)
     if as_json:
@@ -327,10 +333,9 @@ def read_phases(text: str | None) -> str | tuple[float, ...] | None:
 
 
 def _read(file: Path, phases: str | None, **changes: str | None) -> Fleet:
-    """Read a fleet, warn of what it has for nothing, and change it as the options say."""
+    """Read a fleet, warn of settings without effect, and change it as the options say."""
     fleet = dwell.load_fleet(file)
-    unused = "no candidate of any cell uses this node"
-    warn(file, (Fault(f"shared.{name}", unused) for name in fleet.unused()))
+    warn(file, fleet.without_effect())
     return fleet.changed(phases=read_phases(phases), **changes)
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from operator import add
 from typing import TypeAlias
 
+from dwell.control.fleet_rank import FleetRank
 from dwell.control.knapsack import cheapest
 from dwell.control.neighbours import Neighbours, Rank, descend
 from dwell.control.table_loads import Loads
@@ -32,13 +33,14 @@ class FleetSearch:
     prices : FleetPrices
         Plays the fleet.
     loads : Loads
-        The table of loads.
+        The table of loads, as the objective has it in a search.
+    rank : FleetRank
     before : int
         Plays before the search of a change, for moves of single cells.
     """
 
-    def __init__(self, prices: FleetPrices, loads: Loads, before: int) -> None:
-        self._prices, self._loads, self._before = prices, loads, before
+    def __init__(self, prices: FleetPrices, loads: Loads, rank: FleetRank, before: int) -> None:
+        self._prices, self._loads, self._rank, self._before = prices, loads, rank, before
         self._neighbours = Neighbours(prices.cells, loads)
         self._dwells = [cell.problem.min_dwell_decisions > 0 for cell in prices.cells]
         #: By cell, whether it may move; None where it never is part of a search.
@@ -133,7 +135,7 @@ class FleetSearch:
         here : tuple of str
             Present placements.
         alone : sequence of mapping of str to float
-            By cell, J of each candidate without any other cell.
+            By cell, the cost in a search of each candidate without any other cell.
         owed : sequence of mapping of str to float
             By cell, each candidate that it may take, and what the move owes.
         rank : callable
@@ -154,7 +156,8 @@ class FleetSearch:
             return None if price is None else rank(price, sum(dues(placements)))
 
         def neighbours(placements: Names) -> Iterator[Names]:
-            played = [*map(add, self._prices.price(placements).costs, dues(placements))]
+            aims = self._rank.aims(self._prices.price(placements))
+            played = [*map(add, aims, dues(placements))]
             return self._neighbours.of(placements, costs, played)
 
         starts = here, cheapest(self._loads, costs, here)

@@ -20,9 +20,7 @@ A cell whose windows are not what was played for it leaves Φ until they are aga
 `dwell.control.watchdog`). Its load stays where it is; the proof holds from one such change to the
 next.
 
-What is lowered is the sum of the cells' costs; or the worst of them: costs are rounded up to
-multiples of the least Δ_min and sorted from the largest, the smaller list is the better one, and
-of equal lists that with the smaller sum.
+The objective decides which of two prices is better (see `dwell.control.fleet_rank`).
 """
 
 from __future__ import annotations
@@ -34,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.control.coordination import NOT_ASKED, Asked, Coordination, Verdict, Wish
-from dwell.control.fleet_rank import FleetRank
+from dwell.control.fleet_rank import fleet_rank
 from dwell.control.fleet_search import FleetSearch
 from dwell.control.neighbours import Rank
 from dwell.control.table_loads import Loads, moved
@@ -71,7 +69,7 @@ class FleetLedger:
     cells : sequence of PricedCell
     shared : sequence of str
         Nodes that are one computer for all cells.
-    objective : {"sum", "worst"}
+    objective : {"sum", "worst", "served"}
     table : LoadTable, optional
         Proposes moves; made of `tabled` where None.
     tabled : sequence of PricedCell, optional
@@ -80,6 +78,8 @@ class FleetLedger:
         What plays.
     progress : callable, optional
         Told how many of how many levels of the table have been played.
+    limit : float, optional
+        Largest V_D of a cell that is served, with the objective ``served``.
 
     Attributes
     ----------
@@ -107,23 +107,27 @@ class FleetLedger:
         tabled: Sequence[PricedCell] | None = None,
         prices: FleetPrices | None = None,
         progress: Progress | None = None,
+        limit: float | None = None,
     ) -> None:
         self.cells, self.shared, self.objective = tuple(cells), tuple(shared), objective
         problems = [cell.problem for cell in cells]
         self.table = table or load_table(tabled or cells, shared, progress)
         self.prices = prices or FleetPrices(cells, shared)
         self.loads = Loads(self.table)
+        self.rank = fleet_rank(objective, cells, limit)
+        self._aimed = Loads(self.table, self.rank.limit)
         self._terms = [CellTerms(problem, shared) for problem in problems]
         self.placements = [problem.initial for problem in problems]
         self._at = self.loads.at(self.placements)
-        self.alone = [
-            {name: terms.cost(price.qos) for name, price in prices_of(problem).items()}
-            for problem, terms in zip(problems, self._terms, strict=True)
-        ]
+        self._declared = [prices_of(problem) for problem in problems]
+        self.alone: list[dict[str, float]] = [{} for _ in problems]
+        #: The same, as the objective has it in a search.
+        self._aims: list[dict[str, float]] = [{} for _ in problems]
+        for i, prices_alone in enumerate(self._declared):
+            self._note_alone(i, {name: price.qos for name, price in prices_alone.items()})
         self.presents = [Present()] * len(self.cells)
         self._revisions = [-1] * len(self.cells)
         self._has_caps = any(problem.objective.caps != Caps() for problem in problems)
-        self.rank = FleetRank(objective, cells)
         names = sorted(cell.name for cell in cells)
         #: Place of each cell where they take turns, and how long one is.
         self.order = [names.index(cell.name) for cell in cells]
@@ -132,7 +136,6 @@ class FleetLedger:
         self._watchdogs = [Watchdog(problem.window_cycles) for problem in problems]
         #: Candidates of each cell that are doubted at its last close.
         self._doubted: list[set[str]] = [set()] * len(self.cells)
-        self._declared = [prices_of(problem) for problem in problems]
         #: How often Φ has become another function; and of each cell what it was when it was last
         #: looked at.
         self._changes = 0
@@ -141,7 +144,7 @@ class FleetLedger:
         self._looked = [(-1, -1)] * len(self.cells)
         self._refusals: list[dict[str, str]] = [{} for _ in self.cells]
         self.round = 0
-        self._search = FleetSearch(self.prices, self.loads, 1 + LOOKS)
+        self._search = FleetSearch(self.prices, self._aimed, self.rank, 1 + LOOKS)
         #: Moves of a set that have not been made yet, and what their rows say.
         self._set: dict[int, str] = {}
         self._asked: Asked = NOT_ASKED
@@ -208,10 +211,17 @@ class FleetLedger:
         if revision == self._revisions[index]:
             return
         self._revisions[index] = revision
-        self.alone[index] = {name: self._terms[index].cost(qos) for name, qos in estimates.items()}
+        self._note_alone(index, estimates)
         if estimator.present is not None:
             self.presents[index] = estimator.present
         self._search.change()
+
+    def _note_alone(self, index: int, estimates: Mapping[str, QoS]) -> None:
+        costs = {name: self._terms[index].cost(qos) for name, qos in estimates.items()}
+        self.alone[index] = costs
+        self._aims[index] = {
+            name: self.rank.aim(costs[name], qos.violation_rate) for name, qos in estimates.items()
+        }
 
     def consider(
         self, index: int, decision: Decision, *, by_price: bool, on_fallback: bool = False
@@ -279,13 +289,17 @@ class FleetLedger:
                 continue
             there = moved(here, index, name)
             before = play(here)
-            after = before and play(there)
-            if before is None or after is None:
+            if before is None:
+                break
+            self.rank.settle(before)
+            after = play(there)
+            if after is None:
                 break
             asked = self._phi(before), self._phi(after)
             why = self._objection(there, before, after)
             if why is None:
                 verdict = Verdict(name, None, (*asked, self.round))
+                self.rank.settle(after)
                 self.round += 1
                 self._put(index, name)
                 self._search.spend()
@@ -306,14 +320,14 @@ class FleetLedger:
         def rank(price: FleetPrice, due: float) -> Rank:
             if self._over_cap(self.prices.price(here), price):
                 return (math.inf,)
-            parts = [0.0 if i in self.absent else cost for i, cost in enumerate(price.parts)]
-            return self.rank.of(parts, due)
+            return self.rank.of(price, due, self.absent)
 
-        best = self._search.best(here, self.alone, owed, rank)
+        best = self._search.best(here, self._aims, owed, rank)
         if best == here:
             return
         before, after = self.prices.price(here), self.prices.price(best)
         if self._objection(best, before, after) is None:
+            self.rank.settle(after)
             self._set = {i: name for i, name in enumerate(best) if name != here[i]}
             self._asked = self._phi(before), self._phi(after), self.round
         else:
@@ -327,7 +341,7 @@ class FleetLedger:
         if not names or not self._search.has_plays:
             return []
         owed = [self._owed(i, costs) for i, costs in enumerate(self.alone)]
-        jump = self._search.jump(tuple(self.placements), self.alone, owed)[index]
+        jump = self._search.jump(tuple(self.placements), self._aims, owed)[index]
         return [one for one in dict.fromkeys((jump, wished)) if one in names and jump in names]
 
     def _takes(self, index: int) -> Sequence[str]:
@@ -366,9 +380,10 @@ class FleetLedger:
             if name != here:
                 rise = self.loads.rise(self._at, index, here, name)
                 rise += self.alone[index][name] - at_stake
-                if exceeds(-rise, self.owed(index, name)) or self._helps_the_worst(index, name):
-                    found.append((rise, name))
-        return [name for _, name in sorted(found)[:LOOKS]]
+                helps = self._helps_first(index, name)
+                if helps or exceeds(-rise, self.owed(index, name)):
+                    found.append((not (helps and self.rank.limit), rise, name))
+        return [name for *_, name in sorted(found)[:LOOKS]]
 
     def _beyond_table(self, index: int) -> float:
         """J of a cell as played, less what the table says, where foreign load is on shared nodes.
@@ -385,13 +400,13 @@ class FleetLedger:
         says = self.alone[index][here] + self.loads.wait(index, here, load)
         return 0.0 if cell is None else cell.cost - says
 
-    def _helps_the_worst(self, index: int, name: str) -> bool:
-        """Whether the table thinks so."""
-        if self.objective != "worst":
+    def _helps_first(self, index: int, name: str) -> bool:
+        """Whether the table expects a better rank before the sum counts."""
+        if self.objective == "sum":
             return False
-        before = self.loads.costs(self.placements, self.alone)
-        after = self.loads.costs(moved(self.placements, index, name), self.alone)
-        return self.rank.first(after, self.absent) < self.rank.first(before, self.absent)
+        before = self._aimed.costs(self.placements, self._aims)
+        after = self._aimed.costs(moved(self.placements, index, name), self._aims)
+        return self.rank.is_promising(before, after, self.absent)
 
     def owed(self, index: int, name: str) -> float:
         """What Φ has to fall by at least for a cell to move: Δ_min + α_S·S; 0 where it is."""
@@ -407,12 +422,8 @@ class FleetLedger:
     ) -> str | None:
         """Why cells must not move there, by what has been played."""
         owed = sum(self.owed(i, name) for i, name in enumerate(there))
-        if not self.rank.is_better(before.parts, after.parts, owed, self.absent):
-            rises = self._phi(after) - self._phi(before)
-            if rises > 0:
-                return f"ledger: Φ would rise by {rises:.3g}"
-            return f"ledger: Φ would fall by {-rises:.3g}, {owed:.3g} is owed"
-        return self._over_cap(before, after)
+        why = self.rank.objection(before, after, owed, self.absent)
+        return self._over_cap(before, after) if why is None else why
 
     def _over_cap(self, before: FleetPrice, after: FleetPrice) -> str | None:
         """Return the first cap that a cell would exceed and did not before."""
@@ -427,7 +438,7 @@ class FleetLedger:
 
     def _phi(self, played: FleetPrice) -> float:
         """Φ of the cells that are in it."""
-        return self.rank.phi(played.parts, self.absent)
+        return self.rank.phi(played, self.absent)
 
 
 class Seat(Coordination):

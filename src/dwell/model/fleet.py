@@ -17,13 +17,15 @@ from dwell.model.semantics import episode_faults, nearest, nearest_of
 
 Phases: TypeAlias = "Literal['sync', 'even', 'random'] | tuple[float, ...]"
 Coordination: TypeAlias = Literal["none", "random", "ledger"]
-FleetObjective: TypeAlias = Literal["sum", "worst"]
+FleetObjective: TypeAlias = Literal["sum", "worst", "served"]
 
 #: What the phases of a fleet may be, beside a list of them.
 PHASES = ("sync", "even", "random")
 PHASE_WAYS = f"one of {', '.join(PHASES)}, or a list of ms"
 MOST_CELLS = 1_000
 COUNT = Bound(1, MOST_CELLS, whole=True)
+#: Largest V_D of a cell that is served, if a file gives no limit.
+LIMIT = 0.05
 
 #: Count and cell of an entry; None for a cell that could not be read.
 Kind: TypeAlias = "tuple[int, Problem | None]"
@@ -99,7 +101,15 @@ class Fleet:
         "What a move is asked for: nothing, a chance, or the ledger.", default="ledger"
     )
     objective: FleetObjective = key(
-        "What the ledger lowers: the sum over cells, or what the worst of them has.", default="sum"
+        "Aim of the ledger and of plans: the least sum of costs, the least cost of the worst "
+        "cell, or the most cells whose V_D is at most `limit`.",
+        default="sum",
+    )
+    limit: float | None = key(
+        "Largest V_D of a cell that is served.",
+        Bound(0, 1, above=True, below=True),
+        default=None,
+        usual=f"{LIMIT} with `objective: served`",
     )
     policy: str | None = key("Policy of cells that name none.", default=None, usual="the cell's")
     estimator: str | None = key(
@@ -111,6 +121,8 @@ class Fleet:
     def __post_init__(self) -> None:
         if not isinstance(self.phases, str):
             object.__setattr__(self, "phases", tuple(self.phases))
+        if self.objective == "served" and self.limit is None:
+            object.__setattr__(self, "limit", LIMIT)
         kinds = [(entry.count, entry.cell) for entry in self.entries]
         faults = [*fleet_faults(kinds, self.shared, self.phases)]
         met = [
@@ -217,6 +229,14 @@ class Fleet:
         """
         first, *others = self.entries
         return replace(self, entries=(replace(first, count=count), *others))
+
+    def without_effect(self) -> Iterator[Fault]:
+        """Yield the settings that change nothing."""
+        for name in self.unused():
+            yield Fault(f"shared.{name}", "no candidate of any cell uses this node")
+        if self.limit is not None and self.objective != "served":
+            remedy = "remove it, or set `objective: served`"
+            yield Fault("limit", f"it has no effect with objective {self.objective}; {remedy}")
 
     def unused(self) -> tuple[str, ...]:
         """Return the shared nodes that no candidate of any cell uses."""

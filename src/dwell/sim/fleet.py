@@ -272,6 +272,7 @@ def coordinations(
             fleet.objective,
             tabled=tabled_cells(fleet, seed),
             progress=progress,
+            limit=fleet.limit,
         )
     for i, cell in enumerate(fleet.cells):
         if fleet.coordination == "ledger":
