@@ -29,7 +29,7 @@ MOST = {
     "dwell.estimators": 28.7,
     "dwell.kernels": 23.8,
     "dwell.live": 25.4,
-    "dwell.model": 20.5,
+    "dwell.model": 8.0,
     "dwell.record": 29.5,
     "dwell.report": 25.1,
     "dwell.sim": 25.8,
