@@ -33,6 +33,7 @@ from dwell.report.figure import Figure
 from dwell.report.formatting import (
     COST,
     FINAL_L95,
+    L95,
     RATE,
     Measure,
     percent,
@@ -48,6 +49,7 @@ from dwell.report.phases import phase_rows, phase_table
 from dwell.report.run_header import RunHeader
 from dwell.report.table import MOST_ROWS, Columns, Table, Text
 from dwell.report.timeline import begins_by_number, resources_in, run_timeline
+from dwell.study.other_placements import PLACEMENTS
 from dwell.study.predicted_moves import predicted_moves
 from dwell.study.summary import (
     Counted,
@@ -55,6 +57,7 @@ from dwell.study.summary import (
     latency_ms,
     summarise,
 )
+from dwell.study.verdict import verdict_of
 
 if TYPE_CHECKING:
     import polars as pl
@@ -62,6 +65,8 @@ if TYPE_CHECKING:
     from dwell.record import Run
 
 WORST = 10
+#: Numbers of a placement that never moves.
+KEPT = ("violation_rate", "l95_ms", "cost")
 #: Most labels of a figure's cycles.
 LABELS = 25
 #: Share of a deadline that clocks may be off by, where a window's latencies are proven.
@@ -131,7 +136,13 @@ class _RunPage:
     def _facts(self) -> Iterator[Fact]:
         row = {name: float(value) for name, value in self.row.items() if not isinstance(value, str)}
         deadline = f"deadline {write_ms(self.header.deadline_ms)}"
-        yield Fact("V_D, deadlines missed", percent(row["violation_rate"], 1), "aim: under 5 %")
+        verdict = verdict_of(self.run, self.header.problem, row["violation_rate"])
+        yield Fact(
+            "V_D, deadlines missed",
+            percent(verdict.rate, 2),
+            f"aim: under {percent(verdict.aim)}",
+            verdict.word,
+        )
         yield Fact("L95 of all cycles", write_ms(row["p95_ms"]), deadline)
         yield Fact("misses in a row", write_number(row["longest_misses"], 0), "at most")
         yield Fact("J", write_number(row["cost"], 2), "mean")
@@ -143,6 +154,8 @@ class _RunPage:
 
     def _sections(self) -> Iterator[Section]:
         yield Section("", [self._timeline(), *self._phases()])
+        if placements := self.run.meta.get(PLACEMENTS):
+            yield Section("If it never moved", [self._never_moving(placements)])
         yield Section("Worst windows", [self._worst_table()])
         for window in self.worst.iter_rows(named=True):
             number = window["window"]
@@ -191,6 +204,26 @@ class _RunPage:
         rows = phase_rows(self.run, self.header)
         if len(rows) > 1:
             yield phase_table(rows, self.palette)
+
+    def _never_moving(self, placements: Mapping[str, Mapping[str, float]]) -> Table:
+        """Return what each placement would have done without moves."""
+        rows: list[Mapping[str, object]] = [
+            {"placement": name, **numbers} for name, numbers in placements.items()
+        ]
+        if self.header.policy_name != "Static":
+            name = f"{self._policy()}, this run"
+            rows.append({"placement": name, **{key: self.row[key] for key in KEPT}})
+        columns: Columns = [
+            Text("placement", "placement", "placement"),
+            RATE._replace(decimals=2),
+            L95,
+            COST,
+        ]
+        caption = (
+            "Each placement by itself, without moves, on the same random draws. At most 8 "
+            "placements are simulated."
+        )
+        return Table("never-moving", "", columns, rows, caption=caption, palette=self.palette)
 
     # -------------------------------------------------------------------------- worst windows
 

@@ -226,6 +226,23 @@ def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Su
     return Summary(row, costs, latencies.within)
 
 
+def answer_of(run: Run, problem: Problem) -> dict[str, float]:
+    """Return `violation_rate`, `l95_ms` and `cost` of a run's summary, without its other numbers.
+
+    Raises
+    ------
+    SimulationError
+        If the run has no window after its warm-up.
+    """
+    counts, _, counted = _counting(run, problem.window_cycles)
+    windows = run.arrays("windows")
+    return {
+        "violation_rate": share_of(run.arrays("cycles")["missed"][counted]),
+        "l95_ms": mean_of(windows["seen_l95_ms"][counts]),
+        "cost": mean_of(windows["cost"][counts]),
+    }
+
+
 def _unfinished(outcomes: Names) -> dict[str, int]:
     """Count the cycles that were lost, and those that were under way at the end."""
     done, in_flight = (int(outcomes.equal(name).sum()) for name in ("done", "in_flight"))

@@ -14,7 +14,7 @@ from dwell.live.commands.live_view import CellState, Lines, Screen
 from dwell.model import Problem
 from dwell.model.disturbed import Disturbed, disturbed
 
-CELL = Path(__file__).parents[2] / "examples" / "visual_servoing" / "cell.yaml"
+CELL = Path(__file__).parents[3] / "examples" / "visual_servoing" / "cell.yaml"
 
 SECONDS = 116.0
 
