@@ -41,7 +41,8 @@ def test_a_short_run_near_the_aim_is_open(canonical: Problem) -> None:
 def test_a_run_shorter_than_its_episodes_is_open_whatever_it_showed(tmp_path: Path) -> None:
     """Episodes of 1,000 s come every 3,000 s: a run of 40 s shows one side alone."""
     text = Path("examples/canonical.yaml").read_text(encoding="utf-8")
-    rare = "{node: R1, stress_threads: 4, episodes: {name: rare, every_s: {constant: 3000}, for_s: {constant: 1000}}}"
+    times = "every_s: {constant: 3000}, for_s: {constant: 1000}"
+    rare = f"{{node: R1, stress_threads: 4, episodes: {{name: rare, {times}}}}}"
     cell = tmp_path / "cell.yaml"
     begun, _, rest = text.partition("  robot-cpu-stress:")
     cell.write_text(f"{begun}  rare:\n    - {rare}\n  robot-cpu-stress:{rest}", encoding="utf-8")

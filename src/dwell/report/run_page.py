@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
 from typing import TYPE_CHECKING
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from dwell.display import decimals_for
 from dwell.model.bounds import counted
 from dwell.record import OUTCOME_SENTENCES, REASON_SENTENCES
+from dwell.record.moves import Move, moves_in
 from dwell.report.charts import (
     PART_COLOURS,
     PARTS_SHOWN,
@@ -384,9 +385,8 @@ class _RunPage:
         yield Table("reasons", "Why it was decided so", columns, rows)
         if "shadow_cycles" in self.counted.windows.columns:
             yield self._shadows()
-        moves = decisions.filter(decisions["migrated"])
-        if not moves.is_empty():
-            yield self._migrations(moves)
+        if found := moves_in(decisions):
+            yield self._migrations(decisions, found)
 
     def _shadows(self) -> Table:
         windows = self.counted.windows
@@ -408,24 +408,22 @@ class _RunPage:
         caption = "Cycles that went through another placement as well, for the estimator."
         return Table("shadows", "What shadow jobs cost", columns, [row], caption=caption)
 
-    def _migrations(self, moves: pl.DataFrame) -> Table:
+    def _migrations(self, decisions: pl.DataFrame, found: Sequence[Move]) -> Table:
         cost = dict(self.run.windows.select("window", "cost").rows())
         length_s = self.header.problem.window_ms / 1e3
         rows = []
-        for move in moves.head(MOST_ROWS).iter_rows(named=True):
-            window, target, reason = move["window"], move["placement"], str(move["reason"])
-            # A move of the guard is noted under the window that follows it.
-            before, later_s = (window - 1, 0.0) if reason == "guard" else (window, length_s)
+        for move in found[:MOST_ROWS]:
+            known, later_s = (move.window + 1, 0.0) if move.by_guard else (move.window, length_s)
             rows.append(
                 {
-                    "window": before,
-                    "at_s": self.begin_of.get(window, math.nan) + later_s,
-                    "from": str(move["incumbent"]),
-                    "to": str(target),
-                    "reason": reason,
-                    "before": cost.get(before),
-                    "estimated": move[f"j_{target}"],
-                    "after": cost.get(before + 1),
+                    "window": move.window,
+                    "at_s": self.begin_of.get(known, math.nan) + later_s,
+                    "from": move.source,
+                    "to": move.target,
+                    "reason": move.reason,
+                    "before": cost.get(move.window),
+                    "estimated": decisions[f"j_{move.target}"][move.row],
+                    "after": cost.get(move.window + 1),
                 }
             )
         columns: Columns = [
@@ -440,7 +438,7 @@ class _RunPage:
         ]
         return Table(
             "migrations",
-            f"Migrations ({len(rows)} of {moves.height})",
+            f"Migrations ({len(rows)} of {len(found)})",
             columns,
             rows,
             caption=(

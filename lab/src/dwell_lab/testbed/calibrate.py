@@ -24,12 +24,13 @@ from dwell.estimators.registry import name_in_run
 from dwell.files import write_whole
 from dwell.live.local.trace_names import move_traces
 from dwell.model import Problem, Trace
-from dwell_lab.testbed.measured import Floats, Measured, SiteName, cycles_in, look_at, usable
+from dwell.model.number_arrays import Floats
+from dwell.model.order_statistic import percentile
+from dwell_lab.testbed.measured import Measured, SiteName, cycles_in, look_at, usable
 from dwell_lab.testbed.message_costs import OnTheWay, floors, hops, own_delays
 from dwell_lab.testbed.node_loads import (
     backgrounds,
     beside_jobs,
-    contentions,
     interferences,
     wakes,
 )
@@ -45,14 +46,13 @@ ASKED = 20_000
 #: Least execution time written, ms: one of nothing is no execution time.
 LEAST_MS = 1e-3
 #: Findings on a node that a cell states of nodes with a quota alone.
-ONLY_WITH_QUOTA = ("background_beside", "contention")
+ONLY_WITH_QUOTA = ("background_beside",)
 #: Windows that the check simulates of every run at most.
 CHECK_WINDOWS = 300
 
 
 #: What is said of a node by each of its keys, where it is nothing else's.
 NODE_LINES = {
-    "contention": "{node}: others have {value:.3g} of its CPUs while jobs run",
     "background_hz": "{node}: something wakes {value:.4g} times a second",
     "interference": "{node}: stages take {value:.3g} times as long beside foreign threads",
 }
@@ -113,7 +113,6 @@ def calibrate(
             "background": behind,
             "background_beside": beside_jobs(measured, behind),
             "interference": interferences(measured, costs, usual),
-            "contention": contentions(measured),
             "background_hz": wakes(measured, problem),
         }
     )
@@ -324,10 +323,8 @@ def _put_in(
     nodes: Mapping[str, Mapping[str, Any]],
 ) -> None:
     """Put findings on tasks, on nodes by key, and on links into a cell's document."""
-    for (task, node), of in costs.items():
-        on = document["tasks"][task]["on"][node]
-        on["exec_ms"] = replay(file, task_name(task, node))
-        on |= {"before_ms": _short(of.before_ms), "after_ms": _short(of.after_ms)}
+    for task, node in costs:
+        document["tasks"][task]["on"][node]["exec_ms"] = replay(file, task_name(task, node))
         # The samples have what the task shares with others already.
         document["tasks"][task].pop("scale", None)
     for node in nodes["background"]:
@@ -400,7 +397,7 @@ def _check(one: Measured, problem: Problem, usual: Usual) -> dict[str, Any] | No
         cycles = run.cycles.with_columns(pl.col("cycle").cast(pl.Int64))
         cycles = cycles.join(cycles_in(windows, problem), on="cycle", how="semi")
         latency_ms = cycles["latency_ns"].fill_null(np.iinfo(np.int64).max).to_numpy() / 1e6
-        l95_ms = float(np.quantile(latency_ms, 0.95, method="inverted_cdf"))
+        l95_ms = percentile(latency_ms, 95)
         means = {name: windows[name].to_numpy().mean() for name in shares}
         row[what] = {
             "l95_ms": _short(l95_ms) if l95_ms < 1e9 else None,

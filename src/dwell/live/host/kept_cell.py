@@ -17,13 +17,13 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from importlib.resources import files
 from pathlib import Path
 from types import ModuleType
 from typing import Literal, TypeAlias
 
 import msgspec
 
-from dwell import version
 from dwell.cellfile import load, load_without_traces
 from dwell.errors import DwellError, LiveError
 from dwell.files import write_whole
@@ -31,6 +31,7 @@ from dwell.live.failures import start_thread
 from dwell.live.host.state_files import boot_id, make_folder
 from dwell.model import FrozenDict, Problem
 from dwell.model.document import digests
+from dwell.version import __version__
 
 #: Nothing but the text, keys of the controller's alone, a node's code, or all processes.
 Change: TypeAlias = Literal["text", "decision", "code", "wiring"]
@@ -44,9 +45,9 @@ NAMED = re.compile(rb"(\w+)(?:\.\w+)*:\w")
 
 def installed_version() -> str:
     """Return the version of Dwell that a process gets which starts now."""
-    text = Path(version.__file__).read_text(encoding="utf-8")
+    text = files("dwell").joinpath("version.py").read_text(encoding="utf-8")
     found = re.search(r'__version__ = "(.+)"', text)
-    return found[1] if found else version.__version__
+    return found[1] if found else __version__
 
 
 class _Index(msgspec.Struct, frozen=True):
@@ -280,7 +281,7 @@ class CellKeeper:
             return None
         self._say(f"{name}: is taken over ({found})")
         self.look()
-        self.replaced = new.version != version.__version__
+        self.replaced = new.version != __version__
         if found == "code" and not self.replaced:
             self.renew()
         return found
