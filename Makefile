@@ -19,7 +19,7 @@ COMPILE := $(UV) pip compile --quiet --python $(BIN)/python --universal --python
 	--generate-hashes --custom-compile-command "make lock" $(if $(UPGRADE),--upgrade)
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test test-sim test-live test-lab test-all check types tidy bench paper deadlines planted faults seeds chaos soak fuzz audit sbom lock clean again
+.PHONY: help env demo test test-sim test-live test-lab test-all check types tidy bench paper planted faults seeds chaos soak fuzz audit sbom lock clean again
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' Makefile
@@ -85,10 +85,11 @@ test-all: env ## Run the tests that `make test` leaves out (conftest.py)
 	$(TESTS) -m "exhaustive and alone" $(ARGS) || [ $$? -eq 5 ]
 
 # What takes longest runs side by side. clang-tidy reads the headers of the system's own C++ library.
-check: env ## Lint, formatting, types and the borders between packages
+check: env ## Lint, formatting, types, the borders between packages and lines of code
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-logo
+	$(BIN)/python -m tests.code_lines
 	$(BIN)/clang-format --dry-run -Werror $(filter %.cpp %.h,$(SOURCES)) tests/kernels/*.cpp
 	@$(MAKE) --no-print-directory --jobs --output-sync types tidy
 
@@ -103,12 +104,6 @@ bench: env ## Run the benchmarks
 
 paper: env ## Ask the paper's questions; hours (ARGS="--scale quick": minutes; --help)
 	$(BIN)/python -m reproduction $(ARGS)
-
-# What the demo shows of it is kept beside the study.
-deadlines: env ## Play the study behind the demo's figure of deadlines again; minutes
-	$(BIN)/dwell study examples/studies/deadline.yaml --out build/deadline
-	$(BIN)/dwell report build/deadline --figures build/deadline/figures
-	cp build/deadline/figures/violation_rate-0.csv examples/studies/deadline.csv
 
 planted: env ## Plant faults in copies of the tree; each must be found (ARGS="--only NAME -n 4")
 	$(BIN)/python -m tests.planted $(ARGS)

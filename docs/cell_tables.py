@@ -59,10 +59,10 @@ def _table(name: str) -> str:
 
 
 def _lines(shape: Shape) -> Iterator[str]:
-    yield "| key | value | default | meaning |"
-    yield "|---|---|---|---|"
-    for key in shape.keys:
-        yield f"| `{key.named}` | {_value(key)} | {_usual(key)} | {key.says} |"
+    yield "| key | value | default | tier | meaning |"
+    yield "|---|---|---|---|---|"
+    for key in shape.by_tier:
+        yield f"| `{key.named}` | {_value(key)} | {_usual(key)} | {key.tier} | {key.says} |"
 
 
 def words(form: Form) -> str:

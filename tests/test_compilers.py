@@ -15,7 +15,7 @@ from tests.kernels.compilers import ROOT, needs_gcc
 #: What `make env` and the kernel's tests need of a checkout.
 CHECKOUT = (
     *("Makefile", "README.md", "LICENSE", "pyproject.toml", "hatch_build.py"),
-    *("requirements", "src", "examples", "tests"),
+    *("requirements", "src", "lab", "examples", "tests"),
 )
 
 

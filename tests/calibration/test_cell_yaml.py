@@ -15,11 +15,11 @@ import dwell
 from dwell.calibration.cell_yaml import cell_yaml
 from dwell.calibration.measure import Settings, measure_task
 from dwell.calibration.profile_file import Measurement, write_profile
-from dwell.calibration.sample_statistics import percentile
 from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.yaml_text import read_yaml
 from dwell.estimators import Profile
 from dwell.model import Problem, Trace
+from dwell.model.order_statistic import percentile
 from dwell.model.semantics import NAME
 from tests.calibration.samples import link, task
 

@@ -172,7 +172,8 @@ ENTRY = {"columns": ["t@n"], "kind": "task"}
         ('{"format": 1, "measurements": {"t@n": {}}}', "cannot be understood"),
         ('{"format": 1, "measurements": {"t@n": {"columns": []}}}', "cannot be understood"),
         ('{"format": "one", "measurements": {}}', "cannot be understood"),
-        ('{"format": 2, "measurements": {}}', "format 2; this version reads up to 1"),
+        ('{"format": 2, "measurements": {}}', "format 2; this version reads 1 only"),
+        ('{"format": 0, "measurements": {}}', "format 0; this version reads 1 only"),
         (
             json.dumps({"format": 1, "measurements": {"x@n": {"columns": ["x@n"]}}}),
             "no numbers in a column 'x@n'",

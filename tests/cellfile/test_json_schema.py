@@ -5,17 +5,24 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from dwell.cellfile import schema
+from dwell.cellfile import cell_form, schema
 from dwell.model import Problem
+from dwell.model.declaration import KeyTier
 from dwell.model.document import to_document
 from tests.cellfile.faulty import DOCUMENT
 from tests.cellfile.test_cell import LEAST
 from tests.cells.strategies import problems
+
+SHAPES = (
+    *(cell_form.CELL.shape, cell_form.TRACE, cell_form.NODE, cell_form.QUOTA, cell_form.LINK),
+    *(cell_form.TASK, cell_form.EXECUTION, cell_form.FLOW, cell_form.DISTURBANCE),
+    *(cell_form.OBJECTIVE, cell_form.CONTROLLER, cell_form.LIVE, cell_form.HOST),
+)
 
 jsonschema = pytest.importorskip("jsonschema", reason="validates documents against the schema")
 
@@ -54,6 +61,15 @@ def test_every_key_says_what_it_is() -> None:
     processes = {"uniform", "normal", "lognormal", "gamma", "exponential", "ar1", "trace"}
     for name, part in _properties(schema()):
         assert part.get("description") or name in processes, name
+
+
+def test_keys_of_a_first_cell_come_before_those_for_tuning_and_of_measurements() -> None:
+    nodes = list(schema()["$defs"]["Node"]["properties"])
+    assert nodes[:2] == ["tier", "cores"]
+    assert nodes.index("scheduler") < nodes.index("background")
+    tiers = [[key.tier for key in shape.by_tier] for shape in SHAPES]
+    assert all(some == sorted(some, key=get_args(KeyTier).index) for some in tiers)
+    assert sum(some.count("first") for some in tiers) <= 50
 
 
 @pytest.mark.parametrize(

@@ -324,7 +324,6 @@ class _Maker:
             background_beside=beside,
             background_hz=rng.choice([0.0, 50.0, 200.0]) if turns else 0.0,
             interference=rng.choice([1.0, 1.0, 2.0]),
-            contention=rng.choice([0.0, 0.0, 0.25, 0.5, 0.75]) if quota is not None else 0.0,
             cores=1 if turns else cores,
             scheduler="fair" if scheduler == "turns" else scheduler,
             accelerators={"gpu": rng.randint(1, 2)} if rng.random() < 0.3 else {},
@@ -348,12 +347,9 @@ class _Maker:
     def task(self, name: str, load: float, *, source: bool) -> Task:
         rng = self.rng
         feasible = rng.sample(self.nodes, min(len(self.nodes), rng.choice([1, 2, 2, 3])))
-        handed = [0.0, 0.0, self.duration(0, 0.3)]
         on = {
             node.name: Execution(
                 self.process(self.period * load * rng.uniform(0.3, 1.5)),
-                before_ms=rng.choice(handed),
-                after_ms=rng.choice(handed),
                 threads=rng.choice([1, 1, 1, 2, 3, 5]),
                 workers=rng.choice([1, 1, 1, 2, 3]),
                 accelerator="gpu" if node.accelerators and rng.random() < 0.5 else None,

@@ -36,6 +36,13 @@ def test_a_new_cell_passes_its_check_and_its_own_test(here: Path, origin: str) -
         assert found.returncode == 0, found.stdout + found.stderr
 
 
+def test_the_head_lists_the_keys_of_a_first_cell(here: Path) -> None:
+    assert call("new", "hall").exit_code == 0
+    head = (here / "hall/cell.yaml").read_text(encoding="utf-8").partition("\ndwell:")[0]
+    assert "#   nodes               tier, cores\n" in head
+    assert "background" not in head
+
+
 def test_a_new_live_cell_runs_under_its_own_policy(here: Path) -> None:
     assert "dwell live run cell.yaml" in call("new", "hall", "--from", "live").stdout
     words = ("live", "run", "hall/cell.yaml", "--seconds", "6", "--out", "out")

@@ -37,11 +37,34 @@ def test_run_saves_and_sums_up(cell: Path) -> None:
     result = call("run", cell, "--scenario", "stress", "--policy", "OFF", "--windows", "12")
     assert (result.exit_code, result.stderr) == (0, "")
     assert "small, stress, OFF, seed 1: 12 windows of 10 cycles" in result.stdout
-    assert "saved to runs/small-stress-OFF-1" in result.stdout
+    assert "dwell report runs/small-stress-OFF-1, or dwell dash runs" in result.stdout
     run = dwell.open_run("runs/small-stress-OFF-1")
     assert run.windows.height == 12
     assert run.meta["scenario"] == "stress"
     assert not run.has_jobs
+
+
+def test_it_ends_with_a_verdict_and_with_what_other_placements_would_have_done(cell: Path) -> None:
+    result = call("run", cell, "--scenario", "stress", "--policy", "OFF", "--out", "there")
+    found = read_json(
+        call("run", cell, "--scenario", "stress", "--policy", "OFF", "--out", "here", "--json")
+    )
+    kept = dwell.open_run("here").meta["placements"]
+    assert found["placements"] == kept
+    rates = {name: numbers["violation_rate"] for name, numbers in kept.items()}
+    assert rates["OFF"] == found["summary"]["violation_rate"] == found["verdict"]["rate"]
+    assert found["verdict"]["word"] in {"kept", "missed", "open"}
+    assert f"{rates['OFF'] * 100:.2f} %" in result.stdout
+    assert f"(aim: under 5 %): {found['verdict']['word']}" in result.stdout
+    assert f"{min(rates.values()) * 100:.2f} % if" in result.stdout
+
+
+def test_a_saved_run_without_them_can_be_made_again(cell: Path) -> None:
+    call("run", cell, "--out", "here")
+    first = dwell.open_run("here")
+    bare = Run({k: v for k, v in first.meta.items() if k != "placements"}, first._tables)
+    bare.save("here")
+    assert call("run", cell, "--out", "here").exit_code == 0
 
 
 def test_of_a_cell_of_microseconds_times_are_not_written_as_nothing(cell: Path) -> None:

@@ -8,12 +8,10 @@ from collections.abc import Iterator
 from random import Random
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from dwell.estimators.paths import (
-    l95_rank,
     longest_path,
     steps_of,
 )
@@ -101,14 +99,3 @@ def test_nothing_that_is_given_is_changed() -> None:
     longest_path(steps_of(pipeline), jobs, sent)
     assert [float(x[0]) for x in jobs] == [0.0, 1.0, 2.0, 3.0]
     assert [float(x[0]) for x in sent] == [10.0, 9.0, 8.0]
-
-
-@given(st.integers(1, 10_000))
-def test_the_rank_is_that_of_95_percent_and_no_rounding_moves_it(cycles: int) -> None:
-    rank = l95_rank(cycles)
-    assert 100 * rank >= 95 * cycles > 100 * (rank - 1)
-
-
-@pytest.mark.parametrize("n", [1, 2, 19, 20, 21, 40, 100, 101, 10**6])
-def test_the_rank_is_exact(n: int) -> None:
-    assert l95_rank(n) == -(-95 * n // 100)

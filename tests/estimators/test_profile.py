@@ -7,7 +7,7 @@ number.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +18,6 @@ from scipy import stats
 
 from dwell.errors import MetricError, ProblemError
 from dwell.estimators import Profile
-from dwell.estimators.paths import order_statistic
 from dwell.model import (
     AR1,
     Caps,
@@ -501,17 +500,3 @@ def test_missing_nodes_are_named() -> None:
 def test_samples_are_checked(samples: int) -> None:
     with pytest.raises(ProblemError, match=f"samples: {samples} is not allowed"):
         Profile(BUSY, samples=samples)
-
-
-@pytest.mark.parametrize("n", [1, 2, 19, 20, 21, 40, 100, 4000])
-def test_the_order_statistic_is_never_interpolated(n: int) -> None:
-    values = np.random.default_rng(1).permutation(n).astype(np.float64) + 1
-    assert order_statistic(values) == math.ceil(95 * n / 100)
-
-
-@given(st.lists(st.floats(0, 1e6), min_size=1, max_size=200))
-def test_the_order_statistic_has_its_share_below(values: Sequence[float]) -> None:
-    l95 = order_statistic(np.array(values))
-    assert l95 in values
-    assert sum(value <= l95 for value in values) >= 0.95 * len(values)
-    assert sum(value < l95 for value in values) < 0.95 * len(values)

@@ -1,4 +1,4 @@
-"""Nodes: quotas and their ticks, turns, wakes, backgrounds and contention, in whole runs."""
+"""Nodes: quotas and their ticks, turns, wakes and backgrounds, in whole runs."""
 
 from __future__ import annotations
 
@@ -214,27 +214,6 @@ def test_what_waits_while_jobs_run_takes_less_of_their_quota() -> None:
     assert stressed.windows["u_R1"].to_list() == pytest.approx([1.0] * 2, abs=0.02)
 
 
-def test_what_no_quota_counts_makes_the_core_slower_and_the_quota_last() -> None:
-    # Others have half of the core's time: the job has used up its 2.5 ms of every 10 after 5, and
-    # after three such periods it takes another millisecond for the last half of one.
-    node = Node("R1", "robot", 1, quota=Quota(0.25, 10.0), contention=0.5)
-    problem = make_problem(
-        [node],
-        [Task("work", {"R1": Execution(Constant(8.0))})],
-        period_ms=100.0,
-        window_cycles=5,
-    )
-    run = dwell.simulate(problem, policy="LOC", seed=1, windows=2)
-    assert set(run.cycles["latency_ns"].to_list()) == {31 * MS}
-    assert run.windows["u_R1"].to_list() == pytest.approx([8.0 / 25.0] * 2)
-    ticking = replace(node, quota=Quota(0.25, 10.0, slack_ms=1.0, tick_ms=4.0))
-    fabric = replace(problem.fabric, nodes={"R1": ticking})
-    run = dwell.simulate(replace(problem, fabric=fabric), policy="LOC", seed=1, windows=20)
-    assert run.windows["u_R1"].mean() == pytest.approx(8.0 / 25.0, rel=0.01)
-    # What ticks notice late is made up for later; faster than its pace the job never is.
-    assert min(run.cycles["latency_ns"].to_list()) >= 16 * MS
-
-
 def test_a_period_that_begins_with_stress_and_a_job_is_a_stressed_one() -> None:
     # All three at 30 ms. Without stress a period has 5 ms, with it 2.5, of which the job has half.
     problem = make_problem(
@@ -246,38 +225,6 @@ def test_a_period_that_begins_with_stress_and_a_job_is_a_stressed_one() -> None:
     )
     run = dwell.simulate(problem, scenario="disturbed", policy="LOC", seed=1, windows=1)
     assert run.cycles["latency_ns"][0] == 60.5 * MS
-
-
-def test_threads_that_hand_a_job_on_wait_for_their_turns() -> None:
-    # One core, nothing used up: a foreign thread, ticks every 4 ms.
-    def played(before_ms: float, after_ms: float) -> tuple[list[float], list[float]]:
-        execution = Execution(Constant(4.0), before_ms=before_ms, after_ms=after_ms)
-        problem = make_problem(
-            [Node("R1", "robot", 1, quota=Quota(1.0, 1000.0, 0.0, 4.0))],
-            [Task("work", {"R1": execution})],
-            period_ms=101.0,
-            window_cycles=40,
-            scenario=[NodeDisturbance("R1", stress_threads=1)],
-        )
-        run = dwell.simulate(
-            problem, scenario="disturbed", policy="LOC", seed=3, windows=1, jobs=True
-        )
-        waits_ns = run.jobs["start_ns"] - run.jobs["ready_ns"]
-        latency_ns = run.cycles["latency_ns"].to_list()
-        return [ns / MS for ns in latency_ns], [ns / MS for ns in waits_ns.to_list()]
-
-    one, first_waits = played(0.0, 0.0)
-    three, waits = played(1.0, 1.0)
-    # One thread waits for the end of the foreign one's turn, at a tick.
-    assert min(one) > 4.9
-    assert first_waits.count(0.0) <= 2
-    # Of three the first takes the turn at once where it has lasted 1.4 ms.
-    assert waits.count(0.0) >= 18
-    # The worker lets the foreign one go first, which has waited: to the first tick after 1.4 ms.
-    at_once = [ms for ms, wait in zip(three, waits, strict=True) if wait == 0.0]
-    assert min(at_once) >= 4.0 + 1.4
-    # The last goes first: nobody has had another turn.
-    assert max(at_once) < 4.0 + 1.4 + 4.0
 
 
 SLOWED = Node("R", "robot", interference=2.0)
@@ -292,10 +239,9 @@ SLOWED = Node("R", "robot", interference=2.0)
         (replace(SLOWED, scheduler="fifo"), 3, None, 3 + 3 + (24 - 3 - 3 / 2)),
         # What does not interfere makes it later, and is no work.
         (Node("R", "robot"), 3, None, 24),
-        (Node("R", "robot", quota=Quota(0.25, 10.0), contention=0.5), 1, None, 8),
         (replace(SLOWED, accelerators={"gpu": 1}), 1, "gpu", 8),
     ],
-    ids=["fair", "cores", "fifo", "no interference", "contention", "accelerator"],
+    ids=["fair", "cores", "fifo", "no interference", "accelerator"],
 )
 def test_core_time_is_more_than_work_where_foreign_threads_interfere(
     node: Node, threads: int, accelerator: str | None, core_ms: float

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dwell.estimators.pool import ENOUGH, LARGEST, PlaceSums, Pool, Reference, least_deviations
 from dwell.kernels.elementary import moments
 from dwell.kernels.meter import CyclesLayout, PartTimes, WindowRows
-from dwell.kernels.pools import ADDED, HeldValues, PoolRows
+from dwell.kernels.pools import ADDED, GROWN, HeldValues, PoolRows, fill
 
 Floats = NDArray[np.float64]
 PARTS, BLOCK = 5, 10
@@ -95,7 +95,9 @@ def test_a_window_of_all_parts_leaves_pools_as_each_by_itself_does(seed: int) ->
         for patience in (np.inf, 15.0, np.inf, 12.0, np.inf)
     ]
     alone, together = ([Pool(one, additive=False) for one in references] for _ in range(2))
-    least = least_deviations(TESTS)
+    least, grown = least_deviations(TESTS), 0
+    # Of few cycles, windows in succession are one run.
+    cycles = 60 if seed % 2 else 4
     rows = PoolRows([pool.rows for pool in together], np.array([[0, 1, -1], [2, 3, 4]]))
     for window in range(1, 25):
         if window % 8 == 0:
@@ -103,13 +105,17 @@ def test_a_window_of_all_parts_leaves_pools_as_each_by_itself_does(seed: int) ->
             alone, together, rows = copy.deepcopy((alone, together, rows))
         found, parts = of_parts(shown())
         times = found.by_part()
-        looks = rows.learn(found, parts, window, 6.0, 60, least) or [0] * len(parts)
+        looks = rows.learn(found, parts, window, 6.0, cycles, least) or [0] * len(parts)
         for part, why in zip(parts.tolist(), looks, strict=True):
-            has_changed = alone[part].learn(times[part], window, 6.0, 60, TESTS)
-            if why == ADDED:
-                assert together[part].has_left(window, 60, least) == has_changed
+            has_changed = alone[part].learn(times[part], window, 6.0, cycles, TESTS)
+            grown += why == GROWN
+            if why == GROWN:
+                assert not has_changed
+                assert not together[part].is_declared
+            elif why == ADDED:
+                assert together[part].has_left(window, cycles, least) == has_changed
             elif why:
-                assert together[part].learn(times[part], window, 6.0, 60, TESTS) == has_changed
+                assert together[part].learn(times[part], window, 6.0, cycles, TESTS) == has_changed
             else:
                 assert not has_changed
         for one, other in zip(alone, together, strict=True):
@@ -117,11 +123,46 @@ def test_a_window_of_all_parts_leaves_pools_as_each_by_itself_does(seed: int) ->
             assert (one.is_declared, one.last, one.measured, one.touched) == (
                 *(other.is_declared, other.last, other.measured, other.touched),
             )
+            assert (one.usual, one.lost, one.error_ms) == (
+                *(other.usual, other.lost, other.error_ms),
+            )
         assert rows.others() == [i for i, one in enumerate(alone) if not one.is_declared]
         assert rows.weakest() == [
             [min(alone[i].measured for i in of), min(alone[i].last for i in of)]
             for of in ((0, 1), (2, 3, 4))
         ]
+    assert grown or all(one.is_declared for one in alone)
+
+
+def test_figures_are_of_the_values_that_are_held_now() -> None:
+    rng = np.random.default_rng(1)
+    one = Pool(Reference(rng.gamma(9.0, size=400), BLOCK), additive=True)
+    one.replace(np.append(rng.gamma(9.0, size=30), np.inf), 1)
+    before, lost, error_ms = one.held, one.lost, one.error_ms
+    assert one.held is before
+    one.rows.add(rng.gamma(9.0, size=30) + 50.0, (0.0, 0.0, 0.0), 2, np.inf, 30)
+    assert len(one.held) == len(before) + 30 == 61
+    assert one.lost == lost * 31 / 61
+    assert one.error_ms > error_ms
+    with pytest.raises(ValueError, match="read-only"):
+        one.held[0] = 0.0
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_cycles_meet_finite_values_in_turn(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    values = rng.gamma(2.0, size=int(rng.integers(1, 300)))
+    values[rng.random(len(values)) < rng.choice([0.0, 0.3, 1.0])] = np.inf
+    begin, offset = int(rng.choice([0, 7, 99, 100, 120])), int(rng.integers(0, 500))
+    rows = rng.integers(0, 9, (2, 100))
+    expected, known = rows.copy(), values[np.isfinite(values)]
+    if len(known):
+        demands = np.rint(known * 1e6 / 0.7).astype(np.int64)
+        expected[:, begin:] = demands[(np.arange(begin, max(begin, 100)) + offset) % len(known)][
+            : max(100 - begin, 0)
+        ]
+    fill(list(rows), values, 0.7, begin, offset)
+    np.testing.assert_array_equal(rows, expected)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 24])

@@ -55,7 +55,6 @@ nodes:
     background_beside: 0.05
     background_hz: 50
     interference: 1.1
-    contention: 0.2
   E: {tier: cloud, cores: 2, scheduler: fifo}
 links:
   - from: R
@@ -71,7 +70,7 @@ tasks:
   see: {"on": {R: {exec_ms: 1}}, offset_ms: 1, run: "stages:See"}
   think:
     "on":
-      R: {exec_ms: 5, threads: 2, workers: 2, standby: 1, before_ms: 1, after_ms: 1}
+      R: {exec_ms: 5, threads: 2, workers: 2, standby: 1}
       E: {exec_ms: 2}
     input: {queue: 2}
     priority: 1

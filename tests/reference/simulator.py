@@ -247,15 +247,6 @@ class Job:
     outcome: str = "in_flight"
     cores: int = 0
     due: int | None = None
-    rest: int = 0
-    owed: bool = False
-
-    def hand_on(self) -> None:
-        """Let the next thread of its worker do its part: the stage's own, or what follows."""
-        after = nanoseconds(self.execution.after_ms)
-        work = self.rest - after if self.rest > after else self.rest
-        self.owed = self.rest <= after
-        self.left, self.rest = Fraction(work), self.rest - work
 
     @property
     def readiness(self) -> tuple[int, int, int, int]:
@@ -367,8 +358,6 @@ class NodeState:
         self.stressed = 0
         self.period = self.quota = self.left = self.pool = self.slack = self.periods = 0
         self.tick = 0
-        # Core time that what runs receives of the time that it has a core.
-        self.pace = 1 - Fraction(node.contention)
         self.background, self.interference = Fraction(node.background), Fraction(node.interference)
         if node.quota is not None:
             self.period = nanoseconds(node.quota.period_ms)
@@ -394,14 +383,10 @@ class NodeState:
         node, cpu = self.node, Fraction(quota.cpu)
         beside = node.background if node.background_beside is None else node.background_beside
         self.quota, self.stressed = (
-            max(round(self.left_by(taken, cpu) * self.period / self.pace), 1)
+            max(round(self.left_by(taken, cpu) * self.period), 1)
             for taken in (Fraction(beside), Fraction(node.background))
         )
-        self.slack = self.in_time(quota.slack_ms)
-
-    def in_time(self, ms: float) -> int:
-        """How long a core has to be had for so much core time."""
-        return round(nanoseconds(ms) / self.pace)
+        self.slack = nanoseconds(quota.slack_ms)
 
     @property
     def stopped(self) -> bool:
@@ -481,26 +466,8 @@ class NodeState:
         known = [thread.job for thread in (*self.waiting, self.turn) if thread]
         for job in self.own:
             if job not in known:
-                self.waiting.append(Thread(job, self.beginning(job)))
+                self.waiting.append(Thread(job, self.average))
                 self.touched = True
-
-    def hand_over(self, job: Job) -> None:
-        """Let another thread, which is new, go on with a job."""
-        average = self.average  # over the one that wakes it, too
-        self.end_turn()
-        job.hand_on()
-        self.waiting.append(Thread(job, self.beginning(job) if job.owed else average))
-
-    def beginning(self, job: Job) -> int:
-        """What a new thread of a job counts as having received."""
-        if job.owed:
-            there = [*self.waiting, *([self.turn] if self.turn else [])]
-            least = min((thread.received for thread in there), default=0)
-            if not self.debt and self.turn and self.had >= self.in_time(LEAST_TURN_MS):
-                self.waiting.append(self.turn)
-                self.end_turn()
-            return least - 1
-        return self.average
 
     def end_turn(self) -> None:
         self.turn, self.had, self.touched = None, 0, True
@@ -511,7 +478,7 @@ class NodeState:
         self.touched = True
         if self.debt or not self.turn:
             return
-        long = self.had >= self.in_time(LEAST_TURN_MS)
+        long = self.had >= nanoseconds(LEAST_TURN_MS)
         behind = any(thread.received < self.turn.received for thread in self.waiting)
         if (at_tick and long) or (now in self.wakes[-2:] and behind):
             self.waiting.append(self.turn)
@@ -527,7 +494,7 @@ class NodeState:
     def notice(self) -> None:
         """Let the kernel look whether the quota is used up: draw on the pool, or pay the debt."""
         if self.left <= 0:
-            drawn = min(self.pool, (1 if self.debt else self.in_time(DRAWN_MS)) - self.left)
+            drawn = min(self.pool, (1 if self.debt else nanoseconds(DRAWN_MS)) - self.left)
             self.pool -= drawn
             self.left += drawn
         stops = self.left <= 0
@@ -586,7 +553,7 @@ class NodeState:
         """Speed of own jobs, or of shadow jobs."""
         if self.stopped:
             return Fraction(0)
-        share = (self.share if cell == ITSELF else self.share_of_shadows) * self.pace
+        share = self.share if cell == ITSELF else self.share_of_shadows
         return share / self.slowness
 
     @property
@@ -662,7 +629,7 @@ class NodeState:
                 places[1 + job.cell] += received
                 job.core += received
                 places[0] += elapsed
-        self.busy += (rate * self.pace + self.behind) * elapsed
+        self.busy += (rate + self.behind) * elapsed
         self.left -= rate * elapsed
         if self.turn:
             self.had += rate * elapsed
@@ -1586,15 +1553,6 @@ class Simulation:
         if cell == ITSELF:
             since, under = self.now - self.release[cycle], self.stamps[cycle][0]
             self.soonest[under, name] = min(since, self.soonest.get((under, name), since))
-        elif self.nodes[node].tick:
-            return job
-        if self.nodes[node].tick and job.execution.accelerator is None:
-            work, before = int(job.left), nanoseconds(job.execution.before_ms)
-            if 0 < before < work:
-                job.left, job.rest, job.owed = Fraction(before), work - before, True
-            else:
-                job.rest = work
-                job.hand_on()
         return job
 
     def queue_up(self, job: Job) -> None:
@@ -1616,9 +1574,6 @@ class Simulation:
             self.looked_at(job)
 
     def complete(self, job: Job) -> None:
-        if job.rest:
-            self.nodes[job.node].hand_over(job)
-            return
         job.end = self.now
         job.outcome = "done"
         self.nodes[job.node].runnable(job).remove(job)

@@ -11,7 +11,7 @@ import pytest
 
 from dwell.report import comparison_html, comparison_text
 from dwell.report.comparison_page import comparison_page
-from dwell.study import compare, tenants_demo
+from dwell.study import compare
 from tests.cells.small import SEEDS, make_comparison, make_problem
 from tests.report.pages import Page, small_comparison, table_of
 
@@ -84,13 +84,6 @@ def test_a_cell_without_dtp_or_predictions_has_a_page() -> None:
     page = Page(comparison_html(found, static=True))
     assert page.outside == []
     assert not any("through time" in heading for heading in page.headings)
-
-
-def test_the_shares_of_the_tenants_are_an_axis() -> None:
-    tenants = tenants_demo("examples", seeds=2, windows=7, processes=1)
-    page = comparison_page(small_comparison(), tenants=tenants)
-    frame = next(one for one in page.figures if one.slug == "tenants").frames["rows"]
-    assert sorted(set(frame["at"])) == pytest.approx([0.0, 3.0, 6.2, 10.0], abs=0.06)
 
 
 def test_several_comparisons_stand_in_one_page() -> None:

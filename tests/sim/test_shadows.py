@@ -484,7 +484,7 @@ def without_shared_means(case: Case) -> Case:
     """Draw a case again without quotas, accelerators, bytes and order on links."""
     fabric, pipeline = case.problem.fabric, case.problem.pipeline
     nodes = {
-        name: replace(node, quota=None, contention=0.0, background_beside=None)
+        name: replace(node, quota=None, background_beside=None)
         for name, node in fabric.nodes.items()
     }
     tasks = {

@@ -37,7 +37,7 @@ def made(
             "seen_violation_rate": RATES[:count],
         }
     )
-    usual = {"migrated": True, "reason": "cost"}
+    usual = {"migrated": True, "reason": "cost", "last_cycle": 0}
     estimates: dict[str, float] = {"est_l95_ms_B": 31.0, "est_violation_rate_B": 0.15}
     estimates |= {"est_l95_ms_A": 21.0, "est_violation_rate_A": 0.0}
     if errors:

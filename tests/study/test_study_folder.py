@@ -252,18 +252,6 @@ def test_a_folder_of_other_versions_is_refused(small: Path, tmp_path: Path) -> N
         run_study(make_study(), folder=out, processes=1)
 
 
-def test_a_folder_of_a_compiler_at_run_time_is_refused(small: Path, tmp_path: Path) -> None:
-    """Half of a study that Numba played would go on with another kernel."""
-    folder = shutil.copytree(small, tmp_path / "out")
-    path = folder / "study.json"
-    described = json.loads(path.read_text(encoding="utf-8"))
-    del described["software"]["kernel"]
-    described["software"]["numba"] = "0.65.0"
-    path.write_text(json.dumps({**described, "digest": "another"}), encoding="utf-8")
-    with pytest.raises(RunError, match=r"software\.kernel: nothing there, '[0-9a-f]{16}' now"):
-        run_study(make_study(), folder=folder, processes=1)
-
-
 def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("important", encoding="utf-8")
     with pytest.raises(RunError, match="is no study; choose another folder"):

@@ -26,7 +26,6 @@ from dwell.study.summary import (
     latency_grid_ms,
     longest_streak,
     mean_of,
-    order_statistic,
     summarise,
 )
 from tests.cells.examples import EXAMPLES
@@ -326,10 +325,3 @@ def test_the_deadline_is_a_point_of_the_grid() -> None:
 )
 def test_longest_streak(missed: str, length: int) -> None:
     assert longest_streak(np.array([letter == "x" for letter in missed], bool)) == length
-
-
-def test_percentiles_are_order_statistics() -> None:
-    values = np.random.default_rng(1).permutation(np.arange(1.0, 101.0))
-    assert order_statistic(values, 95) == 95.0
-    assert order_statistic(values[:50], 95) == np.sort(values[:50])[47]
-    assert order_statistic(np.array([7.0]), 95) == 7.0

@@ -15,7 +15,6 @@ from tests.cells.known_cost import (
     BACKGROUND,
     BESIDE,
     CELL,
-    CONTENTION,
     INTERFERENCE,
     MESSAGING_MS,
     STAGE_MS,
@@ -55,7 +54,6 @@ def truth(nominal: Path) -> Problem:
                 background=BACKGROUND[node],
                 background_beside=BESIDE[node],
                 interference=INTERFERENCE if node == "E" else 1.0,
-                contention=CONTENTION[node],
             )
             for node, of in problem.fabric.nodes.items()
         },

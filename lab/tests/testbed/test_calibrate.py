@@ -73,14 +73,14 @@ def test_the_check_plays_runs_with_the_estimators_that_they_had(
 def test_a_node_without_a_quota_is_given_no_finding_that_only_a_quota_has(
     nominal: Path, folders: list[Path], tmp_path: Path
 ) -> None:
-    assert "contention" in calibrate(
+    assert "background_beside" in calibrate(
         nominal, folders, tmp_path / "with.yaml", say=lambda line: None
     ).cell.read_text(encoding="utf-8")
     cell = tmp_path / "without.yaml"
     cell.write_text(CELL.replace(", quota: {cpu: 0.8, period_ms: 4}", ""), encoding="utf-8")
     written = calibrate(cell, folders, tmp_path / "out.yaml", say=lambda line: None).problem
-    assert written.fabric.nodes["E"].contention == 0.0
-    assert written.fabric.nodes["R1"].contention > 0.0
+    assert written.fabric.nodes["E"].background_beside is None
+    assert written.fabric.nodes["R1"].background_beside is not None
 
 
 def test_what_was_not_visited_stays(nominal: Path, folders: list[Path], tmp_path: Path) -> None:

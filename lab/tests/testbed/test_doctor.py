@@ -20,7 +20,7 @@ from dwell_lab.testbed.probe import Lateness
 from lab.tests.testbed.machine import no_groups, no_hosts
 from tests.cells.once import with_windows
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 NEEDED = {
     "root",
     "ip",

@@ -20,7 +20,7 @@ from dwell_lab.testbed.run import require_machine, run_once
 from dwell_lab.validation.measured_campaign import read_measured
 from lab.tests.testbed.machine import own_name
 
-CELL = Path(__file__).parents[2] / "examples" / "visual_servoing" / "testbed.yaml"
+CELL = Path(__file__).parents[3] / "examples" / "visual_servoing" / "testbed.yaml"
 #: Of each run: four windows of two seconds after that of warm-up.
 SECONDS = 10.0
 SCENARIOS, POLICIES = ("baseline",), ("SO", "cusum+corrected")

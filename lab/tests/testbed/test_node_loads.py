@@ -1,24 +1,21 @@
-"""Node loads: backgrounds, contention and wakes, from runs of a cell whose loads are known."""
+"""Node loads: backgrounds and wakes, from runs of a cell whose loads are known."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
 
-import polars as pl
 import pytest
 
 import dwell
 from dwell.model import Quota
-from dwell.record import Run
 from dwell_lab.testbed.measured import look_at
 from dwell_lab.testbed.node_loads import TOGETHER, wakes
-from lab.tests.testbed.calibrated import Calibrated, calibrate
+from lab.tests.testbed.calibrated import Calibrated
 from tests.cells.known_cost import (
     ADDED_MS,
     BACKGROUND,
     BESIDE,
-    CONTENTION,
     HZ,
     INTERFERENCE,
 )
@@ -30,25 +27,9 @@ def test_backgrounds_and_links_are_found(calibrated: Calibrated) -> None:
         found = calibrated.problem.fabric.nodes[node]
         assert found.interference == pytest.approx(INTERFERENCE if node == "E" else 1.0, rel=0.05)
         assert found.background_beside == pytest.approx(BESIDE[node], abs=0.001)
-        assert found.contention == pytest.approx(CONTENTION[node], abs=0.001)
     assert calibrated.problem.fabric.nodes["R1"].quota == Quota(0.4, 4)
     for link in ("R1->E", "E->R1"):
         assert calibrated.report["links"][link]["added_ms"] == pytest.approx(ADDED_MS, abs=0.25)
-
-
-def test_what_a_stressed_node_takes_of_the_cpus_of_another_is_no_contention(
-    nominal: Path, folders: list[Path], tmp_path: Path
-) -> None:
-    run = dwell.open_run(folders[2])
-    took_ns = pl.col("end_ns") - pl.col("start_ns")
-    outside = pl.when(pl.col("node") == "R1").then(0.3 * took_ns).otherwise("outside_ns")
-    jobs = run.jobs.with_columns(outside_ns=outside.cast(pl.Int64))
-    tables = {"cycles": run.cycles, "windows": run.windows, "decisions": run.decisions}
-    tables |= {"processes": run.processes}
-    folder = Run(run.meta, {**tables, "jobs": jobs}).save(tmp_path / "OFF-stress")
-    runs = [*folders[:2], folder]
-    node = calibrate(nominal, runs, tmp_path / "out.yaml", say=print).problem.fabric.nodes["R1"]
-    assert node.contention == pytest.approx(CONTENTION["R1"], abs=0.001)
 
 
 def test_how_often_something_wakes_is_of_nodes_whose_quota_has_ticks(

@@ -44,7 +44,7 @@ def replayed(tmp_path: Path) -> Problem:
     document["tasks"]["perception"]["on"]["E"]["exec_ms"] = trace("edge")
     document["links"][0]["delay_ms"] = trace("link")
     quota = {"cpu": 0.9, "period_ms": 4}
-    document["nodes"]["R1"] |= {"background": 0.2, "quota": quota, "contention": 0.1}
+    document["nodes"]["R1"] |= {"background": 0.2, "quota": quota}
     return from_document(document, folder=tmp_path)
 
 
@@ -69,7 +69,6 @@ def test_what_was_measured_takes_longer_and_keeps_its_rows(replayed: Problem) ->
     # One table still: a cycle takes the same row of all of them.
     assert robot.table is edge.table is link.table
     assert slow.fabric.nodes["R1"].background == pytest.approx(0.3)
-    assert slow.fabric.nodes["R1"].contention == pytest.approx(0.15)
     assert slow.pipeline.tasks["sensing"] == replayed.pipeline.tasks["sensing"]
 
 

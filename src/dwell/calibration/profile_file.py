@@ -12,16 +12,14 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.errors import ProfileError
 from dwell.files import write_whole
+from dwell.model.number_arrays import Floats
 from dwell.model.semantics import bad_name
-
-Floats: TypeAlias = NDArray[np.float64]
 
 KEY = "dwell.profile"
 FORMAT = 1
@@ -192,15 +190,15 @@ def _parsed(path: Path, text: str) -> dict[str, dict[str, Any]]:
     try:
         found = json.loads(text)
         version, measurements = int(found["format"]), dict(found["measurements"])
-        sound = version > FORMAT or all(
+        sound = version != FORMAT or all(
             name in list(entry["columns"]) for name, entry in measurements.items()
         )
     except (ValueError, KeyError, TypeError):
         sound = False
     if not sound:
         raise ProfileError(f"{path}: its metadata cannot be understood; measure again")
-    if version > FORMAT:
-        raise ProfileError(f"{path}: format {version}; this version reads up to {FORMAT}")
+    if version != FORMAT:
+        raise ProfileError(f"{path}: format {version}; this version reads {FORMAT} only")
     return measurements
 
 

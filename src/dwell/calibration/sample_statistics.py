@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from dwell.calibration.profile_file import Floats, Measurement
+from dwell.calibration.profile_file import Measurement
+from dwell.model.number_arrays import Floats
+from dwell.model.order_statistic import percentile
 
 # Above these a measurement is called into question. A busy loop on a core of its own was taken
 # off it some 4 times a second by the kernel's own threads, and 250 times where it shared the core.
@@ -57,12 +59,6 @@ def describe(samples: Floats) -> Statistics:
         cv=(square / len(samples)) ** 0.5 / mean if mean > 0 else 0.0,
         lag1=lag1,
     )
-
-
-def percentile(samples: Floats, percent: int) -> float:
-    """Return the ceil(percent / 100 * n)-th smallest of n samples, never interpolated."""
-    rank = -(-percent * len(samples) // 100)  # in integers: 0.95 * n is not exact
-    return float(np.partition(samples, rank - 1)[rank - 1])
 
 
 def find_doubts(measurement: Measurement) -> Iterator[str]:

@@ -301,6 +301,7 @@ LINK = shape_of(
             FlagForm(),
             "Whether there is the same link back too, drawn independently.",
             "false",
+            tier="first",
         ),
     ),
 )
@@ -339,6 +340,7 @@ TASK = shape_of(
             "What waits for a worker: `queue` without a bound, `latest` only, or a bounded queue.",
             "queue",
             named="input",
+            tier="first",
         ),
     },
     further=(
@@ -364,9 +366,9 @@ def _disturbance() -> Shape:
     node = shape_of(NodeDisturbance, TIMED)
     link = shape_of(LinkDisturbance, TIMED)
     known = {key.name: key for key in (*node.keys, *link.keys)}
-    first = optional("node", NAME, known.pop("node").says)
+    first = optional("node", NAME, known.pop("node").says, tier="first")
     further = (
-        optional("link", NAME, "Link that it happens to, as `R1->E`."),
+        optional("link", NAME, "Link that it happens to, as `R1->E`.", tier="first"),
         optional("both_ways", FlagForm(), "Whether it happens to the link back as well.", "false"),
     )
     return Shape(
@@ -383,9 +385,9 @@ OBJECTIVE = shape_of(
     Objective,
     {},
     instead={
-        "weights": optional("weights", WEIGHTS, "Weights of the terms of J."),
-        "targets": optional("targets", TARGETS, "Design targets."),
-        "caps": optional("caps", CAPS, "Hard caps."),
+        "weights": optional("weights", WEIGHTS, "Weights of the terms of J.", tier="first"),
+        "targets": optional("targets", TARGETS, "Design targets.", tier="first"),
+        "caps": optional("caps", CAPS, "Hard caps.", tier="first"),
         "accelerators": optional(
             "accelerators",
             FlagForm(),
@@ -419,19 +421,21 @@ _TIMING = [
     for one in declared_fields(Pipeline)
     if one.name not in _SECTIONS
 ]
-_SAYS = {
-    one.name: one.key.says for kind in (Pipeline, Fabric, Problem) for one in declared_fields(kind)
+_SECTION_KEYS = {
+    one.name: one.key for kind in (Pipeline, Fabric, Problem) for one in declared_fields(kind)
 }
 
 
 def _section(name: str, form: Form) -> FormKey:
     """A section of the file, with what the model says of it."""
-    return optional(name, form, _SAYS[name])
+    about = _SECTION_KEYS[name]
+    return optional(name, form, about.says, tier=about.tier)
 
 
 def _needed(name: str, form: Form) -> FormKey:
     """A section that has to be there."""
-    return required(name, form, _SAYS[name], {})
+    about = _SECTION_KEYS[name]
+    return required(name, form, about.says, {}, tier=about.tier)
 
 
 CELL = FileKind.of(

@@ -16,7 +16,7 @@ from typing import Any, Final, TypeAlias, get_args, get_origin
 
 from dwell.cellfile.document_faults import Faults
 from dwell.model.bounds import Bound, Pattern, as_read
-from dwell.model.declaration import DeclaredField, declared_fields
+from dwell.model.declaration import DeclaredField, KeyTier, declared_fields
 from dwell.model.dotted_paths import Step, beneath
 from dwell.model.semantics import closest, nearest
 
@@ -335,6 +335,8 @@ class FormKey:
         Stands for a value at fault where the key is required; `FAULTY`: the mapping goes.
     breaks : bool
         Whether a value at fault takes the mapping with it though the key is optional.
+    tier : str
+        See `Declaration`.
     """
 
     name: str
@@ -345,6 +347,7 @@ class FormKey:
     usual: str = ""
     stand_in: Any = FAULTY
     breaks: bool = False
+    tier: KeyTier = "tuning"
 
     @property
     def described(self) -> str:
@@ -352,16 +355,30 @@ class FormKey:
         return f"{self.says[:-1]}; default: {self.usual}." if self.usual else self.says
 
 
-def optional(name: str, form: Form, says: str, usual: str = "", *, named: str = "") -> FormKey:
+def optional(
+    name: str,
+    form: Form,
+    says: str,
+    usual: str = "",
+    *,
+    named: str = "",
+    tier: KeyTier = "tuning",
+) -> FormKey:
     """Return a key that may be left out; `named` where the file has another name for it."""
-    return FormKey(name, named or name, form, says, usual=usual)
+    return FormKey(name, named or name, form, says, usual=usual, tier=tier)
 
 
 def required(
-    name: str, form: Form, says: str, stand_in: Any = FAULTY, *, named: str = ""
+    name: str,
+    form: Form,
+    says: str,
+    stand_in: Any = FAULTY,
+    *,
+    named: str = "",
+    tier: KeyTier = "first",
 ) -> FormKey:
     """Return a key that has to be there; see `optional`."""
-    return FormKey(name, named or name, form, says, is_required=True, stand_in=stand_in)
+    return FormKey(name, named or name, form, says, True, "", stand_in, tier=tier)
 
 
 class Entry:
@@ -422,6 +439,12 @@ class Shape(Form):
         """Its keys."""
         return [key.named for key in self.keys]
 
+    @property
+    def by_tier(self) -> list[FormKey]:
+        """Its keys, those that a first cell needs first."""
+        tiers = get_args(KeyTier)
+        return sorted(self.keys, key=lambda key: tiers.index(key.tier))
+
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return an `Entry` with what is given."""
         if not isinstance(value, dict):
@@ -468,7 +491,7 @@ class Shape(Form):
         """Return its schema itself."""
         properties = {
             key.named: {**key.form.schema(definitions), "description": key.described}
-            for key in self.keys
+            for key in self.by_tier
         }
         result: JsonSchema = {
             "type": "object",
@@ -489,7 +512,10 @@ def key_of(
     """Return the key of a field that the model declares."""
     required = one.default is MISSING and one.key.usual is None
     usual = one.key.usual or ("" if required else _shown(one.default))
-    return FormKey(one.name, one.named, form, one.key.says, required, usual, stand_in, breaks)
+    about = one.key
+    return FormKey(
+        one.name, one.named, form, about.says, required, usual, stand_in, breaks, about.tier
+    )
 
 
 def _shown(default: Any) -> str:

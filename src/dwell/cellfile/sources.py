@@ -1,4 +1,4 @@
-"""A digest of this package's own sources: whether two results were made by the same code."""
+"""Digest of Python sources: whether the same code made two results."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from importlib.resources import files
 from importlib.resources.abc import Traversable
 
 
-def digest_of(names: Iterable[str]) -> str:
-    """Return 16 hexadecimal digits that change with any Python file among several.
+def digest_of(names: Iterable[str], package: str = "dwell") -> str:
+    """Return 16 hexadecimal digits that change with any of the named Python files.
 
     Parameters
     ----------
     names : iterable of str
-        Files and folders below the package, as ``sim`` or ``cost.py``.
+        Files and folders of the package, as ``sim`` or ``cost.py``.
 
     Raises
     ------
@@ -23,9 +23,9 @@ def digest_of(names: Iterable[str]) -> str:
     """
     digest = hashlib.sha256()
     for name in names:
-        sources = list(_sources(files("dwell").joinpath(name), name))
+        sources = list(_sources(files(package).joinpath(name), name))
         if not sources:
-            raise FileNotFoundError(f"dwell has no sources {name}")
+            raise FileNotFoundError(f"{package} has no sources {name}")
         for path, text in sources:
             digest.update(path.encode())
             digest.update(text)

@@ -27,10 +27,9 @@ from dwell.errors import TraceError
 from dwell.model import Trace, TraceTable
 from dwell.model.bounds import VALUE
 from dwell.model.document import digest
+from dwell.model.number_arrays import Floats, Mask
 from dwell.model.semantics import nearest
 
-Floats: TypeAlias = NDArray[np.float64]
-Mask: TypeAlias = NDArray[np.bool_]
 Frame: TypeAlias = Mapping[str, FileColumn]
 
 RELATIVE = (

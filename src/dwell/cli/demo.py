@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -22,11 +23,12 @@ from dwell.cli.options import (
 from dwell.cli.output import mark_of, print_json, progress, require_own, working, write_file
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from dwell.model import Problem
+    from dwell.study import Study
 
-    import polars as pl
-
-    from dwell.study import Comparison, StudyResult
+#: The study, and the cells that replay measurements, in the folder of examples.
+STUDY = "studies/demo.yaml"
+REAL = ("real.yaml", "real-5g.yaml")
 
 
 def demo(
@@ -47,41 +49,49 @@ def demo(
 ) -> None:
     """Compare all policies in all scenarios of an example, and write the report.
 
-    Runs are 150 windows long, if neither --windows nor --seconds is given.
+    It is the study examples/studies/demo.yaml; its runs are 150 windows long, if neither --windows
+    nor --seconds is given.
     """
     from dwell.report import comparison_html, comparison_text
-    from dwell.study import canonical_demo, real_demo, stored_deadlines, tenants_demo
-    from dwell.study.demo import CANONICAL, REAL, WINDOWS
+    from dwell.study import compare_study, load_study
 
     require_one_length(windows, seconds)
     folder = find_examples(examples)
+    plan = replace(load_study(folder / STUDY), seeds=tuple(range(1, seeds + 1)))
+    cells = [plan.points[0].problem]
+    if real is not None:
+        cells = [dwell.load(folder / name, traces=real) for name in REAL]
     if seconds is not None:
-        cells = (CANONICAL,) if real is None else REAL
-        windows = windows_of(seconds, *(dwell.load(folder / name, traces=real) for name in cells))
-    windows, page = windows or WINDOWS, out / "report.html"
-    mark = mark_of(str(folder.resolve()), str(real), seeds, windows)
+        windows = windows_of(seconds, *cells)
+    plans = [_on(plan, cell, windows or plan.windows) for cell in cells]
+    page = out / "report.html"
+    mark = mark_of(str(folder.resolve()), str(real), seeds, windows or plan.windows)
     require_own(page, mark)
-    with progress("simulating") as shown:
-        plan: dict[str, Any] = {"seeds": seeds, "windows": windows}
-        plan |= {"processes": processes, "progress": shown}
-        comparisons: Sequence[Comparison]
-        tenants: StudyResult | None = None
-        deadlines: pl.DataFrame | None = None
-        if real is None:
-            deadlines = stored_deadlines(folder)
-            comparisons = [canonical_demo(folder, **plan)]
-            tenants = tenants_demo(folder, **plan)
-        else:
-            comparisons = real_demo(folder, real, **plan)
+    comparisons = []
+    for one in plans:
+        with progress(f"simulating {one.name}") as shown:
+            comparisons.append(compare_study(one, processes=processes, progress=shown))
     if not as_json:
         for comparison in comparisons:
             typer.echo(f"Cell {comparison.problem.name}\n")
             typer.echo(comparison_text(comparison))
     with working("writing the report"):
-        html = comparison_html(*comparisons, tenants=tenants, deadlines=deadlines)
-        write_file(page, html + mark)
+        write_file(page, comparison_html(*comparisons) + mark)
     if as_json:
         tables = {one.problem.name: one.table().to_dicts() for one in comparisons}
         print_json({"report": page, "comparisons": tables})
     else:
         typer.echo(f"report: {page}")
+
+
+def _on(study: Study, cell: Problem, windows: int) -> Study:
+    """Return the study on a cell; runs are no longer than its traces allow."""
+    from dwell.study import Point, longest_run
+
+    return replace(
+        study,
+        name=cell.name,
+        points=(Point({}, cell),),
+        scenarios=tuple(cell.scenarios),
+        windows=longest_run(cell, windows),
+    )

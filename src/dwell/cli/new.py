@@ -39,6 +39,8 @@ HEAD = """\
 #   objective           what a good placement is: weights, targets, caps
 #   controller.policy   who decides: `policy:Patient` is the class in policy.py
 {more}
+# Keys of the tier `first`; docs/cells.md lists all keys by tier:
+{keys}
 # `dwell check cell.yaml` finds every fault in it; `python test_cell.py` plays it.
 """
 MORE = {
@@ -106,7 +108,7 @@ def _files(examples: Path, name: str, origin: Origin) -> dict[str, str]:
             "test_cell.py": "new/test_cell.py",
         }.items()
     }
-    head = HEAD.format(name=name, origin=origin.value, more=MORE[origin])
+    head = HEAD.format(name=name, origin=origin.value, more=MORE[origin], keys=_first_keys())
     cell = re.sub(r"\A(#.*\n)+", "", given["cell.yaml"])
     cell = re.sub(r"^name: .*$", f"name: '{name}'", cell, count=1, flags=re.MULTILINE)
     stages = given["stages.py"].partition("\n")[2]
@@ -116,3 +118,24 @@ def _files(examples: Path, name: str, origin: Origin) -> dict[str, str]:
         "stages.py": STAGES_HEAD[origin] + stages,
         SCHEMA_FILE: schema_text(),
     }
+
+
+def _first_keys() -> str:
+    """Return a comment with the keys that a first cell needs, by their part of the file."""
+    from dwell.cellfile import cell_form
+
+    shapes = {
+        "nodes": cell_form.NODE,
+        "links": cell_form.LINK,
+        "tasks": cell_form.TASK,
+        "tasks.*.on": cell_form.EXECUTION,
+        "flows": cell_form.FLOW,
+        "scenarios": cell_form.DISTURBANCE,
+        "objective": cell_form.OBJECTIVE,
+        "controller": cell_form.CONTROLLER,
+    }
+    firsts = {
+        part: [key.named for key in shape.by_tier if key.tier == "first"]
+        for part, shape in shapes.items()
+    }
+    return "\n".join(f"#   {part:<19} {', '.join(keys)}" for part, keys in firsts.items())

@@ -5,7 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import shlex
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -88,7 +90,9 @@ def run(
     from dwell.estimators import unplayed
     from dwell.record import require_free
     from dwell.sim import describe
+    from dwell.study.other_placements import PLACEMENTS, other_placements
     from dwell.study.summary import summarise
+    from dwell.study.verdict import verdict_of
 
     policy = policy or problem.controller.policy
     folder = out or default_folder(problem.name, scenario, policy, str(seed), *(settings or ()))
@@ -109,22 +113,31 @@ def run(
         result = dwell.simulate_realisation(
             problem, realisation, policy=policy, estimator=estimator, jobs=jobs, guard=guard
         )
+        counts = not result.windows["warmup"].all()
+        placements = other_placements(problem, realisation) if counts else {}
+        result = result.with_facts(**{PLACEMENTS: placements})
         try:
             result.save(folder)
         except RunError as error:
             typer.echo(f"error: {error}", err=True)
             raise typer.Exit(ExitCode.FAILED) from None
     labels: dict[str, str | int] = {"scenario": scenario, "policy": policy, "seed": seed}
-    measured = None
-    if not result.windows["warmup"].all():
+    measured, verdict = None, None
+    if counts:
         measured = summarise(result, problem, labels).row
+        verdict = verdict_of(result, problem, float(measured["violation_rate"]))
     if as_json:
         head: dict[str, Any] = {"cell": problem.name, **labels, "run": folder}
         starts = [start._asdict() for start in realisation.trace_starts]
-        print_json({**head, "traces": starts, "summary": measured})
-    else:
-        typer.echo(_summary(problem, labels, windows, measured))
-        typer.echo(f"\nsaved to {folder}")
+        answer = {"verdict": verdict and asdict(verdict), PLACEMENTS: placements}
+        print_json({**head, "traces": starts, "summary": measured, **answer})
+        return
+    typer.echo(_title(problem, labels, windows, counts))
+    if measured is not None:
+        typer.echo(f"\n{verdict}\n{_never_moving(placements, problem)}\n")
+        typer.echo(_numbers(problem, measured))
+    where = shlex.quote(str(folder))
+    typer.echo(f"\nsaved; to see it: dwell report {where}, or dwell dash {where}")
 
 
 def default_folder(*parts: str) -> Path:
@@ -140,29 +153,42 @@ def _require_same(folder: Path, settings: Mapping[str, Any]) -> None:
     """Raise a RunError where a folder holds another run: other than this one made again."""
     if not (folder / "run.json").is_file():
         return
-    # Of whatever version; that of the software makes no other run.
+    # The software's version and the other placements' results do not make it another run.
+    beside = {"versions": None, "placements": None}
     kept = read_document(folder / "run.json")
-    if {**kept, "versions": None} != {**json.loads(json.dumps(settings)), "versions": None}:
+    if {**kept, **beside} != {**json.loads(json.dumps(settings)), **beside}:
         raise RunError(
-            f"{folder} holds another run; choose another folder, or say --force to replace it"
+            f"{folder} holds another run; choose another folder, or replace it with --force"
         )
 
 
-def _summary(
-    problem: Problem, labels: Mapping[str, str | int], windows: int, row: Row | None
+def _title(
+    problem: Problem, labels: Mapping[str, str | int], windows: int, has_counted: bool
 ) -> str:
     warmup = problem.warmup_windows
     title = (
         f"{problem.name}, {labels['scenario']}, {labels['policy']}, seed {labels['seed']}: "
-        f"{counted(windows, 'window')} of {counted(problem.window_cycles, 'cycle')}"
+        f"{counted(windows, 'window')} of {counted(problem.window_cycles, 'cycle')}, "
+        f"deadline {milliseconds(problem.pipeline.deadline_ms)} ms"
     )
-    if row is None:
+    if not has_counted:
         return f"{title}, none after the {warmup} of warm-up: nothing to sum up; ask for more"
+    return f"{title}\nwithout the first {warmup} (warm-up):" if warmup else title
+
+
+def _never_moving(placements: Mapping[str, Mapping[str, float]], problem: Problem) -> str:
+    """Return the results of the initial placement, and of the best of all that were simulated."""
+    rates = {name: row["violation_rate"] for name, row in placements.items()}
+    first, best = problem.initial, min(rates, key=rates.__getitem__)
+    line = f"{rates[first] * 100:.2f} % if it never moved from {first}"
+    return line if best == first else f"{line}; {rates[best] * 100:.2f} % if always on {best}"
+
+
+def _numbers(problem: Problem, row: Row) -> str:
     shares = {name: float(row[f"share_{name}"]) for name in problem.candidates}
     used = (f"{name} {row[f'node_{name}']:.0%}" for name in problem.fabric.resources)
     unfinished = f"{row['in_flight']} of {row['cycles']}"
     lines = (
-        ("missed deadlines (V_D)", f"{float(row['violation_rate']) * 100:.2f} %"),
         ("L95, mean of windows", f"{milliseconds(float(str(row['l95_ms'])), 2)} ms"),
         ("median latency", _latency(row["p50_ms"])),
         ("95th percentile of all cycles", _latency(row["p95_ms"])),
@@ -180,9 +206,7 @@ def _summary(
         ("utilisation", ", ".join(used)),
     )
     width = max(len(name) for name, _ in lines)
-    left_out = f", the first {warmup} (warm-up) left out below" if warmup else ""
-    body = "\n".join(f"{name.ljust(width)}  {value}" for name, value in lines)
-    return f"{title}{left_out}\n\n{body}"
+    return "\n".join(f"{name.ljust(width)}  {value}" for name, value in lines)
 
 
 def _latency(value: object) -> str:

@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from operator import add
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.control.coordination import Asked, Coordination, Verdict, Wish
 from dwell.control.course import Course
@@ -32,6 +31,7 @@ from dwell.estimators.user_estimator import as_started
 from dwell.model import Caps, Decision, FrozenDict, Objective, Problem, QoS
 from dwell.model.bounds import CLASS_PATH
 from dwell.model.controller_settings import SHADOW_FRACTION
+from dwell.model.number_arrays import Floats, Ints
 from dwell.model.qos import NO_ERROR
 from dwell.model.semantics import too_many_shadows
 from dwell.model.shadow_plan import by_candidate
@@ -42,9 +42,6 @@ from dwell.policies import by_name as policy_by_name
 from dwell.policies.pricing import Pricing
 from dwell.policies.registry import estimator_of
 from dwell.policies.user_policy import as_proposer
-
-Ints: TypeAlias = NDArray[np.int64]
-Floats: TypeAlias = NDArray[np.float64]
 
 
 class LookedAt(NamedTuple):
@@ -466,8 +463,11 @@ class Controller:
         """Compare the incumbent's window with its estimate, if it can be compared."""
         incumbent, (_, last_cycle, cycles) = self.course.placement, self.looked
         seen = SeenWindow(observed.l95_ms, observed.violation_rate, last_cycle, cycles)
-        estimate, deviations = estimates.get(incumbent), self._estimator.deviations(incumbent)
-        if not isinstance(estimate, QoS) or deviations is None or not self._watchdog.is_due(seen):
+        estimate = estimates.get(incumbent)
+        if not isinstance(estimate, QoS) or not self._watchdog.is_due(seen):
+            return
+        deviations = self._estimator.deviations(incumbent)
+        if deviations is None:
             return
         played = Expected.of_estimate(estimate, deviations, self.problem.window_cycles)
         if self._watchdog.compare(seen, played):
@@ -480,7 +480,8 @@ class Controller:
         decision, incumbent = proposal.decision, self.course.placement
         by_price = self._policy.by_price
         seen = SeenWindow(*proposal.seen[:2], *proposal.looked[1:])
-        wish = Wish(decision, estimates, incumbent, self._estimator, by_price, seen, self._doubts)
+        of_cell = self._estimator, by_price, seen, self._doubts, self.course.by_guard
+        wish = Wish(decision, estimates, incumbent, *of_cell)
         verdict = coordination.consider(wish)
         proposal.verdict, name = verdict, verdict.name
         if name != decision.name:

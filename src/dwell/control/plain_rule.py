@@ -7,18 +7,16 @@ the simulator has a second body of some of them, and these are the numbers that 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.control.controller import Controller
 from dwell.cost import GAIN_TOLERANCE, tier_nodes
 from dwell.estimators import Profile
 from dwell.model import Objective
+from dwell.model.number_arrays import Floats
 from dwell.policies import ATP, DTP, Cusum, LatencyFirst, Static
-
-Floats: TypeAlias = NDArray[np.float64]
 
 
 class PlainRule(NamedTuple):

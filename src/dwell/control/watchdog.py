@@ -9,17 +9,13 @@ the cell is not trusted, until as many agree.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, TypeAlias
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import NamedTuple
 
 from dwell.estimators.prices import AGREES, L95_SHARE, RATE, Price
 from dwell.estimators.slow_processes import unseen_error
 from dwell.model import QoS
+from dwell.model.number_arrays import Floats
 from dwell.model.qos import NO_ERROR
-
-Floats: TypeAlias = NDArray[np.float64]
 
 WINDOWS = 2
 #: For how many windows a candidate is doubted first, after its model was not trusted.

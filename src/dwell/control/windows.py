@@ -8,18 +8,14 @@ simulator's kernel (``metrics.h``).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.cost import hamming, price, tier_nodes
-from dwell.estimators.paths import l95_rank
 from dwell.model.instants import NEVER_NS
+from dwell.model.number_arrays import Floats, Ints
+from dwell.model.order_statistic import order_statistic, rank_of
 from dwell.model.problem import Problem
-
-Ints: TypeAlias = NDArray[np.int64]
-Floats: TypeAlias = NDArray[np.float64]
 
 
 def missed_cycles(latency_ns: Ints, age_ns: Ints, deadline_ns: int) -> Ints | int:
@@ -64,8 +60,7 @@ def seen_l95_ms(latency_ns: Ints, age_ns: Ints, censor_ms: float) -> tuple[Float
     """
     seen = np.minimum(latency_ns, age_ns)
     count = seen.shape[-1]
-    rank = l95_rank(count)
-    l95 = np.partition(seen, rank - 1, axis=-1)[..., rank - 1]
+    rank, l95 = rank_of(95, count), order_statistic(seen, 95)
     # Censoring is monotone, so censoring the order statistic is censoring every latency.
     uncut_ms = l95 / 1e6
     l95_ms = np.minimum(uncut_ms, round(censor_ms * 1e6) / 1e6)
@@ -82,8 +77,7 @@ def seen_l95_ms(latency_ns: Ints, age_ns: Ints, censor_ms: float) -> tuple[Float
 
 def final_l95_ms(latency_ns: Ints) -> Floats:
     """L95 of final latencies, shape (..., W), in ms; infinite where too many never completed."""
-    rank = l95_rank(latency_ns.shape[-1])
-    l95 = np.partition(latency_ns, rank - 1, axis=-1)[..., rank - 1]
+    l95 = order_statistic(latency_ns, 95)
     ms: Floats = np.where(l95 >= NEVER_NS, np.inf, l95 / 1e6)
     return ms
 

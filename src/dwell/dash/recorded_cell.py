@@ -20,9 +20,10 @@ from dwell.dash.paged_cell import (
 )
 from dwell.dash.recorded_events import RecordedEvents, disturbance_events, disturbances_met
 from dwell.dash.recorded_windows import RecordedWindows, placement_codes
-from dwell.dash.strip import Floats, Strip, binned_means, plain
+from dwell.dash.strip import Strip, binned_means, plain
 from dwell.errors import RunError
 from dwell.model.instants import NEVER_NS
+from dwell.model.number_arrays import Floats
 from dwell.record import Run, open_run
 
 #: Cycles before a place among which the newest one in effect is looked for.

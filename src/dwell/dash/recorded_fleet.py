@@ -21,11 +21,12 @@ from dwell.dash.paged_cell import NO_WINDOW, UNMEASURED, Plain
 from dwell.dash.recorded_cell import RecordedCell
 from dwell.dash.recorded_events import RecordedEvents, disturbance_events, disturbances_met
 from dwell.dash.recorded_windows import RecordedWindows
-from dwell.dash.strip import Floats, Strip, binned_means, plain
+from dwell.dash.strip import Strip, binned_means, plain
 from dwell.display import placement_hues
 from dwell.errors import RunError
 from dwell.model import Problem
 from dwell.model.fleet import FleetCell
+from dwell.model.number_arrays import Floats
 from dwell.record import FleetRun, Run, open_fleet
 from dwell.record.fleet_run import how_many_are_whole, listed
 

@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.dash.paged_cell import Plain, health_by
-from dwell.dash.strip import Floats, plain
+from dwell.dash.strip import plain
 from dwell.model import Problem
 from dwell.model.live import RECENT_WINDOWS
+from dwell.model.number_arrays import Floats
 from dwell.record import Names, Run
+from dwell.record.moves import GUARD, by_guard
 
 #: What is both estimated and seen of a window, and the columns that say what was seen.
 SEEN = {"l95_ms": "seen_l95_ms", "violation_rate": "seen_violation_rate", "cost": "cost"}
@@ -80,7 +82,7 @@ class RecordedWindows:
         self._incumbent = placement_codes(table.names("incumbent"), self._candidates)
         refused = run.decisions["refused"].to_list() if "refused" in table else []
         self._refused = [text or "" for text in refused] or [""] * len(self._reasons)
-        at_close = ~reasons.equal("guard")
+        at_close = ~by_guard(table)
         # Of a window, the row of its decision; -1 where nothing was decided.
         self._row = np.full(len(self.number), -1)
         # The place of its window; one that is missing has none.
@@ -117,7 +119,7 @@ class RecordedWindows:
             if refused[row]:
                 yield {**event, "kind": "refused", "text": f"{reason}: {self._refused[row]}"}
             else:
-                kind = "guard" if reason == "guard" else "move"
+                kind = "guard" if reason == GUARD else "move"
                 yield {**event, "kind": kind, "text": f"{names[0]} → {names[1]}: {reason}"}
 
     def closed(self, at: float) -> int:

@@ -10,7 +10,8 @@ import numpy as np
 
 from dwell.dash.observer import ObservedCycle, ObservedWindow, Observer
 from dwell.dash.paged_cell import MOST_WITH_JOBS, Plain, TimedCycle, cell_document, jobs_document
-from dwell.dash.strip import Floats, Strip, binned_means
+from dwell.dash.strip import Strip, binned_means
+from dwell.model.number_arrays import Floats
 from dwell.record.json_documents import json_ready
 
 #: Cycles of the time line, which reaches farther back than the observer.

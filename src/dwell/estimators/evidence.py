@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.kernels.meter import WindowRows
+from dwell.model.number_arrays import Ints
 
-Ints: TypeAlias = NDArray[np.int64]
 Rows: TypeAlias = slice | NDArray[np.bool_] | NDArray[np.int64]
 
 #: Stands for an instant that had not come, or was not known, when the window closed.

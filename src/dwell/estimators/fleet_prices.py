@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.cost import price, tier_nodes
 from dwell.estimators.presents import Present, realised
@@ -23,12 +22,12 @@ from dwell.kernels.arrays import Arrays, lay_out
 from dwell.kernels.codes import EventKind, cell_of, kind_of
 from dwell.kernels.random_draws import draw
 from dwell.model.frozen import FrozenDict
+from dwell.model.number_arrays import Floats
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS
 from dwell.model.scenario import Scenario
 
-Floats: TypeAlias = NDArray[np.float64]
 #: Candidate of each cell, in their order; None for a cell that is left out.
 Placements: TypeAlias = tuple[str | None, ...]
 
@@ -215,6 +214,10 @@ class FleetPrices:
                 if any(name in one.down for one in known):
                     down.add(name)
         return replace(present, threads=FrozenDict(threads), down=frozenset(down))
+
+    def knows(self, placements: Placements) -> bool:
+        """Whether the fleet was played at some placements under these presents."""
+        return placements in self._known
 
     def price(self, placements: Placements) -> FleetPrice:
         """Play the fleet at some placements; what was played under these presents is known."""

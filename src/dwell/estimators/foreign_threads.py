@@ -55,6 +55,7 @@ class ForeignThreads:
 
     def __init__(self, node: Node, decisions: float = 1.0) -> None:
         self.node, self._most = node, round(WINDOWS * decisions)
+        self._capacity, self._burst_threads = node.capacity, node.burst_threads
         self.beyond = 0.0
         self._mean, self._windows = 0.0, 0
 
@@ -63,8 +64,8 @@ class ForeignThreads:
 
     @property
     def threads(self) -> float:
-        """All of them, in the mean."""
-        return max(self.node.burst_threads + self.beyond, 0.0)
+        """Average number, declared ones included."""
+        return max(self._burst_threads + self.beyond, 0.0)
 
     def see(
         self,
@@ -88,7 +89,7 @@ class ForeignThreads:
         is_full : bool
             Whether nothing of the node was left, so that there may be more than the share says.
         """
-        capacity = self.node.capacity
+        capacity = self._capacity
         noise = DEVIATIONS * deviation + LEAST_SHARE
         beyond = (share - usual) * capacity
         if abs(beyond) <= noise * capacity and not is_full:
@@ -103,14 +104,14 @@ class ForeignThreads:
         if self.threads + LEAST_SHARE * capacity >= least and self.beyond > 0.0:
             return False  # what was known before says more
         # A thread for each core is the fewest that fill it.
-        return self._see(max(capacity - self.node.burst_threads, 0.0), least)
+        return self._see(max(capacity - self._burst_threads, 0.0), least)
 
     def _see(self, seen: float, noise: float) -> bool:
         is_jump = abs(seen - self._mean) > noise or (seen == 0.0) != (self._mean == 0.0)
         self._windows = 1 if is_jump else min(self._windows + 1, self._most)
         self._mean += (seen - self._mean) / self._windows
         # What drifts is taken over in steps.
-        step = LEAST_SHARE / 2 * (self.node.capacity + abs(self._mean))
+        step = LEAST_SHARE / 2 * (self._capacity + abs(self._mean))
         if not is_jump and abs(self._mean - self.beyond) <= step:
             return False
         self.beyond = self._mean

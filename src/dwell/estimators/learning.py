@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, Self, TypeAlias
+from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.link_rates import Rate, better_rate
@@ -18,11 +17,10 @@ from dwell.estimators.prices import SEED
 from dwell.estimators.protocol import Support
 from dwell.estimators.shadow_price import fraction_of
 from dwell.estimators.slow_processes import unseen_error
-from dwell.kernels.pools import ADDED, PoolRows
+from dwell.kernels.pools import ADDED, GROWN, PoolRows
 from dwell.model.controller_settings import HALF_LIFE_WINDOWS
+from dwell.model.number_arrays import Floats
 from dwell.model.problem import Problem
-
-Floats: TypeAlias = NDArray[np.float64]
 
 #: Deviation of the logarithm of a price one window after a part was measured that is not as
 #: declared.
@@ -136,6 +134,9 @@ class Learning(Online):
         for (part, values), why in zip(demands.items(), looks, strict=False):
             if not why:
                 continue
+            if why == GROWN:
+                self._has_grown = True
+                continue
             pool = self._pools[part]
             if why == ADDED:
                 has_changed = pool.has_left(self._window, cycles, least)
@@ -239,14 +240,16 @@ class Learning(Online):
         parts = self._parts[name]
         sent_ms = [
             sending_ns(self.problem, part, found.mbps) / 1e6 * found.error
-            for part in parts
+            for part in (parts if self._rates else ())
             if isinstance(part, Message) and (found := self._rates.get(part.link)) is not None
         ]
         measured = [pool for part in parts if not (pool := self._pools[part]).is_declared]
         if not measured:
             return math.hypot(*sent_ms), 0.0
         l95_ms = math.hypot(*(pool.error_ms for pool in measured), *sent_ms)
-        lost = [share_error(pool.lost, max(pool.measured, 1)) for pool in measured if pool.lost]
+        lost = [
+            share_error(share, max(pool.measured, 1)) for pool in measured if (share := pool.lost)
+        ]
         if lost:
             l95_ms = math.hypot(l95_ms, self._playing.tail_error_ms(name, math.hypot(*lost)))
         widened = max(map(self._widening, measured)) * self._playing.played(name).l95_ms

@@ -9,14 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.kernels.elementary import logarithms
-
-Floats: TypeAlias = NDArray[np.float64]
+from dwell.model.number_arrays import Floats
 
 #: Rates that are tried first: the largest, a share of it, and so on.
 FASTEST_MBPS, SHARE, TRIED = 1000.0, 0.6, 18

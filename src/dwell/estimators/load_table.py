@@ -12,17 +12,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.estimators.fleet_prices import FleetPrices, PricedCell
 from dwell.estimators.prices import prices_of
+from dwell.model.number_arrays import Floats
 from dwell.model.problem import Problem
 from dwell.model.progress import Progress
-
-Floats: TypeAlias = NDArray[np.float64]
 
 #: Cycles of all levels of a candidate together; fewest and most of a cell at each level.
 CYCLES, FEWEST, MOST = 1_000_000, 3_000, 15_000

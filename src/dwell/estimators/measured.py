@@ -16,12 +16,11 @@ from dwell.estimators.spans import patience_ns
 from dwell.kernels.jobs import NodeJobs, WaitingJobs
 from dwell.kernels.meter import CyclesLayout, PartTimes, WindowRows
 from dwell.model.fabric import Node
+from dwell.model.number_arrays import Floats, Ints
 from dwell.model.pipeline import Execution, Pipeline
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 
-Floats: TypeAlias = NDArray[np.float64]
-Ints: TypeAlias = NDArray[np.int64]
 Rows: TypeAlias = slice | Ints
 
 EVERY = slice(None)
@@ -326,7 +325,7 @@ def sending_ns(problem: Problem, message: Message, rate_mbps: float | None = Non
 def groups(codes: NDArray[np.integer]) -> Iterator[tuple[int, Rows]]:
     """Yield every code with the rows that have it; all rows as a slice where there is but one."""
     first = int(codes[0])
-    if (codes == first).all():
+    if not np.count_nonzero(codes != first):
         yield first, EVERY
         return
     for code in sorted(set(codes.tolist())):

@@ -12,13 +12,11 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Collection, Iterator, Mapping
+from dataclasses import replace
 from functools import partial
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-from dwell.cost import cost, cost_error, hamming
+from dwell.cost import cost_error, hamming, price, tier_nodes
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.foreign_threads import ForeignThreads, Stretches
 from dwell.estimators.link_rates import Rate
@@ -29,11 +27,10 @@ from dwell.estimators.profile import Foreign, Profile, mean_ms
 from dwell.estimators.protocol import CellEstimator
 from dwell.estimators.spans import patience_ns
 from dwell.model.frozen import FrozenDict
+from dwell.model.number_arrays import Floats
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS, unchecked_qos
 from dwell.model.shadow_plan import by_candidate
-
-Floats: TypeAlias = NDArray[np.float64]
 
 #: Steps that are played when the present changes, the first of which settles queues.
 FIRST_STEPS = 6
@@ -67,7 +64,7 @@ class Online(CellEstimator):
     def start(self, problem: Problem) -> None:
         """Forget everything but the profile."""
         self.problem = problem
-        self.profile = Profile(problem)
+        self.profile, self._tiers = Profile(problem), tier_nodes(problem.objective)
         self._regimes = 0
         self._meter, self._stretches = Meter(problem), Stretches(problem)
         self._playing = Playing(problem, self.seed, self.shadow_fraction)
@@ -190,14 +187,25 @@ class Online(CellEstimator):
                     break
                 self._playing.go_on(self._playing.present, unsure, STEPS)
                 estimates = self._priced(names, foreign)
+        for name in names:
+            estimates[name] = replace(estimates[name], error=self._stated_error(name))
         return estimates
+
+    def _stated_error(self, name: str) -> tuple[float, float]:
+        """Return standard errors of a candidate's L95 (ms) and V_D, by the play and its samples."""
+        played = self._playing.played(name)
+        known = self._known_error(name, played.violation_rate)
+        return (
+            math.hypot(played.l95_error_ms, known[0]),
+            math.hypot(played.violation_error, known[1]),
+        )
 
     def deviations(self, name: str) -> tuple[float, float]:
         """Return standard deviations of one window under a candidate (see `CellEstimator`)."""
         return self._playing.deviations(name)
 
     def _priced(self, names: list[str], foreign: Foreign) -> dict[str, QoS]:
-        """Every candidate's metrics; of those that are played by what they have come to."""
+        """Return the metrics of all candidates; `estimate` adds the errors of played ones."""
         played = {name: self._playing.played(name) for name in names}
         if not self._declared:
             self._declared = {name: self._as_declared(name) for name in self.problem.candidates}
@@ -211,14 +219,9 @@ class Online(CellEstimator):
             if name not in played:
                 estimates[name] = unchecked_qos(*one.latency, shares[name], *one.others)
                 continue
-            price = played[name]
-            known = self._known_error(name, price.violation_rate)
-            error = (
-                math.hypot(price.l95_error_ms, known[0]),
-                math.hypot(price.violation_error, known[1]),
-            )
-            l95_ms, rate, uncut_ms = price.l95_ms, price.violation_rate, price.uncut_l95_ms
-            estimates[name] = QoS(l95_ms, rate, shares[name], uncut_ms, error)
+            one_played = played[name]
+            l95_ms, rate = one_played.l95_ms, one_played.violation_rate
+            estimates[name] = QoS(l95_ms, rate, shares[name], one_played.uncut_l95_ms)
         return estimates
 
     def _as_declared(self, name: str) -> _Declared:
@@ -242,13 +245,12 @@ class Online(CellEstimator):
         problem, least = self.problem, self.problem.controller.min_improvement
         objective, here = problem.objective, problem.candidates[incumbent]
         errors = {name: self._sampled(name) for name in names}
-        price = cost(estimates[incumbent], here, here, objective)
         unsure = set()
         for name, there in problem.candidates.items():
             error = math.hypot(errors.get(name, 0.0), errors.get(incumbent, 0.0))
             if name == incumbent or error <= least / 3:
                 continue
-            gain = price - cost(estimates[name], here, here, objective)
+            gain = self._cost(estimates[incumbent]) - self._cost(estimates[name])
             asked = least + objective.weights.switching * hamming(there, here)
             if -BAND * error < gain < asked + BAND * error:
                 unsure |= {name, incumbent}
@@ -257,6 +259,15 @@ class Online(CellEstimator):
             for name in names
             if name in unsure and errors[name] and not self._playing.is_full(name)
         ]
+
+    def _cost(self, qos: QoS) -> float:
+        """J of an estimate, where nothing moves."""
+        used = qos.utilisation
+        robot, edge, cloud = (
+            max([used[one] for one in of if one in used], default=0.0) for of in self._tiers
+        )
+        metrics = qos.l95_ms, qos.violation_rate, robot, edge, cloud
+        return price(*metrics, 0.0, self.problem.objective)
 
     def _sampled(self, name: str) -> float:
         """Standard error of a candidate's J by how few cycles have been played."""
@@ -268,9 +279,9 @@ class Online(CellEstimator):
         self, evidence: Evidence, seen: Foreign, own: Mapping[str, float], incumbent: str
     ) -> None:
         """Take in what a window showed of foreign threads, and of nodes that are down."""
-        price = self._playing.prices[incumbent]
+        known = self._playing.prices[incumbent]
         for name, foreign in self._foreign.items():
-            usual, deviation = price.foreign[name], price.foreign_deviation[name]
+            usual, deviation = known.foreign[name], known.foreign_deviation[name]
             level = partial(self._stretches.level, evidence, name)
             is_full = name in seen.full
             changed = foreign.see(seen.shares[name], usual, deviation, level, is_full=is_full)

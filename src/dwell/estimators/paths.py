@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dwell.model.number_arrays import Floats
 from dwell.model.pipeline import Flow, Pipeline
-
-Floats: TypeAlias = NDArray[np.float64]
 
 
 class Input(NamedTuple):
@@ -99,14 +97,3 @@ def longest_path(
     sinks = [finish[step.column] for step in steps if step.sink]
     latency: Floats = np.maximum.reduce(sinks) if len(sinks) > 1 else sinks[0]
     return latency
-
-
-def order_statistic(values: Floats) -> float:
-    """L95: the ceil(0.95 n)-th smallest of n values, never interpolated."""
-    rank = l95_rank(len(values))
-    return float(np.partition(values, rank - 1)[rank - 1])
-
-
-def l95_rank(count: int) -> int:
-    """Return ceil(0.95 n), in integers: 0.95 * n is not exact."""
-    return (19 * count + 19) // 20

@@ -12,15 +12,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.kernels.elementary import cube_root, logarithms
 from dwell.kernels.pools import HeldValues, places
-
-Floats: TypeAlias = NDArray[np.float64]
+from dwell.model.number_arrays import Floats
 
 #: Most values that a pool holds, and fewest that it keeps however old they are.
 LARGEST = 200
@@ -176,19 +174,18 @@ class Pool:
         Whether what disturbs the part adds to its values (a message) or multiplies them (a job).
     """
 
-    __slots__ = ("_alone", "_before", "_doubt", "additive", "reference", "rows")
+    __slots__ = ("_alone", "_doubts", "_summary", "additive", "reference", "rows")
 
     #: The first job of all, if no other was measured in its window; else 0.
     _alone: float
-    _doubt: _Doubt | None
-    #: The values, ascending, before the run of decisions (see `_run`); the declared ones if None.
-    _before: Floats | None
+    _doubts: _Doubt | None
 
     def __init__(self, reference: Reference, additive: bool) -> None:
         self.reference, self.additive = reference, additive
         #: What is held; the kernel adds to it.
         self.rows = reference.holds_nothing()
         self._alone, self.rows.row.asks = 0.0, not additive
+        self._summary = _Summary(np.empty(0), 0.0, 0.0)
         self.reset()
 
     def __repr__(self) -> str:
@@ -197,8 +194,17 @@ class Pool:
 
     @property
     def held(self) -> Floats:
-        """Values of the present regime, in the order in which they came."""
+        """Values of the present regime, in the order in which they came; one array per change."""
         return self.rows.values
+
+    @property
+    def _doubt(self) -> _Doubt | None:
+        """Decisions since which the regime may be over."""
+        return self._doubts
+
+    @_doubt.setter
+    def _doubt(self, doubt: _Doubt | None) -> None:
+        self._doubts, self.rows.row.doubts = doubt, doubt is not None
 
     @property
     def is_declared(self) -> bool:
@@ -228,20 +234,33 @@ class Pool:
     @property
     def lost(self) -> float:
         """Share of the values that are lost."""
-        if self.is_declared:
-            return self.reference.lost
-        return float(np.isinf(self.held).mean()) if len(self.held) else 0.0
+        return self.reference.lost if self.is_declared else self._summarised().lost
 
     @property
     def error_ms(self) -> float:
         """Standard error of the values' 95th percentile, and no less than of their mean."""
-        known = np.sort(self.held[np.isfinite(self.held)])
+        return self._summarised().error_ms
+
+    def _summarised(self) -> _Summary:
+        """Return figures of the held values, computed once per change of these."""
+        held = self.held
+        if self._summary.of is not held:
+            finite = np.isfinite(held)
+            known = np.sort(held[finite])
+            lost = (len(held) - len(known)) / max(len(held), 1)
+            self._summary = _Summary(held, lost, self._error_ms(known))
+        return self._summary
+
+    def _error_ms(self, known: Floats) -> float:
         if len(known) < 2:
             return 0.0
         count = max(self.measured, 2)
         # Of few values the deviation is itself hardly known (see `Playing`).
         few = (count + 1) / (count - 1)
-        of_mean = few * float(known.std()) / math.sqrt(count)
+        apart = known - np.add.reduce(known) / len(known)
+        # As `known.std()` adds up, in a third of the time.
+        deviation = math.sqrt(np.add.reduce(apart * apart) / len(known))
+        of_mean = few * deviation / math.sqrt(count)
         return max(of_mean, quantile_error(known, share_error(0.05, count)))
 
     def reset(self) -> None:
@@ -317,11 +336,11 @@ class Pool:
     @property
     def _run(self) -> _Doubt | None:
         """Successive decisions whose values are larger, or smaller, than most known before."""
-        row, before = self.rows.row, self._before
+        row = self.rows.row
         if not row.run_cycles:
             return None
         apart = PlaceSums(row.run_size, row.run_larger, row.run_smaller, row.run_places)
-        return _Doubt(self.reference.ordered if before is None else before, apart, row.run_cycles)
+        return _Doubt(self.rows.before, apart, row.run_cycles)
 
     def _run_before(self, cycles: int) -> _Doubt | None:
         """Return the run of the decisions before; None if a stretch ends before this decision."""
@@ -331,7 +350,7 @@ class Pool:
     def _run_on(self, run: _Doubt, apart: PlaceSums, cycles: int) -> _Doubt:
         """Add values to a run, which goes on as long as most are larger, or smaller."""
         run = _Doubt(run.before, run.apart + apart, run.cycles + cycles)
-        row, self._before = self.rows.row, run.before
+        row, self.rows.before = self.rows.row, run.before
         row.run_size, (row.run_larger, row.run_smaller, row.run_places) = (
             *(run.apart.size, run.apart.sums),
         )
@@ -448,7 +467,7 @@ class Pool:
 
     def _begin(self, values: Floats, window: int) -> None:
         self.rows.begin(values, self.reference.places(values).sums, window)
-        self._doubt, self._before = None, None
+        self._doubt = None
 
     def _add(
         self, values: Floats, shift: PlaceSums, window: int, memory: float, cycles: int
@@ -533,6 +552,22 @@ def _mean_log(size: int, deviations: float) -> float:
     return float(root * root * root)
 
 
+class _Summary(NamedTuple):
+    """Figures of the values that a pool holds.
+
+    Parameters
+    ----------
+    of : float64 array
+        The values.
+    lost, error_ms : float
+        See `Pool`.
+    """
+
+    of: Floats
+    lost: float
+    error_ms: float
+
+
 class _Doubt(NamedTuple):
     """Successive decisions whose values are compared with known ones together.
 
@@ -563,10 +598,9 @@ def quantile_error(ordered: Floats, off: float) -> float:
     the distance to the farther one is the error.
     """
     last = len(ordered) - 1
-    low, usual, high = (
-        float(ordered[min(max(round(place * last), 0), last)])
-        for place in (0.95 - 2 * off, 0.95, 0.95 + 2 * off)
-    )
+    usual: float = ordered.item(round(0.95 * last))
+    low: float = ordered.item(max(round((0.95 - 2 * off) * last), 0))
+    high: float = ordered.item(min(round((0.95 + 2 * off) * last), last))
     return max(high - usual, usual - low) / 2
 
 

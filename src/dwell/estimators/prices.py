@@ -1,7 +1,7 @@
 """Prices: what windows of a candidate come to where the cell stays on it.
 
 The kernel plays every candidate alone, as `simulate` does with a policy that never moves: with
-contention, queues, links and cycles that overlap. All candidates meet the same draws, so that they
+queues, links and cycles that overlap. All candidates meet the same draws, so that they
 differ by where their tasks run and not by luck. More is simulated until the means are known well
 enough (`L95_SHARE`, `RATE`) and every slow process has shown all that it does
 (`dwell.estimators.slow_processes`), or until `MOST_CYCLES` or `MOST_EVENTS` are reached. How much
@@ -15,12 +15,10 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.estimators.paths import l95_rank
 from dwell.estimators.sent_shadows import SentShadows, hindered, stamps_of
 from dwell.estimators.slow_processes import mean_and_error, slow_processes, unseen_error
 from dwell.kernels.advance import play
@@ -31,15 +29,14 @@ from dwell.kernels.realisation import Realisation
 from dwell.model.fabric import Fabric
 from dwell.model.frozen import FrozenDict
 from dwell.model.instants import NEVER_NS, longest_run
+from dwell.model.number_arrays import Floats, Ints
+from dwell.model.order_statistic import order_statistic
 from dwell.model.pipeline import Pipeline
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS
 from dwell.model.scenario import Scenario
 from dwell.model.shadow_plan import ShadowFraction, by_candidate
-
-Floats: TypeAlias = NDArray[np.float64]
-Ints: TypeAlias = NDArray[np.int64]
 
 SEED = 20_250_601
 #: Standard errors that are good enough: of L95 as a share of it, and of V_D.
@@ -413,7 +410,6 @@ def _known_later(latency_ns: Ints, seen_ms: Floats) -> tuple[Floats, NDArray[np.
     latency_ns : int64 array, shape (windows, W)
         `NEVER_NS` where a cycle did not come to an end.
     """
-    rank = l95_rank(latency_ns.shape[1])
-    l95_ns = np.partition(latency_ns, rank - 1, axis=1)[:, rank - 1]
+    l95_ns = order_statistic(latency_ns, 95)
     is_lost = l95_ns >= NEVER_NS
     return np.where(is_lost, seen_ms, np.maximum(l95_ns / 1e6, seen_ms)), is_lost

@@ -19,10 +19,7 @@ estimates.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple, Self, TypeAlias
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any, NamedTuple, Self
 
 from dwell.cost import SATURATED
 from dwell.errors import MetricError
@@ -34,8 +31,6 @@ from dwell.model.pipeline import Execution, Pipeline, Task
 from dwell.model.problem import Problem
 from dwell.model.process import Trace
 from dwell.model.qos import QoS, unchecked_qos
-
-Floats: TypeAlias = NDArray[np.float64]
 
 
 class Foreign(NamedTuple):

@@ -29,24 +29,23 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import ClassVar, TypeAlias
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.errors import Fault, ProblemError
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.learning import Learning
 from dwell.estimators.measured import Message, Part, Site, cores_of, message_of, sending_ns
-from dwell.estimators.paths import longest_path, order_statistic, steps_of
+from dwell.estimators.paths import longest_path, steps_of
 from dwell.estimators.spans import NS_PER_MS, spans_ms
 from dwell.model.bounds import VALUE, shown
+from dwell.model.number_arrays import Floats
+from dwell.model.order_statistic import percentile
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS
 from dwell.model.semantics import nearest
-
-Floats: TypeAlias = NDArray[np.float64]
 
 
 class Scaling(Learning):
@@ -131,7 +130,7 @@ class Scaling(Learning):
             self._longest[site] = float(known.max())
         elif site not in self._longest:
             declared = self._pools[site].reference.values
-            self._longest[site] = order_statistic(declared) if len(declared) else 0.0
+            self._longest[site] = percentile(declared, 95) if len(declared) else 0.0
         return np.where(np.isnan(alone_ms), self._longest[site], alone_ms)
 
     def _correct(self, changed: Sequence[Part], measured: frozenset[Part]) -> None:
@@ -190,7 +189,7 @@ class Scaling(Learning):
         # To whole nanoseconds, as everything is timed.
         latency_ms = np.round(longest_path(self._steps, known, on_the_way), 6)
         missed = int(np.count_nonzero(latency_ms > pipeline.deadline_ms)) / len(latency_ms)
-        bound_ms = order_statistic(latency_ms)
+        bound_ms = percentile(latency_ms, 95)
         return replace(
             qos,
             l95_ms=max(qos.l95_ms, min(bound_ms, self.problem.censor_ms)),

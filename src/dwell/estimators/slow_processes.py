@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +21,10 @@ from dwell.estimators.measured import Message, parts_of
 from dwell.kernels.random_draws import NS_PER_MS, NS_PER_S, draw_on_off
 from dwell.kernels.realisation import Realisation
 from dwell.model.fabric import Bursts
+from dwell.model.number_arrays import Floats
 from dwell.model.problem import Problem
 from dwell.model.process import AR1, Constant, Process, Trace
 from dwell.model.scenario import LinkDisturbance, Scenario, acts
-
-Floats: TypeAlias = NDArray[np.float64]
 
 #: Times off and on, or correlation times, after which a mean is known.
 RENEWALS = 30

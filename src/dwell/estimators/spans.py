@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
-
 import numpy as np
-from numpy.typing import NDArray
 
+from dwell.model.number_arrays import Floats, Ints
 from dwell.model.problem import Problem
-
-Floats: TypeAlias = NDArray[np.float64]
-Ints: TypeAlias = NDArray[np.int64]
 
 NS_PER_MS = 1e6
 #: Periods after which a job or message that has not ended counts as lost.

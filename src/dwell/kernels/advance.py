@@ -10,7 +10,7 @@ from dwell.kernels.arrays import Arrays, CellArrays
 from dwell.kernels.codes import EventKind, Status, make_key
 from dwell.kernels.library import foreign
 from dwell.kernels.meter import WindowRows
-from dwell.kernels.rows import Ints
+from dwell.model.number_arrays import Ints
 
 STATUSES = tuple(Status)
 

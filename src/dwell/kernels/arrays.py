@@ -14,9 +14,10 @@ from dwell.errors import SimulationError
 from dwell.kernels import codes
 from dwell.kernels.codes import LAST_NS, EventKind, Scheduler, ShadowPart, make_key
 from dwell.kernels.realisation import LinkSegments, NodeChanges, Phase, Realisation
-from dwell.kernels.rows import Ints, Rows, Tables, row_types
+from dwell.kernels.rows import Rows, Tables, row_types
 from dwell.model import Flow, Node, Pipeline, Placement, Problem, Quota
 from dwell.model.instants import NEVER_NS
+from dwell.model.number_arrays import Ints
 from dwell.model.window_close import close_after_ns, window_close_ns
 
 SCHEDULERS = {"fair": Scheduler.FAIR, "fifo": Scheduler.FIFO, "priority": Scheduler.PRIORITY}
@@ -367,12 +368,11 @@ class _Layout:
         if quota is not None and round(quota.tick_ms * 1e6):
             scheduler = Scheduler.TURNS
         cpu = self._add_server(row, None, scheduler, node.cores)
-        speed = node.pace * (1.0 if node.scheduler == "fair" else node.spare / node.cores)
+        speed = 1.0 if node.scheduler == "fair" else node.spare / node.cores
         cpu |= {
             "spare": node.spare,
             "background": node.background,
             "beside": 1.0 / node.interference,
-            "pace": node.pace,
             "speed": speed,
         }
         if quota is None:
@@ -412,7 +412,6 @@ class _Layout:
             "above": -1,
             "below": -1,
             "beside": 1.0,
-            "pace": 1.0,
             "speed": 1.0,
             "spare": float(cores),
         }
@@ -578,8 +577,6 @@ class _Layout:
                     "threads": threads,
                     "need": threads if fair else min(threads, cores),
                     "start_ns": round(task.start_ms * 1e6),
-                    "before_ns": round(execution.before_ms * 1e6),
-                    "after_ns": round(execution.after_ms * 1e6),
                     "mean_ns": round(min(execution.exec_ms.expectation * 1e6, LAST_NS)),
                 }
             )
@@ -839,11 +836,11 @@ def shadow_parts(pipeline: Pipeline, active: Placement, other: Placement) -> lis
 def _counted_ns(node: Node, quota: Quota) -> dict[str, int]:
     """Quota without and with foreign threads, slack, least turn, and what is drawn at a time."""
     return {
-        "quota_ns": max(node.wall_ns(node.budget_ms), 1),
-        "stressed_ns": max(node.wall_ns(node.stressed_budget_ms), 1),
-        "slack_ns": node.wall_ns(quota.slack_ms),
-        "least_ns": node.wall_ns(LEAST_MS),
-        "drawn_ns": node.wall_ns(DRAWN_MS),
+        "quota_ns": max(round(node.budget_ms * 1e6), 1),
+        "stressed_ns": max(round(node.stressed_budget_ms * 1e6), 1),
+        "slack_ns": round(quota.slack_ms * 1e6),
+        "least_ns": round(LEAST_MS * 1e6),
+        "drawn_ns": round(DRAWN_MS * 1e6),
     }
 
 

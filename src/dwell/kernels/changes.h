@@ -31,7 +31,7 @@ Progress progress(const S& s, const Server& server, i64 at) {
   }
   const Job& job = s.job(key);
   const Site& site = s.site(job);
-  left = std::max(left, 0.0) + static_cast<f64>(job.rest_ns);
+  left = std::max(left, 0.0);
   const f64 alone = time_alone(site, site.exec_ns[cycle_of(key)]);
   return {key, static_cast<f64>(site.need) * (alone - left)};
 }

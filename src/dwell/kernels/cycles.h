@@ -238,7 +238,6 @@ void complete(S& s, i64 key, i64 now) {
   Site& site = s.site(job);
   Server& server = s.server(site);
   if (server.next_key != key || server.next_ns != now) return;
-  if (next_thread(s, server, site, job, key, now)) return;
   leave(s, server, site, now);
   s.own_ns[site.own] += static_cast<f64>(site.threads) * static_cast<f64>(site.exec_ns[cycle]);
   job.compute_ns += now - job.started_ns;

@@ -11,7 +11,8 @@ import numpy as np
 
 from dwell.kernels.library import foreign
 from dwell.kernels.on_off_intervals import OnOffIntervals
-from dwell.kernels.rows import FLOAT_ROWS_OUT, INT_ROWS_OUT, PLAIN, Floats, Ints, structs
+from dwell.kernels.rows import FLOAT_ROWS_OUT, INT_ROWS_OUT, PLAIN, structs
+from dwell.model.number_arrays import Floats, Ints
 
 
 class NodeEffect(NamedTuple):

@@ -11,8 +11,9 @@ from typing import Final
 import numpy as np
 
 from dwell.kernels.library import foreign
-from dwell.kernels.rows import FLOATS_IN, INTS_OUT, Floats, Ints, structs
+from dwell.kernels.rows import FLOATS_IN, INTS_OUT, structs
 from dwell.model import AR1, Constant, LogNormal, Normal, Process, Uniform
+from dwell.model.number_arrays import Floats, Ints
 
 #: Cycles at a time: what NumPy draws of a path stays in the second-level cache.
 BLOCK: Final = 65536

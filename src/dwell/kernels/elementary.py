@@ -8,7 +8,8 @@ from ctypes import c_double, c_int64, c_void_p
 import numpy as np
 
 from dwell.kernels.library import foreign
-from dwell.kernels.rows import FLOATS_IN, FLOATS_OUT, Floats
+from dwell.kernels.rows import FLOATS_IN, FLOATS_OUT
+from dwell.model.number_arrays import Floats
 
 
 def logarithms(x: Floats) -> Floats:

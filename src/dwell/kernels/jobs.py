@@ -10,7 +10,8 @@ import numpy as np
 
 from dwell.kernels.library import foreign
 from dwell.kernels.meter import WindowRows
-from dwell.kernels.rows import Floats, structs
+from dwell.kernels.rows import structs
+from dwell.model.number_arrays import Floats
 
 #: Numbers of scratch for each job of a window, own jobs and shadow jobs.
 SCRATCH = 40
@@ -56,6 +57,8 @@ class WaitingJobs:
         self._nodes, self._flows = tuple(nodes), flows
         rows = [node.row(flows) for node in nodes]
         self._rows: Array[Any] = (structs()["NodeJobs"] * len(rows))(*rows)
+        # Memory of this size takes the system longer to give than the kernel to use.
+        self._scratch = np.empty(0)
 
     def __reduce__(self) -> tuple[type[WaitingJobs], tuple[Sequence[NodeJobs], int]]:
         # A copy has addresses of its own.
@@ -65,8 +68,10 @@ class WaitingJobs:
         """Add to the work of own jobs in a window what most jobs of their task waited for."""
         for row, threads in zip(self._rows, foreign_threads, strict=True):
             row.foreign = threads
-        scratch = _scratch(window)
-        _add_waits()(self._rows, len(self._rows), byref(window.row), scratch.ctypes.data)
+        if len(self._scratch) < len(window.table) * window.tasks * SCRATCH:
+            self._scratch = _scratch(window)
+        of = self._scratch.ctypes.data
+        _add_waits()(self._rows, len(self._rows), byref(window.row), of)
 
 
 def level(

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.kernels.library import foreign
-from dwell.kernels.rows import Floats, Ints, structs
+from dwell.kernels.rows import structs
+from dwell.model.number_arrays import Floats, Ints
 
 
 class CyclesLayout:

@@ -9,9 +9,10 @@ import numpy as np
 
 from dwell.kernels.drawn_path import BLOCK, path_of
 from dwell.kernels.library import foreign
-from dwell.kernels.rows import FLOATS_IN, INTS_OUT, Ints
+from dwell.kernels.rows import FLOATS_IN, INTS_OUT
 from dwell.model import Process
 from dwell.model.instants import HORIZON_NS
+from dwell.model.number_arrays import Ints
 from dwell.model.scenario import RAMP_STEPS
 
 

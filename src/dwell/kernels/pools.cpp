@@ -20,11 +20,24 @@ namespace {
 
 // As in pool.py.
 constexpr i64 kLargest = 200, kEnough = 12;
-constexpr f64 kMoved = 0.75;
+constexpr f64 kMoved = 0.75, kShifted = 4.0, kAlike = 2.0;
 // Room for values and for chunks, of which the newest are held (pools.py).
 constexpr i64 kRoom = 408;
 // Why a pool needs another look: what a window brought has not been added, or it has been.
-constexpr i64 kNotAdded = 1, kAdded = 2;
+// The third: it has been added to a pool that is not as declared.
+constexpr i64 kNotAdded = 1, kAdded = 2, kGrown = 3;
+
+// The first of ascending values that is not below another one. Which half comes next is computed
+// and not branched on: it cannot be foreseen.
+const f64* first_not_below(const f64* known, i64 n, f64 value) {
+  if (n == 0) return known;
+  while (n > 1) {
+    const i64 half = n / 2;
+    known += half * static_cast<i64>(known[half - 1] < value);
+    n -= half;
+  }
+  return known + (*known < value ? 1 : 0);
+}
 
 void add_places(const f64* known, i64 n_known, const f64* values, i64 n, f64 patience_ms,
                 PlaceSums& out) {
@@ -34,7 +47,7 @@ void add_places(const f64* known, i64 n_known, const f64* values, i64 n, f64 pat
   f64 beyond = 1.0, below = 1.0;
   for (i64 i = 0; i < n; ++i) {
     const f64 value = values[i] > patience_ms ? std::numeric_limits<f64>::infinity() : values[i];
-    const f64* first = std::lower_bound(known, known + n_known, value);
+    const f64* first = first_not_below(known, n_known, value);
     const f64* last = first;
     if (first != known + n_known && *first == value) {
       last = std::upper_bound(first, known + n_known, value);
@@ -111,32 +124,70 @@ void add(Pool& pool, const f64* values, const PlaceSums& shift, i64 window, f64 
   std::copy(values, values + shift.size, pool.held + pool.first + kept);
   pool.measured = std::min(pool.measured + shift.size, total.size);
   pool.size = total.size;
+  ++pool.changes;
   pool.larger = total.larger;
   pool.smaller = total.smaller;
   pool.places = total.places;
   if (pool.is_declared == 0) pool.touched = window;
 }
 
-// Adds what a window brought to a pool that is as declared, if that is nothing to look at; returns
-// 0 then, else why another look is needed.
-i64 learn(Pool& pool, const f64* values, i64 n, i64 window, f64 memory, i64 cycles, f64 least) {
-  if (pool.is_declared == 0 || pool.n_known == 0 || pool.asks != 0 || n > kLargest)
-    return kNotAdded;
-  PlaceSums declared;
-  add_places(pool.known, pool.n_known, values, n, pool.patience_ms, declared);
-  // Windows that are larger, or smaller, are a run, up to a stretch.
-  PlaceSums run = declared;
-  i64 run_cycles = cycles;
-  if (pool.run_cycles > 0 && pool.run_cycles + cycles <= pool.block) {
-    run = plus({pool.run_size, pool.run_larger, pool.run_smaller, pool.run_places}, declared, 1);
-    run_cycles += pool.run_cycles;
-  }
-  if (is_large(run) && deviations(pool, run, run_cycles) >= least) return kNotAdded;
-  pool.run_cycles = is_large(run) ? run_cycles : 0;
+void set_run(Pool& pool, const PlaceSums& run, i64 cycles) {
+  pool.run_cycles = is_large(run) ? cycles : 0;
   pool.run_size = run.size;
   pool.run_larger = run.larger;
   pool.run_smaller = run.smaller;
   pool.run_places = run.places;
+}
+
+PlaceSums run_of(const Pool& pool) {
+  return {pool.run_size, pool.run_larger, pool.run_smaller, pool.run_places};
+}
+
+// Whether windows that are larger, or smaller, are a run with those before: up to a stretch.
+bool run_goes_on(const Pool& pool, i64 cycles) {
+  return pool.run_cycles > 0 && pool.run_cycles + cycles <= pool.block;
+}
+
+// Adds what a window brought to a pool that is not as declared, if it is neither near what is
+// declared, nor of another regime.
+i64 learn_otherwise(Pool& pool, const f64* values, i64 n, i64 window, f64 memory, i64 cycles) {
+  if (pool.doubts != 0 || pool.size > kLargest) return kNotAdded;
+  PlaceSums declared, run;
+  add_places(pool.known, pool.n_known, values, n, pool.patience_ms, declared);
+  if (deviations(pool, declared, cycles) < kAlike) return kNotAdded;
+  const bool goes_on = run_goes_on(pool, cycles);
+  if (!goes_on) {
+    const f64* held = pool.held + pool.first;
+    f64* end = std::copy(held, held + pool.size, pool.before);
+    std::sort(pool.before, end, [](f64 one, f64 other) { return one < other; });
+    pool.n_before = pool.size;
+  }
+  const bool is_after_declared = pool.n_before == 0;
+  add_places(is_after_declared ? pool.known : pool.before,
+             is_after_declared ? pool.n_known : pool.n_before, values, n,
+             std::numeric_limits<f64>::infinity(), run);
+  if (goes_on) run = plus(run_of(pool), run, 1);
+  const i64 run_cycles = cycles + (goes_on ? pool.run_cycles : 0);
+  if (is_large(run) && deviations(pool, run, run_cycles) >= kShifted) return kNotAdded;
+  set_run(pool, run, run_cycles);
+  pool.last = window;
+  add(pool, values, declared, window, memory, cycles);
+  return kGrown;
+}
+
+// Adds what a window brought to a pool that is as declared, if that is nothing to look at; returns
+// 0 then, else why another look is needed.
+i64 learn(Pool& pool, const f64* values, i64 n, i64 window, f64 memory, i64 cycles, f64 least) {
+  if (pool.n_known == 0 || pool.asks != 0 || n > kLargest) return kNotAdded;
+  if (pool.is_declared == 0) return learn_otherwise(pool, values, n, window, memory, cycles);
+  PlaceSums declared;
+  add_places(pool.known, pool.n_known, values, n, pool.patience_ms, declared);
+  const bool goes_on = run_goes_on(pool, cycles);
+  const PlaceSums run = goes_on ? plus(run_of(pool), declared, 1) : declared;
+  const i64 run_cycles = cycles + (goes_on ? pool.run_cycles : 0);
+  if (is_large(run) && deviations(pool, run, run_cycles) >= least) return kNotAdded;
+  set_run(pool, run, run_cycles);
+  pool.n_before = 0;
   pool.last = window;
   add(pool, values, declared, window, memory, cycles);
   const PlaceSums held = {pool.size, pool.larger, pool.smaller, pool.places};
@@ -161,8 +212,8 @@ DWELL_EXPORT void dwell_places(const f64* known, i64 n_known, const f64* values,
   out[2] = sums.places;
 }
 
-// Adds what a window brought of some parts to their pools; writes of each part why another look is
-// needed, 0 where none is, and returns how many need one.
+// Adds what a window brought of some parts to their pools; writes of each part why Python has to
+// look at it, 0 where it need not, and returns how many it has to look at.
 DWELL_EXPORT i64 dwell_learn(Pool* const* pools, const Found* found, const i64* parts, i64 n_parts,
                              i64 window, f64 memory, i64 cycles, f64 least, i64* out) noexcept {
   i64 n = 0;
@@ -202,4 +253,21 @@ DWELL_EXPORT void dwell_weakest(const Pool* const* pools, const i64* parts, i64 
       out[1] = std::min(out[1], pools[part]->last);
     }
   }
+}
+
+// Writes the times of cycles, nanoseconds: those of `values` that are finite, in turn, as from the
+// cycle `first` on. Returns how many these are.
+DWELL_EXPORT i64 dwell_fill(const f64* values, i64 n, f64 stretched, i64 first, i64 count,
+                            i64* out) noexcept {
+  const i64 known = std::count_if(values, values + n, [](f64 ms) { return std::isfinite(ms); });
+  if (known == 0) return 0;
+  // From each known value the cycle that it is first met in.
+  i64 at = (known - first % known) % known;
+  for (i64 i = 0; i < n; ++i) {
+    if (!std::isfinite(values[i])) continue;
+    if (at < count) out[at] = static_cast<i64>(std::rint(values[i] * 1e6 / stretched));
+    at = at + 1 == known ? 0 : at + 1;
+  }
+  for (i64 i = known; i < count; ++i) out[i] = out[i - known];
+  return known;
 }

@@ -11,12 +11,14 @@ import numpy as np
 
 from dwell.kernels.library import foreign
 from dwell.kernels.meter import PartTimes
-from dwell.kernels.rows import Floats, Ints, structs
+from dwell.kernels.rows import structs
+from dwell.model.number_arrays import Floats, Ints
 
 #: Room for values, and for windows.
 ROOM = 408
-#: Why a pool needs another look: what a window brought has not been added, or it has been.
-NOT_ADDED, ADDED = 1, 2
+#: What `PoolRows.learn` did with the values of a part where Python has to look at the pool: it left
+#: them out; it added them; it added them to a pool that is not as declared and has not changed.
+NOT_ADDED, ADDED, GROWN = 1, 2, 3
 
 
 class HeldValues:
@@ -38,27 +40,47 @@ class HeldValues:
     def __init__(self, known: Floats, patience_ms: float, likeness: float, block: int) -> None:
         self.row = structs()["Pool"](0, len(known), patience_ms, likeness, block)
         self._known, self._held = known, np.empty(ROOM)
+        self._before, self._values = np.empty(ROOM), (-1, np.empty(0))
         self._chunks = (structs()["Chunk"] * ROOM)()
         self._set_addresses()
 
     def __getstate__(self) -> tuple[Any, ...]:
-        return bytes(self.row), self._known, self._held, bytes(self._chunks)
+        return bytes(self.row), self._known, self._held, self._before, bytes(self._chunks)
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         # A copy has addresses of its own.
-        row, self._known, self._held, chunks = state
+        row, self._known, self._held, self._before, chunks = state
+        self._values = -1, np.empty(0)
         self.row = structs()["Pool"].from_buffer_copy(row)
         self._chunks = (structs()["Chunk"] * ROOM).from_buffer_copy(chunks)
         self._set_addresses()
 
     def _set_addresses(self) -> None:
         self.row.known, self.row.held = self._known.ctypes.data, self._held.ctypes.data
-        self.row.chunks = addressof(self._chunks)
+        self.row.before, self.row.chunks = self._before.ctypes.data, addressof(self._chunks)
 
     @property
     def values(self) -> Floats:
-        """A copy of the values, in the order in which they came."""
-        return self._held[self.row.first : self.row.first + self.row.size].copy()
+        """The values in the order in which they came: the same array until they change."""
+        row, (changes, values) = self.row, self._values
+        if changes != row.changes:
+            values = self._held[row.first : row.first + row.size].copy()
+            values.flags.writeable = False
+            self._values = row.changes, values
+        return values
+
+    @property
+    def before(self) -> Floats:
+        """The values, ascending, before the run of windows that is going on; see `Pool`."""
+        return self._before[: self.row.n_before].copy() if self.row.n_before else self._known
+
+    @before.setter
+    def before(self, values: Floats) -> None:
+        if len(values) > len(self._before):
+            self._before = np.empty(len(values))
+            self._set_addresses()
+        self.row.n_before = 0 if values is self._known else len(values)
+        self._before[: self.row.n_before] = values[: self.row.n_before]
 
     def begin(self, values: Floats, sums: tuple[float, float, float], window: int) -> None:
         """Hold some values, none of which was measured, in the place of all others."""
@@ -67,10 +89,11 @@ class HeldValues:
             self._held = np.empty(len(values))
             self._set_addresses()
         self._held[: len(values)] = values
+        row.changes += 1
         row.first, row.size, (row.larger, row.smaller, row.places) = 0, len(values), sums
         self._chunks[0] = structs()["Chunk"](window, 0, len(values), *sums)
         row.first_chunk, row.n_chunks, row.touched = 0, 1, window
-        row.measured = row.cycles = row.lasting = row.run_cycles = 0
+        row.measured = row.cycles = row.lasting = row.run_cycles = row.n_before = 0
 
     def add(
         self,
@@ -126,7 +149,7 @@ class PoolRows:
     def learn(
         self, found: PartTimes, parts: Ints, window: int, memory: float, cycles: int, least: float
     ) -> list[int]:
-        """Add what a window brought to the pools that are as declared.
+        """Add what a window brought to the pools that stay as they are, declared or not.
 
         Parameters
         ----------
@@ -138,7 +161,7 @@ class PoolRows:
         Returns
         -------
         list of int
-            Of each part, why another look is needed (`NOT_ADDED`, `ADDED`), else 0.
+            Of each part, why another look is needed (`NOT_ADDED`, `ADDED`, `GROWN`), else 0.
         """
         pools, why = self._addresses
         asked = parts.ctypes.data, len(parts), window, memory, cycles, least
@@ -170,7 +193,29 @@ def places(
     return out[0], out[1], out[2]
 
 
+def fill(rows: Sequence[Ints], values: Floats, stretched: float, begin: int, offset: int) -> None:
+    """Let cycles meet known values in turn (see `dwell.estimators.presents`).
+
+    Parameters
+    ----------
+    rows : sequence of int64 array, shape (cycles,)
+        Nanoseconds; as they were if all values are lost.
+    values : float64 array
+        Milliseconds; what is infinite is left out.
+    stretched : float
+        What the values are divided by.
+    begin, offset : int
+        First cycle that is filled, and which cycle the first of a row stands for.
+    """
+    values = np.ascontiguousarray(values)
+    where = values.ctypes.data, len(values), stretched, begin + offset
+    for row in rows:
+        later = row[begin:]
+        _fill()(*where, len(later), later.ctypes.data)
+
+
 _places = foreign("dwell_places", None, c_void_p, c_int64, c_void_p, c_int64, c_double, c_void_p)
+_fill = foreign("dwell_fill", c_int64, c_void_p, c_int64, c_double, c_int64, c_int64, c_void_p)
 _pool_add = foreign(
     "dwell_pool_add",
     None,

@@ -17,7 +17,7 @@ from dwell.kernels.disturbances import LinkFault, NodeEffect, link_segments, nod
 from dwell.kernels.drawn_path import BLOCK, Path, ReplayedPath, independent, path_of
 from dwell.kernels.on_off_intervals import OnOffIntervals, drawn_intervals, interval, ramp
 from dwell.kernels.realisation import LinkSegments, NodeChanges, Phase, Realisation, TraceStart
-from dwell.kernels.rows import LEVELS, Floats, Ints
+from dwell.kernels.rows import LEVELS
 from dwell.model import (
     Bursts,
     Constant,
@@ -32,6 +32,7 @@ from dwell.model import (
 )
 from dwell.model.bounds import short
 from dwell.model.instants import HORIZON_NS
+from dwell.model.number_arrays import Floats, Ints
 from dwell.model.scenario import RAMP_STEPS
 
 NS_PER_MS = 1e6

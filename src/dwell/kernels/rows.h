@@ -92,7 +92,7 @@ struct Crossing;  // of meter.cpp
   field(i64, ready_at_ns)                                                                        \
   field(i32, cell) field(i32, task) field(i32, server) field(i32, node) field(i32, own)          \
   field(i32, rank)                                                                               \
-  field(i64, workers) field(i64, start_ns) field(i64, before_ns) field(i64, after_ns)            \
+  field(i64, workers) field(i64, start_ns)                                                       \
   field(i64, mean_ns) /* of `exec_ns`, as the file states it */
 
 // `busy_ns` is in core-nanoseconds, of which 64 bits may not hold those of all cores. `quota` is a
@@ -109,15 +109,14 @@ struct Crossing;  // of meter.cpp
   field(i8, scheduler) field(i8, is_down) field(i8, is_dirty) field(i8, is_cpu)                  \
   field(i8, is_stopped) /* by its quota */                                                       \
   field(f64, busy_ns) field(f64, behind_ns) field(f64, spare) field(f64, background)             \
-  field(f64, beside) field(f64, pace) field(f64, used_ns) /* integral of `used` */
+  field(f64, beside) field(f64, used_ns) /* integral of `used` */
 
 // `tick_ns` is the time between ticks, 0 for a quota that is noticed at once; at time 0 the last
 // tick was `tick_ago_ns` and the last begin of a period `period_ago_ns` ago. `has_turn` says
 // whether a thread has the turn, `turn_begun_ns` what it had received before, and `turn_ns` what
 // since; a turn lasts `least_ns` at least. `drawn_ns` is what is drawn on a pool at a time.
 // `wakes_ns` is when something of the background wakes next, for the `wakes`-th time, and
-// `wake_gap_ns` the mean time between two. All that a quota counts is in time of the core: of that,
-// what runs receives the share `pace`.
+// `wake_gap_ns` the mean time between two. All that a quota counts is in time of the core.
 #define DWELL_QUOTA(field)                                                                       \
   field(i64, looks_ns)                                                                           \
   field(i64, period_ns) field(i64, period) field(i64, quota_ns) field(i64, stressed_ns)          \
@@ -158,12 +157,11 @@ struct Crossing;  // of meter.cpp
 #define DWELL_WAITING(field)                                                                     \
   field(i64, rank) field(i64, ready_ns) field(i64, key) field(f64, left_ns)
 
-// A job in flight. `missing` counts the inputs that have not arrived; `rest_ns` is the work of the
-// threads that the one at work hands its job over to. `beside_ns` is what it did beside foreign
-// threads, by the `beside_ns` of its server; less that clock while it runs.
+// A job in flight. `missing` counts the inputs that have not arrived. `beside_ns` is what it did
+// beside foreign threads, by the `beside_ns` of its server; less that clock while it runs.
 #define DWELL_JOB(field)                                                                         \
   field(i64, ready_ns) field(i64, started_ns) field(i64, compute_ns) field(i64, network_ns)      \
-  field(i64, rest_ns) field(i64, next) field(f64, beside_ns) field(i32, site)                    \
+  field(i64, next) field(f64, beside_ns) field(i32, site)                    \
   field(i32, missing)
 
 // A cycle in flight. `live` counts its jobs and messages that are under way.
@@ -276,16 +274,19 @@ struct Crossing;  // of meter.cpp
 // places; the windows that they are from, and all cycles of those; for how many cycles they have not
 // been as declared; how many were measured; and the windows of the last of them, and in which it
 // last ceased to be as declared, or got another value since; whether Python asks for the next window;
-// and the cycles and sums of a run of windows that are larger, or smaller, 0 for none.
+// how often the held values have changed; whether Python doubts that they still hold;
+// the cycles and sums of a run of windows that are larger, or smaller, 0 for none; and the values,
+// ascending, that were held before it, 0 where these are the declared ones.
 #define DWELL_POOL(field)                                                                        \
   field(const f64*, known) field(i64, n_known) field(f64, patience_ms) field(f64, likeness)      \
   field(i64, block) field(f64*, held) field(i64, first) field(i64, size)                         \
   field(f64, larger) field(f64, smaller) field(f64, places)                                      \
   field(Chunk*, chunks) field(i64, first_chunk) field(i64, n_chunks)                             \
   field(i64, cycles) field(i64, lasting) field(i64, measured) field(i64, last)                   \
-  field(i64, touched) field(i64, is_declared) field(i64, asks)                                   \
-  field(i64, run_cycles) field(i64, run_size)                                                    \
-  field(f64, run_larger) field(f64, run_smaller) field(f64, run_places)
+  field(i64, touched) field(i64, is_declared) field(i64, asks) field(i64, changes)                \
+  field(i64, doubts) field(i64, run_cycles) field(i64, run_size)                                                    \
+  field(f64, run_larger) field(f64, run_smaller) field(f64, run_places)                          \
+  field(f64*, before) field(i64, n_before)
 
 #define DWELL_ROWS(row)                                                                          \
   row(Clock, DWELL_CLOCK) row(Cell, DWELL_CELL) row(Task, DWELL_TASK) row(Flow, DWELL_FLOW)      \

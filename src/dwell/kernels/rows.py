@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.kernels.library import foreign
+from dwell.model.number_arrays import Floats, Ints
 from dwell.model.scenario import RAMP_STEPS
 
 #: Rows of structs, whose fields `row_types` has.
 Rows: TypeAlias = NDArray[np.void]
-Floats: TypeAlias = NDArray[np.float64]
-Ints: TypeAlias = NDArray[np.int64]
 Row: TypeAlias = Any
 
 #: How strong a disturbance may be: not at all, or as strong as after each step of a ramp.

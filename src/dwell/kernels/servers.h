@@ -29,7 +29,7 @@ void announce_quota(S& s, Server& server, i64 now);
 template <class S>
 void take_turn(S& s, Server& server, i64 now);
 template <class S>
-void admit_threads(S& s, Server& server, const Site& site, Job& job, i64 key, i64 now);
+void line_up(S& s, Server& server, const Job& job, i64 key, i64 work_ns, i64 now);
 inline void end_turn(Quota& quota);
 
 // What is due on an accelerator (remainders.h).
@@ -178,7 +178,7 @@ void tick(S& s, Server& server, i64 now) {
 //
 // With c' = c - b cores left by the background, fair: min(1, c' / (K + s)); fifo and priority:
 // c' / (c + s); in turns: the core among the threads of the job whose turn it is; any: less by what
-// others contend for and foreign threads interfere, and 0 while the quota is used up.
+// foreign threads interfere, and 0 while the quota is used up.
 template <class S>
 void set_speed(S& s, Server& server) {
   f64 speed;
@@ -192,7 +192,6 @@ void set_speed(S& s, Server& server) {
   } else {
     speed = server.spare / static_cast<f64>(server.cores + server.stress);
   }
-  speed *= server.pace;
   if (server.stress > 0) speed *= server.beside;
   server.speed = server.is_stopped ? 0.0 : speed;
 }
@@ -357,12 +356,11 @@ void admit(S& s, i64 key, i64 now) {
   Job& job = s.job(key);
   const Site& site = s.site(job);
   Server& server = s.server(site);
+  const i64 work_ns = site.exec_ns[cycle_of(key)];
   if (takes_turns(s, server)) {
-    admit_threads(s, server, site, job, key, now);
+    line_up(s, server, job, key, work_ns, now);
     return;
   }
-  const i64 work_ns = site.exec_ns[cycle_of(key)];
-  job.rest_ns = 0;
   const f64 left = time_alone(site, work_ns);
   // Where nobody else can want the cores now, the job needs no queue.
   const bool alone = server.n_wait == 0 && s.n_ready == 1;

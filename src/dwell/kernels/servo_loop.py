@@ -25,8 +25,9 @@ from ctypes import c_double, c_int64
 import numpy as np
 
 from dwell.kernels.library import foreign
-from dwell.kernels.rows import FLOAT_ROWS_OUT, FLOATS_IN, FLOATS_OUT, Floats
+from dwell.kernels.rows import FLOAT_ROWS_OUT, FLOATS_IN, FLOATS_OUT
 from dwell.model import Servo
+from dwell.model.number_arrays import Floats
 
 # Status.
 DONE, DIVERGED = 0, 1

@@ -112,15 +112,6 @@ i64 average(const S& s, const Server& server, const Quota& quota) {
   return origin + beyond / n - down;
 }
 
-// Least core time that a thread of a server has received: where one begins that is owed.
-template <class S>
-i64 least(const S& s, const Server& server, const Quota& quota) {
-  const i64 waiting = server.n_wait > 0 ? waiting_of(s, server)->rank : 0;
-  if (!quota.has_turn) return waiting;
-  const i64 received = received_by_turn(quota);
-  return server.n_wait > 0 ? std::min(waiting, received) : received;
-}
-
 // Gives the turn, if nobody has it and the quota lets anybody, to who has received least.
 template <class S>
 void take_turn(S& s, Server& server, i64 now) {
@@ -153,50 +144,14 @@ void restress(S& s, Server& server, i64 threads) {
   for (i64 i = 0; i < threads; ++i) queue_up(s, server, Waiting{received, kLate, kForeign, 0.0});
 }
 
-// Lets the next thread of a job wait for its turn: one before the stage, its own, one after.
-//
-// The stage's, which has worked for long when it sleeps, begins with the mean. One that does little
-// whenever it wakes is owed: it goes before all others, and takes the turn of one that has had it
-// for long enough. `work_ns` is 0 where what it does follows from what is left.
+// Queues a job that a worker has taken for its turn; it begins with the mean.
 template <class S>
-void line_up(S& s, Server& server, const Site& site, Job& job, i64 key, i64 work_ns, i64 mean) {
-  Quota& quota = s.quotas[server.quota];
-  const i64 rest = job.rest_ns;
-  i64 received = mean;
-  if (work_ns == 0 && rest > site.after_ns) {
-    work_ns = rest - site.after_ns;
-  } else {
-    if (work_ns == 0) work_ns = rest;
-    received = least(s, server, quota) - 1;
-    pass_on(s, server, quota);
-  }
-  job.rest_ns = rest - work_ns;
+void line_up(S& s, Server& server, const Job& job, i64 key, i64 work_ns, i64 now) {
+  tick(s, server, now);
+  const i64 received = average(s, server, s.quotas[server.quota]);
   queue_up(s, server, Waiting{received, job.ready_ns, key, static_cast<f64>(work_ns)});
   server.used += 1;
   mark(s, server);
-}
-
-// Lets the first thread of a job that a worker has taken line up.
-template <class S>
-void admit_threads(S& s, Server& server, const Site& site, Job& job, i64 key, i64 now) {
-  tick(s, server, now);
-  const i64 work_ns = site.exec_ns[cycle_of(key)];
-  job.rest_ns = work_ns;
-  const i64 first_ns = site.before_ns < work_ns ? site.before_ns : 0;
-  line_up(s, server, site, job, key, first_ns, average(s, server, s.quotas[server.quota]));
-}
-
-// Lets the next thread of a job line up, if there is one, where its thread has done its part.
-//
-// It is woken by the one that then sleeps, so that the mean that it begins with is over both.
-template <class S>
-bool next_thread(S& s, Server& server, const Site& site, Job& job, i64 key, i64 now) {
-  if (!S::kQuotas || job.rest_ns == 0) return false;
-  tick(s, server, now);
-  const i64 mean = average(s, server, s.quotas[server.quota]);
-  leave(s, server, site, now);
-  line_up(s, server, site, job, key, 0, mean);
-  return true;
 }
 
 }  // namespace dwell

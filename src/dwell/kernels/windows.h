@@ -47,12 +47,12 @@ template <class S>
       const Progress found = progress(s, server, at);
       if (found.key != kForeign && cell_of(found.key) == cell) own += found.received_ns;
     }
-    out[i] = server.busy_ns * server.pace + server.behind_ns;
+    out[i] = server.busy_ns + server.behind_ns;
     out[n_resources + i] = own;
     if (has_below(s, server)) {
       Server& below = s.servers[server.below];
       tick(s, below, now);
-      out[i] += below.busy_ns * below.pace + below.behind_ns;
+      out[i] += below.busy_ns + below.behind_ns;
       if (of.shadow >= 0) {
         f64 extra = s.own_ns[of.shadow * n_resources + i];
         for (i64 at = 0; at < below.n_run + below.n_wait; ++at) {

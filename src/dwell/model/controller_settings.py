@@ -24,15 +24,21 @@ class ControllerSettings:
     """The controller: where it sits, what it runs, and how its orders travel."""
 
     on: str | None = key(
-        "Node it sits on.", default=None, usual="the first edge node, else the first node"
+        "Node it sits on.",
+        default=None,
+        usual="the first edge node, else the first node",
+        tier="first",
     )
     policy: str = key(
         "A policy, `package.module:Class` of your own, or a candidate: the placement that never "
         "moves.",
         default="dtp",
         digested="decision",
+        tier="first",
     )
-    initial: str | None = key("Candidate to start with.", default=None, usual="the first")
+    initial: str | None = key(
+        "Candidate to start with.", default=None, usual="the first", tier="first"
+    )
     decide_cycles: int | None = key(
         "Cycles between two decisions, at most W.",
         DECIDE_CYCLES,
@@ -104,17 +110,21 @@ class ControllerSettings:
     fallbacks: tuple[str, ...] = key(
         "Candidates that the guard may move to, best first; none: no guard.", default=()
     )
-    order_delay_ms: float = key("Time that an order travels, ms.", TIME_MS, default=0.0)
+    order_delay_ms: float = key(
+        "Time that an order travels, ms.", TIME_MS, default=0.0, tier="measured"
+    )
     order_lead_cycles: int = key(
         "Cycles between a window's close and the first one its order may stamp.",
         Bound(0, MAX_COUNT, whole=True),
         default=0,
+        tier="measured",
     )
     close_grace_ms: float = key(
         "Time that a window stays open for stragglers after the release of the first cycle beyond "
         "it, ms. No window closes before the last deadline of its cycles.",
         TIME_MS,
         default=0.0,
+        tier="measured",
     )
 
     @property

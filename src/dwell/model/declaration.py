@@ -34,6 +34,8 @@ KEY = "dwell"
 #: Who reads a key in a live cell: all processes alike (`wiring`), the controller alone
 #: (`decision`), or each node for itself: the code that it runs, and how it is reached.
 Digested: TypeAlias = Literal["wiring", "decision", "code", "hosts"]
+#: Who sets a key: a first cell, who tunes decisions, or a measurement of computers and links.
+KeyTier: TypeAlias = Literal["first", "tuning", "measured"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +56,8 @@ class Declaration:
         Whether a document leaves it out where it is as usual.
     digested : str
         Digest that it is part of, and all below it (`dwell.model.document.digests`).
+    tier : str
+        Where docs, schema and `dwell new` list it.
     """
 
     says: str
@@ -62,6 +66,7 @@ class Declaration:
     usual: str | None = None
     is_rare: bool = False
     digested: Digested = "wiring"
+    tier: KeyTier = "tuning"
 
 
 def key(
@@ -74,9 +79,10 @@ def key(
     usual: str | None = None,
     is_rare: bool = False,
     digested: Digested = "wiring",
+    tier: KeyTier = "tuning",
 ) -> Any:
     """Declare a field of a class that is `declared` (see `Declaration`)."""
-    about = {KEY: Declaration(says, bound, named, usual, is_rare, digested)}
+    about = {KEY: Declaration(says, bound, named, usual, is_rare, digested, tier)}
     if default_factory is not MISSING:
         return dataclasses.field(default_factory=default_factory, metadata=about)
     return dataclasses.field(default=default, metadata=about)

@@ -9,7 +9,6 @@ from typing import Literal, NamedTuple, TypeAlias
 from dwell.model.bounds import (
     BACKGROUND_HZ,
     BURST_MEAN,
-    CONTENTION,
     FOREIGN_THREADS,
     LARGEST,
     RATE_MBPS,
@@ -64,6 +63,7 @@ class Quota:
         Bound(0, 1000),
         default=0.0,
         is_rare=True,
+        tier="measured",
     )
     tick_ms: float = key(
         "Time between the ticks at which a used-up budget is noticed and threads take turns, ms; "
@@ -71,6 +71,7 @@ class Quota:
         Bound(0, 1000),
         default=0.0,
         is_rare=True,
+        tier="measured",
     )
 
     def __post_init__(self) -> None:
@@ -83,8 +84,8 @@ class Node:
     """A computer."""
 
     name: str
-    tier: Tier = key("Kind of computer: robot, edge or cloud.")
-    cores: int = key("Cores of its CPU.", Bound(1, 4096, whole=True), default=1)
+    tier: Tier = key("Kind of computer: robot, edge or cloud.", tier="first")
+    cores: int = key("Cores of its CPU.", Bound(1, 4096, whole=True), default=1, tier="first")
     scheduler: Scheduler = key(
         "How jobs share the cores: `fair` (processor sharing), `fifo` (one after another) or "
         "`priority` (preemptive, by the tasks' `priority`).",
@@ -95,13 +96,16 @@ class Node:
         Bound(1, 4096, whole=True),
         default_factory=FrozenDict,
     )
-    bursts: Bursts | None = key("Foreign work of other tenants, in every scenario.", default=None)
+    bursts: Bursts | None = key(
+        "Foreign work of other tenants, in every scenario.", default=None, tier="measured"
+    )
     quota: Quota | None = key("CPU bandwidth limit on everything that runs there.", default=None)
     background: float = key(
         "Cores that others than the jobs always take, in small pieces; less than the node can do.",
         Bound(0, 4096),
         default=0.0,
         is_rare=True,
+        tier="measured",
     )
     background_beside: float | None = key(
         "What of `background` is taken while jobs run and no foreign thread does, on a node with "
@@ -109,6 +113,7 @@ class Node:
         Bound(0, 4096),
         default=None,
         usual="all of it",
+        tier="measured",
     )
     background_hz: float = key(
         "How often in a second something of `background` wakes, in the mean, on a node whose "
@@ -116,6 +121,7 @@ class Node:
         BACKGROUND_HZ,
         default=0.0,
         is_rare=True,
+        tier="measured",
     )
     interference: float = key(
         "How many times as much core time jobs take while foreign threads run, whose data take "
@@ -123,13 +129,7 @@ class Node:
         Bound(1, 100),
         default=1.0,
         is_rare=True,
-    )
-    contention: float = key(
-        "Share of a CPU's time that others take from what runs there, and that the node's quota "
-        "does not count. Only of a node with a quota.",
-        CONTENTION,
-        default=0.0,
-        is_rare=True,
+        tier="measured",
     )
 
     def __post_init__(self) -> None:
@@ -147,9 +147,6 @@ class Node:
             ticks = self.quota is not None and self.quota.tick_ms > 0
             bound = "0 where there is no `quota` with `tick_ms`; elsewhere it is looked at any time"
             require(ticks, "background_hz", self.background_hz, bound)
-        bound = "0 where there is no quota; elsewhere it is `background`"
-        has_quota = self.quota is not None
-        require(has_quota or self.contention == 0.0, "contention", self.contention, bound)
         if self.quota is not None and self.quota.tick_ms > 0:
             tick_ms, bound = self.quota.tick_ms, "0 where a node has several cores, or is not fair"
             require(self.cores == 1 and self.scheduler == "fair", "quota.tick_ms", tick_ms, bound)
@@ -168,15 +165,6 @@ class Node:
     def spare(self) -> float:
         """Cores that jobs and foreign threads share; a quota is what the background takes from."""
         return float(self.cores) if self.quota is not None else self.cores - self.background
-
-    @property
-    def pace(self) -> float:
-        """Core time that what runs on a core receives of its time."""
-        return 1.0 - self.contention
-
-    def wall_ns(self, core_ms: float) -> int:
-        """Time in which what runs on a core receives so much core time."""
-        return round(core_ms * 1e6 / self.pace)
 
     @property
     def budget_ms(self) -> float:
@@ -254,19 +242,21 @@ def accelerator_name(node: str, kind: str) -> str:
 class Link:
     """A directed connection between two nodes."""
 
-    source: str = key("Node that sends.", named="from")
-    target: str = key("Node that receives.", named="to")
-    delay_ms: Process = key("Propagation delay of a message, ms.")
+    source: str = key("Node that sends.", named="from", tier="first")
+    target: str = key("Node that receives.", named="to", tier="first")
+    delay_ms: Process = key("Propagation delay of a message, ms.", tier="first")
     rate_mbps: float = key(
         "Serialisation rate, megabits a second; messages do not queue where there is none.",
         RATE_MBPS,
         default=math.inf,
         usual="unlimited",
+        tier="first",
     )
     loss: float = key(
         "Probability that an attempt to send a message is lost.",
         Bound(0, 1, below=True),
         default=0.0,
+        tier="first",
     )
     retransmit_ms: float | None = key(
         "Time after which a lost message is sent again, ms; dropped where there is none.",
@@ -279,7 +269,9 @@ class Link:
         "message that is sent again.",
         default=False,
     )
-    bursts: Bursts | None = key("Episodes of extra delay, in every scenario.", default=None)
+    bursts: Bursts | None = key(
+        "Episodes of extra delay, in every scenario.", default=None, tier="measured"
+    )
 
     def __post_init__(self) -> None:
         require(self.source != self.target, "to", self.target, "another node than `from`")
@@ -297,8 +289,10 @@ class Link:
 class Fabric:
     """Nodes and links."""
 
-    nodes: Mapping[str, Node] = key("Computers by name.")
-    links: Mapping[str, Link] = key("Connections between nodes.", default_factory=FrozenDict)
+    nodes: Mapping[str, Node] = key("Computers by name.", tier="first")
+    links: Mapping[str, Link] = key(
+        "Connections between nodes.", default_factory=FrozenDict, tier="first"
+    )
 
     def __post_init__(self) -> None:
         require(len(self.nodes) > 0, "nodes", dict(self.nodes), "at least one node")

@@ -30,8 +30,10 @@ class Endpoint:
 class Host:
     """Where a node's processes listen."""
 
-    address: str = key("Name or address of the host.", default="127.0.0.1")
-    port: int = key("First port; each process of the node takes three.", PORT, default=7450)
+    address: str = key("Name or address of the host.", default="127.0.0.1", tier="first")
+    port: int = key(
+        "First port; each process of the node takes three.", PORT, default=7450, tier="first"
+    )
     seen_from: Mapping[str, Endpoint] = key(
         "Where it is reached from nodes that do not reach it there: behind a translation of "
         "addresses, a tunnel, or the links of a demonstration.",
@@ -55,6 +57,7 @@ class LiveSettings:
         default_factory=FrozenDict,
         usual="all are this machine",
         digested="hosts",
+        tier="first",
     )
     release: Literal["timer", "frames"] = key(
         "Whether a cycle begins by the clock (`timer`), or when the first source has a picture "
@@ -100,6 +103,7 @@ class LiveSettings:
         "What applies the commands of a sink task, as `package.module:Name`.",
         default_factory=FrozenDict,
         digested="code",
+        tier="first",
     )
     observer: str | None = key(
         "What looks on where `dwell live run` runs the cell, as `package.module:Name`.",

@@ -72,9 +72,9 @@ class Caps:
 class Objective:
     """What makes one placement better than another: all that J needs besides the metrics."""
 
-    weights: Weights = key("Weights of the terms of J.", digested="decision")
-    targets: Targets = key("Design targets.", digested="decision")
-    caps: Caps = key("Hard caps.", default_factory=Caps, digested="decision")
+    weights: Weights = key("Weights of the terms of J.", digested="decision", tier="first")
+    targets: Targets = key("Design targets.", digested="decision", tier="first")
+    caps: Caps = key("Hard caps.", default_factory=Caps, digested="decision", tier="first")
     tiers: Mapping[str, Tier] = key(
         "Nodes whose utilisation counts, and as which tier.",
         default_factory=FrozenDict,

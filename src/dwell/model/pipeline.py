@@ -14,7 +14,6 @@ from dwell.model.process import Constant, Process
 #: Of a task on a node, where it says nothing, and of each of its nodes.
 WORKERS = Bound(1, MAX_COUNT, whole=True)
 STANDBY = Bound(0, 1, whole=True)
-HANDED_MS = Bound(0, 1e6)
 
 
 @declared()
@@ -22,12 +21,14 @@ class Execution:
     """How a task runs on one of its feasible nodes."""
 
     exec_ms: Process = key(
-        "Time that one job needs when nothing disturbs it, with all its threads, ms."
+        "Time that one job needs when nothing disturbs it, with all its threads, ms.",
+        tier="first",
     )
     threads: int = key(
         "Cores that one job can use at once; on a node with fewer it takes so many times as long.",
         Bound(1, MAX_COUNT, whole=True),
         default=1,
+        tier="first",
     )
     workers: int = key(
         "Jobs of this task that may run there at a time.", WORKERS, default=1, usual="the task's"
@@ -39,19 +40,6 @@ class Execution:
         "Further workers that a live node keeps, to take over when the first is silent.",
         STANDBY,
         default=0,
-        is_rare=True,
-    )
-    before_ms: float = key(
-        "What of `exec_ms` another thread of its worker does before it, ms; it waits for its own "
-        "turn where threads take turns (`quota.tick_ms`).",
-        HANDED_MS,
-        default=0.0,
-        is_rare=True,
-    )
-    after_ms: float = key(
-        "What of `exec_ms` another thread of its worker does after it, ms.",
-        HANDED_MS,
-        default=0.0,
         is_rare=True,
     )
 
@@ -66,7 +54,8 @@ class Task:
 
     name: str
     on: Mapping[str, Execution] = key(
-        "Nodes it can run on, and how; one anchors it, more make it relocatable."
+        "Nodes it can run on, and how; one anchors it, more make it relocatable.",
+        tier="first",
     )
     depth: int = key(
         "Complete input sets that may wait for a worker, 0 without a bound; beyond it the oldest "
@@ -74,6 +63,7 @@ class Task:
         Bound(0, MAX_COUNT, whole=True),
         default=0,
         named="input",
+        tier="first",
     )
     priority: int = key(
         "Larger runs first on a node with the priority scheduler.",
@@ -81,27 +71,35 @@ class Task:
         default=0,
     )
     scale: str | None = key(
-        "Name under `scales` of what multiplies its execution times on every node.", default=None
+        "Name under `scales` of what multiplies its execution times on every node.",
+        default=None,
+        tier="measured",
     )
     offset_ms: float = key("Start of a source after the cycle's release, ms.", TIME_MS, default=0.0)
     start_ms: float = key(
-        "Time that a new worker needs before its first job, ms.", TIME_MS, default=0.0
+        "Time that a new worker needs before its first job, ms.",
+        TIME_MS,
+        default=0.0,
+        tier="measured",
     )
     state_bytes: int = key(
         "State that a cold migration carries over the link, bytes.",
         Bound(0, 1e15, whole=True),
         default=0,
+        tier="measured",
     )
     run: str | None = key(
         "Class or function of a live worker, as `package.module:Name`.",
         default=None,
         digested="code",
+        tier="first",
     )
     warmup_jobs: int = key(
         "First jobs of a live worker that do not count in times of stages and in estimators.",
         Bound(0, MAX_COUNT, whole=True),
         default=0,
         is_rare=True,
+        tier="measured",
     )
 
     def __post_init__(self) -> None:
@@ -119,10 +117,14 @@ class Task:
 class Flow:
     """A precedence edge: what one task sends to another."""
 
-    source: str = key("Task that sends.", named="from")
-    target: str = key("Task that receives.", named="to")
+    source: str = key("Task that sends.", named="from", tier="first")
+    target: str = key("Task that receives.", named="to", tier="first")
     payload_bytes: int = key(
-        "Payload of a message, bytes.", Bound(0, 1e12, whole=True), default=0, named="bytes"
+        "Payload of a message, bytes.",
+        Bound(0, 1e12, whole=True),
+        default=0,
+        named="bytes",
+        tier="first",
     )
 
 
@@ -130,20 +132,26 @@ class Flow:
 class Pipeline:
     """Tasks and flows of a control loop with its timing."""
 
-    tasks: Mapping[str, Task] = key("Stages of the pipeline by name.")
-    flows: tuple[Flow, ...] = key("What tasks send to one another: a directed acyclic graph.")
-    period_ms: float = key("Time between two releases (P), ms.", PERIOD_MS)
+    tasks: Mapping[str, Task] = key("Stages of the pipeline by name.", tier="first")
+    flows: tuple[Flow, ...] = key(
+        "What tasks send to one another: a directed acyclic graph.", tier="first"
+    )
+    period_ms: float = key("Time between two releases (P), ms.", PERIOD_MS, tier="first")
     deadline_ms: float = key(
         "Latency beyond which a cycle is missed (D, at most P), ms.",
         Bound(1e-6, LARGEST),
         usual="P",
+        tier="first",
     )
     release_jitter_ms: Process = key(
-        "Added to the instant of every release, ms.", default_factory=lambda: Constant(0.0)
+        "Added to the instant of every release, ms.",
+        default_factory=lambda: Constant(0.0),
+        tier="measured",
     )
     scales: Mapping[str, Process] = key(
         "Factors, one a cycle, that tasks may name, as the scene's complexity.",
         default_factory=FrozenDict,
+        tier="measured",
     )
     phase_ms: float | None = key(
         "Offset of all its releases, with their deadlines and windows, ms; less than P.",

@@ -48,19 +48,23 @@ class Problem(Displayed):
         With every fault found.
     """
 
-    name: str = key("Name of the cell.", usual="the file's")
+    name: str = key("Name of the cell.", usual="the file's", tier="first")
     pipeline: Pipeline
     fabric: Fabric
     candidates: Mapping[str, Placement] = key(
         "Placements the policy may choose, by name: relocatable task to node; anchored "
-        "tasks follow."
+        "tasks follow.",
+        tier="first",
     )
-    objective: Objective = key("Cost, targets and caps.")
+    objective: Objective = key("Cost, targets and caps.", tier="first")
     scenarios: Mapping[str, Scenario] = key(
         "What happens to the cell, by name: a list of disturbances. `baseline: []` exists always.",
         default_factory=FrozenDict,
+        tier="first",
     )
-    controller: ControllerSettings = key("Policy and protocol.", default_factory=ControllerSettings)
+    controller: ControllerSettings = key(
+        "Policy and protocol.", default_factory=ControllerSettings, tier="first"
+    )
     window_cycles: int = key("Cycles of a window (W).", Bound(1, MAX_COUNT, whole=True), default=50)
     warmup_windows: int = key(
         "First windows of a run, recorded but left out of statistics.",
@@ -71,7 +75,9 @@ class Problem(Displayed):
         "Loop that every run's commands are tried on; without one there is no tracking error.",
         default=None,
     )
-    live: LiveSettings = key("Hosts and habits of the live runtime.", default_factory=LiveSettings)
+    live: LiveSettings = key(
+        "Hosts and habits of the live runtime.", default_factory=LiveSettings, tier="first"
+    )
     #: Where classes that are named ``package.module:Class`` are looked for first: the cell file's.
     #: No part of what the cell is.
     folder: str | None = field(default=None, compare=False, repr=False)

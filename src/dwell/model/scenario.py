@@ -43,16 +43,25 @@ class Episodes:
 
 def _at_s() -> Any:
     return key(
-        "Begin, seconds from the start of the run.", Bound(0, LARGEST, below=True), default=0.0
+        "Begin, seconds from the start of the run.",
+        Bound(0, LARGEST, below=True),
+        default=0.0,
+        tier="first",
     )
 
 
 def _for_s() -> Any:
-    return key("Duration, seconds.", Bound(0, above=True), default=math.inf, usual="to the end")
+    return key(
+        "Duration, seconds.",
+        Bound(0, above=True),
+        default=math.inf,
+        usual="to the end",
+        tier="first",
+    )
 
 
 def _down() -> Any:
-    return key("Whether the node or the link is down meanwhile.", default=False)
+    return key("Whether the node or the link is down meanwhile.", default=False, tier="first")
 
 
 def _episodes() -> Any:
@@ -99,13 +108,14 @@ class _Timed:
 class NodeDisturbance(_Timed):
     """Foreign CPU load on a node, or the node down."""
 
-    node: str = key("Node that it happens to.")
+    node: str = key("Node that it happens to.", tier="first")
     at_s: float = _at_s()
     for_s: float = _for_s()
     stress_threads: int = key(
         "Foreign threads on the node; along a ramp, rounded to whole ones.",
         FOREIGN_THREADS,
         default=0,
+        tier="first",
     )
     down: bool = _down()
     episodes: Episodes | None = _episodes()
@@ -132,9 +142,13 @@ class LinkDisturbance(_Timed):
     at_s: float = _at_s()
     for_s: float = _for_s()
     add_delay_ms: Process | None = key(
-        "Added to the delay of every message on the link, ms.", default=None
+        "Added to the delay of every message on the link, ms.",
+        default=None,
+        tier="first",
     )
-    loss: float = key("Probability of loss on the link, besides its own.", ADDED_LOSS, default=0.0)
+    loss: float = key(
+        "Probability of loss on the link, besides its own.", ADDED_LOSS, default=0.0, tier="first"
+    )
     rate_mbps: float = key(
         "Rate of the link meanwhile, where its own is not lower, Mbit/s.",
         RATE_MBPS,

@@ -251,7 +251,7 @@ DECISIONS = (
         SUPPORT,
     ),
     Column("phi_before", "Float64", "Φ of the fleet as it is, as played.", null=UNASKED, of=FLEET),
-    Column("phi_after", "Float64", "Φ with the move that was looked at.", null=UNASKED, of=FLEET),
+    Column("phi_after", "Float64", "Φ with the moves that were played.", null=UNASKED, of=FLEET),
     Column("round", "Int64", "The ledger's round that it is of.", null="no ledger", of=FLEET),
     Column(
         "refused",

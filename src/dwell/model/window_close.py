@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from decimal import Decimal
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.model.number_arrays import Ints
+
 if TYPE_CHECKING:
     from dwell.model.problem import Problem
-
-Ints: TypeAlias = NDArray[np.int64]
 
 
 def window_close_ns(

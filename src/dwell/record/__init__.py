@@ -3,6 +3,7 @@
 from dwell.model.table_columns import Feature
 from dwell.record.fleet_run import FleetRun, is_fleet, open_fleet
 from dwell.record.journal import Journal
+from dwell.record.moves import Move, moves, moves_in
 from dwell.record.run import Run, is_run, open_run, require_free, seal_run
 from dwell.record.schema import (
     OUTCOME_SENTENCES,
@@ -28,6 +29,7 @@ __all__ = [
     "Feature",
     "FleetRun",
     "Journal",
+    "Move",
     "Names",
     "Row",
     "Run",
@@ -39,6 +41,8 @@ __all__ = [
     "frame_of",
     "is_fleet",
     "is_run",
+    "moves",
+    "moves_in",
     "open_fleet",
     "open_run",
     "require_free",

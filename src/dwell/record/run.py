@@ -85,6 +85,10 @@ class Run(Displayed):
         meta = self._meta() if callable(self._meta) else self._meta
         return {**meta, "schema_version": SCHEMA_VERSION}
 
+    def with_facts(self, **facts: object) -> Run:
+        """Return the same run with more in `meta`, ready for JSON."""
+        return Run({**self.meta, **facts}, self._tables, self._arrays)
+
     def _table(self, name: str) -> pl.DataFrame:
         table = self._tables[name]
         if callable(table):

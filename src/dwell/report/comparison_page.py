@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import islice
-from typing import TYPE_CHECKING
 
 from dwell.model.bounds import counted
 from dwell.model.disturbed import disturbed
-from dwell.report.charts import curves
 from dwell.report.figure import Figure
 from dwell.report.formatting import (
     COST,
-    RATE,
     Measure,
     few_seeds,
     independent_runs,
@@ -21,25 +18,17 @@ from dwell.report.formatting import (
 )
 from dwell.report.method import numbered
 from dwell.report.page import Page, Section, page_html
-from dwell.report.policy_blocks import THE_AIM, PolicyBlocks, named, scaled
+from dwell.report.policy_blocks import PolicyBlocks
 from dwell.report.table import Columns, Table, Text, table_text, wrapped
 from dwell.report.timeline import begins_by_number, run_timeline
-from dwell.study import Comparison, StudyResult, paper_predictions
+from dwell.study import Comparison, paper_predictions
 from dwell.study.drawn_disturbances import drawn_disturbances
 
-if TYPE_CHECKING:
-    import polars as pl
-
-
 DTP = "dtp"
-#: Scenarios in which perception's time on R1 decides between placements.
-ROBOT_DECIDES = ("baseline", "robot-cpu-stress")
 
 
 def comparison_html(
     *comparisons: Comparison,
-    tenants: StudyResult | None = None,
-    deadlines: pl.DataFrame | None = None,
     static: bool = False,
 ) -> str:
     """Return a page about one comparison, or about several one after the other.
@@ -48,23 +37,13 @@ def comparison_html(
     ----------
     *comparisons : Comparison
         At least one, of cells with different names.
-    tenants : StudyResult, optional
-        Runs of `dwell.study.tenants_demo`; a section of its own.
-    deadlines : DataFrame, optional
-        Rows of `dwell.study.stored_deadlines`; a section of its own.
     static : bool
         See `dwell.report.page.page_html`.
     """
-    page = comparison_page(*comparisons, tenants=tenants, deadlines=deadlines)
-    return page_html(page, static=static)
+    return page_html(comparison_page(*comparisons), static=static)
 
 
-def comparison_page(
-    *comparisons: Comparison,
-    tenants: StudyResult | None = None,
-    deadlines: pl.DataFrame | None = None,
-    sections: int | None = None,
-) -> Page:
+def comparison_page(*comparisons: Comparison, sections: int | None = None) -> Page:
     """Return what there is to show of comparisons; the first `sections` only of each."""
     several = len(comparisons) > 1
     parts: list[Section] = []
@@ -73,7 +52,7 @@ def comparison_page(
         prefix = f"{comparison.problem.name}-" if several else ""
         blocks = PolicyBlocks(comparison, prefix)
         policies |= blocks.colours
-        for part in islice(_sections(comparison, blocks, tenants, deadlines), sections):
+        for part in islice(_sections(comparison, blocks), sections):
             title = f"{comparison.problem.name}: {part.title}" if several else part.title
             parts.append(Section(title.removesuffix(": "), part.blocks, part.note))
     first = comparisons[0]
@@ -90,12 +69,7 @@ def comparison_page(
     )
 
 
-def _sections(
-    comparison: Comparison,
-    blocks: PolicyBlocks,
-    tenants: StudyResult | None,
-    deadlines: pl.DataFrame | None,
-) -> Iterator[Section]:
+def _sections(comparison: Comparison, blocks: PolicyBlocks) -> Iterator[Section]:
     yield Section("", blocks.answer(), note=blocks.headline())
     predictions = predictions_table(comparison, blocks)
     if predictions.rows:
@@ -104,13 +78,6 @@ def _sections(
     figures = [blocks.tail(), blocks.measure(COST, title="J, the cost that DTP seeks to lower")]
     figures += [blocks.distribution(), *blocks.placed(), blocks.split()]
     yield Section("Figures", figures)
-    if tenants is not None:
-        yield Section("V_D by the share of time that E’s tenants take", [_tenants(tenants)])
-    if deadlines is not None:
-        yield Section(
-            "V_D by the deadline, and by how long perception takes on R1",
-            [_deadlines(deadlines, blocks)],
-        )
     moving = [name for name in comparison.policies if name not in comparison.statics]
     if moving and comparison.examples:
         shown = DTP if DTP in moving else moving[0]
@@ -203,40 +170,6 @@ def _beliefs(comparison: Comparison, blocks: PolicyBlocks) -> Table:
         "realisations.",
         blocks.palette,
     )
-
-
-def _tenants(result: StudyResult) -> Figure:
-    """Draw V_D over the share of time that tenants have of the edge."""
-    import polars as pl
-
-    (column,) = result.parameters
-    shares = {}
-    for point in result.study.points:
-        bursts = point.problem.fabric.nodes["E"].bursts
-        percent = 0.0 if bursts is None else round(100 * bursts.share, 1)
-        shares[str(point.values[column.removeprefix("parameter.")])] = percent
-    table = scaled(result.table([RATE.column]), RATE).with_columns(
-        at=pl.col(column).cast(pl.String).replace_strict(shares, return_dtype=pl.Float64)
-    )
-    frame = named(table.select("scenario", "policy", "at", "mean", "low", "high")).sort("at")
-    draw = curves(frame, RATE, PolicyBlocks(result).styles, "share of the time (%)", THE_AIM)
-    caption = "Means over seeds with their 95 % intervals."
-    return Figure("tenants", "", {"rows": frame}, draw, caption)
-
-
-def _deadlines(rows: pl.DataFrame, blocks: PolicyBlocks) -> Figure:
-    """Draw V_D over P = D, a panel for each time of perception on R1."""
-    import polars as pl
-
-    shown = [shown_scenario(name) for name in ROBOT_DECIDES]
-    frame = rows.filter(pl.col("scenario").is_in(shown))
-    styles = {name: style for name, style in blocks.styles.items() if name in frame["policy"]}
-    draw = curves(frame, RATE, styles, "P = D (ms)", THE_AIM)
-    caption = (
-        "Means over seeds with their 95 % intervals. Played beforehand "
-        "(examples/studies/deadline.yaml)."
-    )
-    return Figure("deadlines", "", {"rows": frame}, draw, caption)
 
 
 def comparison_text(comparison: Comparison, *, width: int | None = None) -> str:

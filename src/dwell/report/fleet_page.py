@@ -243,7 +243,8 @@ class _FleetPage:
             ),
             Table(
                 "round-table",
-                f"Rounds that moved a cell ({len(rows)} of {asked['round'].n_unique()} played)",
+                f"Rounds that moved cells ({moved['round'].n_unique()} of "
+                f"{asked['round'].n_unique()} played)",
                 columns,
                 rows,
                 palette=self.palette,

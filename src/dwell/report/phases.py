@@ -8,10 +8,12 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from dwell.model.disturbed import Disturbed
+from dwell.model.order_statistic import percentile
+from dwell.record.moves import moves
 from dwell.report.formatting import FINAL_L95, RATE, Measure
 from dwell.report.palette import Palette
 from dwell.report.table import Columns, Table, Text
-from dwell.study.summary import latency_ms, order_statistic
+from dwell.study.summary import latency_ms
 
 if TYPE_CHECKING:
     import polars as pl
@@ -105,7 +107,7 @@ def phase_rows(run: Run, header: RunHeader) -> list[PhaseRow]:
         mine = cycles.filter(pl.Series(inside))
         if mine.is_empty():
             continue
-        moves = sum(phase.begin_s <= at_s < phase.end_s for at_s, _ in moved_s)
+        count = sum(phase.begin_s <= at_s < phase.end_s for at_s, _ in moved_s)
         guards = sum(phase.begin_s <= at_s < phase.end_s for at_s in guard_s)
         counts = mine["placement"].cast(pl.String).value_counts(sort=True)
         rms_mm, rms_px = (math.nan, math.nan)
@@ -116,10 +118,10 @@ def phase_rows(run: Run, header: RunHeader) -> list[PhaseRow]:
                 *phase,
                 mine.height,
                 float(mine["missed"].to_numpy().mean()),
-                float(order_statistic(latency_ms(mine), 95)),
+                percentile(latency_ms(mine), 95),
                 int(mine["latency_ns"].is_null().sum()),
                 {name: count / mine.height for name, count in counts.rows()},
-                max(moves - guards, 0),
+                max(count - guards, 0),
                 guards,
                 rms_mm,
                 rms_px,
@@ -167,17 +169,16 @@ def _moves(cycles: pl.DataFrame) -> list[tuple[float, str]]:
 
 
 def _guarded(run: Run, moved_s: Sequence[tuple[float, str]]) -> list[float]:
-    """When it was the guard: it is noted under the window that follows the move."""
-    import polars as pl
-
-    decisions = run.decisions
-    guard = decisions["migrated"] & (decisions["reason"].cast(pl.String) == "guard")
+    """Return the instants of the guard's moves."""
     first = dict(zip(run.windows["window"], run.windows["first_cycle"], strict=True))
     released_ns = dict(zip(run.cycles["cycle"], run.cycles["release_ns"], strict=True))
     found = []
-    for window, target in decisions.filter(guard).select("window", "placement").rows():
+    for move in moves(run):
+        if not move.by_guard:
+            continue
         # After the last window there is none that follows.
-        until_ns = released_ns.get(first.get(window, -1), math.inf)
-        mine = [at_s for at_s, name in moved_s if name == target and at_s * 1e9 <= until_ns + 1]
+        until_ns = released_ns.get(first.get(move.window + 1, -1), math.inf)
+        before_s = [at_s for at_s, name in moved_s if name == move.target]
+        mine = [at_s for at_s in before_s if at_s * 1e9 <= until_ns + 1]
         found += mine[-1:]
     return found

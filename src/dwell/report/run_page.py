@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
 from typing import TYPE_CHECKING
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from dwell.display import decimals_for
 from dwell.model.bounds import counted
 from dwell.record import OUTCOME_SENTENCES, REASON_SENTENCES
+from dwell.record.moves import Move, moves_in
 from dwell.report.charts import (
     PART_COLOURS,
     PARTS_SHOWN,
@@ -33,6 +34,7 @@ from dwell.report.figure import Figure
 from dwell.report.formatting import (
     COST,
     FINAL_L95,
+    L95,
     RATE,
     Measure,
     percent,
@@ -48,6 +50,7 @@ from dwell.report.phases import phase_rows, phase_table
 from dwell.report.run_header import RunHeader
 from dwell.report.table import MOST_ROWS, Columns, Table, Text
 from dwell.report.timeline import begins_by_number, resources_in, run_timeline
+from dwell.study.other_placements import PLACEMENTS
 from dwell.study.predicted_moves import predicted_moves
 from dwell.study.summary import (
     Counted,
@@ -55,6 +58,7 @@ from dwell.study.summary import (
     latency_ms,
     summarise,
 )
+from dwell.study.verdict import verdict_of
 
 if TYPE_CHECKING:
     import polars as pl
@@ -62,6 +66,8 @@ if TYPE_CHECKING:
     from dwell.record import Run
 
 WORST = 10
+#: Numbers of a placement that never moves.
+KEPT = ("violation_rate", "l95_ms", "cost")
 #: Most labels of a figure's cycles.
 LABELS = 25
 #: Share of a deadline that clocks may be off by, where a window's latencies are proven.
@@ -131,7 +137,13 @@ class _RunPage:
     def _facts(self) -> Iterator[Fact]:
         row = {name: float(value) for name, value in self.row.items() if not isinstance(value, str)}
         deadline = f"deadline {write_ms(self.header.deadline_ms)}"
-        yield Fact("V_D, deadlines missed", percent(row["violation_rate"], 1), "aim: under 5 %")
+        verdict = verdict_of(self.run, self.header.problem, row["violation_rate"])
+        yield Fact(
+            "V_D, deadlines missed",
+            percent(verdict.rate, 2),
+            f"aim: under {percent(verdict.aim)}",
+            verdict.word,
+        )
         yield Fact("L95 of all cycles", write_ms(row["p95_ms"]), deadline)
         yield Fact("misses in a row", write_number(row["longest_misses"], 0), "at most")
         yield Fact("J", write_number(row["cost"], 2), "mean")
@@ -143,6 +155,8 @@ class _RunPage:
 
     def _sections(self) -> Iterator[Section]:
         yield Section("", [self._timeline(), *self._phases()])
+        if placements := self.run.meta.get(PLACEMENTS):
+            yield Section("If it never moved", [self._never_moving(placements)])
         yield Section("Worst windows", [self._worst_table()])
         for window in self.worst.iter_rows(named=True):
             number = window["window"]
@@ -191,6 +205,26 @@ class _RunPage:
         rows = phase_rows(self.run, self.header)
         if len(rows) > 1:
             yield phase_table(rows, self.palette)
+
+    def _never_moving(self, placements: Mapping[str, Mapping[str, float]]) -> Table:
+        """Return what each placement would have done without moves."""
+        rows: list[Mapping[str, object]] = [
+            {"placement": name, **numbers} for name, numbers in placements.items()
+        ]
+        if self.header.policy_name != "Static":
+            name = f"{self._policy()}, this run"
+            rows.append({"placement": name, **{key: self.row[key] for key in KEPT}})
+        columns: Columns = [
+            Text("placement", "placement", "placement"),
+            RATE._replace(decimals=2),
+            L95,
+            COST,
+        ]
+        caption = (
+            "Each placement by itself, without moves, on the same random draws. At most 8 "
+            "placements are simulated."
+        )
+        return Table("never-moving", "", columns, rows, caption=caption, palette=self.palette)
 
     # -------------------------------------------------------------------------- worst windows
 
@@ -351,9 +385,8 @@ class _RunPage:
         yield Table("reasons", "Why it was decided so", columns, rows)
         if "shadow_cycles" in self.counted.windows.columns:
             yield self._shadows()
-        moves = decisions.filter(decisions["migrated"])
-        if not moves.is_empty():
-            yield self._migrations(moves)
+        if found := moves_in(decisions):
+            yield self._migrations(decisions, found)
 
     def _shadows(self) -> Table:
         windows = self.counted.windows
@@ -375,24 +408,22 @@ class _RunPage:
         caption = "Cycles that went through another placement as well, for the estimator."
         return Table("shadows", "What shadow jobs cost", columns, [row], caption=caption)
 
-    def _migrations(self, moves: pl.DataFrame) -> Table:
+    def _migrations(self, decisions: pl.DataFrame, found: Sequence[Move]) -> Table:
         cost = dict(self.run.windows.select("window", "cost").rows())
         length_s = self.header.problem.window_ms / 1e3
         rows = []
-        for move in moves.head(MOST_ROWS).iter_rows(named=True):
-            window, target, reason = move["window"], move["placement"], str(move["reason"])
-            # A move of the guard is noted under the window that follows it.
-            before, later_s = (window - 1, 0.0) if reason == "guard" else (window, length_s)
+        for move in found[:MOST_ROWS]:
+            known, later_s = (move.window + 1, 0.0) if move.by_guard else (move.window, length_s)
             rows.append(
                 {
-                    "window": before,
-                    "at_s": self.begin_of.get(window, math.nan) + later_s,
-                    "from": str(move["incumbent"]),
-                    "to": str(target),
-                    "reason": reason,
-                    "before": cost.get(before),
-                    "estimated": move[f"j_{target}"],
-                    "after": cost.get(before + 1),
+                    "window": move.window,
+                    "at_s": self.begin_of.get(known, math.nan) + later_s,
+                    "from": move.source,
+                    "to": move.target,
+                    "reason": move.reason,
+                    "before": cost.get(move.window),
+                    "estimated": decisions[f"j_{move.target}"][move.row],
+                    "after": cost.get(move.window + 1),
                 }
             )
         columns: Columns = [
@@ -407,7 +438,7 @@ class _RunPage:
         ]
         return Table(
             "migrations",
-            f"Migrations ({len(rows)} of {moves.height})",
+            f"Migrations ({len(rows)} of {len(found)})",
             columns,
             rows,
             caption=(

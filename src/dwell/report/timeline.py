@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dwell.record.moves import GUARD
 from dwell.report.charts import coloured, disc, is_wide, layer, limit_rule, name_of, names, quantity
 from dwell.report.figure import Draw, Figure, Spec
 from dwell.report.palette import BAD, INK, MUTED, SHADE, Palette
@@ -298,7 +299,7 @@ def _estimates(timed: pl.DataFrame, candidates: Sequence[str], each: int) -> pl.
     """
     import polars as pl
 
-    priced = timed.filter(pl.col("reason").cast(pl.String) != "guard")
+    priced = timed.filter(pl.col("reason").cast(pl.String) != GUARD)
     parts = [
         priced.select(
             "time",

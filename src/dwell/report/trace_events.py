@@ -11,6 +11,7 @@ import heapq
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from dwell.record.moves import moves
 from dwell.report.run_header import RunHeader
 
 if TYPE_CHECKING:
@@ -129,19 +130,19 @@ def _cycle_events(cycles: pl.DataFrame, jobs: pl.DataFrame) -> Iterator[TraceEve
 
 def _migration_events(run: Run) -> Iterator[TraceEvent]:
     """Decisions that migrate, at the release of the first cycle that they did not look at."""
-    import polars as pl
-
-    moves = run.decisions.filter(pl.col("migrated")).with_columns(cycle=pl.col("last_cycle") + 1)
-    for move in moves.join(run.cycles, on="cycle", suffix="_of_cycle").iter_rows(named=True):
+    released_ns = dict(run.cycles.select("cycle", "release_ns").iter_rows())
+    for move in moves(run):
+        if move.cycle not in released_ns:
+            continue
         yield {
-            "name": f"{move['incumbent']} → {move['placement']}",
+            "name": f"{move.source} → {move.target}",
             "cat": "decision",
             "ph": "i",
             "s": "g",
             "pid": CELL,
             "tid": 0,
-            "ts": move["release_ns"] / NS_PER_US,
-            "args": {"window": move["window"], "reason": str(move["reason"])},
+            "ts": released_ns[move.cycle] / NS_PER_US,
+            "args": {"window": run.decisions["window"][move.row], "reason": move.reason},
         }
 
 

@@ -7,9 +7,8 @@ from collections.abc import Collection, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.model.number_arrays import Floats
 from dwell.sim.tables import PlayedRealisation
-
-Floats = NDArray[np.float64]
 
 
 def shared_load(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
-from typing import TYPE_CHECKING, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -17,14 +17,13 @@ from dwell.kernels.realisation import Realisation
 from dwell.kernels.rows import Rows
 from dwell.model import REASONS, Problem
 from dwell.model.instants import HORIZON_NS, NEVER_NS
+from dwell.model.number_arrays import Floats, Ints
 from dwell.model.window_close import window_close_ns
 from dwell.record import OUTCOMES, Feature, Names, TableArrays, frame_of
 
 if TYPE_CHECKING:
     import polars as pl
 
-Ints: TypeAlias = NDArray[np.int64]
-Floats: TypeAlias = NDArray[np.float64]
 T = TypeVar("T", bound=np.generic)
 
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from dwell.kernels.arrays import CellArrays, flow_rows
 from dwell.kernels.realisation import LinkSegments, Realisation
 from dwell.model import Problem
+from dwell.model.number_arrays import Ints
 
-Ints: TypeAlias = NDArray[np.int64]
 #: Nanoseconds by what was waited for: ("resource", "E.gpu"), or ("link", "R1->E").
 Waiting: TypeAlias = Counter[tuple[str, str]]
 

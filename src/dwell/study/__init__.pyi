@@ -4,11 +4,7 @@ from .capacity import Limiting as Limiting
 from .capacity import capacity_of as capacity_of
 from .comparison import Comparison as Comparison
 from .comparison import compare as compare
-from .demo import canonical_demo as canonical_demo
-from .demo import longest_run as longest_run
-from .demo import real_demo as real_demo
-from .demo import stored_deadlines as stored_deadlines
-from .demo import tenants_demo as tenants_demo
+from .comparison import compare_study as compare_study
 from .family import SAME_CYCLES as SAME_CYCLES
 from .family import SAME_RUN as SAME_RUN
 from .family import UNTOLD as UNTOLD
@@ -23,6 +19,7 @@ from .intervals import share_interval as share_interval
 from .intervals import under as under
 from .kept_bounds import AIM as AIM
 from .kept_bounds import keeps as keeps
+from .longest_run import longest_run as longest_run
 from .over_seeds import over_seeds as over_seeds
 from .over_seeds import windows_behind as windows_behind
 from .pairs import PairedDifference as PairedDifference

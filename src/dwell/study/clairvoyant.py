@@ -34,17 +34,13 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from dwell.errors import MetricError, PolicyError
 from dwell.model.bounds import MIN_DWELL
-
-Bools: TypeAlias = NDArray[np.bool_]
-Floats: TypeAlias = NDArray[np.float64]
-Ints: TypeAlias = NDArray[np.int64]
+from dwell.model.number_arrays import Floats, Ints, Mask
 
 #: Totals that differ by no more than this share of the largest are a tie: sums carry rounding.
 TIE_TOLERANCE = 1e-12
@@ -181,7 +177,7 @@ def _one_a_window(what: str, values: ArrayLike | None, windows: int) -> Floats:
     return row
 
 
-def _free_at(decided: Bools, min_dwell: int) -> Ints:
+def _free_at(decided: Mask, min_dwell: int) -> Ints:
     """Return f: the first window that may have another placement again, after one entered anew.
 
     Parameters

@@ -87,6 +87,19 @@ def compare(
         seeds=tuple(seeds),
         windows=windows,
     )
+    return compare_study(study, processes=processes, progress=progress)
+
+
+def compare_study(
+    study: Study, *, processes: int | None = None, progress: Progress | None = None
+) -> Comparison:
+    """Run a study without parameters in memory, as `compare` does.
+
+    Raises
+    ------
+    ProblemError, PolicyError, TraceError, SimulationError
+        See `compare`.
+    """
     player = Player(study, kept=study.seeds[:1])
     tables, kept = play_in_memory(player, processes=processes, progress=progress)
     examples = {(item.scenario, policy): one for (item, _, policy), one in kept.items()}

@@ -17,7 +17,8 @@ import numpy as np
 
 from dwell.errors import SimulationError
 from dwell.model.bounds import counted
-from dwell.study.intervals import CONFIDENCE, Floats
+from dwell.model.number_arrays import Floats
+from dwell.study.intervals import CONFIDENCE
 from dwell.study.over_seeds import has_median, is_share, metric_values, windows_behind
 from dwell.study.pairs import (
     PairedDifference,

@@ -11,6 +11,7 @@ from typing import Any
 
 from dwell.model.fleet import Fleet
 from dwell.record import FleetRun
+from dwell.record.moves import moves
 from dwell.study.family import EQUAL
 from dwell.study.judged_cost import judged_cost
 from dwell.study.summary import Summary, summarise
@@ -78,16 +79,16 @@ def fleet_numbers(run: FleetRun) -> dict[str, Any]:
     means = windows.group_by("cell").agg(
         pl.col("violation_rate", "seen_l95_ms", "cost").mean(),
     )
-    moved = run.decisions.filter(pl.col("migrated"))
-    moves = dict(moved.group_by("cell").len().iter_rows())
-    by_guard = moved.filter(pl.col("reason") == "guard").height
+    moved, cell = moves(run), run.decisions["cell"]
+    by_cell = Counter(cell[move.row] for move in moved)
+    by_guard = sum(move.by_guard for move in moved)
     cells = [
         {
             "cell": row["cell"],
             "violation_rate": row["violation_rate"],
             "l95_ms": _known(row["seen_l95_ms"]),
             "cost": _known(row["cost"]),
-            "moves": moves.get(row["cell"], 0),
+            "moves": by_cell[row["cell"]],
         }
         for row in means.sort("violation_rate", "cell", descending=[True, False]).to_dicts()
     ]
@@ -103,7 +104,7 @@ def fleet_numbers(run: FleetRun) -> dict[str, Any]:
         "cells": cells,
         "cost": _known(means["cost"].mean()),
         "load": load,
-        "moves": moved.height,
+        "moves": len(moved),
         "guard_moves": by_guard,
         "refused": dict(refused),
         "rounds": _rounds(run),

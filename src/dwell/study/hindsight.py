@@ -17,21 +17,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.control.windows import missed_cycles, seen_l95_ms
 from dwell.errors import SimulationError
 from dwell.estimators import Evidence
 from dwell.model import FrozenDict, Problem, QoS
+from dwell.model.number_arrays import Floats, Ints
 
 if TYPE_CHECKING:
     from dwell.record import Run
-
-Ints: TypeAlias = NDArray[np.int64]
-Floats: TypeAlias = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,11 +25,10 @@ from itertools import accumulate
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dwell.model.number_arrays import Floats
 from dwell.model.table_columns import ENDS
 
-Floats: TypeAlias = NDArray[np.float64]
 Values: TypeAlias = Sequence[float] | Floats
 Verdict: TypeAlias = Literal["under", "over", "not shown"]
 

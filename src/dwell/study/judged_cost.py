@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.cost import hamming, price
 from dwell.model import Problem
+from dwell.model.number_arrays import Floats
 from dwell.record import Names
 from dwell.study.reference import tier_use
 
 if TYPE_CHECKING:
     from dwell.record import Run
-
-Floats: TypeAlias = NDArray[np.float64]
 
 
 def judged_cost(run: Run, problem: Problem) -> float:

@@ -16,10 +16,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.cost import cost
 from dwell.estimators.prices import prices_of
@@ -40,12 +39,11 @@ from dwell.model import (
     Uniform,
 )
 from dwell.model.instants import NEVER_NS
+from dwell.model.number_arrays import Floats, Ints
 
 if TYPE_CHECKING:
     from dwell.sim import Realisation
 
-Floats: TypeAlias = NDArray[np.float64]
-Ints: TypeAlias = NDArray[np.int64]
 
 #: Cycles of each candidate that count in the price of a set.
 PRICED_CYCLES = 10_000

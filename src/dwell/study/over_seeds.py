@@ -7,9 +7,9 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from dwell.errors import MetricError
+from dwell.model.number_arrays import Floats
 from dwell.model.semantics import nearest
 from dwell.study.intervals import (
-    Floats,
     Interval,
     mean_interval,
     median_interval,

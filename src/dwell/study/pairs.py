@@ -19,9 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from dwell.errors import SimulationError
+from dwell.model.number_arrays import Floats
 from dwell.study.intervals import (
     RESAMPLING_SEED,
-    Floats,
     Values,
     halves,
     mean_interval,

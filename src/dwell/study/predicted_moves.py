@@ -11,6 +11,8 @@ import math
 from collections.abc import Collection, Iterator
 from typing import TYPE_CHECKING
 
+from dwell.record.moves import moves
+
 if TYPE_CHECKING:
     import polars as pl
 
@@ -61,37 +63,29 @@ def _rows(run: Run, excluded: Collection[int]) -> Iterator[tuple[object, ...]]:
     left_out = pl.col("warmup") | pl.col("window").is_in([*excluded])
     passed = {*excluded, *run.windows.filter(pl.col("warmup"))["window"]}
     shown = run.windows.filter(~left_out & ~pl.col("mixed") & pl.col("seen_l95_ms").is_not_null())
-    moves = run.decisions.filter(pl.col("migrated"))
-    for move, following in itertools.zip_longest(
-        moves.iter_rows(named=True), moves[1:].iter_rows(named=True)
-    ):
-        window, target = move["window"], str(move["placement"])
-        if move["reason"] == "guard" or window in passed:
+    found, decisions = moves(run), run.decisions
+    for move, following in itertools.zip_longest(found, found[1:]):
+        window, target = move.window, move.target
+        if move.by_guard or window in passed:
             continue
+        until = math.inf if following is None else following.window
+        estimates = (f"est_{what}_{target}" for what in QUANTITIES)
         held = shown.filter(
             (pl.col("window") > window)
-            & (pl.col("window") <= _last(following))
+            & (pl.col("window") <= until)
             & (pl.col("placement").cast(pl.String) == target)
         )
         settled = held.filter(pl.col("window") > window + 1)
         held = held if settled.is_empty() else settled
         yield (
             window,
-            str(move["incumbent"]),
+            move.source,
             target,
             held.height,
-            *(move.get(f"est_{what}_{target}") for what in QUANTITIES),
+            *(decisions[name][move.row] if name in decisions else None for name in estimates),
             *_mean_and_error(held["seen_l95_ms"]),
             *_mean_and_error(held["seen_violation_rate"]),
         )
-
-
-def _last(move: dict[str, object] | None) -> float:
-    """Return the last window before a move; the guard's stands under the window it began."""
-    if move is None:
-        return math.inf
-    window = int(str(move["window"]))
-    return window - 1 if move["reason"] == "guard" else window
 
 
 def _mean_and_error(values: pl.Series) -> tuple[object, float | None]:

@@ -15,16 +15,14 @@ References
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dwell.model import Servo
 from dwell.model.instants import NEVER_NS
-
-Floats: TypeAlias = NDArray[np.float64]
-Ints: TypeAlias = NDArray[np.int64]
+from dwell.model.number_arrays import Ints
 
 #: Percentile of the age that is given.
 PERCENT = 95

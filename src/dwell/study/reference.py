@@ -24,10 +24,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.control.windows import busiest, moved_shares, seen_l95_ms
 from dwell.cost import price
@@ -35,6 +34,7 @@ from dwell.errors import SimulationError
 from dwell.estimators import Profile
 from dwell.estimators.registry import resolved
 from dwell.model import FrozenDict, Problem
+from dwell.model.number_arrays import Floats, Mask
 from dwell.model.window_close import window_close_ns
 from dwell.policies.registry import estimator_of
 from dwell.study.clairvoyant import Sequence, clairvoyant, priced
@@ -46,8 +46,6 @@ if TYPE_CHECKING:
     from dwell.record import Run, TableArrays
     from dwell.sim import Realisation
 
-Floats: TypeAlias = NDArray[np.float64]
-Mask: TypeAlias = NDArray[np.bool_]
 
 CLAIRVOYANT = "clairvoyant"
 CLAIRVOYANT_DWELL = "clairvoyant-dwell"

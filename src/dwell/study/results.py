@@ -13,9 +13,10 @@ from dwell.display import Displayed
 from dwell.errors import PolicyError, SimulationError
 from dwell.model import FrozenDict, Problem
 from dwell.model.bounds import counted
+from dwell.model.number_arrays import Floats
 from dwell.model.semantics import nearest
 from dwell.study.family import played_alike
-from dwell.study.intervals import Floats, Interval
+from dwell.study.intervals import Interval
 from dwell.study.over_seeds import (
     difference_of,
     interval_of,

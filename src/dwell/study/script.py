@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.errors import PolicyError
 from dwell.model import Problem, QoS
 from dwell.model.bounds import counted
+from dwell.model.number_arrays import Ints, Mask
 from dwell.model.window_close import window_close_ns
 
 if TYPE_CHECKING:
     from dwell.sim import Realisation
-
-Bools: TypeAlias = NDArray[np.bool_]
-Ints: TypeAlias = NDArray[np.int64]
 
 
 class Script:
@@ -86,7 +83,7 @@ class Script:
         return self.placement(close + 1)
 
 
-def is_up(problem: Problem, realisation: Realisation, at_ns: Ints) -> Bools:
+def is_up(problem: Problem, realisation: Realisation, at_ns: Ints) -> Mask:
     """Return whether the controller's node is up at instants.
 
     Parameters
@@ -98,11 +95,11 @@ def is_up(problem: Problem, realisation: Realisation, at_ns: Ints) -> Bools:
     bool array, shape (n,)
     """
     change_ns, down = _outages(problem, realisation)
-    up: Bools = ~down[np.searchsorted(change_ns, at_ns, side="right")]
+    up: Mask = ~down[np.searchsorted(change_ns, at_ns, side="right")]
     return up
 
 
-def _outages(problem: Problem, realisation: Realisation) -> tuple[Ints, Bools]:
+def _outages(problem: Problem, realisation: Realisation) -> tuple[Ints, Mask]:
     """Return the changes of the controller's node, and whether it is down before and after each.
 
     Returns

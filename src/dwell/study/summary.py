@@ -32,7 +32,10 @@ from dwell.control.windows import busiest
 from dwell.errors import SimulationError
 from dwell.model import FrozenDict, Problem
 from dwell.model.instants import NEVER_NS
+from dwell.model.number_arrays import Floats, Ints, Mask
+from dwell.model.order_statistic import rank_of
 from dwell.model.table_columns import SHARE_OF, USE_OF
+from dwell.record.moves import by_guard
 from dwell.study.quality import actuations, age_of_information, misses_in, track
 
 if TYPE_CHECKING:
@@ -40,9 +43,6 @@ if TYPE_CHECKING:
 
     from dwell.record import Names, Run, TableArrays
 
-Floats: TypeAlias = NDArray[np.float64]
-Ints: TypeAlias = NDArray[np.int64]
-Mask: TypeAlias = NDArray[np.bool_]
 Row: TypeAlias = dict[str, float | int | str]
 
 #: Points of the latency distributions: so many to a deadline, up to four deadlines.
@@ -135,7 +135,7 @@ class Latencies:
 
     def percentile_ms(self, percent: int) -> float:
         """Return the ceil(percent n / 100)-th smallest; infinite of one that never finished."""
-        rank = -(-percent * len(self.latency_ns) // 100)
+        rank = rank_of(percent, len(self.latency_ns))
         at = int(np.searchsorted(self.within, rank))
         rank -= int(self.within[at - 1]) if at else 0
         ns = int(np.partition(self.latency_ns[self.place == at], rank - 1)[rank - 1])
@@ -224,6 +224,23 @@ def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Su
         for name, those in active.items()
     ]
     return Summary(row, costs, latencies.within)
+
+
+def answer_of(run: Run, problem: Problem) -> dict[str, float]:
+    """Return `violation_rate`, `l95_ms` and `cost` of a run's summary, without its other numbers.
+
+    Raises
+    ------
+    SimulationError
+        If the run has no window after its warm-up.
+    """
+    counts, _, counted = _counting(run, problem.window_cycles)
+    windows = run.arrays("windows")
+    return {
+        "violation_rate": share_of(run.arrays("cycles")["missed"][counted]),
+        "l95_ms": mean_of(windows["seen_l95_ms"][counts]),
+        "cost": mean_of(windows["cost"][counts]),
+    }
 
 
 def _unfinished(outcomes: Names) -> dict[str, int]:
@@ -327,12 +344,6 @@ def latency_ms(cycles: pl.DataFrame) -> Floats:
     return final_ms
 
 
-def order_statistic(values: Floats, percent: int) -> float:
-    """Return the ceil(percent n / 100)-th smallest: a percentile, never interpolated."""
-    rank = -(-percent * len(values) // 100)
-    return float(np.partition(values, rank - 1)[rank - 1])
-
-
 def _percentiles(latencies: Latencies) -> dict[str, float]:
     """Percentiles of all cycles together, and how far the 95th is from the median."""
     p50, p95 = (latencies.percentile_ms(percent) for percent in (50, 95))
@@ -358,9 +369,9 @@ def _utilisation(used: Mapping[str, Floats], problem: Problem) -> dict[str, floa
 def _migrations(decisions: TableArrays, decided: Mask) -> dict[str, int]:
     """Count migrations, those that undo the one before, and the guard's moves, which are apart."""
     migrated = decided & decisions["migrated"]
-    by_guard = decisions.names("reason").equal("guard")
-    ends = (decisions.names(end)[migrated & ~by_guard] for end in ("incumbent", "placement"))
+    guarded = by_guard(decisions)
+    ends = (decisions.names(end)[migrated & ~guarded] for end in ("incumbent", "placement"))
     pairs = list(zip(*(end.to_list() for end in ends), strict=True))
     undone = sum(now == before[::-1] for before, now in itertools.pairwise(pairs))
-    guard_moves = int((migrated & by_guard).sum())
+    guard_moves = int((migrated & guarded).sum())
     return {"migrations": len(pairs), "returns": undone, "guard_moves": guard_moves}

@@ -16,7 +16,7 @@ from dwell.live.host.kept_cell import CellKeeper, KeptCell, cell_here, change, f
 from dwell.version import __version__
 from tests.waiting import wait_until
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "live"
+EXAMPLE = Path(__file__).parents[3] / "examples" / "live"
 
 
 @pytest.fixture

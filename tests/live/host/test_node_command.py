@@ -11,7 +11,7 @@ import pytest
 from dwell.errors import LiveError
 from dwell.live.host.node_command import OptionError, agent, controller
 
-CELL = Path(__file__).parents[2] / "examples" / "live" / "cell.yaml"
+CELL = Path(__file__).parents[3] / "examples" / "live" / "cell.yaml"
 
 
 @pytest.mark.parametrize(

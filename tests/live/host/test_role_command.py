@@ -10,7 +10,7 @@ import pytest
 from dwell.live.host.hosting import Platform
 from dwell.live.host.role_command import main, server, words
 
-CELL = Path(__file__).parents[2] / "examples" / "live" / "cell.yaml"
+CELL = Path(__file__).parents[3] / "examples" / "live" / "cell.yaml"
 
 
 def test_the_fork_server_runs_the_platform_s_program() -> None:

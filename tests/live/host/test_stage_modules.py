@@ -12,7 +12,7 @@ from dwell.errors import DwellError, LiveError
 from dwell.live.host.stage_modules import require_stages
 from dwell.model import FrozenDict, Problem
 
-CELL = Path(__file__).parents[2] / "examples" / "live" / "cell.yaml"
+CELL = Path(__file__).parents[3] / "examples" / "live" / "cell.yaml"
 PROBLEM = dwell.load(CELL)
 NODES = tuple(PROBLEM.fabric.nodes)
 

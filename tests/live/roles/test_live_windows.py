@@ -47,7 +47,7 @@ from tests.live.replayed import (
 )
 
 MS, S = 1_000_000, 1_000_000_000
-CANONICAL = Path(__file__).parents[2] / "examples" / "canonical.yaml"
+CANONICAL = Path(__file__).parents[3] / "examples" / "canonical.yaml"
 
 # ------------------------------------------------------------------- a simulated run, played live
 

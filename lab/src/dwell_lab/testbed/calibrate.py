@@ -24,12 +24,13 @@ from dwell.estimators.registry import name_in_run
 from dwell.files import write_whole
 from dwell.live.local.trace_names import move_traces
 from dwell.model import Problem, Trace
-from dwell_lab.testbed.measured import Floats, Measured, SiteName, cycles_in, look_at, usable
+from dwell.model.number_arrays import Floats
+from dwell.model.order_statistic import percentile
+from dwell_lab.testbed.measured import Measured, SiteName, cycles_in, look_at, usable
 from dwell_lab.testbed.message_costs import OnTheWay, floors, hops, own_delays
 from dwell_lab.testbed.node_loads import (
     backgrounds,
     beside_jobs,
-    contentions,
     interferences,
     wakes,
 )
@@ -45,14 +46,13 @@ ASKED = 20_000
 #: Shortest execution time to write, ms: a cell file requires positive times.
 LEAST_MS = 1e-3
 #: Findings that a cell file accepts only for nodes with a quota.
-ONLY_WITH_QUOTA = ("background_beside", "contention")
+ONLY_WITH_QUOTA = ("background_beside",)
 #: Largest number of windows to simulate per run in the check.
 CHECK_WINDOWS = 300
 
 
 #: Line of the report for each key that has no other line.
 NODE_LINES = {
-    "contention": "{node}: other processes use {value:.3g} of its CPUs while jobs run",
     "background_hz": "{node}: background threads wake {value:.4g} times a second",
     "interference": "{node}: stages take {value:.3g} times as long under foreign threads",
 }
@@ -100,7 +100,6 @@ def calibrate(
             "background": behind,
             "background_beside": beside_jobs(measured, behind),
             "interference": interferences(measured, costs, usual),
-            "contention": contentions(measured),
             "background_hz": wakes(measured, problem),
         }
     )
@@ -298,10 +297,8 @@ def _put_in(
     nodes: Mapping[str, Mapping[str, Any]],
 ) -> None:
     """Write the findings for tasks, nodes and links into a cell's document."""
-    for (task, node), of in costs.items():
-        on = document["tasks"][task]["on"][node]
-        on["exec_ms"] = replay(file, task_name(task, node))
-        on |= {"before_ms": _short(of.before_ms), "after_ms": _short(of.after_ms)}
+    for task, node in costs:
+        document["tasks"][task]["on"][node]["exec_ms"] = replay(file, task_name(task, node))
         # The samples include the scale shared between tasks.
         document["tasks"][task].pop("scale", None)
     for node in nodes["background"]:
@@ -374,7 +371,7 @@ def _check(one: Measured, problem: Problem, usual: Usual) -> dict[str, Any] | No
         cycles = run.cycles.with_columns(pl.col("cycle").cast(pl.Int64))
         cycles = cycles.join(cycles_in(windows, problem), on="cycle", how="semi")
         latency_ms = cycles["latency_ns"].fill_null(np.iinfo(np.int64).max).to_numpy() / 1e6
-        l95_ms = float(np.quantile(latency_ms, 0.95, method="inverted_cdf"))
+        l95_ms = percentile(latency_ms, 95)
         means = {name: windows[name].to_numpy().mean() for name in shares}
         row[what] = {
             "l95_ms": _short(l95_ms) if l95_ms < 1e9 else None,

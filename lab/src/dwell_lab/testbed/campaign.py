@@ -26,8 +26,9 @@ from dwell.version import __version__
 from dwell_lab.testbed.campaign_folder import TRACES
 
 PAPERS_SCENARIOS = ("baseline", "robot-cpu-stress", "edge-cpu-stress", "network-impairment")
-#: Parts of this package that influence a measurement.
-SOURCES = ("control", "cost.py", "estimators", "live", "model", "policies", "testbed")
+#: Parts of `dwell` and of this package that influence a measurement.
+SOURCES = ("control", "cost.py", "estimators", "live", "model", "policies")
+LABORATORY = ("testbed",)
 
 
 class Entrant(NamedTuple):
@@ -132,7 +133,10 @@ class Campaign:
     def describe(self) -> dict[str, Any]:
         """Return everything that the runs depend on, ready for JSON."""
         return {
-            "software": {"dwell": __version__, "sources": digest_of(SOURCES)},
+            "software": {
+                "dwell": __version__,
+                "sources": digest_of(SOURCES) + digest_of(LABORATORY, "dwell_lab"),
+            },
             "where": self.where,
             "scenarios": list(self.scenarios),
             "policies": {

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dwell.errors import RunError
 from dwell.model import LinkDisturbance, Problem
+from dwell.model.number_arrays import Floats
 from dwell.model.scenario import is_always_on
 from dwell_lab.testbed.speeds import work_ms
 
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
 
     from dwell.record import Run
 
-Floats: TypeAlias = NDArray[np.float64]
 SiteName: TypeAlias = tuple[str, str]
 
 #: Least number of jobs from which anything is taken.
@@ -121,8 +121,6 @@ class Measured:
     beside : dict of str to (float, float)
         By node: CPU time of other processes while jobs ran, and how long these ran, seconds; of
         nodes where something counts it.
-    outside : dict of str to (float, float)
-        The same of everybody else on the node's CPUs.
     delays_ms : dict of (str, str, str, str) to float64 array
         By source, target, and the nodes of both: from the end of the job that sent a message to its
         arrival.
@@ -140,7 +138,6 @@ class Measured:
     used: dict[str, float]
     handovers_ms: dict[SiteName, float] = field(default_factory=dict)
     beside: dict[str, tuple[float, float]] = field(default_factory=dict)
-    outside: dict[str, tuple[float, float]] = field(default_factory=dict)
     work_ms: dict[str, float] = field(default_factory=dict)
     begins_ms: dict[SiteName, float] = field(default_factory=dict)
     ends_ms: dict[SiteName, float] = field(default_factory=dict)
@@ -214,7 +211,6 @@ def look_at(name: str, run: Run, problem: Problem) -> Measured:
         },
         handovers_ms=handovers_ms,
         beside=_while_jobs_ran(own.filter(~pl.col("accompanied")), "others_ns"),
-        outside=_while_jobs_ran(own, "outside_ns"),
         work_ms=work_ms(run),
         delays_ms=_delays(own, problem),
         begins_ms=_begins(own, run, problem) | sources,

@@ -15,7 +15,8 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from dwell.model import Problem
-from dwell_lab.testbed.measured import LEAST_JOBS, Floats, Measured, SiteName
+from dwell.model.number_arrays import Floats
+from dwell_lab.testbed.measured import LEAST_JOBS, Measured, SiteName
 
 #: Source, target, and the nodes of both.
 HopName: TypeAlias = tuple[str, str, str, str]

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from dwell.model import Problem
-from dwell.model.bounds import BACKGROUND_HZ, CONTENTION
+from dwell.model.bounds import BACKGROUND_HZ
 from dwell_lab.testbed.measured import LEAST_JOBS, Measured, SiteName
 from dwell_lab.testbed.speeds import Usual
 from dwell_lab.testbed.task_costs import TaskCost
@@ -64,20 +64,6 @@ def _cores(of: Sequence[tuple[float, float]]) -> float | None:
     """CPU time taken while jobs ran, over how long these ran; None where none did."""
     took_s = sum(took for _, took in of)
     return sum(taken for taken, _ in of) / took_s if took_s > 0 else None
-
-
-def contentions(measured: Sequence[Measured]) -> dict[str, float]:
-    """Share of the time of every node's jobs in which its CPUs worked for others.
-
-    From runs without any stress: nodes may share CPUs, and one that is stressed takes more of them.
-    """
-    result = {}
-    calm = [one for one in measured if not one.disturbed.nodes]
-    for node in sorted({node for one in calm for node in one.outside}):
-        of = [one.outside[node] for one in calm if node in one.outside]
-        if (taken := _cores(of)) is not None:
-            result[node] = min(taken, CONTENTION.high)
-    return result
 
 
 def wakes(measured: Sequence[Measured], problem: Problem) -> dict[str, float]:

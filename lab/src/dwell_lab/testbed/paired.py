@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.model import FrozenDict
-from dwell_lab.testbed.measured import Floats, SiteName
+from dwell.model.number_arrays import Floats
+from dwell_lab.testbed.measured import SiteName
 
 
 class Part(NamedTuple):

@@ -18,7 +18,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dwell_lab.testbed.measured import Floats, Measured, SiteName, Visit
+from dwell.model.number_arrays import Floats
+from dwell_lab.testbed.measured import Measured, SiteName, Visit
 from dwell_lab.testbed.speeds import Usual, window_work_ms
 
 #: Jobs that a window's mean needs; windows in a row that are one point; points that a slope needs.

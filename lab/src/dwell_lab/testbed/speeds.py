@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dwell.model import FrozenDict, Problem, Trace
-from dwell.model.bounds import CONTENTION
 from dwell.model.process import TraceTable
 
 if TYPE_CHECKING:
@@ -159,7 +158,6 @@ def slowed(
             node,
             background=node.background * factor,
             background_beside=None if beside is None else beside * factor,
-            contention=min(node.contention * factor, CONTENTION.high),
         )
     links = {
         name: replace(link, delay_ms=moved(link.delay_ms))

@@ -21,7 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dwell.model import Flow, Problem
-from dwell_lab.testbed.measured import LEAST_JOBS, Floats, Measured, SiteName
+from dwell.model.number_arrays import Floats
+from dwell_lab.testbed.measured import LEAST_JOBS, Measured, SiteName
 from dwell_lab.testbed.message_costs import OnTheWay, share
 from dwell_lab.testbed.paired import Part
 from dwell_lab.testbed.speeds import Usual

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dwell.model import Problem
-from dwell.study.intervals import Floats, Interval, mean_interval
-from dwell.study.summary import count_in, order_statistic
+from dwell.model.number_arrays import Floats
+from dwell.model.order_statistic import percentile
+from dwell.study.intervals import Interval, mean_interval
+from dwell.study.summary import count_in
 
 if TYPE_CHECKING:
     import polars as pl
@@ -108,7 +110,7 @@ def _spread(jobs: pl.DataFrame, kind: str) -> dict[str, float | None]:
     taken_ms = (known[f"{kind}_ns"] / 1e6).to_numpy()
     means = known.group_by("run").agg(pl.col(f"{kind}_ns").mean()).sort("run")
     over: Interval = mean_interval((means[f"{kind}_ns"] / 1e6).to_numpy())
-    ranked = [order_statistic(taken_ms, percent) for percent in (5, 50, 95)]
+    ranked = [percentile(taken_ms, percent) for percent in (5, 50, 95)]
     values: Sequence[float] = (*over, *ranked)
     return dict(zip((f"{kind}_ms{end}" for end in ENDS), values, strict=True))
 
@@ -289,5 +291,5 @@ def _times(name: str, values_ns: Iterable[float]) -> dict[str, float | None]:
         return {f"{name}_ms": None, f"{name}_p95_ms": None}
     return {
         f"{name}_ms": float(values_ms.mean()),
-        f"{name}_p95_ms": order_statistic(values_ms, 95),
+        f"{name}_p95_ms": percentile(values_ms, 95),
     }

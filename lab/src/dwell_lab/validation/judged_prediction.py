@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.model import Problem
-from dwell.study.intervals import CONFIDENCE, Floats, Interval, rule_of_three
+from dwell.model.number_arrays import Floats
+from dwell.study.intervals import CONFIDENCE, Interval, rule_of_three
 from dwell_lab.validation.qos_sample import QosSample
 from dwell_lab.validation.resampling import ends, resample_units, resample_windows
 

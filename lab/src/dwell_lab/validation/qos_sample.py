@@ -9,14 +9,16 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dwell.errors import SimulationError
-from dwell.record import arrays_of
-from dwell.study.summary import PARTS, count_in, latency_ms, mean_of, order_statistic
+from dwell.model.number_arrays import Floats, Ints
+from dwell.model.order_statistic import percentile
+from dwell.record import arrays_of, moves_in
+from dwell.study.summary import PARTS, count_in, latency_ms, mean_of
 
 if TYPE_CHECKING:
     import polars as pl
@@ -24,8 +26,6 @@ if TYPE_CHECKING:
     from dwell.model import Problem
     from dwell.record import Run
 
-Floats: TypeAlias = NDArray[np.float64]
-Ints: TypeAlias = NDArray[np.int64]
 
 CYCLES = (
     "release_ns",
@@ -80,13 +80,11 @@ def piece_of(run: Run, problem: Problem, excluded: Collection[int] = ()) -> Piec
     if not keep.any():
         raise SimulationError("every window after the warm-up is excluded")
     renumbered = np.cumsum(keep) - 1
-    moved = counted.decisions.filter(
-        counted.decisions["migrated"] & (counted.decisions["reason"].cast(str) != "guard")
-    )
+    moved = sum(not move.by_guard for move in moves_in(counted.decisions))
     cycles = counted.cycles.select(*CYCLES).with_columns(
         place=pl.Series(renumbered[place], dtype=pl.Int64)
     )
-    return Piece(counted.windows.filter(keep), cycles.filter(keep[place]), moved.height)
+    return Piece(counted.windows.filter(keep), cycles.filter(keep[place]), moved)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,7 +172,7 @@ class QosSample:
     @property
     def l95_ms(self) -> float:
         """95th percentile of all cycles, an order statistic; a lost cycle is infinite."""
-        return order_statistic(self.latency_ms, 95)
+        return percentile(self.latency_ms, 95)
 
     @property
     def units(self) -> int:

@@ -20,7 +20,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dwell.study.intervals import CONFIDENCE, RESAMPLING_SEED, Floats
+from dwell.model.number_arrays import Floats
+from dwell.study.intervals import CONFIDENCE, RESAMPLING_SEED
 
 #: So many that the quantiles of 2.5 % are order statistics of the resamples.
 DRAWS = 999

@@ -8,14 +8,15 @@ computes on the back of an envelope, and what a simulator has to do better than.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from dwell.estimators.paths import Floats, longest_path, steps_of
+from dwell.estimators.paths import longest_path, steps_of
 from dwell.model import Problem
 from dwell.model.fabric import Link, Node
+from dwell.model.number_arrays import Floats
+from dwell.model.order_statistic import rank_of
 from dwell.model.placement import Placement
 from dwell.model.scenario import Disturbance, LinkDisturbance, NodeDisturbance
 
@@ -75,7 +76,7 @@ def sums_of_shares(
     names = sorted(cycles, key=lambda name: sums_ms[name])
     counts = np.array([cycles[name] for name in names])
     within = counts.cumsum()
-    l95_ms = sums_ms[names[int(np.searchsorted(within, math.ceil(0.95 * within[-1])))]]
+    l95_ms = sums_ms[names[int(np.searchsorted(within, rank_of(95, int(within[-1]))))]]
     late = sum(cycles[name] for name in names if sums_ms[name] > deadline_ms)
     return l95_ms, late / int(within[-1])
 

@@ -16,7 +16,7 @@ import dwell
 from dwell.cli.check import class_faults
 from dwell.cli.output import mark_of_run, print_json, working, write_file
 from dwell.errors import ExitCode, LiveError, ProblemError, installing, not_installed
-from dwell.live.commands.live_view import CellState, View, live_view
+from dwell.live.commands.live_view import CellState, Lines
 from dwell.live.host.stage_modules import require_stages
 from dwell.live.local.cell_observer import CellObserver, load_observer
 from dwell.live.local.loopback import Loopback, on_this_machine
@@ -35,7 +35,7 @@ from dwell.live.local.timeline import timeline_of
 from dwell.model import Problem
 from dwell.model.bounds import counted
 from dwell.model.disturbed import Disturbed, disturbed
-from dwell.record import Run, open_run, seal_run
+from dwell.record import Run, moves_in, open_run, seal_run
 from dwell.record.journal import note_in_journal, read_plain_journal
 from dwell.report import run_html
 from dwell.report.formatting import listed
@@ -145,10 +145,6 @@ class _ObservedRun(Played):
 
     observer: CellObserver | None = None
 
-    def planned(self) -> list[Disturbed]:
-        """Return what is to be played, as it is shown."""
-        return disturbed(self.timeline.items, self.problem.fabric)
-
     def on(self) -> list[Disturbed]:
         """Return what is on now, as it is shown."""
         return disturbed(self.active(), self.problem.fabric)
@@ -185,18 +181,17 @@ def _watch_from_start(cell: Loopback, seconds: float, played: _ObservedRun) -> N
     if name is not None:
         played.observer = load_observer(name, cell.problem, cell.folder, cell.begun_ns)
     try:
-        with live_view(cell.problem, seconds, played.planned()) as view:
-            _watch(cell, seconds, played, view)
+        _watch(cell, seconds, played)
     finally:
         if played.observer is not None:
             played.look()
             played.observer.close()
 
 
-def _watch(cell: Loopback, seconds: float, played: _ObservedRun, view: View) -> None:
+def _watch(cell: Loopback, seconds: float, played: _ObservedRun) -> None:
     """Play the changes at their times, and show how the cell is."""
     status: Mapping[str, Any] = {}
-    answered_s = 0.0
+    answered_s, lines = 0.0, Lines()
 
     def show(at_s: float) -> None:
         nonlocal status, answered_s
@@ -204,8 +199,8 @@ def _watch(cell: Loopback, seconds: float, played: _ObservedRun, view: View) -> 
             status = cell.sample(LOOK_S)
             answered_s = (time.monotonic_ns() - cell.begun_ns) / 1e9
         except LiveError:
-            pass  # the view shows for how long nobody has answered
-        view.show(CellState(at_s, status, answered_s, played.look(), played.on()))
+            pass  # the next line says that the controller is silent
+        lines.show(CellState(at_s, status, answered_s, played.look(), played.on()))
 
     play_on(cell, played, seconds, show)
 
@@ -213,7 +208,7 @@ def _watch(cell: Loopback, seconds: float, played: _ObservedRun, view: View) -> 
 class _Table(Protocol):
     """Columns of a run's table, whoever keeps them."""
 
-    def __getitem__(self, column: str, /) -> Iterable[Any]: ...
+    def __getitem__(self, column: str, /) -> Sequence[Any] | Any: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,15 +228,14 @@ class _Outcome:
     @classmethod
     def of(cls, meta: Mapping[str, Any], cycles: _Table, decisions: _Table) -> _Outcome:
         """Count what was missed, lost and moved."""
-        missed, moved = list(cycles["missed"]), list(decisions["migrated"])
-        by_guard = [reason == "guard" for reason in decisions["reason"]]
-        guard_moves = sum(map(all, zip(moved, by_guard, strict=True)))
+        missed, moved = list(cycles["missed"]), moves_in(decisions)
+        guard_moves = sum(move.by_guard for move in moved)
         return cls(
             meta,
             cycles=len(missed),
             missed=sum(map(bool, missed)) / len(missed) if missed else math.nan,
             lost=sum(latency is None for latency in cycles["latency_ns"]),
-            migrations=sum(map(bool, moved)) - guard_moves,
+            migrations=len(moved) - guard_moves,
             guard_moves=guard_moves,
         )
 

@@ -306,7 +306,7 @@ def _of_task(about: Mapping[str, Any]) -> list[str]:
 
 
 def _of_link(one: Measurement) -> list[str]:
-    from dwell.calibration.sample_statistics import percentile
+    from dwell.model.order_statistic import percentile
 
     minimal = one.columns[f"{one.name}/round_trip_ms"]
     payload = one.columns[f"{one.name}/payload_round_trip_ms"]

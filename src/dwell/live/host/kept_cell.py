@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from importlib.resources import files
 from pathlib import Path
 from types import ModuleType
 from typing import Literal, TypeAlias
@@ -44,7 +45,7 @@ NAMED = re.compile(rb"(\w+)(?:\.\w+)*:\w")
 
 def installed_version() -> str:
     """Return the version of Dwell that a process gets which starts now."""
-    text = Path(__file__).parents[1].joinpath("version.py").read_text(encoding="utf-8")
+    text = files("dwell").joinpath("version.py").read_text(encoding="utf-8")
     found = re.search(r'__version__ = "(.+)"', text)
     return found[1] if found else __version__
 

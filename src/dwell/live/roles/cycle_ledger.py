@@ -14,7 +14,6 @@ from typing import TypeAlias
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.control import Evidence, Instants
 from dwell.live.roles.loads import NodeLoad
@@ -24,10 +23,9 @@ from dwell.live.wire.wiring import lane_of
 from dwell.model import Execution, Problem
 from dwell.model.fabric import accelerator_name
 from dwell.model.instants import NEVER_NS
+from dwell.model.number_arrays import Floats, Ints
 from dwell.record import Values
 
-Ints: TypeAlias = NDArray[np.int64]
-Floats: TypeAlias = NDArray[np.float64]
 #: Whether it is the shadow's; task and node.
 JobName: TypeAlias = tuple[bool, str, str]
 Jobs: TypeAlias = dict[JobName, Hop]

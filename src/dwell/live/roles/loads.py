@@ -5,15 +5,12 @@ from __future__ import annotations
 import bisect
 from collections import Counter, deque
 from collections.abc import Iterable
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.live.wire.continuity import OvershootDetector
 from dwell.live.wire.messages import Load
-
-Floats: TypeAlias = NDArray[np.float64]
+from dwell.model.number_arrays import Floats
 
 #: Reports remembered of a node.
 KEPT = 4_096

@@ -16,13 +16,12 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.live.wire.messages import Header, InputCounts, Load, OutputCounts, StageCounts, Stamp
 from dwell.live.wire.wiring import Role, roles
 from dwell.model import Placement, Problem
+from dwell.model.number_arrays import Ints
 
-Ints: TypeAlias = NDArray[np.int64]
 #: Run and number of a cycle or of a block.
 Key: TypeAlias = tuple[int, int]
 

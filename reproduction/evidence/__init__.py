@@ -1,0 +1,1 @@
+"""Results of experiments: each page is the output of the command that its first lines name."""

@@ -1,0 +1,26 @@
+"""Percentiles that are never interpolated: the ceil(p n / 100)-th smallest of n values."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+Number = TypeVar("Number", bound=np.generic)
+
+
+def rank_of(percent: int, count: int) -> int:
+    """Return ceil(percent n / 100), in integers: 0.95 * n is not exact."""
+    return -(-percent * count // 100)
+
+
+def order_statistic(values: NDArray[Number], percent: int) -> NDArray[Number]:
+    """Return the percentile along the last axis, which has at least one value."""
+    rank = rank_of(percent, values.shape[-1])
+    return np.partition(values, rank - 1, axis=-1)[..., rank - 1]
+
+
+def percentile(values: NDArray[Number], percent: int) -> float:
+    """Return the percentile of values in one dimension, as a plain number."""
+    return float(order_statistic(values, percent))

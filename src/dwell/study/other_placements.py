@@ -1,0 +1,37 @@
+"""The results of every placement, if it never moves, on the realisation of a run."""
+
+from __future__ import annotations
+
+from itertools import islice
+
+from dwell.model import Problem
+from dwell.sim import Realisation, simulate_realisation
+from dwell.study.summary import answer_of
+
+#: Most candidates that are simulated, in the order of the cell file, the initial one first.
+MOST = 8
+#: Key of a run's record.
+PLACEMENTS = "placements"
+
+
+def other_placements(
+    problem: Problem, realisation: Realisation, most: int = MOST
+) -> dict[str, dict[str, float]]:
+    """Simulate placements that never move.
+
+    Returns
+    -------
+    dict of str to dict
+        `violation_rate`, `l95_ms` and `cost` by candidate, as `dwell.study.summary` has them.
+
+    Raises
+    ------
+    SimulationError
+        If the realisation has no window after the warm-up.
+    """
+    first = problem.initial
+    names = (first, *(name for name in problem.candidates if name != first))
+    return {
+        name: answer_of(simulate_realisation(problem, realisation, policy=name), problem)
+        for name in islice(names, most)
+    }

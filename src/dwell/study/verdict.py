@@ -1,0 +1,73 @@
+"""Verdict on a run: whether it kept the aim for its share of missed deadlines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+from dwell.model import Problem
+from dwell.record import Run
+from dwell.study.independence import unit_of
+from dwell.study.intervals import share_interval, under
+from dwell.study.kept_bounds import AIM
+from dwell.study.over_seeds import WINDOW
+
+Word: TypeAlias = Literal["kept", "missed", "open"]
+
+_WORDS: dict[str, Word] = {"under": "kept", "over": "missed", "not shown": "open"}
+
+
+@dataclass(frozen=True, slots=True)
+class RunVerdict:
+    """Whether the share of missed deadlines is under the aim.
+
+    Parameters
+    ----------
+    word : {"kept", "missed", "open"}
+        Kept or missed if `dwell.study.under` shows it by the run's windows; open otherwise, and
+        if the windows of the run are not independent (a recorded trace, long episodes).
+    rate : float
+        V_D of all counted cycles.
+    low, high : float or None
+        95 % interval of the windows' mean; None if the windows are not independent.
+    aim : float
+    """
+
+    word: Word
+    rate: float
+    low: float | None
+    high: float | None
+    aim: float
+
+    def __str__(self) -> str:
+        interval = ""
+        if self.low is not None and self.high is not None:
+            interval = f" [{self.low * 100:.2f}, {self.high * 100:.2f}]"
+        return (
+            f"{self.rate * 100:.2f} %{interval} of deadlines missed "
+            f"(aim: under {self.aim * 100:g} %): {self.word}"
+        )
+
+
+def verdict_of(run: Run, problem: Problem, rate: float) -> RunVerdict:
+    """Judge a run by the windows after its warm-up.
+
+    Parameters
+    ----------
+    rate : float
+        V_D of the run's summary (`dwell.study.summary`).
+
+    Raises
+    ------
+    SimulationError
+        If the run has no window after its warm-up.
+    """
+    windows = run.arrays("windows")
+    rates = windows["violation_rate"][~windows["warmup"]].tolist()
+    if run.is_simulated:
+        cells = [(problem, str(run.meta["scenario"]))]
+        if unit_of(cells, len(windows["warmup"])) != WINDOW:
+            return RunVerdict("open", rate, None, None, AIM)
+    interval = share_interval(rates, windows=len(rates))
+    word = _WORDS[under(rates, AIM, windows=len(rates))]
+    return RunVerdict(word, rate, min(interval.low, rate), max(interval.high, rate), AIM)
