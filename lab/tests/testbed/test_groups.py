@@ -178,7 +178,7 @@ def test_what_the_kernel_would_not_take_is_refused_before_anything_is_made() -> 
         Groups(own_name(), shares)
     first, second = str(caught.value).splitlines()
     assert first.startswith(f"nodes.A: CPU {many} is not there")
-    assert second.startswith("nodes.B.quota: 0.1 CPU in every 4 ms is 0.4 ms a period")
+    assert second.startswith("nodes.B.quota: 0.1 CPU in every 4 ms is 0.4 ms per period")
 
 
 # ------------------------------------------------------------------------- how they are laid out
