@@ -37,7 +37,7 @@ MOST = {
     "dwell_lab.chaos": 28.2,
     "dwell_lab.commands": 31.5,
     "dwell_lab.pages": 31.4,
-    "dwell_lab.testbed": 21.7,
+    "dwell_lab.testbed": 13.3,
     "dwell_lab.validation": 25.9,
 }
 
