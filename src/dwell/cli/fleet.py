@@ -45,7 +45,7 @@ CHANGE = ("change", "times")
 
 fleet = typer.Typer(
     no_args_is_help=True,
-    help="Play cells that share nodes, and find out how many of them there may be.",
+    help="Simulate cells that share nodes; find how many fit.",
 )
 
 FleetArgument = Annotated[Path, argument("FILE", "Fleet file (YAML).")]
@@ -105,7 +105,7 @@ def run(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Simulate the cells of a fleet together, save a run a cell, sum them up."""
+    """Simulate the cells of a fleet; save one run per cell."""
     from dwell.record.fleet_run import describe_fleet, require_free_or_same
     from dwell.sim.fleet import duration_of, phases_ms
     from dwell.study.fleet_summary import fleet_numbers
@@ -155,7 +155,7 @@ def plan(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Find where the cells are best placed while their scenarios go on, all at once.
+    """Find the placements with the least cost for all cells.
 
     Φ of the table of loads is least there; what the placements come to is played.
     """
@@ -218,7 +218,7 @@ def capacity(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Find how many robots a fleet may have, so that no cell misses more than a limit.
+    """Find how many robots the shared nodes carry.
 
     The count of the first entry is varied, the others stay. Where phases are drawn and no cell
     moves, 100 draws of 200 cycles are played of each size; else 10 seeds of 2,000 cycles.
