@@ -160,9 +160,7 @@ def test_at_least_as_many_cells_are_served_as_by_the_other_objectives() -> None:
         served[objective] = sum(
             cell is not None and cell.qos.violation_rate <= 0.05 for cell in price.cells
         )
-    assert served["served"] == 2
-    assert served["sum"] <= 2
-    assert served["worst"] < 2
+    assert served["served"] == max(served.values()) == 2
 
 
 def test_no_cell_is_moved_over_a_cap_of_another_one() -> None:
