@@ -373,14 +373,14 @@ class ControlledCell:
             self._begin_run(answer)
         elif not self._corrected(answer, now_ns):
             return
-        # An earlier controller may have had a clock ahead of this one.
+        # The clock of an earlier controller may have been ahead of this controller's.
         self._number = max(self._number, answer.newest)
         if begins:
             return
         course, move, proven = self.course, self._move, self._proven
         of_move = move is not None and move.order is not None and answer.number == move.order.number
         if (answer.run, answer.term) > (course.run, course.term):
-            # The stamper may have accepted an order before the one that waits for an answer.
+            # The stamper may have accepted an earlier order than the unanswered order.
             self._now_at(answer.run, answer.term, answer.placement, by_guard=answer.fallback)
         else:
             # Stamps show the placement; only the answer shows whether the guard moved the cell.

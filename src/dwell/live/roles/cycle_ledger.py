@@ -405,7 +405,7 @@ class Ledger:
         return used
 
     def forget(self, before: LiveCycle) -> None:
-        """Drop load reports that only cycles before this one need."""
+        """Drop load reports that only earlier cycles need."""
         for node, load in self.loads.items():
             load.forget(self.span_ns(node, before, before.at_ns)[0])
 
@@ -458,7 +458,7 @@ class Ledger:
         return known
 
     def _execution(self, hop: Hop) -> Execution | None:
-        """Return the execution of a job's task on its node; None if there is none."""
+        """Return the execution of a job's task on its node, or None."""
         task = self._pipeline.tasks.get(hop.task)
         return None if task is None else task.on.get(hop.node)
 

@@ -29,7 +29,7 @@ class _HeardProcess:
 
 
 class FailureDetector:
-    """Beats that one process has received; after `patience_ns` (g periods) they are not fresh."""
+    """Beats received by a process; they are fresh for `patience_ns` (g periods)."""
 
     def __init__(self, who: str, patience_ns: int) -> None:
         self.who = who
@@ -71,7 +71,7 @@ class FailureDetector:
         return process.beat if process is not None else None
 
     def age_ns(self, who: str, now_ns: int) -> int | None:
-        """Time since the last beat of a process; None without a beat."""
+        """Time since the last beat of a process; None before its first beat."""
         process = self._processes.get(who)
         return process.age_ns(now_ns) if process is not None else None
 

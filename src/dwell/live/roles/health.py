@@ -62,7 +62,7 @@ def window_late_ns(problem: Problem, release_ratio: float | None = None) -> int:
 
 
 def diagnose(problem: Problem, status: Mapping[str, Any]) -> tuple[Health, str | None]:
-    """Return a cell's health, and a headline with its faults; None without faults and warnings.
+    """Return a cell's health, and a headline with its faults and warnings, or None.
 
     `status` is the result of `dwell.live.roles.controlled_cell.ControlledCell.status`.
     """
@@ -95,7 +95,7 @@ def diagnose(problem: Problem, status: Mapping[str, Any]) -> tuple[Health, str |
 
 
 def _certificates(status: Mapping[str, Any]) -> tuple[list[str], list[str]]:
-    """Return certificates that have ended or end within `LAST_MS`, and those that end soon."""
+    """Return faults and warnings: certificates that end within `LAST_MS`, or later but soon."""
     named: tuple[dict[str, list[str]], dict[str, list[str]]] = {}, {}
     for name, certificate in status["certificates"].items():
         left_ms = certificate["days"] * 86_400e3

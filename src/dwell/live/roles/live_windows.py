@@ -323,7 +323,7 @@ class LiveWindows:
                 yield LiveCycle(*who, at_ns, last.origin_ns, heard=False)
 
     def _insert(self, stamp: Stamp) -> LiveCycle | None:
-        """Insert a cycle whose number seemed to have been skipped; None if it does not fit."""
+        """Insert a cycle whose number seemed to have been skipped, if its release fits."""
         line = self._line
         cycle = LiveCycle.of(stamp, line[-1].origin_ns)
         place = bisect.bisect(line, cycle.key, key=lambda other: other.key)
@@ -381,7 +381,7 @@ class LiveWindows:
         return self._left is not None and term <= self._left
 
     def due_ns(self, now_ns: int) -> int | None:
-        """Return when the next decision is due, on the controller's clock; None if not known."""
+        """Return when the next decision is due, on the controller's clock; None if unknown."""
         end = self._end()
         if end is None:
             return None

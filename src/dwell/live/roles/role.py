@@ -74,7 +74,7 @@ class RoleLogic(Protocol):
         """Key expressions to subscribe to."""
 
     def receive(self, sample: Arrival, now_ns: int) -> int | None:
-        """Process a message; return a new instant for `wake`, or None if it has not changed."""
+        """Process a message; return the next instant for `wake` if it has changed, or None."""
 
     def wake(self, now_ns: int) -> int:
         """Do the work that is due; return the instant of the next call."""
@@ -254,10 +254,10 @@ class RolePlace:
             self.say(what)
 
     def header(self, sample: Arrival) -> Header | None:
-        """Read the header of a data message; complain and return None if it is not valid.
+        """Read the header of a data message; complain and return None if it is invalid.
 
-        A stamp without a valid signature is not valid: a false cycle with too high a number would
-        block all later cycles at the actuator.
+        A stamp needs a valid signature, because a false cycle with too high a number would block
+        all later cycles at the actuator.
         """
         try:
             header = decode(sample.header, Header, limit=MAX_HEADER_BYTES)
@@ -314,7 +314,7 @@ class Pulse:
         return tuple(keys.beat(node, who) for node, who in self._hears)
 
     def receive(self, sample: Arrival, now_ns: int) -> Beat | None:
-        """Process a beat; return None if it is not a valid beat or has nothing new."""
+        """Process a beat; return it if it is valid and new, else None."""
         if not sample.key.startswith(self._prefix):
             return None
         if self._is_copy(sample):
@@ -442,5 +442,5 @@ class Pulse:
 
 
 def _series(version: str) -> str:
-    """Return major and minor version; processes with equal ones understand each other."""
+    """Return major and minor version; they must be equal for processes to work together."""
     return ".".join(version.split(".")[:2])
