@@ -1,8 +1,8 @@
 """Failures: every exception in a callback or thread of the live runtime is reported.
 
-If a callback fails, the transport reports the error and continues with the next message. If a
-thread fails, its process ends with exit code 1, and its supervisor, an agent or an init system,
-starts it again.
+If a callback fails, its caller reports the error and continues with the next message. If a thread
+fails, its process ends with exit code 1, and its supervisor, an agent or an init system, starts it
+again.
 """
 
 from __future__ import annotations

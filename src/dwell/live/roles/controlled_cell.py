@@ -174,7 +174,7 @@ class ControlledCell:
         return self._due_ns(now_ns)
 
     def _due_ns(self, now_ns: int) -> int:
-        """Return when the next window ends, order is sent again or status request is due."""
+        """Return when a decision, a copy of an unanswered order or a status request is due."""
         due_ns = self._ask_ns
         if self._move is not None:
             due_ns = min(due_ns, self._move.sent_ns + RESEND_NS)
@@ -257,7 +257,7 @@ class ControlledCell:
             )
 
     def _goes_on(self, stamp: Stamp, who: str, now_ns: int, *, alone: bool = False) -> bool:
-        """Whether a cycle plausibly follows the known cycles; complain if not, then rarely."""
+        """Whether a cycle can follow the known cycles; complain about the first that cannot."""
         continuity, cycle = self.continuity, stamp.key
         newest, ahead = continuity.newest, continuity.ahead(now_ns)
         course = self.course
@@ -294,7 +294,7 @@ class ControlledCell:
         if known != reported:
             # Only an order that was sent before this stamp can have caused the move.
             ordered, count = self._has_ordered(stamp), 0
-            # Request an answer, which tells guard and order apart.
+            # Request an answer, which shows whether the guard or an order moved the cell.
             self._ask_ns = now_ns
         count += 1
         self._unconfirmed = reported, ordered, count
@@ -596,7 +596,7 @@ class ControlledCell:
         closed = windows.close(unix_ns=time.time_ns())
         self._unwritten = self._unwritten or windows.last is not before
         windows.spent(self.place.node, now_ns, self.place.who, time.process_time_ns())
-        # A migration that has taken a complete window is given up.
+        # A migration that is still under way at the next decision is given up.
         self._give_up(now_ns)
         # Miss the decision if less than half of its cycles are known, or the next one is due too.
         next_ns = windows.due_ns(now_ns) if windows.often else None

@@ -86,7 +86,7 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
     told : bool
         Whether its latency is `stamper_interval_ns`, because not all sinks have reported here.
     deaf : bool
-        Whether the stamp of this cycle or of the next is missing: its completion may be lost.
+        Whether all messages of this cycle or of the next are missing: its completion may be lost.
     row : int
         Row in the record; -1 until the cycle is recorded.
     close_ns : int or None

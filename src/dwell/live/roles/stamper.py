@@ -210,7 +210,7 @@ class Stamper:
                 presence.gone(worker)
 
     def _claimed(self, who: str, run: int) -> None:
-        """Begin a later run than another process's, unless the saved state is from this boot."""
+        """Without a saved state from this boot, begin a later run than another process claims."""
         if not self._unsure or not self._claims.believed(who, run) or run <= self.run:
             return
         self._ahead, self._answered = None, None

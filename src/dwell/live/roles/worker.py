@@ -249,7 +249,7 @@ class Worker:
         self._checkpoints: dict[str, tuple[State, bytes]] = {}
         #: Run and cycle of the newest stamp that has arrived with an input.
         self._newest = (-1, -1)
-        # Jobs forked to here ahead of a migration; those to process after the restored state.
+        # Jobs forked to here ahead of a migration; jobs to process after restoring the state.
         self._forked: deque[Job] = deque(maxlen=10 * MAX_JOINS)
         self._replay: deque[Job] = deque(maxlen=10 * MAX_JOINS)
         self._follows = False
@@ -398,7 +398,7 @@ class Worker:
 
     @property
     def _restoring(self) -> tuple[State, bytes] | None:
-        """The requested state, if it has arrived and stamps of all its cycles have arrived too.
+        """The requested state, if it has arrived and the stamp of its last cycle is known here.
 
         Inputs of later cycles are forked to here.
         """

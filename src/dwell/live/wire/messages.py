@@ -408,7 +408,7 @@ class Load(_Array, frozen=True):
 
 
 class Snapshot(_Array, frozen=True):
-    """Request to a task's worker to send its state to another node; its worker gets a copy.
+    """Request to a task's worker to send its state to another node; the worker there gets a copy.
 
     Parameters
     ----------
