@@ -54,6 +54,7 @@ $(VENV)/.installed: $(VENV)/.pinned pyproject.toml lab/pyproject.toml hatch_buil
 	@test -f $(KERNEL) || $(BIN)/python hatch_build.py || true
 	@$(BIN)/python -m dwell run examples/canonical.yaml --windows 20 \
 		--out build/first-run --force >/dev/null 2>&1 || true
+	@git config core.hooksPath .githooks 2>/dev/null || true
 	@touch $@
 
 demo: env ## Simulate and report an example into demo-out/ (REAL=path: on a real trace)
@@ -89,6 +90,7 @@ check: env ## Lint, formatting, types, the borders between packages and lines of
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-logo
+	$(BIN)/python -m tests.plain_english
 	$(BIN)/python -m tests.code_lines
 	$(BIN)/clang-format --dry-run -Werror $(filter %.cpp %.h,$(SOURCES)) tests/kernels/*.cpp
 	@$(MAKE) --no-print-directory --jobs --output-sync types tidy

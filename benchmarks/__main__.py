@@ -44,6 +44,7 @@ BENCHMARKS = {
     "order": ("live", "decision"),
     "moves": ("live", "moves"),
     "share": ("live", "share"),
+    "rest": ("at_rest", "measure"),
     "page-cost": ("page_cost", "measure"),
     "live-fleet": ("fleet_live", "measure"),
     "restart": ("restart", "measure"),

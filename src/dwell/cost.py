@@ -6,15 +6,15 @@ that moved::
     J = a_L * L95 / L_target + a_V * V_D + a_r * U_r / U_r_target + a_e * U_e / U_e_target
         [+ a_c * U_c / U_c_target] + a_S * S
 
-U_r and U_e are maxima over the tier's nodes, because a mean hides the one saturated robot, and over
-their accelerators, too, where the objective counts these. The bracketed term exists only where the
-objective weighs cloud nodes apart; otherwise they count as edge nodes.
+U_r and U_e are maxima over the tier's nodes, because a mean hides a single saturated robot. They
+include accelerators if the objective counts them. The bracketed term exists only if the objective
+weighs cloud nodes separately; otherwise cloud nodes count as edge nodes.
 
-All arithmetic is in `price`, which takes floats and arrays alike: a window priced alone and a
-window priced among thousands give the same bits.
+All arithmetic is in `price`, which takes floats and arrays: one window and an array of thousands
+give the same bits.
 
-Estimates have standard errors (`QoS.error`), and a rule that compares two of them takes a
-difference as shown where it is larger than their `margin`.
+Estimates have standard errors (`QoS.error`). A difference of two estimates is significant if it
+exceeds their `margin`.
 """
 
 from __future__ import annotations
@@ -53,16 +53,16 @@ __all__ = [
 
 Metric = TypeVar("Metric", float, "NDArray[np.float64]")
 
-#: Utilisation from which a resource is full: what more is asked of it cannot be seen any more.
+#: Utilisation from which a resource counts as full: further load no longer raises it.
 SATURATED = 0.995
-#: How many standard errors a difference of two estimates must exceed, beside a rule's threshold.
+#: Number of standard errors in the `margin` of two estimates.
 ERRORS = 1.0
-#: A gain within this distance of a threshold does not exceed it: rounding decides no move.
+#: A gain must exceed a threshold by more than this, or rounding could cause a move.
 GAIN_TOLERANCE = 1e-9
 
 
 class TierNodes(NamedTuple):
-    """Nodes and accelerators whose maximum is U_r, U_e and U_c; a tier without any counts as 0."""
+    """Nodes and accelerators of U_r, U_e and U_c; an empty tier has utilisation 0."""
 
     robot: tuple[str, ...]
     edge: tuple[str, ...]
@@ -105,9 +105,9 @@ def hamming(current: Placement, previous: Placement) -> float:
 
 
 def tier_nodes(objective: Objective) -> TierNodes:
-    """Nodes, then accelerators, behind each utilisation term of J, in the objective's order.
+    """Return nodes, then accelerators, of each utilisation term of J, in the objective's order.
 
-    Cloud nodes stand under `edge` unless ``weights.cloud`` is given.
+    Cloud nodes are in `edge` unless ``weights.cloud`` is given.
     """
     apart = objective.weights.cloud is not None
     counted = {"robot": "robot", "edge": "edge", "cloud": "cloud" if apart else "edge"}
@@ -118,13 +118,13 @@ def tier_nodes(objective: Objective) -> TierNodes:
 
 
 def tier_utilisation(utilisation: Mapping[str, float], objective: Objective) -> TierUtilisation:
-    """U_r, U_e and U_c of a window: the maximum over each tier's nodes and accelerators.
+    """Return U_r, U_e and U_c of a window: maxima over each tier's nodes and accelerators.
 
     Parameters
     ----------
     utilisation : mapping of str to float
-        Busy share of each resource: of every node of ``objective.tiers``, and of those of
-        ``objective.accelerators`` that are known; others are ignored.
+        Busy share by resource, for every node of ``objective.tiers``. Accelerators of
+        ``objective.accelerators`` may be missing; other resources are ignored.
 
     Raises
     ------
@@ -154,9 +154,9 @@ def price(
     switching: Metric | float,
     objective: Objective,
 ) -> Metric:
-    """J from bare metrics, elementwise for floats and arrays alike (paper, eq. 5 and 7).
+    """Return J of metrics given as floats or arrays, elementwise (paper, eq. 5 and 7).
 
-    The operations and their order are the same for both, so the results are equal bit by bit.
+    Floats and arrays use the same operations in the same order, so the bits are equal.
 
     Parameters
     ----------
@@ -187,14 +187,14 @@ def price(
 
 
 def cost(qos: QoS, current: Placement, previous: Placement, objective: Objective) -> float:
-    """J of a window under `current`, when `previous` was the placement before it (paper, eq. 7).
+    """Return J of a window under `current`, after the placement `previous` (paper, eq. 7).
 
     Parameters
     ----------
     qos : QoS
         Observed or estimated metrics of the window.
     current, previous : Placement
-        Over the same tasks; equal where nothing moved.
+        Over the same tasks; equal if no task moved.
 
     Returns
     -------
@@ -217,10 +217,10 @@ def cost(qos: QoS, current: Placement, previous: Placement, objective: Objective
 
 
 def cost_error(error: tuple[float, float] | None, objective: Objective) -> float:
-    """Standard error of the J of one estimate, from those of its L95 and V_D (`QoS.error`).
+    """Return the standard error of an estimate's J from the errors of L95 and V_D (`QoS.error`).
 
-    The two terms are added as they are, not in quadrature: L95 and V_D are of the same cycles, and
-    where one comes out too high, so does the other. No correlation of them gives more.
+    The two terms are added, not combined in quadrature: L95 and V_D come from the same cycles and
+    err in the same direction. The sum is the largest error that any correlation gives.
     """
     if error is None:
         return 0.0
@@ -233,10 +233,10 @@ def cost_error(error: tuple[float, float] | None, objective: Objective) -> float
 
 
 def margin(one: float, other: float) -> float:
-    """Return what a difference of two estimates must exceed to be more than their error.
+    """Return the least difference of two estimates that exceeds their error.
 
-    It is `ERRORS` standard errors of the difference of two independent estimates. Of estimates from
-    the same draws the difference is known better than that.
+    The margin is `ERRORS` standard errors of the difference of two independent estimates. It is
+    larger than necessary for estimates from the same samples.
 
     Parameters
     ----------
@@ -247,26 +247,25 @@ def margin(one: float, other: float) -> float:
 
 
 def exceeds(gain: float, threshold: float) -> bool:
-    """Whether a gain exceeds a threshold by more than `GAIN_TOLERANCE`."""
+    """Return whether a gain exceeds a threshold by more than `GAIN_TOLERANCE`."""
     return gain > threshold + GAIN_TOLERANCE
 
 
 def censored(used: Metric, own: Metric) -> bool | NDArray[np.bool_]:
-    """Whether a resource is saturated and others have a part of it, so that theirs is hidden.
+    """Return whether a resource is saturated by load that includes other cells' unknown load.
 
     Parameters
     ----------
     used, own : float, or array of shape (windows, resources)
-        Busy share of it, and the cell's own share with its shadow jobs.
+        Total busy share, and the cell's own share with its shadow jobs.
     """
     return (used >= SATURATED) & (own < SATURATED)
 
 
 def busiest(qos: QoS) -> float:
-    """Utilisation of the busiest resource, as caps are compared with it; 0 where there is none.
+    """Return the utilisation of the busiest resource for comparison with caps; 0 without resources.
 
-    A saturated one counts as full, observed or estimated: an observation of 0.997 is no less than
-    an estimate of 1.
+    A saturated resource counts as full: an observed 0.997 equals an estimated 1.
     """
     used = qos.utilisation
     largest = max(used.values()) if used else 0.0
@@ -274,18 +273,18 @@ def busiest(qos: QoS) -> float:
 
 
 def excess(qos: QoS, objective: Objective) -> float:
-    """Largest relative excess over the caps L_max and U_max (constraints of paper, eq. 8).
+    """Return the largest relative excess over the caps L_max and U_max (constraints of eq. 8).
 
     Returns
     -------
     float
-        Maximum of ``value / cap - 1`` over L95 (uncut: a lost one exceeds every cap) and the
-        utilisation of every resource in `qos` (see `busiest`); above 0 if and only if a cap is
-        exceeded, -1 where there are no caps.
+        Maximum of ``value / cap - 1`` over the uncut L95 (a lost cycle exceeds every cap) and the
+        utilisation of every resource in `qos` (see `busiest`). Above 0 if and only if a cap is
+        exceeded.
     """
     caps = objective.caps
-    # No latency, a lost one either, is over a cap that is not there.
+    # Without a cap, even an infinite latency does not exceed it.
     latency = qos.uncut_l95_ms / caps.latency_ms if caps.latency_ms < math.inf else 0.0
-    # A condition and not max(): this runs for every candidate at the close of every window.
+    # Faster than max(); this runs for every candidate in every window.
     load = busiest(qos) / caps.utilisation
     return (load if load > latency else latency) - 1.0

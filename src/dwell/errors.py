@@ -1,6 +1,6 @@
-"""The exceptions of Dwell: one root, one class for each kind of thing that can be wrong.
+"""The exceptions of Dwell, one class per kind of error under one root.
 
-With what a command says of them, and the code that it exits with.
+Also the line that a command prints for an error, and its exit code.
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ __all__ = [
     "user_note",
 ]
 
-#: Characters of what foreign code has raised.
+#: Longest text of an error from foreign code, in characters.
 LONGEST = 300
 #: Folder of this package.
 PACKAGE = os.path.join(os.path.dirname(__file__), "")
-#: Name of the distribution: `dwell` on the package index is somebody else's.
+#: Name of the distribution; `dwell` on the package index is an unrelated project.
 DISTRIBUTION = "dwell-placement"
 
-#: The line that installs the laboratory, which no index has, from a checkout.
+#: How to install the laboratory from a checkout; no package index has it.
 INSTALL_LAB = "in a checkout of Dwell: python -m pip install ./lab"
 
-#: By module: the package that brings it, and the extra that brings the package.
+#: The package of each optional module, and the extra that installs the package.
 OPTIONAL = {
     "cryptography": ("cryptography", "live"),
     "distributed": ("distributed", "dask"),
@@ -65,43 +65,36 @@ OPTIONAL = {
     "vl_convert": ("vl-convert", "report"),
     "zenoh": ("Zenoh", "live"),
 }
-#: By module: a package that no extra brings.
+#: Packages of modules that no extra installs.
 FURTHER = {"SALib": "salib", "cv2": "opencv-python-headless", "osqp": "osqp"}
 
 
 class ExitCode(IntEnum):
     """Exit codes, the same for every command."""
 
-    #: All that was asked for is there.
+    #: The command succeeded.
     DONE = 0
-    #: The work failed, or what was examined is not as it has to be.
+    #: The work failed, or a check found a fault.
     FAILED = 1
     #: The input is wrong: arguments, files, names.
     WRONG = 2
-    #: By Ctrl-C.
+    #: The user pressed Ctrl-C.
     INTERRUPTED = 130
 
 
 class DwellError(Exception):
-    """Root of every error that Dwell raises on purpose; its text is meant for the user."""
+    """Root of every error that Dwell raises on purpose; its text is for the user."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One thing wrong with a problem: where it is, what it is, and what to do about it.
+    """One fault of a problem: the field, the description and the remedy."""
 
-    Parameters
-    ----------
-    path : str
-        The field, as ``tasks.perception.on.E.exec_ms``; empty for the whole.
-    message : str
-        The value found, the bound it breaks, and the remedy.
-    line : int, optional
-        Where it stands in the file, from 1.
-    """
-
+    #: The field, as ``tasks.perception.on.E.exec_ms``; empty for the whole problem.
     path: str
+    #: The value, the bound it breaks, and the remedy.
     message: str
+    #: Line in the file, from 1.
     line: int | None = None
 
     def __str__(self) -> str:
@@ -110,14 +103,9 @@ class Fault:
 
 
 class ProblemError(DwellError, ValueError):
-    """A cell, or a part of one, is not valid; it carries every fault that was found.
+    """A cell, or a part of it, is not valid; the error lists every fault found.
 
-    Parameters
-    ----------
-    faults : sequence of Fault, or str
-        Faults; a string is one fault without a path.
-    source : str, optional
-        The file the problem was read from.
+    A string in place of faults is one fault without a path. `source` is the file of the problem.
     """
 
     def __init__(self, faults: Sequence[Fault] | str, source: str | None = None) -> None:
@@ -140,11 +128,11 @@ class ProblemError(DwellError, ValueError):
 
 
 class TraceError(ProblemError):
-    """A trace of measurements is missing, empty, too short, or holds values it may not."""
+    """A trace of measurements is missing, empty, too short, or has a value out of range."""
 
 
 class PlacementError(DwellError, ValueError):
-    """A placement does not cover the tasks it should, or puts one where it may not run."""
+    """A placement lacks a task, or puts a task on a node where it may not run."""
 
 
 class MetricError(DwellError, ValueError):
@@ -152,26 +140,21 @@ class MetricError(DwellError, ValueError):
 
 
 class PolicyError(DwellError, ValueError):
-    """A policy is unknown, or decided something that cannot be done."""
+    """A policy is unknown, or its decision cannot be executed."""
 
 
 class MissingPartError(DwellError, ValueError):
-    """A name or a command is of a distribution of Dwell that is not installed."""
+    """A name or a command belongs to a distribution of Dwell that is not installed."""
 
 
 class SimulationError(DwellError, RuntimeError):
-    """A simulation was asked for something it cannot do."""
+    """A simulation does not support a requested feature."""
 
 
 class KernelError(DwellError, RuntimeError):
     """The compiled kernel is missing, damaged, of other sources or for another processor.
 
-    Parameters
-    ----------
-    flaw : str
-        The file, and what is wrong with it.
-    remedy : str
-        The line that mends it.
+    `flaw` names the file and the fault, and `remedy` the command that repairs it.
     """
 
     def __init__(self, flaw: str, remedy: str) -> None:
@@ -185,31 +168,31 @@ class KernelError(DwellError, RuntimeError):
 
 
 class RunError(DwellError, ValueError):
-    """A folder is not the record of a run, or not one that this version can read."""
+    """A folder is not the record of a run, or another version wrote it."""
 
 
 class UnwritableError(RunError):
-    """A run cannot be written at the moment: its disk is full, or fails; later it may be."""
+    """A run cannot be written because its disk is full or fails; a later attempt may succeed."""
 
 
 class ProfileError(DwellError, ValueError):
-    """A subject of measurement is not there, or a file is not a profile of measurements."""
+    """A subject of measurement is missing, or a file is not a profile of measurements."""
 
 
 class MeasurementError(DwellError, RuntimeError):
-    """A measurement could not be finished: what was measured failed, or a peer went away."""
+    """A measurement is incomplete because its subject failed or a peer disconnected."""
 
 
 class LiveError(DwellError, RuntimeError):
-    """The live runtime cannot do what it was asked to."""
+    """The live runtime cannot do its work."""
 
 
 class TrustError(DwellError, ValueError):
-    """A key, a certificate or a list of them is missing, not valid, or not who it should be."""
+    """A key, a certificate or a list of them is missing, invalid, or of another identity."""
 
 
 class UserNote(str):
-    """Note on an exception that a user's code raised: the class, the call, the error, its line."""
+    """Note on an exception from a user's code: class, call, error and line."""
 
     __slots__ = ()
 
@@ -221,13 +204,10 @@ def user_note(error: BaseException) -> UserNote | None:
 
 
 def describe_raised(error: BaseException, *, users: bool = False) -> str:
-    """Return ``ValueError: no frame (stages.py:12)``, of an error that foreign code has raised.
+    """Describe an error from foreign code, as ``ValueError: no frame (stages.py:12)``.
 
-    Parameters
-    ----------
-    users : bool
-        Whether to name the last line in the file that Dwell called, not the last line of all; no
-        line if the call itself failed.
+    With `users`, name the last line in the file that Dwell called, or no line if the call itself
+    failed; otherwise name the last line of the traceback.
     """
     lines = str(error).strip().splitlines()
     raised = f"{type(error).__name__}: {lines[0][:LONGEST]}" if lines else type(error).__name__
@@ -235,7 +215,7 @@ def describe_raised(error: BaseException, *, users: bool = False) -> str:
     if users:
         outside = [one for one in frames if not one.filename.startswith(PACKAGE)]
         frames = [one for one in outside if one.filename == outside[0].filename]
-    # A SyntaxError says by itself where it is.
+    # The text of a SyntaxError already includes its position.
     if isinstance(error, SyntaxError) or not frames:
         return raised
     file, line = frames[-1].filename, frames[-1].lineno
@@ -243,7 +223,7 @@ def describe_raised(error: BaseException, *, users: bool = False) -> str:
 
 
 def installing(extra: str) -> str:
-    """Return the command that installs what an extra brings, for a message that misses it."""
+    """Return the command that installs an extra."""
     return f"pip install '{DISTRIBUTION}[{extra}]'"
 
 
@@ -259,10 +239,7 @@ def not_installed(*extras: str) -> list[str]:
 def missing_package(error: ModuleNotFoundError) -> DwellError | None:
     """Return the error that names an optional package and the command that installs it.
 
-    Returns
-    -------
-    DwellError or None
-        None where the module is none of an optional package of Dwell's.
+    Returns None if the module belongs to no optional package.
     """
     module = (error.name or "").partition(".")[0]
     if module in OPTIONAL:
@@ -276,10 +253,7 @@ def missing_package(error: ModuleNotFoundError) -> DwellError | None:
 def line_and_code(error: Exception) -> tuple[str, ExitCode] | None:
     """Return the line that a command prints for an error, and its exit code.
 
-    Returns
-    -------
-    tuple of str and ExitCode, or None
-        None for errors of other kinds.
+    Returns None for an error of another kind.
     """
     if note := user_note(error):
         return f"error: {note}", ExitCode.WRONG
@@ -292,6 +266,6 @@ def line_and_code(error: Exception) -> tuple[str, ExitCode] | None:
     if not isinstance(error, DwellError):
         return None
     located = isinstance(error, ProblemError) and error.source is not None
-    # Of the errors, those of what was given are ValueErrors.
+    # Errors in the input are ValueErrors.
     code = ExitCode.WRONG if isinstance(error, ValueError) else ExitCode.FAILED
     return str(error) if located else f"error: {error}", code

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all: written beside, then put in place."""
+"""Atomic writes of files: a draft in the same folder replaces the old file."""
 
 from __future__ import annotations
 
@@ -7,35 +7,21 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeAlias
 
-#: What a file shall hold, or what writes it to the path that it is given.
+#: The content of a file, or a function that writes it to a path.
 Content: TypeAlias = bytes | str | Callable[[Path], object]
 
 
 def write_whole(
     path: Path, content: Content, *, private: bool = False, durable: bool = True
 ) -> None:
-    """Write a file that appears complete or not at all; an older one stays until then.
+    """Write a file atomically, in UTF-8 if it is text; an older file stays until the end.
 
-    A process that is killed meanwhile leaves a file ``.NAME.PID.draft`` beside it.
-
-    Parameters
-    ----------
-    path : Path
-        In a folder that exists.
-    content : bytes, str or callable
-        Texts are UTF-8. A callable is given the path of the draft, and writes it.
-    private : bool
-        Whether its owner alone can read it.
-    durable : bool
-        Whether it must be on the disk, and stay when the power goes, before this returns.
-
-    Raises
-    ------
-    OSError
-        If that fails.
+    Only the owner can read a `private` file. With `durable`, the file survives a power failure once
+    this function has returned. A killed process leaves a file ``.NAME.PID.draft`` in the folder,
+    which must exist. Raises OSError if writing fails.
     """
     draft = path.with_name(f".{path.name}.{os.getpid()}.draft")
-    # What a killed process of this number left would keep its own mode.
+    # A draft of a killed process with the same number would keep its own mode.
     draft.unlink(missing_ok=True)
     try:
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
@@ -59,7 +45,7 @@ def write_whole(
 
 
 def _synchronise(folder: Path) -> None:
-    """Have the kernel write down a folder's names."""
+    """Write a folder's entries to the disk."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)

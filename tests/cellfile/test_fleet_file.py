@@ -34,6 +34,33 @@ def test_the_example_is_a_fleet_of_twelve() -> None:
     assert len(fleet.with_count(3).cells) == 3
 
 
+def test_a_limit_is_5_per_cent_where_cells_are_to_be_served(tmp_path: Path) -> None:
+    file = tmp_path / "fleet.yaml"
+    text = f"dwell-fleet: 1\ncells: [{{cell: {EXAMPLES / 'canonical.yaml'}}}]\n"
+    for objective, limit, known in (
+        ("objective: served", "", 0.05),
+        ("objective: served", "limit: 0.1", 0.1),
+        ("objective: sum", "", None),
+        ("", "limit: 0.1", 0.1),
+    ):
+        file.write_text(f"{text}{objective}\n{limit}\n")
+        fleet = load_fleet(file)
+        assert fleet.limit == known
+        has_effect = fleet.objective == "served" or limit == ""
+        assert [fault.path for fault in fleet.without_effect()] == ([] if has_effect else ["limit"])
+
+
+@pytest.mark.parametrize("limit", ["-0.1", "0", "1", "5", "NaN", "much"])
+def test_a_limit_is_a_share(tmp_path: Path, limit: str) -> None:
+    (fault,) = faults_of(
+        tmp_path,
+        "dwell-fleet: 1\ncells: [{cell: EXAMPLES/canonical.yaml}]\nobjective: served\n"
+        f"limit: {limit}\n",
+    )
+    assert "fleet.yaml:4: limit: " in fault
+    assert "it must be a number above 0 and below 1" in fault
+
+
 def test_copies_are_counted_over_all_entries_of_a_file(tmp_path: Path) -> None:
     file = tmp_path / "fleet.yaml"
     cell = EXAMPLES / "canonical.yaml"
@@ -84,7 +111,7 @@ estimator: corected
         "list of ms; did you mean 'even'?",
         "fleet.yaml:9: coordination: 'legder' is not allowed; it must be one of none, random, "
         "ledger; did you mean 'ledger'?",
-        "fleet.yaml:10: objective: 'best' is not allowed; it must be one of sum, worst",
+        "fleet.yaml:10: objective: 'best' is not allowed; it must be one of sum, worst, served",
         "fleet.yaml:11: estimator: unknown estimator 'corected'; did you mean 'corrected'?",
     ]
 

@@ -10,11 +10,13 @@ from pathlib import Path
 import numpy as np
 
 import dwell
+from dwell.control.coordination import Verdict
 from dwell.control.ledger import FleetLedger
 from dwell.estimators.fleet_prices import PricedCell
-from dwell.model import Problem
+from dwell.model import Decision, FrozenDict, Problem
 from dwell.model.fleet import Fleet, FleetEntry
 from dwell.model.process import Constant
+from dwell.model.qos import Reason
 from dwell.sim.fleet import phased
 
 CANONICAL = Path(__file__).parents[2] / "examples" / "canonical.yaml"
@@ -70,3 +72,21 @@ def every_phi(ledger: FleetLedger) -> dict[tuple[str, ...], float]:
     """Return the Φ of all placements, as the ledger plays them."""
     every = itertools.product(*(list(cell.problem.candidates) for cell in ledger.cells))
     return {placements: ledger.prices.price(placements).phi for placements in every}
+
+
+def close(ledger: FleetLedger, index: int, reason: Reason = "hold") -> Verdict:
+    """Let a cell decide that would stay where it is."""
+    problem, here = ledger.cells[index].problem, ledger.placements[index]
+    costs = FrozenDict(dict.fromkeys(problem.candidates, 0.0))
+    decision = Decision(problem.candidates[here], here, False, reason, costs)
+    return ledger.consider(index, decision, by_price=True)
+
+
+def settle(ledger: FleetLedger, order: Sequence[int]) -> None:
+    """Let all cells decide until none has moved for three rounds."""
+    quiet = 0
+    while quiet < 3:
+        before = list(ledger.placements)
+        for i in order:
+            close(ledger, i)
+        quiet = quiet + 1 if ledger.placements == before else 0

@@ -96,6 +96,16 @@ def test_a_shared_node_that_nobody_uses_is_warned_of(fleet: Path) -> None:
     assert "shared.E: no candidate of any cell uses this node" in result.stderr
 
 
+def test_a_limit_without_effect_is_warned_of(fleet: Path) -> None:
+    text = fleet.read_text(encoding="utf-8")
+    for objective, warns in (("sum", True), ("served", False)):
+        fleet.write_text(f"{text}objective: {objective}\nlimit: 0.1\n", encoding="utf-8")
+        options = ("--windows", "6", "--policy", "LOC", "--out", objective)
+        result = call("fleet", "run", fleet, *options)
+        assert result.exit_code == 0
+        assert ("limit: it has no effect with objective sum; remove it" in result.stderr) == warns
+
+
 def test_a_length_in_seconds(fleet: Path) -> None:
     found = read_json(call("fleet", "run", fleet, "--seconds", "1.25", "--json"))
     assert found["seconds"] == 1.25
@@ -297,3 +307,5 @@ def test_a_plan_names_the_cells_that_stay_above_a_limit(crowd: Path) -> None:
     assert_refused(call(*command, "--limit", "5"), "--limit: 5 is not allowed", "between 0 and 1")
     crowd.write_text(FLEET, encoding="utf-8")
     assert call(*command, "--limit", "0.05").stdout.endswith("\n0 of 2 cells stay above 5 %\n")
+    crowd.write_text(f"{FLEET}objective: served\nlimit: 0.2\n", encoding="utf-8")
+    assert call(*command).stdout.endswith("\n0 of 2 cells stay above 20 %\n")

@@ -15,6 +15,7 @@ import dwell
 from dwell.cellfile import from_document
 from dwell.control import Controller
 from dwell.control.coordination import Coordination, Verdict, Wish
+from dwell.control.fleet_rank import MostServed
 from dwell.control.ledger import FleetLedger, Loads, PricedCell, Seat
 from dwell.estimators.load_table import LoadColumn, LoadTable
 from dwell.estimators.presents import Present
@@ -68,6 +69,8 @@ def settle(ledger: FleetLedger, rounds: int = 50) -> list[tuple[int, str, Verdic
         for i, cell in enumerate(ledger.cells):
             here = ledger.placements[i]
             costs = dict.fromkeys(cell.problem.candidates, 0.0)
+            if isinstance(ledger.rank, MostServed):
+                served = sum(ledger.rank.served(ledger.prices.price(tuple(ledger.placements))))
             owed = {name: ledger.owed(i, name) for name in costs}
             verdict = ledger.consider(i, priced(cell.problem, here, here, costs), by_price=True)
             if verdict.name != here:
@@ -77,6 +80,9 @@ def settle(ledger: FleetLedger, rounds: int = 50) -> list[tuple[int, str, Verdic
                 assert last is not None
                 if ledger.objective == "sum":
                     assert first - last > owed[verdict.name]
+                if isinstance(ledger.rank, MostServed):
+                    more = sum(ledger.rank.served(ledger.prices.price(tuple(ledger.placements))))
+                    assert more > served or (more == served and first - last > owed[verdict.name])
                 moves.append((i, verdict.name, verdict))
         if len(moves) == before:
             return moves
@@ -99,7 +105,7 @@ def wrong_table(cells: list[PricedCell], seed: int) -> LoadTable:
     count=st.integers(2, 5),
     cores=st.integers(1, 4),
     seed=st.integers(0, 1000),
-    objective=st.sampled_from(["sum", "worst"]),
+    objective=st.sampled_from(["sum", "worst", "served"]),
     slow=st.lists(st.booleans(), min_size=5, max_size=5),
 )
 def test_moves_are_finite_and_lower_the_played_phi_whatever_the_table_says(
@@ -141,6 +147,20 @@ def test_the_worst_cell_counts_before_the_sum() -> None:
     worst = by_worst.prices.price(tuple(by_worst.placements))
     least = cells[0].problem.controller.min_improvement
     assert max(worst.costs) <= max(sums.costs) + least
+
+
+def test_at_least_as_many_cells_are_served_as_by_the_other_objectives() -> None:
+    """Six robots are slow, and the edge has room for two."""
+    cells = cells_of(stressed(with_cores(CANONICAL, 2)), 6)
+    served: dict[FleetObjective, int] = {}
+    for objective in ("sum", "worst", "served"):
+        ledger = FleetLedger(cells, ["E"], objective)
+        settle(ledger)
+        price = ledger.prices.price(tuple(ledger.placements))
+        served[objective] = sum(
+            cell is not None and cell.qos.violation_rate <= 0.05 for cell in price.cells
+        )
+    assert served["served"] == max(served.values()) == 2
 
 
 def test_no_cell_is_moved_over_a_cap_of_another_one() -> None:

@@ -164,7 +164,7 @@ def test_without_a_pair_around_the_initial_candidate_it_takes_another() -> None:
 def test_moves_between_robots_make_no_pair() -> None:
     candidates = {"A": place("R1", "R2"), "B": place("R2", "R2"), "C": place("E", "E")}
     assert find_pairs(candidates, OBJECTIVE.tiers) == ()
-    with pytest.raises(PolicyError, match="no such pair among A, B, C"):
+    with pytest.raises(PolicyError, match="no pair qualifies among A, B, C"):
         atp(initial="A", candidates=candidates)
 
 
@@ -184,7 +184,7 @@ def test_wrong_parameters_are_named() -> None:
         ATPThresholds(candidates=CANDIDATES, objective=OBJECTIVE, edge=-0.5)
     with pytest.raises(PolicyError, match="offload is 'NOWHERE'"):
         ATPThresholds(candidates=CANDIDATES, objective=OBJECTIVE, offload="NOWHERE")
-    with pytest.raises(PolicyError, match="no such pair with local='LOC', offload='SO'"):
+    with pytest.raises(PolicyError, match="no pair with local='LOC', offload='SO' qualifies"):
         ATPThresholds(candidates=CANDIDATES, objective=OBJECTIVE, local="LOC", offload="SO")
 
 

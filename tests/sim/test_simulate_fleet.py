@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -180,14 +181,18 @@ def test_under_a_ledger_each_move_is_worth_what_it_costs_and_none_goes_back(
     run = simulate_fleet(fleet, policy="dtp", estimator="corrected", windows=20)
     moved = run.decisions.filter("migrated")
     objective, least = problem.objective, problem.controller.min_improvement
+    # The moves of a round are a set: together they are worth what all of them cost.
+    owed: defaultdict[tuple[int, float, float], float] = defaultdict(float)
     for row in moved.to_dicts():
         here, there = (problem.candidates[row[name]] for name in ("incumbent", "placement"))
-        owed = least + objective.weights.switching * hamming(there, here)
-        assert row["phi_before"] - row["phi_after"] > owed
-    assert moved["round"].n_unique() == moved.height
+        of_round = row["round"], row["phi_before"], row["phi_after"]
+        owed[of_round] += least + objective.weights.switching * hamming(there, here)
+    assert all(before - after > due for (_, before, after), due in owed.items())
+    assert moved["round"].n_unique() == len(owed)
     # The last windows of cells that have moved are not whole.
     counts = on_edge(run)[:-2]
-    assert 3 < counts[-1] < 6
+    # All cells on HYB are the best of all placements.
+    assert counts[-1] == 6
     assert counts == sorted(counts)
     refused = run.decisions.filter(pl.col("refused").is_not_null())
     assert not refused["migrated"].any()
@@ -227,7 +232,10 @@ def test_when_the_edge_is_back_nobody_tramples_it(canonical: Problem) -> None:
     late = pl.concat([one.cycles for one in run.cells.values()])
     seconds = (pl.col("release_ns") / 10_000_000_000).floor()
     missed = dict(late.group_by(seconds).agg(pl.col("missed").mean()).rows())
-    assert all(missed[at] <= missed[6] + 0.01 for at in range(7, 11))
+    # At first all are on their robots, as they were in the first ten seconds.
+    assert missed[7] <= missed[0]
+    assert missed[7] > missed[8] > missed[9] > missed[10]
+    assert missed[10] <= missed[5]
 
 
 def test_cells_take_turns_in_sending_shadows_to_the_edge(canonical: Problem) -> None:

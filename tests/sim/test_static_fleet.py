@@ -12,6 +12,7 @@ import dwell
 from dwell.cellfile import from_document
 from dwell.model import Problem
 from dwell.model.fleet import Fleet, FleetEntry
+from dwell.sim.fleet import phased
 from dwell.sim.static_fleet import StaticFleet
 from tests.cells.with_traces import trace_cell
 
@@ -82,3 +83,12 @@ def test_cells_of_several_files(canonical: Problem) -> None:
     static = StaticFleet(seed=2, duration_ns=fleet.duration_ns(8))
     found = rates(static, fleet.changed(policy="SO"))
     assert found == pytest.approx(shown(fleet, "SO"), abs=1e-12)
+
+
+def test_cells_that_are_equal_keep_their_own_folders(canonical: Problem) -> None:
+    folders = ["one", "another"]
+    fleets = [
+        Fleet("hall", (FleetEntry(replace(canonical, folder=folder), 1),), ("E",))
+        for folder in folders
+    ]
+    assert [problem.folder for fleet in fleets for problem in phased(fleet, 1)] == folders

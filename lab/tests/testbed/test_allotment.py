@@ -38,7 +38,7 @@ def test_where_there_are_more_each_node_has_its_own(problem: Problem) -> None:
 
 
 def test_what_does_not_fit_is_refused_with_what_would(problem: Problem) -> None:
-    with pytest.raises(LiveError, match=r"all together want 1\.6 of 0\.6"):
+    with pytest.raises(LiveError, match=r"all nodes need 1\.6 CPUs; 0\.6 are available"):
         allot([problem], [0])
 
 
@@ -56,5 +56,5 @@ def test_cells_share_a_node_that_is_the_same_in_both(problem: Problem) -> None:
     nodes = dict(problem.fabric.nodes)
     nodes["E"] = replace(nodes["E"], quota=Quota(0.5, 4.0))
     fabric = replace(problem.fabric, nodes=FrozenDict(nodes))
-    with pytest.raises(LiveError, match=r"nodes\.E: two cells share it"):
+    with pytest.raises(LiveError, match=r"nodes\.E: two cells share this node"):
         allot([problem, replace(other, fabric=fabric)], [0, 1])

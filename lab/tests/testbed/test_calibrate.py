@@ -88,7 +88,7 @@ def test_what_was_not_visited_stays(nominal: Path, folders: list[Path], tmp_path
     found = calibrate(nominal, folders[:1], tmp_path / "out.yaml", say=said.append)
     assert found.missing == ("find@E",)
     assert found.problem.pipeline.tasks["find"].on["E"].exec_ms == Constant(9)
-    assert "find@E: not measured, as it was" in said
+    assert "find@E: not measured, unchanged" in said
 
 
 def test_bad_input_is_refused_all_at_once(

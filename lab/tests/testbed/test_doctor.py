@@ -89,9 +89,9 @@ def test_quotas_that_fit_are_told_where_they_run(monkeypatch: pytest.MonkeyPatch
 @pytest.mark.parametrize(
     ("quotas", "said"),
     [
-        ((Quota(0.4, 4), Quota(0.9, 4), Quota(0.3, 4)), "of the 0.8 that nodes may have of each"),
+        ((Quota(0.4, 4), Quota(0.9, 4), Quota(0.3, 4)), "of the 0.8 per CPU that nodes may use"),
         ((Quota(0.5, 4), Quota(0.5, 4), Quota(0.7, 4)), "1.6"),
-        ((Quota(0.1, 4), Quota(0.4, 4), Quota(0.8, 4)), "no less than 1 ms"),
+        ((Quota(0.1, 4), Quota(0.4, 4), Quota(0.8, 4)), "at least 1 ms"),
     ],
 )
 def test_quotas_that_do_not_fit_are_refused(

@@ -167,7 +167,7 @@ def test_a_name_that_is_taken_is_an_error_and_what_is_there_stays(
 
 @here
 def test_an_unknown_node_is_an_error(groups: Groups) -> None:
-    with pytest.raises(LiveError, match="no group of a node 'X'; there are A, B"):
+    with pytest.raises(LiveError, match="node 'X' has no group; nodes with a group: A, B"):
         groups.inside("X", ["true"])
 
 
@@ -177,8 +177,8 @@ def test_what_the_kernel_would_not_take_is_refused_before_anything_is_made() -> 
     with pytest.raises(LiveError) as caught:
         Groups(own_name(), shares)
     first, second = str(caught.value).splitlines()
-    assert first.startswith(f"nodes.A: CPU {many} is not there")
-    assert second.startswith("nodes.B.quota: 0.1 CPU in every 4 ms is 0.4 ms a period")
+    assert first.startswith(f"nodes.A: CPU {many} is not available")
+    assert second.startswith("nodes.B.quota: 0.1 CPU in every 4 ms is 0.4 ms per period")
 
 
 # ------------------------------------------------------------------------- how they are laid out

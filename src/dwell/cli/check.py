@@ -41,7 +41,7 @@ def check(
     insecure: Insecure = False,
     as_json: Json = False,
 ) -> None:
-    """Find every fault in a cell, or say what it amounts to.
+    """Find all faults of a cell, or show what its candidates do.
 
     Faults go to stderr, one a line as file:line: path: message, and the exit code is 2. Warnings
     go there too, but do not change it.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,9 +23,38 @@ from dwell.cli.study import study
 from dwell.errors import INSTALL_LAB, ExitCode, MissingPartError, line_and_code
 from dwell.model.entry_points import COMMANDS, added
 
+#: Most characters of a command's line in the help.
+SHORT = 64
+#: Headings of the help, with their commands; commands of no heading follow under `Other`.
+GROUPS = {
+    "Simulate": ("new", "check", "run", "study", "demo"),
+    "See": ("report", "dash"),
+    "Fleet": ("fleet",),
+    "Live": ("live", "keys", "agent", "controller", "doctor"),
+    "Measure": ("profile", "testbed", "validate"),
+}
+EXAMPLES = """\
+Examples:
+  dwell run examples/first.yaml --scenario robot-cpu-stress
+  dwell fleet capacity examples/fleet.yaml --policy SO --phases even
+  dwell live run examples/live/cell.yaml --seconds 30
+"""
+
 
 class Commands(TyperGroup):
     """All commands; an error that is meant for the user is printed and becomes an exit code."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the commands under their headings."""
+        left = {name: one for name, one in self.commands.items() if not one.hidden}
+        for heading, names in GROUPS.items():
+            found = {name: left.pop(name) for name in names if name in left}
+            _write_commands(formatter, heading, found)
+        _write_commands(formatter, "Other", left)
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        """Write the examples."""
+        formatter.write(f"\n{EXAMPLES}")
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command that the arguments name."""
@@ -45,6 +74,13 @@ class Commands(TyperGroup):
             raise typer.Exit(code) from None
         except KeyboardInterrupt:
             raise typer.Exit(ExitCode.INTERRUPTED) from None
+
+
+def _write_commands(formatter: Any, heading: str, commands: Mapping[str, Any]) -> None:
+    if commands:
+        rows = [(name, one.get_short_help_str(SHORT)) for name, one in commands.items()]
+        with formatter.section(heading):
+            formatter.write_dl(rows)
 
 
 app = typer.Typer(
@@ -82,7 +118,7 @@ def doctor(
     keys: Keys = None,
     as_json: Json = False,
 ) -> None:
-    """Say what this computer has for Dwell and what it lacks, with the line that mends it.
+    """Check this computer; print a command for whatever is missing.
 
     The exit code is 1 where something is broken; an extra that is not installed is not.
     """

@@ -30,7 +30,7 @@ def completion(
     context: typer.Context,
     shell: Annotated[Shell, typer.Argument(metavar="SHELL", help="bash, zsh or fish.")],
 ) -> None:
-    """Print the script that has a shell complete commands, options and their values.
+    """Print the completion script of bash, zsh or fish.
 
     Read it where your shell begins: source <(dwell completion bash) in ~/.bashrc, the same with zsh
     in ~/.zshrc after compinit, dwell completion fish | source in ~/.config/fish/config.fish.

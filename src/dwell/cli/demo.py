@@ -47,7 +47,7 @@ def demo(
     processes: Processes = None,
     as_json: Json = False,
 ) -> None:
-    """Compare all policies in all scenarios of an example, and write the report.
+    """Compare all policies in all scenarios of an example cell.
 
     It is the study examples/studies/demo.yaml; its runs are 150 windows long, if neither --windows
     nor --seconds is given.

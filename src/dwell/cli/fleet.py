@@ -27,7 +27,6 @@ from dwell.cli.output import (
 )
 from dwell.cli.run import default_folder
 from dwell.display import milliseconds
-from dwell.errors import Fault
 from dwell.model.bounds import counted
 
 if TYPE_CHECKING:
@@ -46,7 +45,7 @@ CHANGE = ("change", "times")
 
 fleet = typer.Typer(
     no_args_is_help=True,
-    help="Play cells that share nodes, and find out how many of them there may be.",
+    help="Simulate cells that share nodes; find how many fit.",
 )
 
 FleetArgument = Annotated[Path, argument("FILE", "Fleet file (YAML).")]
@@ -106,7 +105,7 @@ def run(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Simulate the cells of a fleet together, save a run a cell, sum them up."""
+    """Simulate the cells of a fleet; save one run per cell."""
     from dwell.record.fleet_run import describe_fleet, require_free_or_same
     from dwell.sim.fleet import duration_of, phases_ms
     from dwell.study.fleet_summary import fleet_numbers
@@ -147,11 +146,16 @@ def plan(
     seed: Seed = 1,
     phases: Phases = None,
     limit: Annotated[
-        float | None, option("SHARE", "Also name the cells whose V_D stays above this, as 0.05.")
+        float | None,
+        option(
+            "SHARE",
+            "Also name the cells whose V_D stays above this, as 0.05; with `objective: served` the "
+            "limit of the file if not given.",
+        ),
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Find where the cells are best placed while their scenarios go on, all at once.
+    """Find the placements with the least cost for all cells.
 
     Φ of the table of loads is least there; what the placements come to is played.
     """
@@ -160,6 +164,8 @@ def plan(
     if limit is not None:
         _require_limit(limit)
     planned = _read(file, phases)
+    if limit is None and planned.objective == "served":
+        limit = planned.limit
     with progress(f"playing loads of {counted(len(planned.cells), 'cell')}") as shown:
         found = plan_fleet(planned, seed=seed, progress=shown)
     if as_json:
@@ -212,7 +218,7 @@ def capacity(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Find how many robots a fleet may have, so that no cell misses more than a limit.
+    """Find how many robots the shared nodes carry.
 
     The count of the first entry is varied, the others stay. Where phases are drawn and no cell
     moves, 100 draws of 200 cycles are played of each size; else 10 seeds of 2,000 cycles.
@@ -327,10 +333,9 @@ def read_phases(text: str | None) -> str | tuple[float, ...] | None:
 
 
 def _read(file: Path, phases: str | None, **changes: str | None) -> Fleet:
-    """Read a fleet, warn of what it has for nothing, and change it as the options say."""
+    """Read a fleet, warn of settings without effect, and change it as the options say."""
     fleet = dwell.load_fleet(file)
-    unused = "no candidate of any cell uses this node"
-    warn(file, (Fault(f"shared.{name}", unused) for name in fleet.unused()))
+    warn(file, fleet.without_effect())
     return fleet.changed(phases=read_phases(phases), **changes)
 
 
@@ -384,6 +389,7 @@ def _cells(result: FleetRun, cells: Sequence[Mapping[str, Any]]) -> Iterator[str
         [
             str(row["cell"]),
             f"{row['violation_rate'] * 100:.2f}",
+            str(row["verdict"]),
             milliseconds(row["l95_ms"], 2),
             f"{row['cost']:.3f}",
             str(row["moves"]),
@@ -394,11 +400,19 @@ def _cells(result: FleetRun, cells: Sequence[Mapping[str, Any]]) -> Iterator[str
     if not rows:
         yield "no window is after the warm-up: nothing to sum up; ask for more"
         return
-    head = ["cell, the worst first", "V_D (%)", "L95 (ms)", "J", "moves", "where over time"]
+    head = [
+        "cell, the worst first",
+        "V_D (%)",
+        "verdict",
+        "L95 (ms)",
+        "J",
+        "moves",
+        "where over time",
+    ]
     yield aligned(head, rows)
     if len(cells) > SHOWN:
         yield f"{len(cells) - SHOWN} more, with fewer misses, are in the folder"
-    yield f"where: {legend}; V_D, L95 and J leave the warm-up out"
+    yield f"where: {legend}; V_D, L95 and J leave the warm-up out; aim: V_D under 5 %"
 
 
 def _letters(names: Iterable[str]) -> dict[str, str]:

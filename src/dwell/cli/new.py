@@ -66,7 +66,7 @@ def new(
         Origin, typer.Option("--from", help="Example to begin as: simulated, or live.")
     ] = Origin.CANONICAL,
 ) -> None:
-    """Make a folder with a cell of your own: cell.yaml, policy.py, stages.py, test_cell.py.
+    """Make a folder with a cell, a policy, stages and a test.
 
     All of it works as it is; comments say what to change.
     """

@@ -66,7 +66,7 @@ def report(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Write the page of runs, fleets, studies, campaigns: one HTML file that needs nothing else."""
+    """Write the HTML page of a run, fleet, study or campaign."""
     from dwell.model.entry_points import PAGES, added
     from dwell.record.fleet_run import is_fleet
     from dwell.report.added import FolderPages

@@ -76,7 +76,7 @@ def run(
     force: Annotated[bool, flag("--force", "Replace another run in the folder.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Simulate a policy on a scenario, save the run, sum it up.
+    """Simulate one policy in one scenario, and save the run.
 
     300 windows, if neither --windows nor --seconds is given.
     """

@@ -61,7 +61,7 @@ def study(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Simulate every scenario, policy, parameter and seed of a study.
+    """Simulate all scenarios, policies and seeds of a study.
 
     Finished runs stay in the folder, whatever ends the work: the same command plays the rest. Runs
     have the length of the file, if neither --windows nor --seconds is given. Several computers

@@ -480,7 +480,8 @@ class Controller:
         decision, incumbent = proposal.decision, self.course.placement
         by_price = self._policy.by_price
         seen = SeenWindow(*proposal.seen[:2], *proposal.looked[1:])
-        wish = Wish(decision, estimates, incumbent, self._estimator, by_price, seen, self._doubts)
+        of_cell = self._estimator, by_price, seen, self._doubts, self.course.by_guard
+        wish = Wish(decision, estimates, incumbent, *of_cell)
         verdict = coordination.consider(wish)
         proposal.verdict, name = verdict, verdict.name
         if name != decision.name:

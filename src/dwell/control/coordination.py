@@ -54,6 +54,8 @@ class Wish(NamedTuple):
         What the decision looks at.
     doubts : Doubts, optional
         Candidates of the cell whose windows were not what was played.
+    on_fallback : bool
+        Whether the guard holds the cell on a fallback.
     """
 
     decision: Decision
@@ -63,6 +65,7 @@ class Wish(NamedTuple):
     by_price: bool
     seen: SeenWindow | None = None
     doubts: Doubts | None = None
+    on_fallback: bool = False
 
 
 class Coordination(Protocol):

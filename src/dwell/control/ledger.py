@@ -1,36 +1,40 @@
-"""Ledger: who of a fleet is where, and which move is good for all.
+"""Ledger: the placements of a fleet's cells, and the moves that are good for all.
 
-Closes are looked at one after another. What cells know of themselves (their *presents*, see
-`dwell.estimators.presents`) and where they are is frozen from one close to the next; a cell that
-may move is asked for if something of it is new. A table of loads says which of its candidates are
-worth a look; then the fleet is played as it is and as it would be, on the same draws. The move is
-made if
+Closes are considered one after another. The *presents* of the cells (see
+`dwell.estimators.presents`) and their placements are frozen from one close to the next. A cell that
+may move is considered if something of it is new: a table of loads proposes candidates, and the
+fleet is played as it is and with the move, on the same draws. The move is made if
 
 * Φ as played falls by more than the mover owes, Δ_min + α_S·S, and
-* no cell comes over a cap that it was under.
+* no cell exceeds a cap that it kept before.
 
-A move counts from then on, before any window shows it. Under given presents Φ is a function of the
-placements alone, and every move lowers it by more than the least Δ_min: the number of moves is
+When every cell has decided since a change, the ledger searches moves of several cells (see
+`dwell.control.fleet_search`). The best placements become a *set* of moves if Φ falls by more than
+all movers owe. Each member moves at its next close, and nothing else is played until all have.
+
+A move counts at once, before any window shows it. Under given presents Φ is a function of the
+placements alone, and every move or set lowers it by more than the least Δ_min: their number is
 finite, whatever the table says, and at most (Φ at first − least Φ) / least Δ_min.
 
 A cell whose windows are not what was played for it leaves Φ until they are again (see
 `dwell.control.watchdog`). Its load stays where it is; the proof holds from one such change to the
 next.
 
-What is lowered is the sum of the cells' costs; or the worst of them: costs are rounded up to
-multiples of the least Δ_min and sorted from the largest, the smaller list is the better one, and
-of equal lists that with the smaller sum.
+The objective decides which of two prices is better (see `dwell.control.fleet_rank`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.control.coordination import Coordination, Verdict, Wish
-from dwell.control.fleet_rank import FleetRank
+from dwell.control.coordination import NOT_ASKED, Asked, Coordination, Verdict, Wish
+from dwell.control.fleet_rank import fleet_rank
+from dwell.control.fleet_search import FleetSearch
+from dwell.control.neighbours import Rank
 from dwell.control.table_loads import Loads, moved
 from dwell.control.watchdog import (
     NOT_AS_PLAYED,
@@ -54,6 +58,7 @@ __all__ = ["FleetLedger", "Loads", "PricedCell", "Seat"]
 
 #: So many of a cell's candidates are played at a close, those that the table thinks best of.
 LOOKS = 2
+SET_UNDER_WAY = "ledger: Φ would change, a set is under way"
 
 
 class FleetLedger:
@@ -64,7 +69,7 @@ class FleetLedger:
     cells : sequence of PricedCell
     shared : sequence of str
         Nodes that are one computer for all cells.
-    objective : {"sum", "worst"}
+    objective : {"sum", "worst", "served"}
     table : LoadTable, optional
         Proposes moves; made of `tabled` where None.
     tabled : sequence of PricedCell, optional
@@ -73,6 +78,8 @@ class FleetLedger:
         What plays.
     progress : callable, optional
         Told how many of how many levels of the table have been played.
+    limit : float, optional
+        Largest V_D of a cell that is served, with the objective ``served``.
 
     Attributes
     ----------
@@ -100,23 +107,27 @@ class FleetLedger:
         tabled: Sequence[PricedCell] | None = None,
         prices: FleetPrices | None = None,
         progress: Progress | None = None,
+        limit: float | None = None,
     ) -> None:
         self.cells, self.shared, self.objective = tuple(cells), tuple(shared), objective
         problems = [cell.problem for cell in cells]
         self.table = table or load_table(tabled or cells, shared, progress)
         self.prices = prices or FleetPrices(cells, shared)
         self.loads = Loads(self.table)
+        self.rank = fleet_rank(objective, cells, limit)
+        self._aimed = Loads(self.table, self.rank.limit)
         self._terms = [CellTerms(problem, shared) for problem in problems]
         self.placements = [problem.initial for problem in problems]
         self._at = self.loads.at(self.placements)
-        self.alone = [
-            {name: terms.cost(price.qos) for name, price in prices_of(problem).items()}
-            for problem, terms in zip(problems, self._terms, strict=True)
-        ]
+        self._declared = [prices_of(problem) for problem in problems]
+        self.alone: list[dict[str, float]] = [{} for _ in problems]
+        #: The same, as the objective has it in a search.
+        self._aims: list[dict[str, float]] = [{} for _ in problems]
+        for i, prices_alone in enumerate(self._declared):
+            self._note_alone(i, {name: price.qos for name, price in prices_alone.items()})
         self.presents = [Present()] * len(self.cells)
         self._revisions = [-1] * len(self.cells)
         self._has_caps = any(problem.objective.caps != Caps() for problem in problems)
-        self.rank = FleetRank(objective, cells)
         names = sorted(cell.name for cell in cells)
         #: Place of each cell where they take turns, and how long one is.
         self.order = [names.index(cell.name) for cell in cells]
@@ -125,7 +136,6 @@ class FleetLedger:
         self._watchdogs = [Watchdog(problem.window_cycles) for problem in problems]
         #: Candidates of each cell that are doubted at its last close.
         self._doubted: list[set[str]] = [set()] * len(self.cells)
-        self._declared = [prices_of(problem) for problem in problems]
         #: How often Φ has become another function; and of each cell what it was when it was last
         #: looked at.
         self._changes = 0
@@ -134,17 +144,37 @@ class FleetLedger:
         self._looked = [(-1, -1)] * len(self.cells)
         self._refusals: list[dict[str, str]] = [{} for _ in self.cells]
         self.round = 0
+        self._search = FleetSearch(self.prices, self._aimed, self.rank, 1 + LOOKS)
+        #: Moves of a set that have not been made yet, and what their rows say.
+        self._set: dict[int, str] = {}
+        self._asked: Asked = NOT_ASKED
 
     def __repr__(self) -> str:
         return f"<FleetLedger of {len(self.cells)} cells: round {self.round}>"
 
     def place(self, index: int, name: str) -> None:
-        """Take note of where a cell is."""
+        """Take note that a cell is elsewhere, if the ledger has not moved it."""
         if name != self.placements[index]:
-            self.placements[index] = name
-            self._at = self.loads.at(self.placements)
-            self._moves += 1
-            self._changes += 1
+            self._put(index, name)
+            self._change()
+
+    def keep(self, index: int, name: str) -> None:
+        """Take note that a cell is still on its guard's fallback: its move is not proven yet."""
+        if name != self.placements[index]:
+            self._put(index, name)
+
+    def _put(self, index: int, name: str) -> None:
+        self.placements[index] = name
+        self._at = self.loads.at(self.placements)
+        self._moves += 1
+        self._changes += 1
+        self._search.move(index)
+
+    def _change(self) -> None:
+        """Drop the set, and begin a change."""
+        self.round += bool(self._set)
+        self._set.clear()
+        self._search.change()
 
     def watch(self, index: int, seen: SeenWindow, doubts: Doubts, estimator: CellEstimator) -> bool:
         """Compare a window with what was played; returns whether that is what was seen.
@@ -155,13 +185,15 @@ class FleetLedger:
         dog, name = self._watchdogs[index], self.placements[index]
         if dog.is_due(seen, self._moves):
             self._begin()
-            cell = self.prices.price(tuple(self.placements)).cells[index]
+            price = self._search.play(tuple(self.placements))
+            cell = None if price is None else price.cells[index]
             cycles = self.cells[index].problem.window_cycles
             if cell is not None:
                 played = Expected.of(cell.windows, self._declared[index][name], cycles)
                 if dog.compare(seen, played) and estimator.learns:
                     self.absent ^= {index}
                     self._changes += 1
+                    self._change()
                     estimator.share(self.shared, len(self.cells), known=dog.trusts)
                     doubts.change(name, seen.last_cycle, trusts=dog.trusts)
         doubted = doubts.at(seen.last_cycle)
@@ -179,46 +211,148 @@ class FleetLedger:
         if revision == self._revisions[index]:
             return
         self._revisions[index] = revision
-        self.alone[index] = {name: self._terms[index].cost(qos) for name, qos in estimates.items()}
+        self._note_alone(index, estimates)
         if estimator.present is not None:
             self.presents[index] = estimator.present
+        self._search.change()
 
-    def consider(self, index: int, decision: Decision, *, by_price: bool) -> Verdict:
+    def _note_alone(self, index: int, estimates: Mapping[str, QoS]) -> None:
+        costs = {name: self._terms[index].cost(qos) for name, qos in estimates.items()}
+        self.alone[index] = costs
+        self._aims[index] = {
+            name: self.rank.aim(costs[name], qos.violation_rate) for name, qos in estimates.items()
+        }
+
+    def consider(
+        self, index: int, decision: Decision, *, by_price: bool, on_fallback: bool = False
+    ) -> Verdict:
         """Say where a cell is to be that its policy has decided on (see `Wish`)."""
+        here, is_absent = self.placements[index], index in self.absent
+        may_move = by_price and bool(decision.costs) and decision.reason != "dwell"
+        in_sets = by_price and not is_absent
+        self._search.decide(index, free=may_move and not on_fallback if in_sets else None)
+        if is_absent:
+            verdict = self._outside(index, decision)
+        elif self._set:
+            return self._of_set(index, decision.name)
+        elif by_price and not may_move:
+            verdict = self._refused(index, decision.name)
+        else:
+            verdict = self._of_one(index, decision, by_price=by_price, on_fallback=on_fallback)
+        if self._search.is_due and not self._set:
+            self._find_set()
+            if index in self._set and verdict.name == here:
+                return self._of_set(index, decision.name)
+        return verdict
+
+    def _of_set(self, index: int, wished: str) -> Verdict:
+        """Make the move of a member of the set; other cells stay until all have moved."""
+        name = self._set.get(index)
+        if name is None:
+            why = SET_UNDER_WAY if wished != self.placements[index] else None
+            return Verdict(self.placements[index], why, (None, None, self.round))
+        if not self._search.is_free(index):
+            self._change()
+            return self._refused(index, wished)
+        del self._set[index]
+        self._put(index, name)
+        self.round += not self._set
+        return Verdict(name, None, self._asked)
+
+    def _of_one(
+        self, index: int, decision: Decision, *, by_price: bool, on_fallback: bool
+    ) -> Verdict:
+        """Look at moves of the cell alone."""
         wished = decision.name
-        if index in self.absent:
-            return self._outside(index, decision)
         state = self._changes, self._revisions[index]
         if self._looked[index] != state:
             self._looked[index] = state
             self._refusals[index] = {}
         elif not decision.migrated or wished in self._refusals[index]:
             return self._refused(index, wished)
+        # Other cells are no part of the search, so they get an answer in any case.
+        is_limited = by_price and not on_fallback
+        play = self._search.play if is_limited else self.prices.price
+        is_led = is_limited and self._search.is_open and self.objective == "sum"
         if not by_price:
             names = [wished] if decision.migrated else []
-        elif decision.costs and decision.reason != "dwell":
-            names = self._promising(index)
         else:
-            # It may be looked at again as soon as it is free to move.
-            self._looked[index] = -1, -1
-            return self._refused(index, wished)
+            names = self._promising(index)
+            if is_led:
+                names = self._led(index, names, wished)
+        self._begin()
+        here = tuple(self.placements)
         asked: tuple[float, float] | None = None
         for name in names:
             if name in self._doubted[index]:
                 self._refusals[index][name] = WAS_NOT_AS_PLAYED
                 continue
-            before, after = self._played(index, name)
+            there = moved(here, index, name)
+            before = play(here)
+            if before is None:
+                break
+            self.rank.settle(before)
+            after = play(there)
+            if after is None:
+                break
             asked = self._phi(before), self._phi(after)
-            why = self._objection(index, name, before, after)
+            why = self._objection(there, before, after)
             if why is None:
                 verdict = Verdict(name, None, (*asked, self.round))
+                self.rank.settle(after)
                 self.round += 1
-                self.place(index, name)
+                self._put(index, name)
+                self._search.spend()
                 return verdict
             self._refusals[index][name] = why
+            if is_led and not why.startswith("cap "):
+                break
         verdict = self._refused(index, wished, asked)
         self.round += asked is not None
         return verdict
+
+    def _find_set(self) -> None:
+        """Look for moves of several cells that pay together."""
+        here = tuple(self.placements)
+        owed = [self._owed(i, self._takes(i)) for i in range(len(self.cells))]
+        self._begin()
+
+        def rank(price: FleetPrice, due: float) -> Rank:
+            if self._over_cap(self.prices.price(here), price):
+                return (math.inf,)
+            return self.rank.of(price, due, self.absent)
+
+        best = self._search.best(here, self._aims, owed, rank)
+        if best == here:
+            return
+        before, after = self.prices.price(here), self.prices.price(best)
+        if self._objection(best, before, after) is None:
+            self.rank.settle(after)
+            self._set = {i: name for i, name in enumerate(best) if name != here[i]}
+            self._asked = self._phi(before), self._phi(after), self.round
+        else:
+            self.round += 1
+
+    def _led(self, index: int, names: Sequence[str], wished: str) -> list[str]:
+        """Return those of some candidates that lead to the table's best placements.
+
+        The table knows no caps, so the candidate that the policy wishes follows.
+        """
+        if not names or not self._search.has_plays:
+            return []
+        owed = [self._owed(i, costs) for i, costs in enumerate(self.alone)]
+        jump = self._search.jump(tuple(self.placements), self._aims, owed)[index]
+        return [one for one in dict.fromkeys((jump, wished)) if one in names and jump in names]
+
+    def _takes(self, index: int) -> Sequence[str]:
+        """Return the candidates that a cell may take as a member of a set."""
+        here = self.placements[index]
+        if not self._search.is_free(index):
+            return [here]
+        return [one for one in self.alone[index] if one == here or one not in self._doubted[index]]
+
+    def _owed(self, index: int, names: Iterable[str]) -> dict[str, float]:
+        return {name: self.owed(index, name) for name in names}
 
     def _outside(self, index: int, decision: Decision) -> Verdict:
         """Let a cell that has left Φ do as it likes, except take more of a shared node."""
@@ -246,9 +380,10 @@ class FleetLedger:
             if name != here:
                 rise = self.loads.rise(self._at, index, here, name)
                 rise += self.alone[index][name] - at_stake
-                if exceeds(-rise, self.owed(index, name)) or self._helps_the_worst(index, name):
-                    found.append((rise, name))
-        return [name for _, name in sorted(found)[:LOOKS]]
+                helps = self._helps_first(index, name)
+                if helps or exceeds(-rise, self.owed(index, name)):
+                    found.append((not (helps and self.rank.limit), rise, name))
+        return [name for *_, name in sorted(found)[:LOOKS]]
 
     def _beyond_table(self, index: int) -> float:
         """J of a cell as played, less what the table says, where foreign load is on shared nodes.
@@ -259,41 +394,39 @@ class FleetLedger:
         if not any(one.threads.keys() & self.shared for one in known):
             return 0.0
         self._begin()
-        cell, here = self.prices.price(tuple(self.placements)).cells[index], self.placements[index]
+        price, here = self._search.play(tuple(self.placements)), self.placements[index]
+        cell = None if price is None else price.cells[index]
         load = self._at.loads.get(self.loads.resource(index, here) or "", 0.0)
         says = self.alone[index][here] + self.loads.wait(index, here, load)
         return 0.0 if cell is None else cell.cost - says
 
-    def _helps_the_worst(self, index: int, name: str) -> bool:
-        """Whether the table thinks so."""
-        if self.objective != "worst":
+    def _helps_first(self, index: int, name: str) -> bool:
+        """Whether the table expects a better rank before the sum counts."""
+        if self.objective == "sum":
             return False
-        before = self.loads.costs(self.placements, self.alone)
-        after = self.loads.costs(moved(self.placements, index, name), self.alone)
-        return self.rank.first(after, self.absent) < self.rank.first(before, self.absent)
+        before = self._aimed.costs(self.placements, self._aims)
+        after = self._aimed.costs(moved(self.placements, index, name), self._aims)
+        return self.rank.is_promising(before, after, self.absent)
 
     def owed(self, index: int, name: str) -> float:
-        """What Φ has to fall by at least for a cell to move: Δ_min + α_S·S."""
+        """What Φ has to fall by at least for a cell to move: Δ_min + α_S·S; 0 where it is."""
+        if name == self.placements[index]:
+            return 0.0
         problem = self.cells[index].problem
         here, there = problem.candidates[self.placements[index]], problem.candidates[name]
         weight = problem.objective.weights.switching
         return problem.controller.min_improvement + weight * hamming(there, here)
 
-    def _played(self, index: int, name: str) -> tuple[FleetPrice, FleetPrice]:
-        self._begin()
-        before = self.prices.price(tuple(self.placements))
-        return before, self.prices.price(moved(self.placements, index, name))
-
     def _objection(
-        self, index: int, name: str, before: FleetPrice, after: FleetPrice
+        self, there: tuple[str, ...], before: FleetPrice, after: FleetPrice
     ) -> str | None:
-        """Why a cell must not move, by what has been played."""
-        costs = before.parts, after.parts
-        if not self.rank.is_better(*costs, self.owed(index, name), self.absent):
-            rises = self._phi(after) - self._phi(before)
-            if rises > 0:
-                return f"ledger: Φ would rise by {rises:.3g}"
-            return f"ledger: Φ would fall by {-rises:.3g}, {self.owed(index, name):.3g} is owed"
+        """Why cells must not move there, by what has been played."""
+        owed = sum(self.owed(i, name) for i, name in enumerate(there))
+        why = self.rank.objection(before, after, owed, self.absent)
+        return self._over_cap(before, after) if why is None else why
+
+    def _over_cap(self, before: FleetPrice, after: FleetPrice) -> str | None:
+        """Return the first cap that a cell would exceed and did not before."""
         if self._has_caps:
             for i, cell in enumerate(self.cells):
                 if i in self.absent:
@@ -305,7 +438,7 @@ class FleetLedger:
 
     def _phi(self, played: FleetPrice) -> float:
         """Φ of the cells that are in it."""
-        return self.rank.phi(played.parts, self.absent)
+        return self.rank.phi(played, self.absent)
 
 
 class Seat(Coordination):
@@ -339,13 +472,16 @@ class Seat(Coordination):
 
     def consider(self, wish: Wish) -> Verdict:
         """Have the ledger look at what the policy has decided."""
-        self.ledger.place(self._index, wish.incumbent)
+        put = self.ledger.keep if wish.on_fallback else self.ledger.place
+        put(self._index, wish.incumbent)
         self.ledger.note(self._index, wish.estimates, wish.estimator)
         is_as_played = True
         if wish.seen is not None and wish.doubts is not None and len(self.ledger.cells) > 1:
             asked = wish.seen, wish.doubts, wish.estimator
             is_as_played = self.ledger.watch(self._index, *asked)
-        verdict = self.ledger.consider(self._index, wish.decision, by_price=wish.by_price)
+        verdict = self.ledger.consider(
+            self._index, wish.decision, by_price=wish.by_price, on_fallback=wish.on_fallback
+        )
         if is_as_played or verdict.why or verdict.name != wish.incumbent:
             return verdict
         return verdict._replace(why=NOT_AS_PLAYED)

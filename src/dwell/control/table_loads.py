@@ -29,10 +29,22 @@ class AtLoad(NamedTuple):
     waiting: Mapping[tuple[int, str], int]
 
 
-class Loads:
-    """Costs of a fleet's cells at any placements, as a table of loads has them."""
+#: Cost of a cell that is not served, in the search for placements that serve most cells. It is
+#: more than the other cells can save.
+UNSERVED = 1000.0
 
-    def __init__(self, table: LoadTable) -> None:
+
+class Loads:
+    """Costs of a fleet's cells at any placements, as a table of loads has them.
+
+    Parameters
+    ----------
+    table : LoadTable
+    limit : float, optional
+        V_D above which a cell costs more, by `shortfall`.
+    """
+
+    def __init__(self, table: LoadTable, limit: float | None = None) -> None:
         self._kinds, self._work = table.kinds, table.work
         #: Loads and what J is more there, by kind and candidate.
         self._waits: dict[tuple[int, str], tuple[list[float], list[float]]] = {}
@@ -40,6 +52,8 @@ class Loads:
             objective = table.cells[group[0]].problem.objective
             l95_ms, rate, nothing = column.l95_ms, column.violation_rate, np.zeros(1)
             j = price(l95_ms, rate, nothing, nothing, 0.0, 0.0, objective)
+            if limit is not None:
+                j = j + [shortfall(one, limit) for one in rate.tolist()]
             self._waits[group] = column.level.tolist(), (j - j[0]).tolist()
         terms = [CellTerms(cell.problem, table.shared).of_one() for cell in table.cells]
         #: What a busy core, or place, of each shared resource costs the fleet.
@@ -133,6 +147,14 @@ class Loads:
             for i, (name, mine) in enumerate(zip(placements, alone, strict=True))
         ]
         return [*costs, sum(self._of_one[one] * load for one, load in loads.items())]
+
+
+def shortfall(rate: float, limit: float) -> float:
+    """Return the cost of a V_D above the limit: `UNSERVED` from twice the limit on.
+
+    It grows with V_D, since the table's V_D has errors.
+    """
+    return UNSERVED * min(max(rate / limit - 1.0, 0.0), 1.0)
 
 
 def moved(placements: Sequence[str], index: int, name: str) -> tuple[str, ...]:

@@ -215,6 +215,10 @@ class FleetPrices:
                     down.add(name)
         return replace(present, threads=FrozenDict(threads), down=frozenset(down))
 
+    def knows(self, placements: Placements) -> bool:
+        """Whether the fleet was played at some placements under these presents."""
+        return placements in self._known
+
     def price(self, placements: Placements) -> FleetPrice:
         """Play the fleet at some placements; what was played under these presents is known."""
         known = self._known.get(placements)

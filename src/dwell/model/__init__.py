@@ -1,4 +1,4 @@
-"""The frozen domain objects: a pipeline on a fabric, its candidates, and what a window shows."""
+"""The frozen domain objects: pipeline, fabric, candidates, metrics and decisions."""
 
 from dwell.model.controller_settings import ControllerSettings
 from dwell.model.evolve import evolve

@@ -1,4 +1,4 @@
-"""Bounds on the numbers of a cell, each stated once: constructors and file readers both use it."""
+"""Bounds on the numbers of a cell, shared by constructors and file readers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def require(holds: bool, path: str, value: object, bound: str) -> None:
 
 
 def shown(value: object) -> str:
-    """Return a value as messages show it: its repr, unless that is very long."""
+    """Return a value's repr for messages, shortened if it is long."""
     if isinstance(value, int) and abs(value) >= 10**18:
         # Python refuses to print numbers of more than some thousand digits.
         return f"a whole number of about {int(value.bit_length() * math.log10(2)) + 1} digits"
@@ -30,7 +30,7 @@ def shown(value: object) -> str:
 
 
 def as_read(value: object) -> str:
-    """Return a value as its author wrote it, or what it is where it is no single value."""
+    """Return a single value as its author wrote it, or the kind of a compound value."""
     if value is None:
         return "nothing"
     if isinstance(value, bool):
@@ -45,7 +45,7 @@ def as_read(value: object) -> str:
 
 
 def counted(count: float, noun: str) -> str:
-    """Return how many there are of a thing: ``1 window``, ``2 windows``, ``2 policies``."""
+    """Return a count with its noun: ``1 window``, ``2 windows``, ``2 policies``."""
     if count == 1:
         return f"1 {noun}"
     stem, ending = (noun[:-1], "ies") if re.search("[^aeiou]y$", noun) else (noun, "s")
@@ -59,13 +59,13 @@ class Bound:
     Parameters
     ----------
     low, high : float
-        Ends of the interval; an infinite `high` lets infinity in.
+        Ends of the interval; an infinite `high` allows infinity.
     above, below : bool
-        Whether `low`, and `high`, are themselves outside.
+        Whether the interval excludes `low`, and `high`.
     whole : bool
-        Whether only whole numbers are inside.
+        Whether only whole numbers are allowed.
     word : str
-        A text that is allowed, too, unless it is empty.
+        A text that is also allowed; empty for none.
     """
 
     low: float
@@ -76,7 +76,7 @@ class Bound:
     word: str = ""
 
     def holds(self, value: object) -> bool:
-        """Whether `value` is a number inside; a truth value is no number, and NaN is in none."""
+        """Return whether `value` is a number inside; NaN and truth values never are."""
         if self.word and value == self.word:
             return True
         if isinstance(value, bool) or not isinstance(value, numbers.Real):
@@ -93,7 +93,7 @@ class Bound:
         require(self.holds(value), path, value, str(self))
 
     def __str__(self) -> str:
-        """Return ``a number from 0 to 1e9``, or what the bound is."""
+        """Return a description of the interval, as ``a number from 0 to 1e9``."""
         kind = "a whole number" if self.whole else "a number"
         kind = f"{self.word} or {kind}" if self.word else kind
         low, high = short(self.low), short(self.high)
@@ -113,18 +113,18 @@ class Pattern:
     Parameters
     ----------
     words : str
-        What they are; completes the sentence "it must be ...".
+        Description of the texts; completes the sentence "it must be ...".
     """
 
     expression: str
     words: str
 
     def holds(self, value: object) -> bool:
-        """Whether `value` is such a text."""
+        """Return whether `value` is a text that matches."""
         return isinstance(value, str) and re.fullmatch(self.expression, value) is not None
 
     def check(self, path: str, value: object) -> None:
-        """Raise a ProblemError that names `path`, `value` and what it must be, unless it is."""
+        """Raise a ProblemError that names `path`, `value` and the description unless it matches."""
         require(self.holds(value), path, value, self.words)
 
     def __str__(self) -> str:
@@ -140,7 +140,7 @@ def short(value: float) -> str:
 
 NOT_EMPTY = Pattern(r"[\s\S]+", "a text that is not empty")
 
-# Bounds that several keys share, or that others than the model check by.
+# Bounds that several keys, or modules outside the model, use.
 VALUE = Bound(0, LARGEST)
 TIME_MS = Bound(0, LARGEST)
 PERIOD_MS = Bound(1e-3, LARGEST)
@@ -152,14 +152,13 @@ RATE_MBPS = Bound(1e-4)
 MIN_DWELL = Bound(0, MAX_COUNT, whole=True)
 MIN_IMPROVEMENT = Bound(0, LARGEST)
 
-# Length of a run: the cycles that an event of the simulator counts, and the seconds that 64 bits of
-# nanoseconds hold.
+# Length of a run: the simulator counts cycles in 32 bits, and time in 64 bits of nanoseconds.
 CYCLES = Bound(1, 2**32 - 1, whole=True)
 LENGTH_S = Bound(0, 9.2e9)
 
 # Seeds of a study are 1 to N.
 SEEDS = Bound(1, 100_000, whole=True)
-#: Classes of a user's own.
+#: Names of a user's own classes.
 CLASS_PATH = Pattern(r"[^\W\d]\w*(?:\.[^\W\d]\w*)*:[^\W\d]\w*", "package.module:Class")
-#: Functions of a user's own.
+#: Names of a user's own functions.
 FUNCTION_PATH = Pattern(CLASS_PATH.expression, "package.module:function")

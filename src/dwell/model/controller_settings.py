@@ -1,4 +1,4 @@
-"""Settings of a cell's controller, and the bounds that others keep to as well."""
+"""Settings of a cell's controller, and bounds that other modules share."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ AUTO = "auto"
 SHADOW_FRACTION = Bound(0, 1)
 DECIDE_CYCLES = Bound(1, MAX_COUNT, whole=True)
 MIN_DWELL_CYCLES = Bound(0, MAX_COUNT, whole=True)
-#: N_min where a cell gives none and the estimator states no errors.
+#: N_min if the cell sets none and the estimator states no errors.
 USUAL_DWELL = 3
 
 
 @declared()
 class ControllerSettings:
-    """The controller: where it sits, what it runs, and how its orders travel."""
+    """The controller: its node, policy and estimator, and the timing of its orders."""
 
     on: str | None = key(
         "Node it sits on.",
@@ -129,10 +129,10 @@ class ControllerSettings:
 
     @property
     def shadow_workers(self) -> bool:
-        """Whether nodes keep workers for shadow jobs: to measure with, or to prove ways back."""
+        """Whether nodes keep workers for shadow jobs, for estimates or for the guard's probes."""
         return self.estimator != "profile" or bool(self.fallbacks)
 
     @property
     def failures_in_a_row(self) -> int:
-        """Failures in a row that count as a fault of a worker, or of a candidate: g + 1."""
+        """Consecutive failures that count as a fault of a worker or candidate: g + 1."""
         return self.guard_cycles + 1

@@ -1,7 +1,7 @@
-"""Keys: what a field of the model says of itself, once: type, bound, default and one sentence.
+"""Declarations of keys: type, bound, default and one sentence per field of the model.
 
-Whoever makes, reads, writes or describes a cell takes it from there: constructors check the bounds,
-`dwell.cellfile` reads files and writes their JSON Schema, the docs have their tables of it.
+Constructors check the bounds, `dwell.cellfile` reads files and writes the JSON Schema, and the
+tables of the docs are generated, all from these declarations.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from dwell.model.frozen import FrozenDict
 
 T = TypeVar("T")
 
-#: Where a field keeps its `Declaration`.
+#: Key of a `Declaration` in the metadata of a field.
 KEY = "dwell"
 #: Who reads a key in a live cell: all processes alike (`wiring`), the controller alone
 #: (`decision`), or each node for itself: the code that it runs, and how it is reached.
@@ -40,18 +40,18 @@ KeyTier: TypeAlias = Literal["first", "tuning", "measured"]
 
 @dataclass(frozen=True, slots=True)
 class Declaration:
-    """What a field is, beside its type and default.
+    """The declaration of a field, in addition to its type and default.
 
     Parameters
     ----------
     says : str
         One sentence, its unit in it.
     bound : Bound or Pattern, optional
-        Of a number or a text, or of every one of a mapping.
+        Bound of a number or a text, or of every value of a mapping.
     named : str, optional
-        Its name in a cell file, and in messages, where that is another than the field's.
+        Its name in a cell file and in messages, if it differs from the field's.
     usual : str, optional
-        What holds where it is not given, in words, where that follows from others.
+        The default in words, if it depends on other keys.
     is_rare : bool
         Whether a document leaves it out where it is as usual.
     digested : str
@@ -90,15 +90,15 @@ def key(
 
 @dataclass_transform(frozen_default=True, field_specifiers=(key, dataclasses.field))
 def declared(section: str = "") -> Callable[[type[T]], type[T]]:
-    """Make a frozen dataclass, with slots, whose fields are checked by what they declare.
+    """Make a frozen dataclass with slots that checks each field by its declaration.
 
-    Mappings become immutable, sequences tuples. What a class has as `__post_init__` runs after
-    that, and checks values against each other.
+    Mappings become immutable, and sequences become tuples. The class's own `__post_init__` runs
+    afterwards and checks values against each other.
 
     Parameters
     ----------
     section : str
-        Key of a cell file that holds those of the class, where messages name it.
+        Key of a cell file that contains the keys of the class, if messages name it.
     """
 
     def make(cls: type[T]) -> type[T]:
@@ -128,7 +128,7 @@ def within_path(path: str, kind: type, fault: str) -> str:
 
 
 def made_at(path: str, kind: Any, make: Callable[..., T], *args: object, **values: object) -> T:
-    """Make something of a declared class at a path, which its faults then say.
+    """Make an object of a declared class; the paths of its faults begin with `path`.
 
     Raises
     ------
@@ -143,7 +143,7 @@ def made_at(path: str, kind: Any, make: Callable[..., T], *args: object, **value
 
 
 def is_declared(kind: Any) -> bool:
-    """Whether a class, or that of an object, was made by `declared`."""
+    """Return whether `declared` made a class, or the class of an object."""
     return (kind if isinstance(kind, type) else type(kind)) in _sections
 
 
@@ -157,11 +157,11 @@ class DeclaredField(NamedTuple):
     kind : object
         Its type, without None.
     choices : tuple of str
-        What a text must be one of, or the texts of a mapping; empty where any is right.
+        Allowed texts, or texts of a mapping; empty if any text is allowed.
     default : object
         `dataclasses.MISSING` where it is required.
     key : Declaration
-        What else it declares.
+        Its declaration.
     """
 
     name: str

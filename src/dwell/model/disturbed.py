@@ -1,4 +1,4 @@
-"""Disturbed: what a scenario does to nodes and links, in words and with its time."""
+"""Descriptions of the disturbances of a scenario, with their times."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from dwell.model.fabric import Fabric
 from dwell.model.process import AR1, Constant, Exponential, Gamma, LogNormal, Normal, Process
 from dwell.model.scenario import Disturbance, LinkDisturbance, NodeDisturbance
 
-#: Who is disturbed, as it is called: by what the disturbance acts on.
+#: Kind of all disturbances of links.
 NETWORK = "network impairment"
-#: Decimals of seconds: what began and ended together did so within a tenth.
+#: Decimals of seconds: disturbances whose times agree to a tenth are shown together.
 DIGITS = 1
 
 
 class Disturbed(NamedTuple):
-    """Something that was done to a node or to links for a while.
+    """A disturbance of a node or of links, described in words.
 
     Parameters
     ----------
@@ -34,14 +34,9 @@ class Disturbed(NamedTuple):
 
 
 def disturbed(scenario: Iterable[Disturbance], fabric: Fabric) -> list[Disturbed]:
-    """Return what a scenario did, links that were disturbed together as one.
+    """Return the disturbances of a scenario; equal simultaneous ones are merged.
 
-    Parameters
-    ----------
-    scenario : iterable of Disturbance
-        Disturbances; those in episodes are left out, as their times were drawn.
-    fabric : Fabric
-        Whose nodes say their tiers.
+    Disturbances in episodes are left out, because their times are random.
     """
     found: dict[tuple[float, float, str, str], tuple[float, float, list[str]]] = {}
     for item in scenario:
@@ -65,7 +60,7 @@ def disturbed(scenario: Iterable[Disturbance], fabric: Fabric) -> list[Disturbed
 
 
 def on_node(item: NodeDisturbance) -> str:
-    """Return what is done to a node, as ``2 busy threads``."""
+    """Describe the disturbance of a node, as ``2 busy threads``."""
     if item.down:
         return "down"
     threads = item.stress_threads
@@ -87,7 +82,7 @@ def _on_link(item: LinkDisturbance) -> str:
 
 
 def _declared_mean(process: Process) -> float | None:
-    """Return the mean that a process is declared with; None where it is declared otherwise."""
+    """Return the declared mean of a process, or None if it is declared without one."""
     if isinstance(process, Constant):
         return process.value
     if isinstance(process, AR1 | Exponential | Gamma | LogNormal | Normal):

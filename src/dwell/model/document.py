@@ -1,4 +1,4 @@
-"""A problem as a document: plain values that a cell file could hold, from which it can be read."""
+"""Problems as documents: plain values with the structure of a cell file."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ INTERVAL = ("at_s", "for_s", "down", "episodes", "ramp_s")
 def to_document(problem: Problem) -> Document:
     """Return the document of a problem.
 
-    `dwell.cellfile.from_document` makes an equal problem of it. A trace is named, not copied: its
-    declaration carries a digest of the data, so that other data are not taken for it.
+    `dwell.cellfile.from_document` makes an equal problem from it. A trace is named, not copied; its
+    declaration includes a digest, which detects other data.
 
     Returns
     -------
@@ -48,7 +48,7 @@ def to_document(problem: Problem) -> Document:
     Raises
     ------
     ProblemError
-        If it holds a process that a cell file has no word for.
+        If it contains a process that a cell file cannot express.
     """
     pipeline, fabric = problem.pipeline, problem.fabric
     return _filled(
@@ -82,12 +82,9 @@ def to_document(problem: Problem) -> Document:
 
 
 def digest(trace: Trace) -> str:
-    """Return the SHA-256 of what a trace replays: values, groups and instants, in hexadecimal.
+    """Return the SHA-256 of a trace's values, groups and instants, in hexadecimal.
 
-    Returns
-    -------
-    str
-        The same for the same numbers on any machine, whatever the file's format.
+    Equal numbers have equal digests on every machine and in every file format.
     """
     import numpy as np
 
@@ -100,12 +97,12 @@ def digest(trace: Trace) -> str:
 
 
 def _filled(values: Document) -> Document:
-    """Leave out what a cell file would: what is not there, and infinite limits."""
+    """Leave out missing values and infinite limits, as a cell file does."""
     return {key: value for key, value in values.items() if value not in (None, math.inf)}
 
 
 def _part(path: str, part: Any, *but: str, **more: object) -> Document:
-    """Return a dataclass by its fields, but some; `more` comes last."""
+    """Return a dataclass as a document without the fields in `but`; `more` is appended."""
     document: Document = {}
     kind: Any = type(part)
     for name, key, usual in _fields(kind):
@@ -119,7 +116,7 @@ def _part(path: str, part: Any, *but: str, **more: object) -> Document:
 
 @lru_cache(maxsize=64)
 def _fields(kind: type) -> tuple[tuple[str, str, object], ...]:
-    """Return name, key and, where a document leaves that out, default of every field."""
+    """Return name, key and, if a document omits it, default of every field."""
     return tuple(
         (one.name, one.named, one.default if one.key.is_rare else None)
         for one in declared_fields(kind)
@@ -169,7 +166,7 @@ def _trace(trace: Trace) -> Document:
 
 
 def relocated(placement: Placement, tasks: Mapping[str, Task]) -> dict[str, str]:
-    """Return the part of a placement that a document has: anchored tasks are left out."""
+    """Return a placement without anchored tasks, as in a document."""
     return {name: node for name, node in placement.items() if not tasks[name].anchored}
 
 
@@ -200,7 +197,7 @@ def _task(task: Task) -> Document:
 
 
 def disturbance_document(item: Disturbance) -> Document:
-    """Return an item of a scenario as a cell file has it, the ways of a link apart."""
+    """Return an item of a scenario as in a cell file, for one direction of a link."""
     return _disturbance("", item)
 
 
@@ -212,9 +209,9 @@ def _disturbance(path: str, item: Disturbance) -> Document:
 
 
 def objective_document(objective: Objective) -> Document:
-    """Return an objective as a cell file's ``objective`` says it, every tier named."""
+    """Return an objective as in a cell file's ``objective``, with every tier."""
     document = _part("objective", objective)
-    # Which accelerators count follows from the tiers.
+    # The tiers determine which accelerators count.
     if not document.pop("accelerators", None):
         return document
     return {**document, "accelerators": True}
@@ -229,10 +226,10 @@ def _objective(problem: Problem) -> Document:
 
 
 def digests(problem: Problem) -> dict[Digested, str]:
-    """Return short digests of a live cell, by who reads what they are made of.
+    """Return short digests of a live cell, one for each group of readers (see `Digested`).
 
-    Processes hear each other if their `wiring` is equal. Data of traces are in none, since a node
-    need not have them. The order of nodes and tasks counts: ports are given out by it.
+    Processes communicate only if their `wiring` is equal. The digests exclude the data of traces,
+    which a node may lack. They depend on the order of nodes and tasks, which assigns the ports.
     """
     document = to_document(problem)
     document["live"] = document.get("live", {})
@@ -247,14 +244,14 @@ def digests(problem: Problem) -> dict[Digested, str]:
         for field in declared_fields(kind):
             if field.key.digested != "wiring" and field.named in values:
                 parts[field.key.digested][f"{path}.{field.named}"] = values.pop(field.named)
-    # Which processes there are follows from the estimator, too.
+    # The estimator determines whether processes for shadow jobs exist.
     parts["wiring"] = {**document, "shadow workers": problem.controller.shadow_workers}
     texts = {part: json.dumps(_without_data(values)) for part, values in parts.items()}
     return {part: hashlib.sha256(text.encode()).hexdigest()[:16] for part, text in texts.items()}
 
 
 def _without_data(part: Any) -> Any:
-    """Return a document whose traces say their file and column, and nothing of what is in them."""
+    """Return a document with only file and column of each trace."""
     if isinstance(part, dict):
         trace = part.get("trace")
         if isinstance(trace, dict):

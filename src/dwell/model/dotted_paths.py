@@ -13,7 +13,7 @@ from dwell.model.semantics import nearest
 
 Step: TypeAlias = str | int
 
-# Sections whose keys are names; what a path adds to one of them would not be connected to the rest.
+# Sections whose keys are names; a path cannot add a name, which nothing else would refer to.
 NAMED = ("nodes", "tasks", "scales", "candidates", "scenarios")
 
 INDEX = re.compile(r"\[(\d{1,9})\]")
@@ -26,7 +26,7 @@ def dotted(steps: Iterable[Step]) -> str:
 
 
 def beneath(path: str, step: Step) -> str:
-    """Return the path of what stands at a key or an index of what is at a path."""
+    """Return the path of a key or an index below a path."""
     if isinstance(step, int):
         return f"{path}[{step}]"
     key = step or "''"
@@ -39,15 +39,14 @@ def steps_of(path: str, document: object) -> tuple[Step, ...]:
     Parameters
     ----------
     path : str
-        As ``links[0].delay_ms``. A name may hold a dot: the longest key that the document has is
-        taken.
+        As ``links[0].delay_ms``. If names contain dots, the longest key of the document matches.
     document : object
         The cell's, as it is in the file.
 
     Raises
     ------
     ProblemError
-        If it is no path, or leads where the document has nothing and may have nothing.
+        If the text is no path, or the document cannot have a value there.
     """
     steps: list[Step] = []
     here, rest = document, path
@@ -85,7 +84,7 @@ def _after(rest: str, path: str) -> str:
 
 
 def _require_place(step: Step, before: list[Step], here: object, path: str) -> None:
-    """Refuse a step that leads nowhere."""
+    """Raise a ProblemError if the document has no place for a step."""
     where = dotted(before) or "the cell"
     if isinstance(here, list):
         if not isinstance(step, int):

@@ -1,6 +1,6 @@
-"""Classes by name: ours by a dotted path, those of other packages by entry points.
+"""Classes by name: Dwell's by a dotted path, other packages' by entry points.
 
-They are imported when they are needed.
+A class is imported at its first use.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 
-#: Groups of what the upper flats, and other distributions, add: commands and groups of commands;
-#: pages (`dwell.report.added`); warnings of `dwell check`, of a cell; what `dwell doctor` looks at,
-#: for a cell or None and a keyring; names in our packages, as ``study.validate``.
+#: Groups of entry points by which upper flats and other distributions extend Dwell: commands and
+#: groups of commands; pages (`dwell.report.added`); warnings of `dwell check` about a cell; checks
+#: of `dwell doctor` for a cell or None and a keyring; names in Dwell's packages, as
+#: ``study.validate``.
 COMMANDS = "dwell.commands"
 PAGES = "dwell.pages"
 WARNINGS = "dwell.warnings"
@@ -30,23 +31,23 @@ OF_LAB = ("study.Validation", "study.validate")
 
 
 def class_at(path: str) -> Any:
-    """Import a class of ours from ``module:Class``."""
+    """Import a class of Dwell from ``module:Class``."""
     module, _, attribute = path.partition(":")
     return getattr(import_module(module), attribute)
 
 
 def added(group: str) -> dict[str, Any]:
-    """Return all that a group of entry points adds, by name in order; all of it is imported."""
+    """Import and return the objects of a group of entry points, sorted by name."""
     return {name: entry.load() for name, entry in sorted(_declared(group).items())}
 
 
 def added_name(name: str) -> Any:
-    """Return the object that a distribution adds to ours under a name, as ``study.validate``.
+    """Return the object that a distribution adds under a name, as ``study.validate``.
 
     Raises
     ------
     MissingPartError
-        If dwell-lab adds it, which is not installed; with the command that installs it.
+        If dwell-lab adds the name and is not installed; the message has the command to install it.
     AttributeError
         If nothing adds the name.
     """
@@ -59,33 +60,17 @@ def added_name(name: str) -> Any:
 
 
 def names_with(ours: Iterable[str], group: str) -> tuple[str, ...]:
-    """Return our names, then those that other packages declare in a group, by name."""
+    """Return Dwell's names, then the names of other packages in a group, sorted."""
     mine = tuple(ours)
     return (*mine, *sorted(_declared(group).keys() - set(mine)))
 
 
 def class_named(name: str, path: str | None, group: str, what: str, error: type[DwellError]) -> Any:
-    """Import the class of a name: ours, or else another package's.
+    """Import the class of a name, Dwell's or else another package's; None if the name is unknown.
 
-    Parameters
-    ----------
-    path : str, optional
-        Path of our class, as `class_at` takes it; None where no class of ours has the name.
-    group : str
-        Group of the entry points of other packages.
-    what : str
-        Kind of the class, for the message: ``policy``.
-
-    Returns
-    -------
-    type or None
-        None where there is none of that name.
-
-    Raises
-    ------
-    DwellError
-        An `error`, if the class of another package cannot be imported; the message names the
-        package.
+    `path` is the path of Dwell's class (see `class_at`), None if Dwell has no such class. `group`
+    is the group of entry points of other packages, and `what` the kind of class for the message,
+    as ``policy``. Raises an `error` that names the package if its class cannot be imported.
     """
     if path is not None:
         return class_at(path)
@@ -108,7 +93,7 @@ def _declared(group: str) -> Mapping[str, EntryPoint]:
 
 @lru_cache(maxsize=8)
 def _found(group: str, path: tuple[str, ...]) -> Mapping[str, EntryPoint]:
-    """Look for entry points: milliseconds, in which all that is on the path is looked through."""
+    """Find the entry points of a group; a search of the whole path takes milliseconds."""
     from importlib.metadata import entry_points
 
     return {one.name: one for one in entry_points(group=group)}

@@ -1,4 +1,4 @@
-"""Evolve: a problem with other values, by the paths that they have in its cell file."""
+"""Evolve: replace values of a problem, given by their paths in the cell file."""
 
 from __future__ import annotations
 
@@ -29,26 +29,26 @@ _Tree: TypeAlias = "dict[Step, _Tree | _Value]"
 
 
 def evolve(problem: Problem, changes: Mapping[str, object]) -> Problem:
-    """Return a problem with other values.
+    """Return the problem with some values replaced.
 
     Parameters
     ----------
     changes : mapping of str to object
         Values by their paths in a cell file: ``{"controller.min_dwell": 1, "period_ms": 40.0,
-        "tasks.plan.on.E.exec_ms": 3.0}``. A value is one of the model; a number stands for a
-        constant process, too, and a mapping for a part with these keys.
+        "tasks.plan.on.E.exec_ms": 3.0}``. A value is an object of the model, a number for a
+        constant process, or a mapping for a part with these keys.
 
     Raises
     ------
     ProblemError
-        If a path leads nowhere, or a value is out of its bound or does not fit the others.
+        If a path does not exist, or a value is out of its bound or inconsistent with others.
     """
     document = to_document(problem)
     trees: dict[str, _Tree] = {}
     for path, value in changes.items():
         given = value
         if path == "objective.targets" and isinstance(value, Mapping):
-            # As a file's, which need not say the deadline again.
+            # As in a file, the latency target defaults to the deadline.
             given = {"latency_ms": problem.pipeline.deadline_ms, **value}
         *before, last = steps_of(path, document)
         first = before[0] if before else last
@@ -79,7 +79,7 @@ def _arguments(part: Any, tree: _Tree, path: str) -> dict[str, Any]:
 
 
 def _changed(part: Any, tree: _Tree | _Value, one: DeclaredField | None, path: str) -> Any:
-    """Return a part with what a tree has for it; `one` is what it is, or is within."""
+    """Return a part with the values of a tree; `one` is the field of the part or around it."""
     if isinstance(tree, _Value):
         return tree.value if one is None else made_at(path, one.kind, _made, one, tree.value)
     if isinstance(part, Mapping | tuple):
@@ -93,7 +93,7 @@ def _changed(part: Any, tree: _Tree | _Value, one: DeclaredField | None, path: s
 
 
 def _made(one: DeclaredField, value: object) -> Any:
-    """Return what a value is in the model: a process of a number, a part of a mapping."""
+    """Convert a value to the model: a number to a process, a mapping to a part."""
     kind = one.kind if not one.is_mapping or isinstance(value, Mapping) else get_args(one.kind)[1]
     whole = isinstance(one.key.bound, Bound) and one.key.bound.whole
     if whole and isinstance(value, float) and value.is_integer():

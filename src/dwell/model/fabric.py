@@ -26,10 +26,10 @@ Scheduler: TypeAlias = Literal["fair", "fifo", "priority"]
 
 @declared()
 class Bursts:
-    """Episodes that come and go in every scenario: quiet for `every_ms`, then disturbed.
+    """Episodes of disturbance in every scenario: quiet for `every_ms`, then disturbed.
 
-    What the disturbance does belongs to what it is declared on: `threads` of foreign work on a
-    node, `add_delay_ms` to every message on a link.
+    On a node a burst adds `threads` of foreign work; on a link it adds `add_delay_ms` to every
+    message.
     """
 
     every_ms: Process = key("Quiet time between bursts, ms; mean above 0.01.")
@@ -46,7 +46,7 @@ class Bursts:
 
     @property
     def share(self) -> float:
-        """Share of the time in which it disturbs."""
+        """Expected share of the time within a burst."""
         on_ms, off_ms = self.for_ms.expectation, self.every_ms.expectation
         return on_ms / (on_ms + off_ms)
 
@@ -75,7 +75,7 @@ class Quota:
     )
 
     def __post_init__(self) -> None:
-        # In nanoseconds it must not be none.
+        # A smaller tick would round to 0 ns.
         require(not 0 < self.tick_ms < 0.001, "quota.tick_ms", self.tick_ms, "0, or 0.001 at least")
 
 
@@ -153,17 +153,17 @@ class Node:
 
     @property
     def capacity(self) -> float:
-        """Cores' worth of work it can do: what its utilisation is relative to."""
+        """Number of cores that its utilisation is relative to, at most the quota."""
         return min(self.quota.cpu, self.cores) if self.quota is not None else float(self.cores)
 
     @property
     def burst_threads(self) -> float:
-        """Foreign threads of its bursts, in the mean."""
+        """Mean number of foreign threads of its bursts."""
         return self.bursts.share * self.bursts.threads if self.bursts is not None else 0.0
 
     @property
     def spare(self) -> float:
-        """Cores that jobs and foreign threads share; a quota is what the background takes from."""
+        """Cores for jobs and foreign threads; with a quota, the background reduces the quota."""
         return float(self.cores) if self.quota is not None else self.cores - self.background
 
     @property
@@ -185,38 +185,30 @@ class Node:
 
 
 class Resource(NamedTuple):
-    """What works in a cell, and may be busy: a node's CPU, or the accelerators of one of its kinds.
+    """A node's CPU, or its accelerators of one kind."""
 
-    Parameters
-    ----------
-    name : str
-        The node's, or ``<node>.<kind>``: ``E.gpu``.
-    node : str
-        Name of the node.
-    kind : str
-        Kind of the accelerators; empty for the CPU.
-    capacity : float
-        What its utilisation is relative to: cores' worth of work, or number of accelerators.
-    """
-
+    #: The node's name, or ``<node>.<kind>``: ``E.gpu``.
     name: str
+    #: Name of the node.
     node: str
+    #: Kind of the accelerators; empty for the CPU.
     kind: str
+    #: Number of cores, at most the quota, or number of accelerators.
     capacity: float
 
     @property
     def path(self) -> str:
-        """Where a cell file declares it."""
+        """Its path in a cell file."""
         return f"nodes.{self.node}.accelerators.{self.kind}" if self.kind else f"nodes.{self.node}"
 
     @property
     def described(self) -> str:
-        """What it is, as messages have it."""
+        """Its description in messages."""
         return f"accelerator {self.kind} of node {self.node}" if self.kind else f"node {self.node}"
 
 
 def resources_of(nodes: Mapping[str, Node | None]) -> Iterator[Resource]:
-    """Yield the CPUs of nodes, in their order, then their accelerators; None is an unknown node."""
+    """Yield the CPUs of nodes, then their accelerators, in order; None is an unknown node."""
     for name, node in nodes.items():
         yield Resource(name, name, "", math.nan if node is None else node.capacity)
     for name, node in nodes.items():
@@ -227,7 +219,7 @@ def resources_of(nodes: Mapping[str, Node | None]) -> Iterator[Resource]:
 def accelerator_tiers(
     nodes: Mapping[str, Node | None], tiers: Mapping[str, Tier]
 ) -> dict[str, Tier]:
-    """Return the tier of every kind of accelerators of the nodes that have one in J."""
+    """Return the tier of every kind of accelerators of the nodes in `tiers`."""
     return {
         one.name: tiers[one.node] for one in resources_of(nodes) if one.kind and one.node in tiers
     }

@@ -17,13 +17,15 @@ from dwell.model.semantics import episode_faults, nearest, nearest_of
 
 Phases: TypeAlias = "Literal['sync', 'even', 'random'] | tuple[float, ...]"
 Coordination: TypeAlias = Literal["none", "random", "ledger"]
-FleetObjective: TypeAlias = Literal["sum", "worst"]
+FleetObjective: TypeAlias = Literal["sum", "worst", "served"]
 
-#: What the phases of a fleet may be, beside a list of them.
+#: Words for the phases of a fleet; a list of phases is also allowed.
 PHASES = ("sync", "even", "random")
 PHASE_WAYS = f"one of {', '.join(PHASES)}, or a list of ms"
 MOST_CELLS = 1_000
 COUNT = Bound(1, MOST_CELLS, whole=True)
+#: Largest V_D of a cell that is served, if a file gives no limit.
+LIMIT = 0.05
 
 #: Count and cell of an entry; None for a cell that could not be read.
 Kind: TypeAlias = "tuple[int, Problem | None]"
@@ -64,9 +66,9 @@ class FleetCell:
     Parameters
     ----------
     name : str
-        Its own, ``canonical-01``.
+        As ``canonical-01``.
     copy : int
-        Which of the cells of its file it is, from 1.
+        Its number among the cells of the same file, from 1.
     entry : FleetEntry
     """
 
@@ -76,18 +78,18 @@ class FleetCell:
 
     @property
     def problem(self) -> Problem:
-        """What it is."""
+        """The cell's problem."""
         return self.entry.cell
 
     @property
     def streams(self) -> str:
-        """What the names of its random streams begin with: nothing for the first of its file."""
+        """Prefix of the names of its random streams; empty for the first cell of its file."""
         return "" if self.copy == 1 else f"{self.problem.name}-{self.copy}/"
 
 
 @declared()
 class Fleet:
-    """Several cells that share nodes, each with a controller of its own."""
+    """Several cells that share nodes, each with its own controller."""
 
     name: str
     entries: tuple[FleetEntry, ...]
@@ -99,18 +101,28 @@ class Fleet:
         "What a move is asked for: nothing, a chance, or the ledger.", default="ledger"
     )
     objective: FleetObjective = key(
-        "What the ledger lowers: the sum over cells, or what the worst of them has.", default="sum"
+        "Aim of the ledger and of plans: the least sum of costs, the least cost of the worst "
+        "cell, or the most cells whose V_D is at most `limit`.",
+        default="sum",
+    )
+    limit: float | None = key(
+        "Largest V_D of a cell that is served.",
+        Bound(0, 1, above=True, below=True),
+        default=None,
+        usual=f"{LIMIT} with `objective: served`",
     )
     policy: str | None = key("Policy of cells that name none.", default=None, usual="the cell's")
     estimator: str | None = key(
         "Estimator of cells that name none.", default=None, usual="the cell's"
     )
-    #: That it was read from; nothing where it was made otherwise.
+    #: The file of the fleet; empty if it was not read from a file.
     file: str = field(default="", compare=False)
 
     def __post_init__(self) -> None:
         if not isinstance(self.phases, str):
             object.__setattr__(self, "phases", tuple(self.phases))
+        if self.objective == "served" and self.limit is None:
+            object.__setattr__(self, "limit", LIMIT)
         kinds = [(entry.count, entry.cell) for entry in self.entries]
         faults = [*fleet_faults(kinds, self.shared, self.phases)]
         met = [
@@ -140,7 +152,7 @@ class Fleet:
 
     @property
     def problems(self) -> dict[str, Problem]:
-        """What every cell is, by its name."""
+        """The problem of every cell, by the cell's name."""
         return {cell.name: cell.problem for cell in self.cells}
 
     def policy_of(self, entry: FleetEntry) -> str:
@@ -148,7 +160,7 @@ class Fleet:
         return entry.policy or self.policy or entry.cell.controller.policy
 
     def candidate_of(self, entry: FleetEntry) -> str | None:
-        """Return the candidate that the cells of an entry never leave; None where they may move."""
+        """Return the candidate that the cells of an entry never leave; None if they may move."""
         name, _ = entry.cell.policy_and_estimator(self.policy_of(entry))
         return name if name in entry.cell.candidates else None
 
@@ -159,7 +171,7 @@ class Fleet:
 
     @property
     def disturbances(self) -> Scenario:
-        """What the scenarios of its cells do to shared nodes; equal ones count once."""
+        """Disturbances of shared nodes by the scenarios of its cells, without duplicates."""
         return tuple(dict.fromkeys(item for entry in self.entries for item in self._of(entry)))
 
     def _of(self, entry: FleetEntry) -> Iterator[Disturbance]:
@@ -168,18 +180,18 @@ class Fleet:
                 yield item
 
     def duration_ns(self, windows: int) -> int:
-        """Return the length of so many of the longest windows."""
+        """Return the length of this many of the longest windows."""
         return windows * max(entry.cell.window_ns for entry in self.entries)
 
     @property
     def warmup_ns(self) -> int:
-        """Longest warm-up of a cell; all cells are counted from then on."""
+        """Longest warm-up of a cell; statistics of all cells begin after it."""
         cells = [entry.cell for entry in self.entries]
         return max(cell.warmup_windows * cell.window_ns for cell in cells)
 
     @property
     def phasing(self) -> str:
-        """When cells begin, in a word: ``listed`` if each has a phase of its own."""
+        """The word for the phases of the cells; ``listed`` for a list of phases."""
         return self.phases if isinstance(self.phases, str) else "listed"
 
     def changed(
@@ -190,12 +202,9 @@ class Fleet:
         coordination: str | None = None,
         phases: str | Sequence[float] | None = None,
     ) -> Fleet:
-        """Return the fleet with other settings, those of entries included; None keeps them.
+        """Return the fleet, and its entries, with other settings; None keeps a setting.
 
-        Raises
-        ------
-        ProblemError
-            If one is none of those that there are.
+        Raises a ProblemError if a value is unknown.
         """
         given = {
             "policy": policy,
@@ -208,15 +217,20 @@ class Fleet:
         return replace(self, entries=tuple(replace(one, **own) for one in self.entries), **new)
 
     def with_count(self, count: int) -> Fleet:
-        """Return the fleet with so many cells of the first entry.
+        """Return the fleet with another number of cells of the first entry.
 
-        Raises
-        ------
-        ProblemError
-            If that is out of bounds, or phases are given one by one.
+        Raises a ProblemError if the number is out of bounds, or does not match a list of phases.
         """
         first, *others = self.entries
         return replace(self, entries=(replace(first, count=count), *others))
+
+    def without_effect(self) -> Iterator[Fault]:
+        """Yield the settings that change nothing."""
+        for name in self.unused():
+            yield Fault(f"shared.{name}", "no candidate of any cell uses this node")
+        if self.limit is not None and self.objective != "served":
+            remedy = "remove it, or set `objective: served`"
+            yield Fault("limit", f"it has no effect with objective {self.objective}; {remedy}")
 
     def unused(self) -> tuple[str, ...]:
         """Return the shared nodes that no candidate of any cell uses."""
@@ -230,7 +244,7 @@ class Fleet:
 
 
 def fleet_faults(kinds: Sequence[Kind], shared: Sequence[str], phases: Phases) -> Iterator[Fault]:
-    """Yield what is wrong with a fleet beyond its single entries."""
+    """Yield the faults of a fleet that concern more than one entry."""
     if not kinds:
         yield Fault("cells", "the list is empty; name at least one cell")
     count = sum(of for of, _ in kinds)
@@ -258,7 +272,7 @@ def fleet_faults(kinds: Sequence[Kind], shared: Sequence[str], phases: Phases) -
 
 
 def _node_faults(path: str, name: str, cells: Sequence[tuple[int, Problem]]) -> Iterator[Fault]:
-    """Yield where a shared node is missing in a cell, or another one than in those before."""
+    """Yield a fault for each cell that lacks a shared node or has a different node."""
     first: Problem | None = None
     for place, cell in cells:
         nodes = cell.fabric.nodes
@@ -284,7 +298,7 @@ def _phase_faults(kinds: Sequence[Kind], phases: Sequence[float]) -> Iterator[Fa
 
 
 def _differences(path: str, node: Node, other: Node, of: str) -> Iterator[Fault]:
-    """Yield a fault for every key by which a shared node differs from that of the first cell."""
+    """Yield a fault for every key of a shared node that differs from the first cell's node."""
     named: Mapping[str, str] = {one.name: one.named for one in declared_fields(Node)}
     for one in fields(node):
         here, there = getattr(node, one.name), getattr(other, one.name)

@@ -1,4 +1,4 @@
-"""An immutable mapping: the one container of the model that is not a tuple."""
+"""An immutable mapping, used throughout the model."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import NoReturn, Protocol, TypeVar
 
 from dwell.model.bounds import require
 
-#: Names that are shown of many.
+#: Largest number of names in a shortened list.
 SHOWN = 6
 
 K = TypeVar("K")
@@ -16,9 +16,9 @@ V = TypeVar("V")
 
 
 class FrozenDict(dict[K, V]):
-    """A ``dict`` that cannot be changed after it is made; it hashes and pickles.
+    """An immutable ``dict``; it can be hashed and pickled.
 
-    A subclass of ``dict`` and not a wrapper, because every decision looks things up in it.
+    A subclass of ``dict`` is faster than a wrapper, and every decision reads such mappings.
     """
 
     __slots__ = ()
@@ -36,16 +36,16 @@ class FrozenDict(dict[K, V]):
     update = _immutable
 
     def __hash__(self) -> int:  # type: ignore[override]
-        """Hash by content, whatever the order."""
+        """Hash the content independently of its order."""
         return hash(frozenset(self.items()))
 
     def __reduce__(self) -> tuple[type, tuple[dict[K, V]]]:
-        """Pickle and copy through the constructor, which is allowed to fill it."""
+        """Pickle and copy through the constructor."""
         return type(self), (dict(self),)
 
 
 class Named(Protocol):
-    """An item that carries its own key as its name."""
+    """An item whose name is its key."""
 
     @property
     def name(self) -> str:
@@ -60,7 +60,7 @@ def require_names(path: str, items: Mapping[str, Named]) -> None:
 
 
 def shortened(names: Collection[str], between: str = ", ") -> str:
-    """Return names as text, the first few of many."""
+    """Return names as text; a long list is cut after a few."""
     more = len(names) - SHOWN
     shown = between.join(islice(names, SHOWN))
     return f"{shown}{between}{more} more" if more > 0 else shown or "none"

@@ -1,34 +1,25 @@
-"""The ends of time: the last instant of a run, and the instant that never comes."""
+"""Limits of time: the last instant of a run, and an instant after all others."""
 
 from __future__ import annotations
 
 from dwell.errors import Fault, ProblemError
 from dwell.model.bounds import CYCLES, LENGTH_S, counted, short
 
-#: Later than every instant of people, longer than every latency; the sum with any of them fits 64
-#: bits.
+#: Later than every real instant and longer than every latency; its sum with either fits 64 bits.
 NEVER_NS = 1 << 62
-#: Age beyond which failures of calls, cycles and shadows say nothing any more.
+#: Age beyond which failures of calls, cycles and shadows are ignored.
 EVIDENCE_NS = 10_000_000_000
-#: Last instant at which a run may release a cycle, since its first (291 years). Twenty times of a
-#: cell file (1e9 ms each) can be added to it, and 64 bits hold the sum.
+#: Last instant at which a run may release a cycle, since its first (291 years). The sum with
+#: twenty times of a cell file (1e9 ms each) fits 64 bits.
 HORIZON_NS = 9_200_000_000_000_000_000
 
 
 def require_length(
     windows: int, window_cycles: int, period_ms: float, asked: str = "windows"
 ) -> int:
-    """Return the number of cycles of a run, which 64 bits must hold with their instants.
+    """Return the number of cycles of a run.
 
-    Parameters
-    ----------
-    asked : str
-        Name of what asks for the windows, as messages have it.
-
-    Raises
-    ------
-    ProblemError
-        If they are too many, or last too long.
+    Raises a ProblemError about the option `asked` if the cycles are too many or last too long.
     """
     cycles = windows * window_cycles
     product = f"{counted(windows, 'window')} of window_cycles = {window_cycles}"
@@ -47,5 +38,5 @@ def require_length(
 
 
 def longest_run(period_ms: float) -> int:
-    """Return how many cycles a run has at most."""
+    """Return the largest number of cycles of a run."""
     return int(min(CYCLES.high, LENGTH_S.high / (period_ms / 1e3)))

@@ -9,7 +9,7 @@ from dwell.model.bounds import LARGEST, MAX_COUNT, Bound, require
 from dwell.model.declaration import declared, key
 from dwell.model.frozen import FrozenDict
 
-#: Closed windows whose V_D says whether a cell is degraded.
+#: Number of closed windows whose V_D determines whether a cell is degraded.
 RECENT_WINDOWS = 3
 
 PORT = Bound(1024, 65_000, whole=True)
@@ -28,7 +28,7 @@ class Endpoint:
 
 @declared()
 class Host:
-    """Where a node's processes listen."""
+    """The addresses on which a node's processes listen."""
 
     address: str = key("Name or address of the host.", default="127.0.0.1", tier="first")
     port: int = key(
@@ -50,7 +50,7 @@ class Host:
 
 @declared("live")
 class LiveSettings:
-    """What the live runtime needs to know beside the problem."""
+    """Settings of the live runtime, in addition to the problem."""
 
     hosts: Mapping[str, Host] = key(
         "Where each node is reached.",
@@ -118,9 +118,9 @@ class LiveSettings:
             require_callable_name("live.observer", self.observer)
 
     def degraded_by(self, rates: Sequence[float]) -> bool:
-        """Whether V_D of the last windows is too high: in the mean, and in the last.
+        """Return whether V_D of the last windows is too high, both on average and in the last.
 
-        What is over shall not count for as long as it lasted.
+        The condition on the last window ends the state soon after a disturbance.
         """
         return bool(rates) and min(sum(rates) / len(rates), rates[-1]) > self.degraded_at
 

@@ -15,7 +15,7 @@ Tier: TypeAlias = Literal["robot", "edge", "cloud"]
 TIERS: tuple[Tier, ...] = ("robot", "edge", "cloud")
 
 
-#: Bounded so that J is finite whatever a window shows.
+#: The bounds keep J finite for any metrics.
 WEIGHT, TARGET, CAP = Bound(0, LARGEST), Bound(1e-9, LARGEST), Bound(0, above=True)
 
 
@@ -70,7 +70,7 @@ class Caps:
 
 @declared()
 class Objective:
-    """What makes one placement better than another: all that J needs besides the metrics."""
+    """The parameters of J: weights, targets, caps, and the tiers of nodes."""
 
     weights: Weights = key("Weights of the terms of J.", digested="decision", tier="first")
     targets: Targets = key("Design targets.", digested="decision", tier="first")

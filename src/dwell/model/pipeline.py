@@ -11,7 +11,7 @@ from dwell.model.frozen import FrozenDict, require_names, shortened
 from dwell.model.live import require_callable_name
 from dwell.model.process import Constant, Process
 
-#: Of a task on a node, where it says nothing, and of each of its nodes.
+#: Workers of a task on a node, and the task's default for each of its nodes.
 WORKERS = Bound(1, MAX_COUNT, whole=True)
 STANDBY = Bound(0, 1, whole=True)
 
@@ -44,7 +44,7 @@ class Execution:
     )
 
     def resource(self, node: str) -> str:
-        """Name of what it works on, on a node: the node's, for its CPU, or that of a kind."""
+        """Return the name of its resource on a node: the CPU's, or a kind of accelerator."""
         return node if self.accelerator is None else accelerator_name(node, self.accelerator)
 
 
@@ -109,13 +109,13 @@ class Task:
 
     @property
     def anchored(self) -> bool:
-        """Whether one node only can run it."""
+        """Whether only one node can run it."""
         return len(self.on) == 1
 
 
 @declared()
 class Flow:
-    """A precedence edge: what one task sends to another."""
+    """A precedence edge: messages from one task to another."""
 
     source: str = key("Task that sends.", named="from", tier="first")
     target: str = key("Task that receives.", named="to", tier="first")
@@ -203,9 +203,9 @@ class Pipeline:
         return tuple(flow for flow in self.flows if flow.source == task)
 
     def diverging(self, active: Mapping[str, str], other: Mapping[str, str]) -> frozenset[str]:
-        """Tasks that run elsewhere under `other`, or have such a task before them.
+        """Return the tasks on another node under `other`, and all tasks downstream of them.
 
-        What a cycle that runs under `active` cannot share with a shadow sent through `other`.
+        A shadow through `other` runs these tasks and shares the rest with the cycle under `active`.
         """
         found: set[str] = set()
         for name in self.topological():
@@ -215,7 +215,7 @@ class Pipeline:
         return frozenset(found)
 
     def topological(self) -> tuple[str, ...]:
-        """Tasks so that every flow points forward; tasks on a cycle are left out."""
+        """Return the tasks in topological order; tasks on a cycle are left out."""
         waiting = {name: len(self.inputs(name)) for name in self.tasks}
         order: list[str] = [name for name, count in waiting.items() if count == 0]
         for name in order:
@@ -226,7 +226,7 @@ class Pipeline:
         return tuple(order)
 
     def chains(self) -> tuple[tuple[str, ...], ...]:
-        """Paths that have every flow once among their steps, and every task at least once."""
+        """Return paths that contain every flow exactly once and every task at least once."""
         left = {name: [flow.target for flow in self.outputs(name)] for name in self.tasks}
         found: list[tuple[str, ...]] = []
         for name in self.topological():

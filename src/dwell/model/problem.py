@@ -23,12 +23,12 @@ from dwell.model.scenario import Scenario
 from dwell.model.semantics import CellParts, find_faults, nearest_of
 from dwell.model.servo import Servo
 
-#: Share of the cycles for each alternative where none is given, and not all together are too many.
+#: Default share of the cycles for each alternative, unless the shares add up to more than 1.
 SHADOWED = 0.05
 
 
 class Drawn(NamedTuple):
-    """All of a problem that its realisations depend on: equal problems play the same ones."""
+    """The part of a problem that determines its realisations."""
 
     pipeline: Pipeline
     fabric: Fabric
@@ -40,7 +40,7 @@ class Drawn(NamedTuple):
 
 @declared()
 class Problem(Displayed):
-    """A cell, checked as a whole: one that exists is valid.
+    """A valid cell, with all parts checked against each other.
 
     Raises
     ------
@@ -78,8 +78,8 @@ class Problem(Displayed):
     live: LiveSettings = key(
         "Hosts and habits of the live runtime.", default_factory=LiveSettings, tier="first"
     )
-    #: Where classes that are named ``package.module:Class`` are looked for first: the cell file's.
-    #: No part of what the cell is.
+    #: The cell file's folder, searched first for classes named ``package.module:Class``. Equality
+    #: ignores it.
     folder: str | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -118,7 +118,7 @@ class Problem(Displayed):
         )
 
     def _unplaced(self) -> list[Fault]:
-        """Anchored tasks that a placement leaves out (a cell file's may, a Placement may not)."""
+        """Return faults of placements without an anchored task, which only cell files may omit."""
         return [
             Fault(f"candidates.{name}.{task}", f"not placed; put it on {next(iter(on))}")
             for name, placement in self.candidates.items()
@@ -149,7 +149,7 @@ class Problem(Displayed):
 
     @property
     def drawn(self) -> Drawn:
-        """What its realisations depend on."""
+        """The part that determines its realisations."""
         return Drawn(*(getattr(self, name) for name in Drawn._fields))
 
     def at_phase(self, phase_ms: float | None) -> Problem:
@@ -162,24 +162,21 @@ class Problem(Displayed):
         return self.controller.initial or next(iter(self.candidates))
 
     def policy_and_estimator(self, name: str) -> tuple[str, str | None]:
-        """Return the policy that a name means, and the estimator that the name asks for.
+        """Split a name as ``cusum+corrected`` into policy and estimator.
 
-        Parameters
-        ----------
-        name : str
-            ``cusum`` or ``LOC``, for which the estimator is None, or ``cusum+corrected``.
+        The estimator is None for a name without one, as ``cusum`` or ``LOC``.
         """
         policy, plus, estimator = name.rpartition("+")
         return (policy, estimator) if plus and name not in self.candidates else (name, None)
 
     def under(self, name: str) -> Problem:
-        """Return the problem with another policy, which begins where it belongs.
+        """Return the problem with another policy, which may change the initial candidate.
 
         Parameters
         ----------
         name : str
-            As ``cusum`` or ``cusum+corrected``; a candidate's name for the placement that never
-            moves, and so begins on it.
+            As ``cusum`` or ``cusum+corrected``; or a candidate, which then never moves and is
+            the initial placement.
         """
         policy, estimator = self.policy_and_estimator(name)
         controller = replace(
@@ -191,7 +188,7 @@ class Problem(Displayed):
         return replace(self, controller=controller)
 
     def cycles_of(self, windows: int) -> int:
-        """Return the number of cycles of a run of so many windows.
+        """Return the number of cycles of a run of this many windows.
 
         Raises
         ------
@@ -223,18 +220,18 @@ class Problem(Displayed):
 
     @property
     def min_dwell(self) -> int:
-        """N_min, windows; where the cell gives none, as with an estimator that states no errors."""
+        """N_min, windows; by default the value for estimators without errors."""
         given = self.controller.min_dwell
         return USUAL_DWELL if given is None else given
 
     @property
     def dwell_cycles(self) -> int:
-        """Cycles that a placement stays at least: max(N_min W, `min_dwell_cycles`)."""
+        """Least number of cycles for which a placement stays: max(N_min W, `min_dwell_cycles`)."""
         return max(self.min_dwell * self.window_cycles, self.controller.min_dwell_cycles)
 
     @property
     def min_dwell_decisions(self) -> int:
-        """Decisions that a placement stays at least."""
+        """Least number of decisions for which a placement stays."""
         return -(-self.dwell_cycles // self.decide_cycles)
 
     @property
@@ -244,9 +241,9 @@ class Problem(Displayed):
 
     @property
     def censor_ms(self) -> float:
-        """Latency that stands for any longer one in J: max(4 D, 2 P), and no less than L_max.
+        """Largest latency in J: max(4 D, 2 P), and no less than L_max; longer ones are cut to it.
 
-        docs/concepts.md says why.
+        docs/concepts.md explains the reason.
         """
         pipeline, cap_ms = self.pipeline, self.objective.caps.latency_ms
         bound_ms = max(4 * pipeline.deadline_ms, 2 * pipeline.period_ms)
@@ -265,51 +262,42 @@ class Problem(Displayed):
 
     @property
     def controller_node(self) -> str:
-        """Node the controller sits on."""
+        """Node of the controller."""
         if self.controller.on is not None:
             return self.controller.on
         return next(iter((*self.fabric.tier("edge"), *self.fabric.nodes)))
 
     @property
     def relay_node(self) -> str:
-        """Node whose agent carries small messages where a direct link fails."""
+        """Node whose agent relays small messages if a direct link fails."""
         return self.live.relay or self.controller_node
 
     @property
     def max_age_ms(self) -> float:
-        """Age beyond which an actuator is given no command; by default two periods."""
+        """Largest age of a command that an actuator receives; by default two periods."""
         given_ms = self.live.max_age_ms
         return 2 * self.pipeline.period_ms if given_ms is None else given_ms
 
     @property
     def stamper_node(self) -> str:
-        """Node where cycles are released: that of the first source task in the initial placement.
+        """Node that releases cycles: the first source task's node in the initial placement.
 
-        In a live cell that task is anchored there.
+        In a live cell the task is anchored there.
         """
         pipeline = self.pipeline
         source = next(name for name in pipeline.tasks if not pipeline.inputs(name))
         return self.candidates[self.initial][source]
 
     def require_node(self, name: str) -> None:
-        """Refuse a node that the cell does not have.
-
-        Raises
-        ------
-        ProblemError
-            With the nodes that there are.
-        """
+        """Raise a ProblemError that lists the nodes if the cell has no such node."""
         if name not in self.fabric.nodes:
             known = ", ".join(self.fabric.nodes)
             raise ProblemError(f"no node {name!r} in cell {self.name!r}; there are {known}")
 
     def scenario(self, name: str) -> Scenario:
-        """Disturbances of a scenario.
+        """Return the disturbances of a scenario.
 
-        Raises
-        ------
-        ProblemError
-            If there is none of that name; the message lists the known ones.
+        Raises a ProblemError that lists the known names if the name is unknown.
         """
         if name not in self.scenarios:
             hint = nearest_of(name, self.scenarios, "scenarios")

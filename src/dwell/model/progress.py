@@ -5,5 +5,5 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeAlias
 
-#: Told how much is done, and of how much.
+#: A function that receives the finished and the total amount of work.
 Progress: TypeAlias = Callable[[int, int], None]

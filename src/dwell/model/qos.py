@@ -1,4 +1,4 @@
-"""QoS, what a window shows, and Decision, what a policy makes of it."""
+"""QoS, the metrics of a window, and Decision, the result of a policy."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from dwell.model.frozen import FrozenDict
 from dwell.model.placement import Placement
 
 Reason: TypeAlias = Literal["dwell", "hold", "migrate", "capped", "infeasible", "guard"]
-#: Every reason, in the order in which they are looked at.
+#: Every reason of a decision.
 REASONS: tuple[Reason, ...] = get_args(Reason)
 INFINITY = math.inf
-#: Standard errors of L95 and V_D that count where a QoS says none.
+#: Standard errors of L95 and V_D if a QoS has none.
 NO_ERROR = (0.0, 0.0)
 
 
@@ -31,18 +31,18 @@ class QoS:
         Share of the window's cycles that missed the deadline, in [0, 1].
     utilisation : mapping of str to float
         Busy share of each resource: a node's cores, by its name, or a kind of its accelerators,
-        as ``E.gpu``; finite, at least 0. Of what is not named nothing is known.
+        as ``E.gpu``; finite, at least 0. A missing resource has an unknown utilisation.
     cut_from_ms : float, optional
-        L95 that `l95_ms` stands for in J where it is larger than that; infinite where it is lost.
-        Caps are compared with it.
+        The true L95 if it is above the bound `l95_ms`, which replaces it in J; infinite for a lost
+        cycle. Caps apply to this value.
     error : tuple of float, optional
         Standard errors of `l95_ms` (milliseconds) and of `violation_rate`; finite, at least 0.
-        None says nothing of them, and counts as 0.
+        None if unknown, which counts as 0.
 
     Raises
     ------
     MetricError
-        If a value is missing, NaN, infinite (but `cut_from_ms`), or out of its range.
+        If a value is missing, NaN, out of its range, or infinite (`cut_from_ms` may be).
     """
 
     l95_ms: float
@@ -81,7 +81,7 @@ class QoS:
 
     @property
     def uncut_l95_ms(self) -> float:
-        """L95 as caps are compared with it, milliseconds; infinite where it is lost."""
+        """L95 for comparison with caps, milliseconds; infinite for a lost cycle."""
         return self.l95_ms if self.cut_from_ms is None else self.cut_from_ms
 
 
@@ -97,12 +97,9 @@ def unchecked_qos(
     cut_from_ms: float | None,
     error: tuple[float, float] | None = None,
 ) -> QoS:
-    """Make a QoS of metrics that are known to be good, in a third of the time.
+    """Make a QoS without checks, in a third of the time.
 
-    Parameters
-    ----------
-    l95_ms, violation_rate, utilisation, cut_from_ms, error
-        As a `QoS` has them: `cut_from_ms` is None where it is `l95_ms`.
+    The caller guarantees valid metrics; `cut_from_ms` must be None if it equals `l95_ms`.
     """
     qos: QoS = object.__new__(QoS)
     _set_l95_ms(qos, l95_ms)
@@ -115,7 +112,7 @@ def unchecked_qos(
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """The placement for the next window, and why.
+    """The placement for the next window, and the reason.
 
     Parameters
     ----------
@@ -126,14 +123,14 @@ class Decision:
     migrated : bool
         Whether it differs from the incumbent.
     reason : {"dwell", "hold", "migrate", "capped", "infeasible", "guard"}
-        Which rule made it.
+        The rule that determined it.
     costs : mapping of str to float
-        Estimated J of every candidate against the incumbent; empty where the policy prices none.
+        Estimated J of every candidate against the incumbent; empty if the policy computes none.
     dwell : int
         Windows since the last migration, after this decision (n_d).
     delta_j : float
-        J of the incumbent, with the switching term of its own last decision, less J of the best
-        candidate; NaN where not computed.
+        J of the incumbent, with the switching term of its own last decision, minus J of the best
+        candidate; NaN if not computed.
     """
 
     placement: Placement

@@ -1,7 +1,7 @@
-"""Scenario: what happens to the fabric over time, one disturbance an item.
+"""Scenario: a list of disturbances of the fabric over time.
 
-A disturbance is on from `at_s` for `for_s` seconds: all the time, in drawn `episodes`, or growing
-and falling along a ramp of `ramp_s`.
+A disturbance lasts from `at_s` for `for_s` seconds: continuously, in random `episodes`, or growing
+and falling along ramps of `ramp_s`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ EPISODE_MEAN_S, ADDED_LOSS = Bound(1e-5, LARGEST), Bound(0, 1)
 
 @declared("episodes")
 class Episodes:
-    """Episodes that come and go: off for `every_s` seconds, then on for `for_s`, and so on."""
+    """Alternating episodes: off for `every_s` seconds, then on for `for_s`."""
 
     name: str = key(
         "Name of the episodes, and of their random streams; what shares it in a scenario comes and "
@@ -78,7 +78,7 @@ def _ramp_s() -> Any:
 
 
 class _Timed:
-    """What has a begin and a duration."""
+    """Base of disturbances: begin, duration, episodes and ramp."""
 
     __slots__ = ()
     at_s: float
@@ -100,7 +100,7 @@ class _Timed:
 
     @property
     def end_s(self) -> float:
-        """End, seconds; infinite where it lasts."""
+        """End, seconds; infinite if the disturbance lasts to the end of the run."""
         return self.at_s + self.for_s
 
 
@@ -132,9 +132,8 @@ class LinkDisturbance(_Timed):
     """Extra delay, loss or another rate on a directed link, or the link down.
 
     Loss probabilities of disturbances at the same time, and the link's own, combine as
-    independent; extra delays add up; the lowest rate counts. Along a ramp the extra delay, the
-    loss, and the time that a bit takes at `rate_mbps` beyond what it takes at the link's own rate
-    are what grows.
+    independent; extra delays add up; the lowest rate counts. A ramp scales the extra delay, the
+    loss, and the increase of the transmission time per bit from the link's own rate to `rate_mbps`.
     """
 
     source: str
@@ -171,7 +170,7 @@ class LinkDisturbance(_Timed):
 
     @property
     def layers(self) -> int:
-        """Layers of extra delay that it takes of the link's `MAX_LAYERS`."""
+        """Number of layers of extra delay that it uses, of the link's `MAX_LAYERS`."""
         if self.add_delay_ms is None:
             return 0
         return RAMP_LAYERS if self.ramp_s else 1
@@ -182,13 +181,13 @@ Scenario: TypeAlias = tuple[Disturbance, ...]
 
 
 def is_always_on(item: Disturbance) -> bool:
-    """Whether a disturbance is on, at its full strength, from the first cycle to the last."""
+    """Return whether a disturbance has full strength from the first cycle to the last."""
     whole = item.at_s == 0 and math.isinf(item.for_s)
     return whole and item.episodes is None and not item.ramp_s
 
 
 def acts(item: Disturbance, fabric: Fabric) -> bool:
-    """Whether a disturbance changes anything while it is on."""
+    """Return whether a disturbance has any effect."""
     if isinstance(item, NodeDisturbance):
         return item.down or item.stress_threads > 0
     delays = item.add_delay_ms is not None and item.add_delay_ms.expectation > 0

@@ -1,7 +1,7 @@
 """Checks of a cell as a whole: names that resolve, an acyclic DAG, links that exist.
 
-The checks work on parts, so that a file whose structure is broken in one place is still checked
-everywhere else, and every fault is reported at once.
+The checks work on parts: if the structure of a file is broken in one place, all other places are
+still checked, and all faults are reported at once.
 """
 
 from __future__ import annotations
@@ -33,28 +33,28 @@ from dwell.model.scenario import (
 NAME = re.compile(r"\w[\w.+:-]*(?: [\w.+:-]+)*")
 NAME_SIGN = re.compile(r"[\w.+:\- ]")
 LONGEST_NAME = 64
-#: What a cell has at least one of.
+#: Kinds of which a cell has at least one.
 NEEDED = frozenset({"node", "task", "candidate"})
 # How far shares may sum up beyond 1 by rounding.
 SHARE_TOLERANCE = 1e-9
 
 
 class UnreadNames(dict[str, None]):
-    """The names that a section declares which could not be read: any may be one of them."""
+    """Names of an unreadable section; every name counts as declared."""
 
     def __contains__(self, name: object) -> bool:
         return True
 
     def __missing__(self, name: str) -> None:
-        """Nothing is known of what has the name."""
+        """Return None: the content is unknown."""
 
 
 @dataclass(slots=True)
 class CellParts:
     """Parts of a cell, with the path each has in its file.
 
-    A value of None is a part whose name is known but whose content could not be read (its own
-    fault is reported elsewhere): references to it resolve, and nothing more is asked of it.
+    A value of None is a part with a known name and unreadable content, whose fault is reported
+    elsewhere. References to it resolve, and no other check applies.
 
     """
 
@@ -94,7 +94,7 @@ def nearest(word: str, known: Iterable[str]) -> str:
 
 
 def nearest_of(word: str, known: Iterable[str], what: str) -> str:
-    """Return a remedy for an unknown name, with all known ones, each said once."""
+    """Return a remedy for an unknown name that lists each known name once."""
     names = list(known)
     hint = nearest(word, names)
     return f"{hint} ({what} here: {', '.join(names)})" if hint.startswith("did") else hint
@@ -123,14 +123,10 @@ def find_unregistered(
     estimators: Sequence[str],
     shadowing: Collection[str],
 ) -> Iterator[Fault]:
-    """Yield the faults of names that only a cell file has: who makes an object has a class.
+    """Yield the faults of names that only a cell file uses instead of classes.
 
-    Parameters
-    ----------
-    name : str
-        The cell's own.
-    policies, estimators, shadowing : collection of str
-        Those that there are, and the estimators that send shadow jobs.
+    `name` is the name of the cell, `policies` and `estimators` are the known names, and `shadowing`
+    are the estimators that send shadow jobs.
     """
     if message := bad_name(name):
         yield Fault("name", message)
@@ -156,9 +152,9 @@ def find_unregistered(
 
 
 def _unknown(path: str, what: str, word: str, known: Collection[str]) -> Iterator[Fault]:
-    # That there is none is told once.
+    # A missing section is reported only once.
     if word not in known and (known or what not in NEEDED):
-        # Decomposed, a name looks like the one that is declared.
+        # A name in decomposed Unicode looks like the declared name.
         twin = unicodedata.normalize("NFC", word) in known and bad_name(word)
         yield Fault(path, twin or f"unknown {what} {word!r}; {nearest(word, known)}")
 

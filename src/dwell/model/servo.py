@@ -1,4 +1,4 @@
-"""The reference servo loop: what the commands of a run would have done to a robot."""
+"""The reference servo loop, which applies the commands of a run to a simulated robot."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Plant: TypeAlias = Literal["integrator", "double-integrator"]
 
 @declared("target")
 class MovingTarget:
-    """What the robot follows: r(t) = amplitude · sin(2 pi t / period), t from the first release."""
+    """The target: r(t) = amplitude · sin(2 pi t / period), t from the first release."""
 
     amplitude_mm: float = key(
         "Amplitude, mm; errors are proportional to it.", Bound(1e-6, MAX_COUNT)
@@ -30,7 +30,7 @@ class MovingTarget:
 
 @declared()
 class Servo:
-    """One axis of a robot that follows a moving target by what the camera saw."""
+    """One axis of a robot that follows a moving target with a camera."""
 
     plant: Plant = key("What a command sets: the velocity (`integrator`), or the acceleration.")
     gain: float = key(
@@ -54,7 +54,7 @@ class Servo:
             require(self.damping == 0, "damping", self.damping, bound)
 
     def require_seen(self, period_ms: float) -> None:
-        """Refuse a target that moves too fast for the camera: it takes a frame a cycle.
+        """Check that the target is slow enough for the camera, which takes one frame per cycle.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Stamps of shadows: the alternative that a cycle is also sent through."""
+"""Shadow plan: the alternative that also processes a cycle, as a shadow."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from dwell.model.frozen import FrozenDict
 
 GOLDEN = (np.sqrt(5) - 1) / 2
 
-#: Share of the cycles that each alternative gets: one number, or one per candidate that is active.
+#: Share of the cycles for each alternative: one number, or a number per active candidate.
 ShadowFraction: TypeAlias = float | Mapping[str, float]
 
 
 def by_candidate(fraction: ShadowFraction, candidates: Iterable[str]) -> FrozenDict[str, float]:
-    """Return the share that each alternative gets while each of the candidates is active."""
+    """Return the share of each alternative, by the active candidate."""
     if isinstance(fraction, Mapping):
         return FrozenDict({name: fraction.get(name, 0.0) for name in candidates})
     return FrozenDict(dict.fromkeys(candidates, fraction))
@@ -79,9 +79,9 @@ class ShadowPlan:
 
     @property
     def sent(self) -> NDArray[np.int64]:
-        """The cycles that are sent through any, under the candidate that sends most, ascending.
+        """Cycles with a shadow under the active candidate that sends most, ascending.
 
-        Those of the others are among them.
+        They include the cycles with a shadow under every other active candidate.
         """
         most = self._places[max(self._fractions)]
         return self._first + np.flatnonzero(most < self._none)

@@ -1,8 +1,7 @@
-"""Columns of the tables that are made of a cell: each declared once, with the names in them.
+"""Declarations of the columns of all tables.
 
-A `Column` says what a column is called, what it holds, in which unit, and when it is null. A table
-may have one for each resource, each candidate, or each pair of them; `clash_faults` says where two
-of a cell's are called the same.
+A `Column` declares name, type, unit and the meaning of null. A table may have a column for each
+resource, each candidate, or each pair of them; `clash_faults` finds equal names among them.
 """
 
 from __future__ import annotations
@@ -16,13 +15,13 @@ from typing import Literal, NamedTuple, TypeAlias
 from dwell.errors import Fault, ProblemError
 from dwell.model.fabric import Resource
 
-#: What a column holds: a number, a truth value, a text, or a name of the cell's.
+#: Type of a column: a number, a truth value, a text, or a name of the cell.
 Kind: TypeAlias = Literal[
     "Int64", "Float64", "Boolean", "String", "candidate", "node", "task", "outcome", "reason"
 ]
-#: What a run has that not every run has: `live` processes; cycles that may be sent through
-#: alternatives, too (`shadows`); an estimator that says what stands behind its estimates
-#: (`support`); a cell of a `fleet`; decisions between the closes of windows (`between`).
+#: Optional features of a run: `live` processes; shadows through alternatives (`shadows`); an
+#: estimator that reports samples and age of its estimates (`support`); a cell of a `fleet`;
+#: decisions between the ends of windows (`between`).
 Feature: TypeAlias = Literal["live", "shadows", "support", "fleet", "between"]
 
 
@@ -33,17 +32,17 @@ class Column:
     Parameters
     ----------
     name : str
-        With ``{resource}`` and ``{candidate}`` where there is one for each.
+        With ``{resource}`` and ``{candidate}`` for a column per resource or candidate.
     kind : str
-        A type of Polars', or what its names are names of.
+        A type of Polars, or the kind of its names.
     sentence : str
         Meaning of the column.
     unit : str
         Unit of a number; empty for a count, a share and a bare number.
     null : str
-        When it is null; empty where it never is. NaN is null there, too.
+        When it is null, or NaN; empty if it never is.
     of : tuple of {"live", "shadows", "support", "fleet", "between"}
-        Runs that have it: those with one of these; all where empty.
+        Features of which a run needs at least one to have the column; empty for all runs.
     """
 
     name: str
@@ -63,12 +62,11 @@ class TableSchema:
     sentence : str
         Meaning of a row.
     columns : tuple of tuple of Column
-        In their order; one for each resource and candidate goes through a resource's candidates
-        first.
+        In their order; a column per resource and candidate is ordered by resource first.
     numbered : bool
-        Whether its first column numbers the rows; a row that comes again replaces the one before.
+        Whether its first column numbers the rows; a repeated row replaces the earlier row.
     on_request : bool
-        Whether a run has it only where it was asked for.
+        Whether a run has it only on request.
     """
 
     sentence: str
@@ -251,7 +249,7 @@ DECISIONS = (
         SUPPORT,
     ),
     Column("phi_before", "Float64", "Φ of the fleet as it is, as played.", null=UNASKED, of=FLEET),
-    Column("phi_after", "Float64", "Φ with the move that was looked at.", null=UNASKED, of=FLEET),
+    Column("phi_after", "Float64", "Φ with the moves that were played.", null=UNASKED, of=FLEET),
     Column("round", "Int64", "The ledger's round that it is of.", null="no ledger", of=FLEET),
     Column(
         "refused",
@@ -341,13 +339,13 @@ TABLES: Mapping[str, TableSchema] = {
     "processes": TableSchema("a window and a process of a live cell", PROCESSES, on_request=True),
 }
 
-#: Columns of a study's tables that are made of names: share of the windows that began under a
+#: Columns of a study's tables with names in them: share of the windows that began under a
 #: candidate, and mean utilisation of a resource.
 SHARE_OF, USE_OF = "share_{candidate}", "node_{resource}"
-#: What follows the name of a column over seeds: its mean, and the ends of its interval.
+#: Suffixes of a column over seeds: its mean, and the ends of its interval.
 ENDS = ("", "_low", "_high")
 
-#: By table, how its columns are called.
+#: Names of the columns by table.
 TEMPLATES: Mapping[str, Sequence[str]] = {
     **{name: [column.name for column in table.columns] for name, table in TABLES.items()},
     "runs": [of + end for of in (SHARE_OF, USE_OF) for end in ENDS],
@@ -363,7 +361,7 @@ class NamedColumn(NamedTuple):
 
     @property
     def of(self) -> str:
-        """The names that it is made of, as messages have them."""
+        """The resource and the candidate in its name, for messages."""
         names = [] if self.resource is None else [self.resource.described]
         if self.candidate:
             names.append(f"candidate {self.candidate}")
@@ -371,7 +369,7 @@ class NamedColumn(NamedTuple):
 
     @property
     def path(self) -> str:
-        """Where a cell file has the last of these names."""
+        """Path in a cell file of the candidate, or else the resource, in its name."""
         if self.candidate or self.resource is None:
             return f"candidates.{self.candidate}"
         return self.resource.path
@@ -408,7 +406,7 @@ def clash_faults(resources: Iterable[Resource], candidates: Sequence[str]) -> It
             )
     for table, templates in TEMPLATES.items():
         taken: dict[str, NamedColumn] = {}
-        # The table's own come first, so that a clash with one is that of the cell's name.
+        # Fixed columns first: a clash with a fixed column is a fault of the cell's name.
         for template in sorted(templates, key=lambda one: "{" in one):
             for column in columns_of(template, known.values(), candidates):
                 one = taken.setdefault(column.name, column)
@@ -422,12 +420,6 @@ def clash_faults(resources: Iterable[Resource], candidates: Sequence[str]) -> It
 
 @cache
 def require_apart(resources: tuple[Resource, ...], candidates: tuple[str, ...]) -> None:
-    """Refuse names of a cell of which two columns of a table would be called the same.
-
-    Raises
-    ------
-    ProblemError
-        With every pair of them.
-    """
+    """Raise a ProblemError with all names of a cell that would give two columns the same name."""
     if faults := list(clash_faults(resources, candidates)):
         raise ProblemError(faults)

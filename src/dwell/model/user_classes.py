@@ -19,36 +19,24 @@ from dwell.errors import DwellError, KernelError, SimulationError, UserNote, des
 if TYPE_CHECKING:
     from dwell.model.problem import Problem
 
-#: Modules of this package begin with it.
+#: Prefix of the modules of this package.
 OURS = f"{__name__.partition('.')[0]}."
-#: Modules that were found beside a cell file, by its folder and their name.
+#: Modules from folders of cell files, by folder and name.
 _beside: dict[tuple[str, str], ModuleType] = {}
 _importing = threading.RLock()
-#: Digests of sources, as they were first needed.
+#: Digests of sources at their first use.
 _digests: dict[ModuleType, str] = {}
 
 
 def make_user_class(
     name: str, problem: Problem, method: str, what: str, error: type[DwellError]
 ) -> Any:
-    """Make an object of a user's class: by ``from_problem(problem)`` if there is one, else bare.
+    """Make an object of a user's class, by ``from_problem(problem)`` if defined.
 
-    Parameters
-    ----------
-    name : str
-        ``package.module:Class``.
-    problem : Problem
-        Modules in its `folder` go before installed ones.
-    method : str
-        Which the object must have.
-    what : str
-        Kind of the class, for messages: ``policy``.
-
-    Raises
-    ------
-    DwellError
-        An `error`, if there is no such module or class, the module raises when it is imported,
-        the class wants arguments or raises, or its object has no such method.
+    `name` is ``package.module:Class``. Modules in the problem's `folder` take precedence over
+    installed ones. `what` is the kind of class for messages, as ``policy``. Raises an `error` if
+    the module or class does not exist, the import raises, the class requires arguments or raises,
+    or its object lacks the `method`.
     """
     who, attribute = f"{what} {name!r}", name.partition(":")[2]
     kind = user_class(name, problem.folder, what, error)
@@ -72,19 +60,9 @@ def make_user_class(
 
 
 def user_class(name: str, folder: str | None, what: str, error: type[DwellError]) -> type:
-    """Return a user's class.
+    """Return a user's class; arguments as in `make_user_class`.
 
-    Parameters
-    ----------
-    name, what
-        As in `make_user_class`.
-    folder : str, optional
-        Its modules are preferred to installed modules.
-
-    Raises
-    ------
-    DwellError
-        An `error`, if there is no such module or class, or the module raises when it is imported.
+    Raises an `error` if the module or class does not exist, or the import raises.
     """
     who = f"{what} {name!r}"
     kind = _named(name, folder, "class", who, error)
@@ -95,18 +73,11 @@ def user_class(name: str, folder: str | None, what: str, error: type[DwellError]
 
 
 class UserCall(NamedTuple):
-    """A call of an object that may be a user's: the errors that it raises get a `UserNote`.
-
-    Parameters
-    ----------
-    method : str
-        Which is called.
-    window : int, optional
-        At whose close, where it is at a close.
-    """
+    """A call of a method that a user may have written; its errors get a `UserNote`."""
 
     given: object
     method: str
+    #: The window of the call, if any.
     window: int | None = None
 
     def __enter__(self) -> None:
@@ -126,22 +97,11 @@ class UserCall(NamedTuple):
 def user_function(
     name: str, folder: str | None, what: str, error: type[DwellError]
 ) -> Callable[..., object]:
-    """Return a function of a user's own.
+    """Return a user's function.
 
-    Parameters
-    ----------
-    name : str
-        ``package.module:function``.
-    folder : str, optional
-        Its modules are preferred to installed modules.
-    what : str
-        Kind of the function, for messages: ``metric``.
-
-    Raises
-    ------
-    DwellError
-        An `error`, if there is no such module or function, or the module raises when it is
-        imported.
+    `name` is ``package.module:function``, and `what` the kind of function for messages, as
+    ``metric``. Modules in `folder` take precedence over installed ones. Raises an `error` if the
+    module or function does not exist, or the import raises.
     """
     who = f"{what} {name!r}"
     function = _named(name, folder, "function", who, error)
@@ -166,15 +126,8 @@ def _named(name: str, folder: str | None, kind: str, who: str, error: type[Dwell
 def source_digest(name: str, folder: str | None) -> str | None:
     """Return a digest of the source of the module that ``package.module:Class`` names.
 
-    Returns
-    -------
-    str or None
-        None where the module cannot be imported, or has no source.
-
-    Raises
-    ------
-    SimulationError
-        If the source has changed since this process imported it.
+    Returns None if the module cannot be imported or has no source. Raises SimulationError if the
+    source has changed since this process imported it.
     """
     try:
         module = import_user_module(name.partition(":")[0], folder, name, DwellError)
@@ -190,7 +143,7 @@ def object_digest(given: object) -> str | None:
 
 
 def _digest(module: ModuleType) -> str | None:
-    """Return a digest of a module's source, which must stay as this process plays it."""
+    """Return a digest of a module's source, which must not have changed since its import."""
     try:
         source = inspect.getsource(module)
     except (OSError, TypeError):
@@ -205,7 +158,7 @@ def _digest(module: ModuleType) -> str | None:
 
 
 def _arguments(kind: type) -> list[str]:
-    """Return the names of the arguments that a class cannot be made without."""
+    """Return the names of the required arguments of a class."""
     try:
         parameters = inspect.signature(kind).parameters.values()
     except (TypeError, ValueError):  # a class in C may have no signature
@@ -217,7 +170,7 @@ def _arguments(kind: type) -> list[str]:
 def import_user_module(
     name: str, folder: str | None, who: str, error: type[DwellError]
 ) -> ModuleType:
-    """Import a module from a folder, or an installed one where the folder has none of that name."""
+    """Import a module from a folder, or else an installed module."""
     beside = folder is not None and name.partition(".")[0] in _modules_in(folder)
     try:
         if folder is not None and beside:
@@ -232,7 +185,7 @@ def import_user_module(
 
 
 def _import_beside(name: str, folder: str) -> ModuleType:
-    """Import a module from a folder, whatever another folder has under the same name."""
+    """Import a module from a folder, separately from equal names in other folders."""
     with _importing:
         if (folder, name) not in _beside:
             with _first_on_path(folder):
@@ -241,7 +194,7 @@ def _import_beside(name: str, folder: str) -> ModuleType:
 
 
 def _import_installed(name: str) -> ModuleType:
-    """Import an installed module, not one of its name that stands beside another cell file."""
+    """Import an installed module, ignoring equal names in folders of cell files."""
     package = name.partition(".")[0]
     with _importing:
         beside = {
@@ -256,7 +209,7 @@ def _import_installed(name: str) -> ModuleType:
 
 @contextmanager
 def _first_on_path(folder: str) -> Iterator[None]:
-    """Look for modules in a folder first; modules of the same names from elsewhere come back."""
+    """Search a folder first for modules; restore modules with equal names afterwards."""
     names = _modules_in(folder)
     elsewhere = {
         name: module
@@ -269,7 +222,7 @@ def _first_on_path(folder: str) -> Iterator[None]:
 
 @contextmanager
 def importable_from(folder: str) -> Iterator[None]:
-    """Look for modules in a folder first, as ``python -m`` does in the current one."""
+    """Search a folder first for modules, as ``python -m`` does with the current folder."""
     sys.path.insert(0, folder)
     importlib.invalidate_caches()
     try:
@@ -281,7 +234,7 @@ def importable_from(folder: str) -> Iterator[None]:
 
 @contextmanager
 def _hidden(modules: Mapping[str, ModuleType]) -> Iterator[None]:
-    """Have modules count as never imported, for a while."""
+    """Hide imported modules within the block."""
     for name in modules:
         del sys.modules[name]
     try:
@@ -291,11 +244,11 @@ def _hidden(modules: Mapping[str, ModuleType]) -> Iterator[None]:
 
 
 def _modules_in(folder: str) -> set[str]:
-    """Return the names of the modules and packages in a folder; none of them replaces ours."""
+    """Return the names of the modules and packages in a folder, except Dwell's own."""
     return {one.name for one in pkgutil.iter_modules([folder])} - {"dwell", "__main__"}
 
 
 def _is_in(module: ModuleType, folder: str) -> bool:
-    # A package without __init__.py has no file, but places.
+    # A package without __init__.py has paths instead of a file.
     places = [getattr(module, "__file__", None), *getattr(module, "__path__", ())]
     return any(isinstance(one, str) and one.startswith(f"{folder}/") for one in places)

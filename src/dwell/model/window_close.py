@@ -1,4 +1,4 @@
-"""When a window closes."""
+"""The instant at which a window closes."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 def window_close_ns(
     problem: Problem, last_ns: Ints | int, beyond_ns: Ints | int
 ) -> NDArray[np.int64]:
-    """Instant at which a window closes: `close_grace_ms` after it, and no deadline of it is open.
+    """Return the instant at which a window closes: after its grace and its last deadline.
 
-    Releases never decrease from cycle to cycle, and so neither do the closes of windows that follow
-    each other, however short the windows are.
+    Releases never decrease from cycle to cycle, so the closes of consecutive windows never
+    decrease, even if the windows are short.
 
     Parameters
     ----------
@@ -32,9 +32,9 @@ def window_close_ns(
     Returns
     -------
     int64 array, shape (...)
-        The later of `beyond_ns` + `close_grace_ms` and `last_ns` + D. Where releases are P apart
-        and D is at most P, that is the first, also where P is no whole number of nanoseconds: a
-        deadline between two of them is over after the first.
+        The later of `beyond_ns` + `close_grace_ms` and `last_ns` + D. If releases are P apart and D
+        is at most P, the first is later, even if P is not a whole number of nanoseconds: a deadline
+        between two nanoseconds has passed after the first of them.
     """
     due_ns, grace_ns = close_after_ns(problem)
     close_ns: Ints = np.maximum(beyond_ns + grace_ns, last_ns + due_ns)
@@ -42,7 +42,7 @@ def window_close_ns(
 
 
 def close_after_ns(problem: Problem) -> tuple[int, int]:
-    """Least times to a window's close: from its last release, and from the first beyond it."""
+    """Return the least times to a window's close, from its last and from the next release."""
     # 28.6 ms are 28600000 ns, though their product in floating point may be a little less.
     due_ns = int(Decimal(str(problem.pipeline.deadline_ms)).scaleb(6))
     return due_ns, round(problem.controller.close_grace_ms * 1e6)

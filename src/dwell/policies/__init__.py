@@ -2,5 +2,5 @@
 
 import lazy_loader
 
-# What is asked for is imported, and nothing else; the names are in the stub.
+# Importing the package loads no policy: a name is imported at its first use. The stub lists them.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

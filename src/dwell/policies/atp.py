@@ -1,34 +1,34 @@
-"""ATP: one stage moved where thresholds ask for it and a cost of three terms agrees.
+"""ATP: moves one stage if a threshold is exceeded and a cost of three terms falls.
 
 Tran et al., "Edge-Based QoS-Aware Adaptive Task Placement: A Closed-Loop Control in Multi-Robot
-Systems", arXiv 2606.00552. The full text was not at hand; this is a **reconstruction** from the
-abstract. What is from where:
+Systems", arXiv 2606.00552. The full text was not available; this is a **reconstruction** from the
+abstract. Its sources:
 
 * *Abstract*: candidate placements are scored by a cost of normalised latency, CPU utilisation and
   switching overhead over control windows of two seconds; placement is switched based on measured
   latency and utilisation thresholds.
-* *The paper of DTP* (arXiv 2605.19887): a single stage moves. It also says that ATP decides by
-  thresholds alone, without a cost of switching (`dwell.policies.atp_thresholds`); the abstract
-  holds.
-* *Ours*: thresholds open the question and the cost answers it; the weights and targets are those of
-  the cell's objective, violations not among them; thresholds default to the targets; a dwell as in
+* *The paper of DTP* (arXiv 2605.19887): a single stage moves. In that paper, ATP uses thresholds
+  alone and has no cost of switching (see `dwell.policies.atp_thresholds`). Here the abstract takes
+  precedence.
+* *Dwell*: the order of the two tests, thresholds first and then the cost; weights and targets from
+  the cell's objective, without violations; thresholds that default to the targets; a dwell as in
   DTP.
 
-Decisions are taken together until `every_ms` is reached, max(1, round(every_ms / (d P))) of them, d
-cycles apart. At the last of them, with means over them, and unless the dwell goes on:
+The policy averages n = max(1, round(every_ms / (d P))) consecutive decision windows, d cycles
+apart. At the last of them, after the dwell, it applies two tests to the means:
 
-1. *Question.* On the robot, is L95 or U_r above its threshold; offloaded, L95 or U_e (U_c where the
-   objective weighs cloud nodes apart)? If not, it stays.
-2. *Answer.* It moves if the other side costs less than staying::
+1. *Thresholds.* On the robot, L95 or U_r must exceed its threshold. Offloaded, L95 or U_e must (U_c
+   if the objective weighs cloud nodes separately). Otherwise the stage stays.
+2. *Cost.* The stage moves if the other side costs less than staying::
 
        C(s) = a_L * L95 / L_target + a_r * U_r / U_r_target + a_e * U_e / U_e_target
               [+ a_c * U_c / U_c_target] + a_S * S
 
-   with what was estimated of both sides, and S = 0 for staying; less by more than the
-   `dwell.cost.margin` of the two, which is 0 where estimates say no errors.
+   C uses the estimates of both sides, with S = 0 for staying. The difference must exceed the
+   `dwell.cost.margin` of the two estimates, which is 0 if they have no standard errors.
 
-At other closes it stays (``hold``, or ``dwell`` while the dwell lasts). A move, its own or somebody
-else's, begins the next such windows.
+At other windows the stage stays (``hold``, or ``dwell`` during the dwell). A move by this policy or
+by the guard restarts the average.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ from dwell.policies.incumbent import CandidatePolicy, check_parameter
 class _Shown(NamedTuple):
     """Metrics that the rule reads, observed or estimated: L95 and its error (ms), U_r, U_e, U_c.
 
-    The error of a mean is the mean of errors: estimates of windows in a row have the same samples.
+    The error of a mean is the mean of errors, because consecutive estimates share their samples.
     """
 
     l95_ms: float
@@ -60,7 +60,7 @@ class _Shown(NamedTuple):
 
 
 class _Window(NamedTuple):
-    """A window: what was seen of it, and what was expected of every candidate."""
+    """The observed metrics of a window, and the estimates of every candidate."""
 
     observed: _Shown
     expected: Mapping[str, _Shown] | None
@@ -83,11 +83,10 @@ class ATP(ATPThresholds):
     Parameters
     ----------
     candidates, initial, objective, local, offload, latency_ms, robot, edge, min_dwell
-        As in `dwell.policies.ATPThresholds`; weights and targets of the objective are those of the
-        cost, too.
+        As in `dwell.policies.ATPThresholds`. The cost uses the objective's weights and targets.
     every_ms : float
-        Time between two decisions, milliseconds; rounded to whole windows when a run starts. A
-        policy that was never started decides at every close.
+        Time between two decisions, milliseconds; rounded to whole windows when a run starts.
+        Before `start`, the policy decides at every window.
     """
 
     usual_estimator = CandidatePolicy.usual_estimator
@@ -129,7 +128,7 @@ class ATP(ATPThresholds):
         )
 
     def start(self, problem: Problem) -> None:
-        """Begin again: the initial candidate, n_d = 0, and no window seen."""
+        """Reset the policy to the initial candidate, n_d = 0 and an empty average."""
         super().start(problem)
         decision_ms = problem.decide_cycles * problem.pipeline.period_ms
         self.every_windows = max(1, round(self.every_ms / decision_ms))
@@ -140,12 +139,11 @@ class ATP(ATPThresholds):
     def _decide(
         self, observed: QoS, estimates: Mapping[str, QoS] | None
     ) -> tuple[Decision, tuple[_Window, ...]]:
-        """Toggle the task if a threshold asks for it and the other side costs less.
+        """Toggle the task if a threshold is exceeded and the other side costs less.
 
-        Windows since the last decision are remembered. `costs` are J of the window, as every
-        policy records them; `delta_j` is what moving saves in the three terms, NaN where no
-        threshold asked. Estimates are needed in every window of those that a question is answered
-        on.
+        The memory holds the windows since the last decision. `costs` are J of the current window,
+        as for every policy. `delta_j` is the saving in the three terms, NaN if no threshold is
+        exceeded. If one is, every window of the average needs estimates.
         """
         costs = self._costs(estimates)
         expected: Mapping[str, _Shown] | None = None
@@ -186,5 +184,5 @@ class ATP(ATPThresholds):
         return cost_error((shown.l95_error_ms, 0.0), self.objective)
 
     def _cost(self, shown: _Shown, switching: float) -> float:
-        """C of the module's head: J without violations."""
+        """Return C of the module docstring: J without violations."""
         return price(shown.l95_ms, 0.0, *shown.used, switching, self.objective)

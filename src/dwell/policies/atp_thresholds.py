@@ -1,17 +1,17 @@
-"""ATPThresholds: one stage moved by thresholds alone, as the paper of DTP describes its forerunner.
+"""ATPThresholds: moves one stage by thresholds alone, as the paper of DTP describes ATP.
 
-Tran et al. (arXiv 2605.19887) say of ATP that it relocates a single stage, decides by binary
-thresholds on individual metrics, and has no model of the cost of switching. The abstract of the
-paper of ATP itself says otherwise (see `dwell.policies.atp`). This is the rule of the first, with
-thresholds of our own: the design targets.
+According to Tran et al. (arXiv 2605.19887), ATP relocates a single stage, decides by binary
+thresholds on individual metrics, and has no model of the cost of switching. The abstract of ATP's
+own paper disagrees (see `dwell.policies.atp`). This module follows Tran et al., with the design
+targets as thresholds.
 
 * On the robot (`local`), the stage is offloaded if L95 or the robots' utilisation is above its
   threshold.
 * Offloaded, it returns if L95 or the edge's utilisation is above its threshold.
 * After a move it stays for at least `min_dwell` windows, counted as in DTP.
 
-It looks at the last window only, and never asks what the other side would have shown: where both
-sides are over a threshold it moves to and fro, held back by the dwell alone.
+The rule reads the last window only and ignores estimates. If both sides exceed a threshold, it
+alternates between them, and only the dwell limits the number of moves.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ THRESHOLD = Bound(0)
 
 
 class Pair(NamedTuple):
-    """Two candidates that differ in where one task runs: on a robot, or on the edge or cloud."""
+    """Two candidates that differ in one task: on a robot, or on an edge or cloud node."""
 
     local: str
     offload: str
@@ -40,7 +40,7 @@ class Pair(NamedTuple):
 
 
 def find_pairs(candidates: Mapping[str, Placement], tiers: Mapping[str, Tier]) -> tuple[Pair, ...]:
-    """Return every pair of candidates that one task could toggle between, in their order."""
+    """Return every pair of candidates that differ in the side of one task, in candidate order."""
     pairs = []
     for local, here in candidates.items():
         for offload, there in candidates.items():
@@ -62,22 +62,22 @@ class ATPThresholds(PricingPolicy):
     candidates : mapping of str to Placement
         Over the same tasks.
     initial : str, optional
-        The candidate it starts on; the first where None. On one that is neither `local` nor
-        `offload`, the side it is on is that of the toggled task's tier.
+        The candidate it starts on; the first if None. If it is neither `local` nor `offload`, the
+        tier of the toggled task selects the side.
     objective : Objective
         Tiers of the nodes, and the thresholds that are not given.
     local, offload : str, optional
         Candidates that differ in exactly one task, on a robot in `local` and on the edge or in
-        the cloud in `offload`. Where None, the first pair that contains `initial`, else the
-        first pair.
+        the cloud in `offload`. If None, the first pair that contains `initial`, else the first
+        pair.
     latency_ms : float, optional
-        Threshold on L95, milliseconds; ``targets.latency_ms`` where None.
+        Threshold on L95, milliseconds; ``targets.latency_ms`` if None.
     robot, edge : float, optional
-        Thresholds on U_r and U_e, infinity for none; ``targets.robot`` and ``targets.edge``
-        where None. Where the objective weighs cloud nodes apart and the task is offloaded to one,
-        `edge` is a threshold on U_c, and ``targets.cloud`` where None.
+        Thresholds on U_r and U_e, infinity for none; ``targets.robot`` and ``targets.edge`` if
+        None. If the objective weighs cloud nodes separately and the task is offloaded to a cloud
+        node, `edge` is the threshold on U_c and defaults to ``targets.cloud``.
     min_dwell : int
-        Windows after a migration that never migrate.
+        Windows without a migration after each migration.
 
     Raises
     ------
@@ -107,7 +107,7 @@ class ATPThresholds(PricingPolicy):
         self.pair = self._choose(local, offload)
         targets = objective.targets
         outside_tier = objective.tiers[self.candidates[self.pair.offload][self.pair.task]]
-        #: Whether the task is offloaded to a cloud node that the objective weighs apart.
+        #: Whether the task is offloaded to a cloud node that the objective weighs separately.
         self.on_cloud = objective.weights.cloud is not None and outside_tier == "cloud"
         outside = targets.cloud if self.on_cloud and targets.cloud else targets.edge
         self.latency_ms = targets.latency_ms if latency_ms is None else latency_ms
@@ -119,7 +119,7 @@ class ATPThresholds(PricingPolicy):
 
     @classmethod
     def from_problem(cls, problem: Problem) -> Self:
-        """Make a policy that toggles one task: the heaviest, of pairs with the initial candidate.
+        """Make a policy that toggles the heaviest task, preferably from the initial candidate.
 
         Raises
         ------
@@ -134,7 +134,7 @@ class ATPThresholds(PricingPolicy):
             scale = 1.0 if task.scale is None else problem.pipeline.scales[task.scale].expectation
             return on_robot.exec_ms.expectation * scale
 
-        # The heaviest stage is the one worth offloading; max() keeps the first of equals.
+        # Offloading the heaviest stage saves most; of equal pairs max() returns the first.
         pair = max(
             pairs,
             key=lambda pair: (problem.initial in pair[:2], robot_time_ms(pair)),
@@ -156,12 +156,12 @@ class ATPThresholds(PricingPolicy):
         )
 
     def _choose(self, local: str | None, offload: str | None) -> Pair:
-        """Return the first pair that agrees with what is given, one with `initial` before others.
+        """Return the first pair that matches the arguments, preferably with `initial`.
 
         Raises
         ------
         PolicyError
-            If there is none.
+            If no pair matches.
         """
         for field, name in (("local", local), ("offload", offload)):
             if name is not None:
@@ -175,8 +175,9 @@ class ATPThresholds(PricingPolicy):
             asked = f" with local={local!r}, offload={offload!r}" if local or offload else ""
             raise PolicyError(
                 f"atp needs two candidates that differ in exactly one task, on a robot node in "
-                f"one and on an edge or cloud node in the other; there is no such pair{asked} "
-                f"among {', '.join(self.candidates)}: add a candidate, or use another policy"
+                f"one and on an edge or cloud node in the other; no pair{asked} "
+                f"qualifies among {', '.join(self.candidates)}: add a candidate, or use another "
+                "policy"
             )
         return next((pair for pair in pairs if self.initial in pair[:2]), pairs[0])
 
@@ -202,7 +203,7 @@ class ATPThresholds(PricingPolicy):
         return (self._move(other, "migrate", costs) if over else self._stay("hold", costs)), None
 
     def _question(self, l95_ms: float, used: TierUtilisation) -> tuple[str, bool]:
-        """Return the other side of the pair, and whether a metric is above its threshold here."""
+        """Return the other side of the pair, and whether a metric exceeds its threshold."""
         task = self.pair.task
         if self.objective.tiers.get(self.candidates[self.incumbent][task]) == "robot":
             other, busy = self.pair.offload, used.robot > self.robot

@@ -1,7 +1,7 @@
-"""Whether a policy keeps its word in the windows where policies break.
+"""Test a policy on windows where policies often fail.
 
-The windows are what a controller could really show: the incumbent's estimate is what was
-observed, and which candidate is the incumbent follows from the policy's own decisions.
+A controller could produce all of these windows: the incumbent's estimate equals the observation,
+and the incumbent follows from the policy's own decisions.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from dwell.model.problem import Problem
 from dwell.model.qos import REASONS, Decision, QoS
 from dwell.policies.protocol import MinimalPolicy
 
-#: CPU time that one call may take before it counts as never ending.
+#: CPU time of one call, in seconds, above which the call counts as endless.
 LIMIT_S = 5.0
 
 SHORT, LONG = 24, 300
@@ -34,7 +34,7 @@ Window = Mapping[str, QoS]
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """Windows in a row, and the candidates that a guard moves the cell to, by window."""
+    """A sequence of windows, and the candidates that a guard moves the cell to, by window."""
 
     name: str
     windows: tuple[Window, ...]
@@ -42,7 +42,7 @@ class Situation:
 
 
 class _BrokenOffError(Exception):
-    """A fault has been noted after which a run cannot go on."""
+    """A recorded fault ends the run."""
 
 
 class _EndlessError(BaseException):
@@ -50,16 +50,17 @@ class _EndlessError(BaseException):
 
 
 def check_policy(policy: MinimalPolicy, problem: Problem) -> tuple[str, ...]:
-    """Run copies of a policy through awkward windows and say what it breaks.
+    """Run copies of a policy through difficult windows and return the rules that it breaks.
 
     The windows: all metrics zero, every node saturated, latencies at their bound, every candidate
-    over its caps, ties, an incumbent that is always the worst, hundreds of windows of a random
-    walk, and a guard that moves the cell (where the policy has ``adopt``). In each of them it must
+    over its caps, ties, a different best candidate in each window, estimates with large errors,
+    hundreds of windows of a random walk, and a guard that moves the cell (if the policy has
+    ``adopt``). In each of them the policy must
 
     * raise nothing, and return within `LIMIT_S` of CPU time;
     * return a candidate's name, or a Decision whose name, placement, reason and flag agree;
-    * leave alone what it was given;
-    * decide the same again after ``start`` (a fresh copy, where it has none).
+    * leave its arguments unchanged;
+    * repeat its decisions after ``start`` (or as a new copy, if it has no ``start``).
 
     Parameters
     ----------
@@ -69,12 +70,12 @@ def check_policy(policy: MinimalPolicy, problem: Problem) -> tuple[str, ...]:
     Returns
     -------
     tuple of str
-        One sentence for each kind of fault, about its first occurrence; empty if there is none.
+        One sentence per kind of fault, about its first occurrence; empty if the policy passes.
 
     Notes
     -----
-    The limit is a timer of the main thread (``signal.ITIMER_VIRTUAL``). In other threads there is
-    none, and a policy that never returns keeps the caller waiting.
+    The limit is a timer of the main thread (``signal.ITIMER_VIRTUAL``). Other threads have no
+    limit: there, a policy that never returns blocks the caller.
     """
     if not callable(getattr(policy, "decide", None)):
         return ("it has no method decide(*, observed, estimates)",)
@@ -91,7 +92,7 @@ def check_policy(policy: MinimalPolicy, problem: Problem) -> tuple[str, ...]:
 
 
 class _Check:
-    """The faults found so far in one policy, one of each kind."""
+    """The first fault of each kind found in one policy."""
 
     def __init__(self, policy: MinimalPolicy, problem: Problem) -> None:
         self.policy = policy
@@ -105,12 +106,12 @@ class _Check:
         self.faults.setdefault(kind, sentence)
 
     def stop(self, kind: str, sentence: str) -> NoReturn:
-        """Note a fault, and break the run off."""
+        """Record a fault and end the run."""
         self.note(kind, sentence)
         raise _BrokenOffError
 
     def play_twice(self, situation: Situation) -> None:
-        """Play a situation, restart, play it again, and compare."""
+        """Run a situation twice, with a restart in between, and compare the decisions."""
         policy = copy.deepcopy(self.policy)
         first = self.play(policy, situation)
         if len(first) < len(situation.windows):
@@ -129,7 +130,7 @@ class _Check:
                 return
 
     def play(self, policy: Any, situation: Situation) -> list[str]:
-        """Return the decisions of one run, as far as it got."""
+        """Return the decisions of one run, up to the first fault that ends it."""
         decisions: list[str] = []
         with suppress(_BrokenOffError):
             if start := getattr(policy, "start", None):
@@ -149,7 +150,7 @@ class _Check:
         return decisions
 
     def decide(self, policy: Any, window: Window, incumbent: str, where: str) -> object:
-        """Return the answer to a window."""
+        """Return the policy's decision on a window."""
         observed, estimates = window[incumbent], FrozenDict(window)
         before = repr(estimates)
         answer = self.call("decide", where, policy.decide, observed=observed, estimates=estimates)
@@ -160,7 +161,7 @@ class _Check:
         return answer
 
     def judge(self, answer: object, incumbent: str, where: str) -> str:
-        """Return the name that was decided."""
+        """Return the name of the chosen candidate, after recording faults of the decision."""
         name = answer.name if isinstance(answer, Decision) else answer
         if not isinstance(name, str):
             self.stop(
@@ -195,7 +196,7 @@ def _placements(problem: Problem) -> dict[str, dict[str, str]]:
 def _contradictions(
     decision: Decision, incumbent: str, placements: Mapping[str, Mapping[str, str]]
 ) -> Iterator[tuple[str, str]]:
-    """Yield the kind of each contradiction within a decision, and what is wrong."""
+    """Yield the kind and the description of each contradiction within a decision."""
     placement, reason, dwell = decision.placement, decision.reason, decision.dwell
     if not isinstance(placement, Mapping) or dict(placement) != placements[decision.name]:
         yield "placement", f"with another placement than that candidate's: {placement!r}"
@@ -223,7 +224,7 @@ def _contradictions(
 
 @contextmanager
 def _limited(seconds: float) -> Iterator[None]:
-    """Raise _EndlessError inside the block once it has taken so much CPU time."""
+    """Raise _EndlessError inside the block once it has used this much CPU time."""
 
     def stop(number: int, frame: FrameType | None) -> NoReturn:
         raise _EndlessError
@@ -241,7 +242,7 @@ def _limited(seconds: float) -> Iterator[None]:
 
 
 def _situations(problem: Problem) -> Iterator[Situation]:
-    """Yield the awkward windows for a problem's candidates and resources."""
+    """Yield the difficult windows for a problem's candidates and resources."""
     names = list(problem.candidates)
     deadline, bound = problem.pipeline.deadline_ms, problem.censor_ms
     caps = problem.objective.caps

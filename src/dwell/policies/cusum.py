@@ -1,24 +1,24 @@
-"""CUSUM: moves once the advantage of another candidate has added up to enough.
+"""CUSUM: moves when the cumulative advantage of another candidate exceeds a threshold.
 
-A single window says little about a small difference of J and much about a large one. Instead of a
-threshold on one window's difference and a minimum dwell, each candidate s has a cumulative sum of
-what it would have saved, as in Page's test for a change of the mean (Biometrika 41, 1954,
+A single window is weak evidence of a small difference of J and strong evidence of a large one.
+Instead of a threshold on one window's difference and a minimum dwell, each candidate s has a
+cumulative sum of its savings, as in Page's test for a change of the mean (Biometrika 41, 1954,
 DOI 10.1093/biomet/41.1-2.100)::
 
     g(s) < -max(0, memory * g(s) + J(incumbent) - J(s) - slack - margin(s))
 
-J is that of the estimates, against the incumbent, whose own switching term is therefore 0;
-margin(s) is the `dwell.cost.margin` of the two, 0 where estimates say no errors. An error stays as
-long as the samples behind it, so that it must not add up: it is taken off in every window. If any
-eligible g(s) exceeds the threshold, the cheapest of those candidates becomes the incumbent, if it
-is cheaper in this window too, and all sums begin again at 0.
+J comes from the estimates, with switching terms against the incumbent, so the incumbent's own term
+is 0. margin(s) is the `dwell.cost.margin` of the two estimates, 0 if they have no standard errors.
+Consecutive estimates share samples, so their errors persist; every window subtracts the margin, and
+errors do not accumulate. If an eligible g(s) exceeds the threshold, the cheapest such candidate
+becomes the incumbent, provided that it is also cheaper in this window, and all sums restart at 0.
 
-An advantage above ``threshold + slack + margin`` moves the cell at once, whatever the last move's
-date; one below ``slack + margin + (1 - memory) * threshold`` never does, however long it lasts.
-There is no minimum dwell: what bounds migrations is what they are worth. Before each of them, and
-after the one before it, the advantages of the candidate it goes to, each less slack and margin
-where that is above 0, have added up to more than the threshold. So, with A the sum over all windows
-of the largest such advantage, there are fewer than A / threshold migrations.
+An advantage above ``threshold + slack + margin`` moves the cell at once, even just after a move. An
+advantage below ``slack + margin + (1 - memory) * threshold`` never moves it, however long it lasts.
+The advantage bounds the number of migrations, without a minimum dwell. Between two
+migrations, the positive parts of advantage - slack - margin of the second migration's target add up
+to more than the threshold. With A the sum over all windows of the largest such part, a run
+therefore has fewer than A / threshold migrations.
 """
 
 from __future__ import annotations
@@ -36,19 +36,20 @@ from dwell.policies.incumbent import PricingPolicy, check_parameter
 
 
 class Cusum(PricingPolicy):
-    """Moves to the cheapest candidate whose advantage over the incumbent has added up.
+    """Moves to the cheapest candidate whose cumulative advantage exceeds the threshold.
 
     A candidate over a cap is not eligible, as in DTP, and the reasons are the same; if none is
-    eligible, those closest to their caps are compared. Sums of candidates over a cap go on.
+    eligible, the candidates closest to their caps are compared. Sums of candidates over a cap
+    continue to grow and shrink.
 
     Parameters
     ----------
     candidates, initial, objective
         As in `dwell.policies.DTP`.
     threshold : float
-        Sum that an advantage must exceed, in units of J.
+        Cumulative advantage that a move must exceed, in units of J.
     slack : float
-        Advantage of a window, beside the margin of the estimates, that counts as none, in units of
+        Part of each window's advantage that is subtracted in addition to the margin, in units of
         J.
     memory : float
         Share of a sum that outlives a window, in (0, 1].
@@ -96,10 +97,10 @@ class Cusum(PricingPolicy):
     def _decide(
         self, observed: QoS, estimates: Mapping[str, QoS] | None
     ) -> tuple[Decision, tuple[float, ...]]:
-        """Add a window to the sums, which are remembered, and compare them with the threshold.
+        """Add a window to the sums and compare them with the threshold.
 
-        `delta_j` is the advantage of this window over the cheapest candidate whose sum is over the
-        threshold, 0 where there is none.
+        `delta_j` is this window's advantage of the cheapest candidate whose sum exceeds the
+        threshold, 0 if no sum does.
         """
         estimates = self._known(estimates)
         now, pricing = self.incumbent, self._pricing

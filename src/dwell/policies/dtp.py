@@ -3,24 +3,25 @@
 Window k ran under the incumbent, placement k - 1. The lines of the algorithm, with its corner
 cases decided:
 
-* J of the incumbent comes from its entry in the estimates, with the switching term of its own last
-  decision (placement k - 1 against k - 2). J of every candidate, the incumbent included, comes from
-  its entry against the incumbent. The incumbent's entry is what was measured, as in the paper,
-  unless the estimator learns: both sides of Delta J are then its predictions.
-* Delta J must exceed Delta_min and the `dwell.cost.margin` of the two estimates, which is 0 where
-  they say no errors, by more than `dwell.cost.GAIN_TOLERANCE`.
-* n_d counts decisions since the last migration and blocks while n_d < N_min. Two migrations are
-  therefore at least N_min + 1 decisions apart, and K decisions hold at most
-  floor(K / (N_min + 1)) of them, whatever the metrics do.
-* The minimum goes to the incumbent on a tie, then to the order of the candidates. If it is the
-  incumbent, the window is a hold whatever Delta J says, and n_d grows.
-* A candidate over a cap is not eligible; where a cheaper one was left out for that, the reason of
-  a move is ``capped``. If none is eligible, those closest to their caps are compared by J as
-  usual, and the reason is ``infeasible``; the hysteresis still applies.
+* J of staying uses the incumbent's estimate and the switching term of its own last decision
+  (placement k - 1 against k - 2). J of every candidate, including the incumbent, uses the
+  candidate's estimate and its switching term against the incumbent. The incumbent's estimate equals
+  its measurement, as in the paper, unless the estimator learns: both sides of Delta J are then
+  predictions.
+* Delta J must exceed the sum of Delta_min and the `dwell.cost.margin` of the two estimates by more
+  than `dwell.cost.GAIN_TOLERANCE`. The margin is 0 if the estimates have no standard errors.
+* n_d counts decisions since the last migration; no migration happens while n_d < N_min. Two
+  migrations are therefore at least N_min + 1 decisions apart, and K decisions contain at most
+  floor(K / (N_min + 1)) migrations, for any metrics.
+* On a tie the incumbent wins, then the earlier candidate. If the incumbent is the minimum, the
+  decision is a hold for any Delta J, and n_d grows.
+* A candidate over a cap is not eligible. If this excludes a cheaper candidate, the reason of the
+  move is ``capped``. If no candidate is eligible, the candidates closest to their caps are compared
+  by J as usual, and the reason is ``infeasible``; the hysteresis still applies.
 
-``escape`` is an addition to the algorithm, off by default: an incumbent that was seen over a cap
-moves to the cheapest candidate within its caps, if there is one, whatever n_d and Delta J say. The
-bounds on migrations do not hold then.
+``escape`` is an addition to the algorithm, off by default: if the incumbent was observed over a cap
+and another candidate is within its caps, the cell moves to the cheapest such candidate, regardless
+of n_d and Delta J. The bounds on migrations do not apply to these moves.
 """
 
 from __future__ import annotations
@@ -47,12 +48,12 @@ class DTP(PricingPolicy):
     candidates : mapping of str to Placement
         Pi_cand, over the same tasks; the order breaks ties.
     initial : str, optional
-        pi_0; the first candidate where None.
+        pi_0; the first candidate if None.
     objective : Objective
         Weights, targets, caps and tiers of J.
     min_dwell : int
-        N_min, calls of `decide`; 0 lets every call migrate. `from_problem` turns the cell's windows
-        into calls.
+        N_min, in calls of `decide`; 0 lets every call migrate. `from_problem` converts the cell's
+        windows to calls.
     min_improvement : float
         Delta_min, in units of J: an improvement must exceed it, and the margin of the estimates.
     escape : bool
@@ -98,7 +99,7 @@ class DTP(PricingPolicy):
         )
 
     def _decide(self, observed: QoS, estimates: Mapping[str, QoS] | None) -> tuple[Decision, None]:
-        """One pass of the loop of Algorithm 1, which does without estimates in a dwell window."""
+        """Run one pass of Algorithm 1's loop; a dwell window needs no estimates."""
         now, dwell, pricing = self.incumbent, self._standing.dwell, self._pricing
         costs = self._costs(estimates)
         if self.escape and estimates is not None and excess(observed, self.objective) > 0:
@@ -124,7 +125,7 @@ class DTP(PricingPolicy):
         return self._stay("hold" if within_caps else "infeasible", costs, delta_j), None
 
     def _stays(self, estimates: Mapping[str, QoS]) -> float:
-        """J of the incumbent, with the switching term of its own last decision."""
+        """Return J of the incumbent, with the switching term of its own last decision."""
         name = self.incumbent
         return self._pricing.cost(estimates[name], name, self._standing.previous)
 
@@ -139,7 +140,7 @@ def cheapest(costs: Mapping[str, float], eligible: Iterable[str], incumbent: str
     eligible : iterable of str
         At least one, in the order that breaks ties.
     incumbent : str
-        Wins every tie, where it is eligible.
+        Wins every tie, if it is eligible.
     """
     best, lowest = "", float("inf")
     for name in eligible:

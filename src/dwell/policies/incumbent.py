@@ -1,4 +1,4 @@
-"""What our policies have in common: candidates, the active one among them, J, and a rule."""
+"""Base classes of Dwell's policies: candidates, the incumbent, J and a decision rule."""
 
 from __future__ import annotations
 
@@ -26,14 +26,10 @@ NOT_PRICED: FrozenDict[str, float] = FrozenDict()
 
 
 def check_candidates(candidates: Mapping[str, Placement]) -> FrozenDict[str, Placement]:
-    """Return the candidates unchangeable, in their order.
+    """Return the candidates as an immutable mapping, in their order.
 
-    Raises
-    ------
-    PolicyError
-        If there is none, or two of them place different tasks.
-    PlacementError
-        If one is not a placement.
+    Raises PolicyError if the mapping is empty or two candidates place different tasks, and
+    PlacementError if a value is not a placement.
     """
     if not candidates:
         raise PolicyError("candidates is empty; give at least one placement, as {'LOC': ...}")
@@ -52,12 +48,9 @@ def check_candidates(candidates: Mapping[str, Placement]) -> FrozenDict[str, Pla
 
 
 def check_name(field: str, name: str | None, candidates: Mapping[str, Placement]) -> str:
-    """Return `name`, or the first candidate's where it is None.
+    """Return `name`, or the first candidate's name if it is None.
 
-    Raises
-    ------
-    PolicyError
-        If no candidate has that name.
+    Raises PolicyError if no candidate has that name.
     """
     if name is None:
         return next(iter(candidates))
@@ -77,47 +70,28 @@ def check_parameter(field: str, value: Number, bound: Bound) -> Number:
 
 
 class Standing(NamedTuple):
-    """All that changes of a policy, as one value.
+    """The state of a policy, as one immutable value."""
 
-    Parameters
-    ----------
-    name : str
-        The active candidate (pi_{k-1} when window k is decided).
-    previous : str
-        The one active before the last decision (pi_{k-2}).
-    dwell : int
-        Windows since the last move (n_d).
-    memory : object
-        What it remembers of windows, where it does; unchangeable.
-    """
-
+    #: The incumbent (pi_{k-1} when window k is decided).
     name: str
+    #: The incumbent before the last decision (pi_{k-2}).
     previous: str
+    #: Decisions since the last move (n_d).
     dwell: int
+    #: The rule's own state from earlier windows; immutable, or None.
     memory: Any
 
 
 class CandidatePolicy(Proposer):
-    """Base of our policies: the candidates, the active one among them, and their J.
+    """Base of Dwell's policies: the candidates, the incumbent, and J of each candidate.
 
-    A subclass has a rule, `_decide`, which changes nothing.
-
-    Parameters
-    ----------
-    candidates : mapping of str to Placement
-        Over the same tasks; the order breaks ties.
-    initial : str, optional
-        The candidate it starts on; the first where None.
-    objective : Objective, optional
-        Weights, targets, caps and tiers of J; where None, nothing is priced.
-
-    Raises
-    ------
-    PolicyError
-        If `initial` is no candidate, or candidates place different tasks.
+    A subclass implements the rule, `_decide`, without changing any state. The order of the
+    candidates breaks ties. `initial` is the candidate at the start, the first if None. Without an
+    `objective`, J is not computed. Raises PolicyError if `initial` is no candidate, or candidates
+    place different tasks.
     """
 
-    #: Arguments beside these that `from_problem` gives, with their names in ``problem.controller``.
+    #: Further arguments that `from_problem` passes, with their keys in ``problem.controller``.
     SETTINGS: ClassVar[Mapping[str, str]] = {}
 
     initial: str
@@ -155,16 +129,13 @@ class CandidatePolicy(Proposer):
         return self._standing.name
 
     def start(self, problem: Problem) -> None:
-        """Begin again on the initial candidate, n_d = 0, with no window seen."""
+        """Reset the policy to the initial candidate and n_d = 0, without memory of windows."""
         self._standing = self._first()
 
     def adopt(self, name: str) -> None:
-        """Take over `name` as the incumbent with n_d = 0: somebody else moved the cell there.
+        """Make `name` the incumbent with n_d = 0, although this policy did not choose it.
 
-        Raises
-        ------
-        PolicyError
-            If no candidate has that name.
+        Raises PolicyError if no candidate has that name.
         """
         name = check_name("the adopted placement", name, self.candidates)
         self._standing = Standing(name, self._standing.name, 0, self._adopted())
@@ -172,17 +143,9 @@ class CandidatePolicy(Proposer):
     def decide(self, *, observed: QoS, estimates: Mapping[str, QoS] | None = None) -> Decision:
         """Decide the placement for the next window.
 
-        Parameters
-        ----------
-        observed : QoS
-            Metrics of the window under the incumbent.
-        estimates : mapping of str to QoS, optional
-            Metrics by candidate; a rule that reads none does without.
-
-        Raises
-        ------
-        MetricError
-            If a metric, or the estimate of a candidate, is missing. Nothing has changed then.
+        `observed` has the metrics under the incumbent, and `estimates` the metrics of each
+        candidate, optional if the rule does not read them. Raises MetricError, with the policy
+        unchanged, if a metric or a candidate's estimate is missing.
         """
         decision, self._standing = self.propose(observed=observed, estimates=estimates)
         return decision
@@ -194,27 +157,27 @@ class CandidatePolicy(Proposer):
         estimates: Mapping[str, QoS] | None = None,
         tentative: bool = False,
     ) -> tuple[Decision, Standing]:
-        """Return the decision on a window, and how the policy stands after it."""
+        """Return the decision on a window, and the policy's state after it."""
         check_metrics(observed, "observed")
         decision, memory = self._decide(observed, estimates)
         return decision, Standing(decision.name, self._standing.name, decision.dwell, memory)
 
     def commit(self, after: Standing) -> None:
-        """Stand as after a decision that was proposed."""
+        """Set the state that `propose` returned."""
         self._standing = after
 
     @abstractmethod
     def _decide(
         self, observed: QoS, estimates: Mapping[str, QoS] | None
     ) -> tuple[Decision, object]:
-        """Return the decision on a window, and what is remembered after it (see `decide`)."""
+        """Return the decision on a window, and the rule's memory after it (see `decide`)."""
 
     def _blank(self) -> object:
-        """Return what it remembers where it has seen no window."""
+        """Return the memory before the first window."""
         return None
 
     def _adopted(self) -> object:
-        """Return what it remembers where somebody else has moved the cell."""
+        """Return the memory after `adopt`."""
         return self._blank()
 
     def _first(self) -> Standing:
@@ -241,13 +204,7 @@ class CandidatePolicy(Proposer):
         return Decision(self.candidates[name], name, True, reason, costs, 0, delta_j)
 
     def _known(self, estimates: Mapping[str, QoS] | None) -> Mapping[str, QoS]:
-        """Return the estimates of a rule that cannot do without.
-
-        Raises
-        ------
-        MetricError
-            If there are none.
-        """
+        """Return the estimates; raise MetricError if they are None."""
         if estimates is None:
             raise MetricError(
                 f"estimates is None; give one for each of {', '.join(self.candidates)}"
@@ -255,12 +212,9 @@ class CandidatePolicy(Proposer):
         return estimates
 
     def _costs(self, estimates: Mapping[str, QoS] | None) -> FrozenDict[str, float]:
-        """J of every candidate against the incumbent, where it is priced and estimated.
+        """Return J of every candidate against the incumbent; empty without objective or estimates.
 
-        Raises
-        ------
-        MetricError
-            If a metric, or the estimate of a candidate, is missing.
+        Raises MetricError if a metric, or the estimate of a candidate, is missing.
         """
         if self._pricing is None or estimates is None:
             return NOT_PRICED

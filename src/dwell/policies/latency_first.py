@@ -1,4 +1,4 @@
-"""LatencyFirst: always the candidate with the lowest estimated L95."""
+"""LatencyFirst: moves to the candidate with the lowest estimated L95."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from dwell.policies.pricing import explain_estimate
 class LatencyFirst(CandidatePolicy):
     """Moves to the lowest estimated L95 in every window, with neither hysteresis nor dwell.
 
-    This is latency-driven service selection, what FogROS2-LS (Chen et al., ICRA 2024) does among
-    replicated deployments of a service: it knows no deadline, no utilisation, no caps and no price
-    of a move. Ties go to the incumbent, then to the order of the candidates. Where estimates have
-    errors, the lowest must be below the incumbent's by more than their `dwell.cost.margin`.
+    FogROS2-LS (Chen et al., ICRA 2024) selects among replicas of a service in the same way. The
+    rule ignores deadline, utilisation, caps and the price of a move. On a tie the incumbent wins,
+    then the earlier candidate. If estimates have errors, the lowest L95 must be below the
+    incumbent's by more than their `dwell.cost.margin`.
 
     Parameters
     ----------
     candidates, initial
         As in `dwell.policies.DTP`.
     objective : Objective, optional
-        Where given, J of every candidate is recorded; it decides nothing.
+        If given, decisions record J of every candidate; J has no influence.
     """
 
     by_price = True

@@ -1,4 +1,4 @@
-"""Parameters of a policy, as its run's record keeps them."""
+"""Parameters of a policy, as the record of a run stores them."""
 
 from __future__ import annotations
 
@@ -10,18 +10,10 @@ from dwell.model.objective import Objective
 
 
 def parameters_of(policy: object) -> dict[str, object]:
-    """Return the arguments of a policy's class that it keeps under their own names.
+    """Return the constructor arguments that a policy stores under their own names.
 
-    Parameters
-    ----------
-    policy : policy
-        Ours or a user's.
-
-    Returns
-    -------
-    dict of str to object
-        Ready for JSON: numbers, names and None, an infinite number as ``"inf"``, and the objective
-        as in a cell file. What is none of these (candidates, objects of a user's) is left out.
+    The values are ready for JSON: numbers, names and None, an infinite number as ``"inf"``, and the
+    objective as in a cell file. Other values, such as candidates, are left out.
     """
     kept: dict[str, object] = {}
     for name in inspect.signature(type(policy)).parameters:

@@ -1,7 +1,7 @@
-"""J and the caps for a fixed set of candidates, with everything constant looked up once.
+"""J and the caps for a fixed set of candidates.
 
-The numbers are those of `dwell.cost`, which they go through. What is saved is finding a tier's
-nodes and comparing placements again in every window.
+The formulas are in `dwell.cost`. This module looks up the nodes of each tier and compares
+placements once instead of in every window.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from dwell.model.qos import QoS, Reason
 
 INFINITY = math.inf
 
-#: Candidates this close to the least relative excess are told apart by J instead.
+#: Candidates within this distance of the least relative excess are compared by J.
 EXCESS_TOLERANCE = 1e-6
 
 
@@ -59,7 +59,7 @@ def _shares(
     """Return the function that looks up the utilisation of a tier: a tuple, never empty."""
     nodes = tuple(name for name in names if name not in accelerators)
     if len(nodes) < len(names):
-        # Of accelerators a window need not show anything.
+        # The metrics of a window may lack accelerators.
         rest = names[len(nodes) :]
         return lambda used: (
             0.0,
@@ -86,12 +86,12 @@ class Pricing:
         of = objective.accelerators
         self._robot, self._edge = _shares(nodes.robot, of), _shares(nodes.edge, of)
         self._cloud = _shares(nodes.cloud, of) if nodes.cloud else None
-        # One row of Hamming distances an incumbent, made when it first is one: n candidates of
-        # which few are ever active do not cost n * n comparisons.
+        # Hamming distances by incumbent, computed at its first use: usually few of the n candidates
+        # become the incumbent, and n * n comparisons would be wasted.
         self._rows: dict[str, dict[str, float]] = {}
 
     def switching(self, previous: str) -> Mapping[str, float]:
-        """S of every candidate, when `previous` was active before it."""
+        """Return S of every candidate, with `previous` as the placement before it."""
         row = self._rows.get(previous)
         if row is None:
             before = self.candidates[previous]
@@ -100,13 +100,7 @@ class Pricing:
         return row
 
     def used(self, qos: QoS) -> TierUtilisation:
-        """U_r, U_e and U_c of an observed window.
-
-        Raises
-        ------
-        MetricError
-            If a metric is missing.
-        """
+        """Return U_r, U_e and U_c of a window; raise MetricError if a metric is missing."""
         try:
             used = qos.utilisation
             cloud = 0.0 if self._cloud is None else max(self._cloud(used))
@@ -115,12 +109,9 @@ class Pricing:
             self._explain(qos, "observed")
 
     def cost(self, qos: QoS, current: str, previous: str) -> float:
-        """J of a window under `current`, when `previous` was the candidate before it.
+        """Return J of a window under `current` after `previous`.
 
-        Raises
-        ------
-        MetricError
-            If a metric is missing, or J is not finite.
+        Raises MetricError if a metric is missing, or J is not finite.
         """
         try:
             value = self._price(qos, self.switching(previous)[current])
@@ -131,12 +122,9 @@ class Pricing:
         return value
 
     def estimated(self, estimates: Mapping[str, QoS], incumbent: str) -> FrozenDict[str, float]:
-        """J of every candidate against the incumbent, in the candidates' order.
+        """Return J of every candidate against the incumbent, in the candidates' order.
 
-        Raises
-        ------
-        MetricError
-            If a candidate or one of its metrics is missing, or a J is not finite.
+        Raises MetricError if a candidate or one of its metrics is missing, or a J is not finite.
         """
         costs = {}
         name = ""
@@ -152,7 +140,7 @@ class Pricing:
         return FrozenDict(costs)
 
     def margin(self, one: QoS, other: QoS) -> float:
-        """Return what J of two estimates must differ by to be more than their error."""
+        """Return the least difference in J of two estimates that exceeds their error."""
         if one.error is None and other.error is None:
             return 0.0
         return margin(
@@ -160,11 +148,11 @@ class Pricing:
         )
 
     def eligible(self, estimates: Mapping[str, QoS]) -> tuple[list[str], bool]:
-        """Candidates to choose from, and whether they respect the caps.
+        """Return the candidates to choose from, and whether they respect the caps.
 
-        Where none does, these are the candidates whose largest relative excess is within
-        `EXCESS_TOLERANCE` of the least: on a saturated robot every placement is over its cap, and
-        that must not freeze the policy.
+        If no candidate respects them, return the candidates whose largest relative excess is within
+        `EXCESS_TOLERANCE` of the least. Otherwise a saturated robot, over its cap in every
+        placement, would block the policy.
         """
         caps = self.objective.caps
         latency_ms, utilisation = caps.latency_ms, caps.utilisation
@@ -182,7 +170,7 @@ class Pricing:
     def reason(
         self, best: str, costs: Mapping[str, float], eligible: Sequence[str], *, within_caps: bool
     ) -> Reason:
-        """Why the cell moves to `best`; what `eligible` gave comes last."""
+        """Return the reason of a move to `best`, from the two results of `eligible`."""
         if not within_caps:
             return "infeasible"
         cheaper = [name for name, value in costs.items() if value < costs[best]]

@@ -1,4 +1,4 @@
-"""What a policy has to be, and what the controller makes of it."""
+"""Interfaces of policies: the methods users write, and the base class the controller uses."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from dwell.model.qos import Decision, QoS
 
 @runtime_checkable
 class MinimalPolicy(Protocol):
-    """The least a policy has to be: something that decides.
+    """The smallest policy: an object with the method `decide`.
 
     A policy may also have
 
-    * ``start(problem)``, called before every run, which makes it forget the run before; without
-      it every run begins with a fresh copy;
-    * ``initial``, the name of the candidate it starts on, where that is not the problem's;
-    * ``adopt(name)``, called when somebody else (the guard) has moved the cell to a candidate.
+    * ``start(problem)``, called before every run, which resets it; without ``start``, every run
+      begins with a new copy;
+    * ``initial``, the name of the candidate at the start, if it differs from the problem's;
+    * ``adopt(name)``, called if the cell is on a candidate that the policy did not choose, such as
+      after a move by the guard.
     """
 
     def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> Decision | str:
@@ -31,76 +32,67 @@ class MinimalPolicy(Protocol):
         observed : QoS
             Metrics of the last window, under the incumbent.
         estimates : mapping of str to QoS
-            Estimated metrics of the same window, by candidate, with their standard errors where
-            they are known (`QoS.error`); the incumbent's are a prediction, as the others', where
-            the estimator learns, and `observed` where it does not.
+            Estimated metrics of the same window, by candidate, with their standard errors if
+            known (`QoS.error`). The incumbent's entry is a prediction if the estimator learns, and
+            equals `observed` otherwise.
 
         Returns
         -------
         Decision, or str
-            A candidate's name is enough.
+            A decision, or only the name of a candidate.
         """
         ...
 
 
 @runtime_checkable
 class Policy(MinimalPolicy, Protocol):
-    """Observation and estimates in, decision out; it knows no clock, simulator or socket."""
+    """A policy that can be restarted; it depends on no clock, simulator or socket."""
 
     def start(self, problem: Problem) -> None:
-        """Forget everything: a run of `problem` begins."""
+        """Reset the state before a run of `problem`."""
         ...
 
 
 class Proposer(ABC):
-    """A policy as the controller works with it: it proposes, and changes by what is carried out.
+    """Base of the policies that the controller calls.
 
-    Attributes
-    ----------
-    initial : str or None
-        Candidate that it starts on; the problem's where None.
-    objective : Objective or None
-        What it prices by; the problem's where None.
-    guarded : bool
-        Whether a guard may move the cell.
-    usual_estimator : str
-        Estimator where neither the cell nor the caller names one.
-    by_price : bool
-        Whether it moves to any candidate that is cheap enough, so that in a fleet another one may
-        be taken in the place of its own.
+    A policy proposes a decision, and its state changes only when the decision is committed.
     """
 
+    #: The candidate at the start; the problem's if None.
     initial: str | None = None
+    #: The objective for J; the problem's if None.
     objective: Objective | None = None
+    #: Whether a guard may move the cell.
     guarded: bool = True
+    #: The estimator if neither the cell nor the caller names one.
     usual_estimator: ClassVar[str] = "corrected"
+    #: Whether the policy moves to any candidate that is cheap enough, which lets the ledger of a
+    #: fleet replace its choice.
     by_price: ClassVar[bool] = False
 
     @property
     def given(self) -> object:
-        """The object that was given as the policy."""
+        """The object that the user passed as the policy."""
         return self
 
     @abstractmethod
     def start(self, problem: Problem) -> None:
-        """Forget everything: a run of `problem` begins."""
+        """Reset the state before a run of `problem`."""
 
     @abstractmethod
     def propose(
         self, *, observed: QoS, estimates: Mapping[str, QoS], tentative: bool = False
     ) -> tuple[Decision | str, Any]:
-        """Return the decision on a window, and what `commit` takes where it counts.
+        """Return the decision on a window, and the state for `commit`.
 
-        Parameters
-        ----------
-        tentative : bool
-            Whether it may not count: the policy is as before then.
+        A `tentative` proposal leaves the policy unchanged, because it may be discarded.
         """
 
     @abstractmethod
     def commit(self, after: Any) -> None:
-        """Be as after a decision that was proposed."""
+        """Change to the state that `propose` returned."""
 
     @abstractmethod
     def adopt(self, name: str) -> None:
-        """Take note that somebody else has moved the cell to a candidate."""
+        """Make a candidate the incumbent that the policy did not choose."""

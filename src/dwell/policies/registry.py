@@ -1,9 +1,8 @@
 """Policies by the names that a cell file and the command line use.
 
-Each policy of ours is declared here, and nowhere else by name. The declarations load without the
-classes: these are imported when a policy is made. Another package adds a policy by an entry point
-of the group ``dwell.policies``; its class is imported only when that policy is asked for. A class
-of a user's own needs no entry: its name is ``package.module:Class``.
+This is the only place that names Dwell's own policies. A policy's class is imported when the policy
+is made. Another package adds a policy with an entry point of the group ``dwell.policies``. A user's
+own class needs no entry: its name is ``package.module:Class``.
 """
 
 from __future__ import annotations
@@ -66,13 +65,13 @@ REGISTRY: Mapping[str, PolicyEntry] = MappingProxyType(
             "DTP",
             "ink",
             "DTP is the paper's Algorithm 1: it moves to the placement with the lowest estimated J "
-            "once the dwell time is over and the improvement large enough.",
+            "after the dwell time, if the improvement is large enough.",
         ),
         "atp": PolicyEntry(
             "dwell.policies.atp:ATP",
             "ATP",
             "#e69f00",
-            "ATP moves one task to the edge and back, where a threshold on L95 or utilisation is "
+            "ATP moves one task to the edge and back, if a threshold on L95 or utilisation is "
             "exceeded and the other side costs less latency, utilisation and switching.",
         ),
         "atp-thresholds": PolicyEntry(
@@ -99,39 +98,31 @@ REGISTRY: Mapping[str, PolicyEntry] = MappingProxyType(
             "dwell.policies.cusum:Cusum",
             "CUSUM",
             "#b8a800",
-            "CUSUM adds up what another placement would have saved, window after window, and "
-            "moves once that is enough; it has no dwell time.",
+            "CUSUM adds up the savings of another placement over windows, and moves when the sum "
+            "exceeds a threshold; it has no dwell time.",
         ),
     }
 )
 
 
-#: Those that have a label, a colour and a sentence of their own.
+#: The policies that have their own label, colour and sentence.
 FAMILIES: Mapping[str, PolicyEntry] = MappingProxyType(
     {name: entry for name, entry in REGISTRY.items() if not entry.variant_of}
 )
 
 
 def names() -> tuple[str, ...]:
-    """Return the names of all policies: ours, then those of installed packages by name."""
+    """Return the names of all policies: Dwell's, then other packages' in alphabetical order."""
     return names_with(REGISTRY, GROUP)
 
 
 def by_name(name: str, problem: Problem) -> Policy:
     """Make a policy with the parameters of ``problem.controller``.
 
-    Parameters
-    ----------
-    name : str
-        A policy's name, a candidate's for the placement that never moves, or
-        ``package.module:Class`` (see `dwell.model.user_classes`).
-
-    Raises
-    ------
-    PolicyError
-        If there is none of that name (the message lists the known ones), a candidate has it, too,
-        the problem has no candidates that the policy could work with, or the package that declares
-        the policy, or the class that is named, cannot be imported or made.
+    `name` is a policy, a candidate (for the placement that never moves), or
+    ``package.module:Class`` (see `dwell.model.user_classes`). Raises PolicyError if the name is
+    unknown (the message lists the known names) or names both a policy and a candidate, if the
+    policy does not support the problem's candidates, or if the class cannot be imported or made.
     """
     if name in REGISTRY and name in problem.candidates:
         raise PolicyError(f"{name!r} is a policy's name and a candidate's; rename the candidate")
@@ -153,17 +144,14 @@ def by_name(name: str, problem: Problem) -> Policy:
 
 
 def estimates(name: str) -> bool:
-    """Return whether a policy reads estimates; one that is not of ours is taken to do so."""
+    """Return whether a policy reads estimates; True for policies from outside Dwell."""
     return name not in REGISTRY or REGISTRY[name].estimates
 
 
 def estimator_of(problem: Problem, policy: MinimalPolicy | str | None = None) -> str:
-    """Return the estimator that a cell names, or else the usual one of a policy.
+    """Return the estimator that a cell names, or else the usual estimator of a policy.
 
-    Parameters
-    ----------
-    policy : policy, str, or None
-        The cell's where None.
+    Without `policy`, use the cell's policy.
     """
     from dwell.policies.protocol import Proposer
 
@@ -181,7 +169,7 @@ def estimator_of(problem: Problem, policy: MinimalPolicy | str | None = None) ->
 
 
 def name_of_class(kind: str) -> str | None:
-    """Return the name of the policy of ours whose class is called ``kind``; None where none is."""
+    """Return the name of Dwell's policy with the class name ``kind``, or None."""
     for name, entry in REGISTRY.items():
         if entry.path.partition(":")[2] == kind:
             return name

@@ -9,16 +9,16 @@ from dwell.policies.incumbent import CandidatePolicy
 
 
 class Static(CandidatePolicy):
-    """Wants its candidate whatever happens; every decision is a hold there.
+    """Keeps the cell on one candidate; every decision there is a hold.
 
-    Where somebody else has moved the cell, every decision is for the way back.
+    If the guard has moved the cell, every decision is to move back.
 
     Parameters
     ----------
     candidates, initial
-        As in `dwell.policies.DTP`; `initial` is the candidate that it stays on.
+        As in `dwell.policies.DTP`; the cell stays on `initial`.
     objective : Objective, optional
-        Where given, J of every estimated candidate is recorded; it decides nothing.
+        If given, decisions record J of every estimated candidate; J has no influence.
     """
 
     guarded = False

@@ -1,4 +1,4 @@
-"""A user's object as the controller works with it."""
+"""Adapter from a user's policy to the controller's interface."""
 
 from __future__ import annotations
 
@@ -13,17 +13,9 @@ from dwell.policies.protocol import MinimalPolicy, Proposer
 
 
 class UserPolicy(Proposer):
-    """A copy of a user's object, and what it does without.
+    """A copy of a user's policy, with defaults for its optional methods and attributes.
 
-    Parameters
-    ----------
-    given : policy
-        An object with `decide`.
-
-    Raises
-    ------
-    PolicyError
-        If it has none.
+    Raises PolicyError if the object has no method `decide`.
     """
 
     def __init__(self, given: MinimalPolicy) -> None:
@@ -43,7 +35,7 @@ class UserPolicy(Proposer):
         return self._given
 
     def start(self, problem: Problem) -> None:
-        """Start it, if it wants to be."""
+        """Call the user's ``start``, if defined, and read the optional attributes."""
         start = getattr(self._given, "start", None)
         if start is not None:
             start(problem)
@@ -54,24 +46,24 @@ class UserPolicy(Proposer):
     def propose(
         self, *, observed: QoS, estimates: Mapping[str, QoS], tentative: bool = False
     ) -> tuple[Decision | str, MinimalPolicy]:
-        """Have it decide, or another copy of it."""
+        """Return the user's decision; a tentative decision is made by a copy."""
         acting = copy.deepcopy(self._given) if tentative else self._given
         return acting.decide(observed=observed, estimates=estimates), acting
 
     def commit(self, after: MinimalPolicy) -> None:
-        """Go on with the copy that has decided."""
+        """Replace the policy by the copy that decided."""
         self._given = after
 
     def adopt(self, name: str) -> None:
-        """Tell it, if it wants to know."""
+        """Call the user's ``adopt``, if defined."""
         adopt = getattr(self._given, "adopt", None)
         if adopt is not None:
             adopt(name)
 
 
 def as_proposer(policy: MinimalPolicy) -> Proposer:
-    """Return a copy of a policy that the controller works with."""
-    # A subclass may have another `decide`.
+    """Return a copy of a policy with the controller's interface."""
+    # A subclass with its own `decide` counts as a user's policy.
     if isinstance(policy, CandidatePolicy) and type(policy).decide is CandidatePolicy.decide:
         return copy.deepcopy(policy)
     return UserPolicy(policy)

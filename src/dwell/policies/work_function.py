@@ -2,41 +2,40 @@
 
 Borodin, Linial and Saks (J. ACM 39(4), 1992, DOI 10.1145/146585.146588) pose the problem and give
 the bound; the algorithm is written here as in Chrobak and Larmore (LNCS 1442, 1998,
-DOI 10.1007/BFb0029565). Its states are the candidates, what it serves are windows, and its
-distance is the price of a move, ``d(x, s) = weights.switching * hamming(x, s)``.
+DOI 10.1007/BFb0029565). Its states are the candidates, its requests are windows, and its distance
+is the price of a move, ``d(x, s) = weights.switching * hamming(x, s)``.
 
-The work function w_k(s) is the least that windows 1 to k could have cost a cell that knew them all
-in advance, began on the initial candidate, and ends on s::
+The work function w_k(s) is the least possible cost of windows 1 to k for a cell that knows them all
+in advance, starts on the initial candidate, and ends on s::
 
     w_0(s) = d(initial, s)
     w_k(s) = min over x of  w_{k-1}(x) + r_k(x) + d(x, s)
 
 where r_k(x) is J of window k under x, as estimated, without its switching term. The next candidate
-is the s that minimises w_k(s) + d(s, incumbent) among those with w_k(s) = w_{k-1}(s) + r_k(s), that
-is, among those that it would be best to have spent window k on in order to end there.
+is the s that minimises w_k(s) + d(s, incumbent) under the condition w_k(s) = w_{k-1}(s) + r_k(s):
+the cheapest way to end on s spends window k on s.
 
 How it is computed
-    Both conditions together say: s minimises w_{k-1}(s) + r_k(s) + d(s, incumbent). The minimum of
+    Both conditions together mean: s minimises w_{k-1}(s) + r_k(s) + d(s, incumbent). The minimum of
     that sum is w_k(incumbent) by definition, and by the triangle inequality no w_k(s) +
-    d(s, incumbent) is below it. A window takes O(n^2) operations for n candidates. The minimum of
-    w_k is subtracted in each window, so that w_k lies in [0, weights.switching] however long a run
-    is; decisions depend on differences alone.
+    d(s, incumbent) is below it. A window takes O(n^2) operations for n candidates. Each window
+    subtracts the minimum of w_k, which keeps w_k in [0, weights.switching] in a run of any length;
+    decisions depend only on differences.
 
 Errors of estimates
-    The cell moves to s only where w_{k-1} + r_k of the incumbent exceeds the sum above by more than
+    The cell moves to s only if w_{k-1} + r_k of the incumbent exceeds the sum above by more than
     the `dwell.cost.margin` of the two estimates. Since w_{k-1}(incumbent) - w_{k-1}(s) is never
-    more than d(s, incumbent), that takes a window in which s is cheaper by more than the margin,
-    and errors that last add up to no move. An incumbent that is not eligible is left without it:
-    there caps decide, not J. Where estimates say no errors, all is as above. A decision that serves
-    a share of a window takes the same share of the margin.
+    more than d(s, incumbent), a move needs a window in which s is cheaper by more than the margin,
+    and persistent errors cannot accumulate into a move. If the incumbent is not eligible, the
+    margin does not apply: caps take precedence over J. If estimates have no standard errors, the
+    margin is 0. A decision that covers a share of a window uses the same share of the margin.
 
-What is not claimed
+Not claimed
     The algorithm costs at most 2n - 1 times the optimum, plus a constant, if it sees a window's
     costs before it chooses where to spend that window, if the costs are exact, and if nothing
-    stops it from moving. Here a window is over when its costs are seen, they are estimates, and
-    caps and margins exclude candidates. **No bound holds**: costs that
-    always strike the incumbent are paid in full every time, however large. What it is worth on a
-    cell has to be measured.
+    stops it from moving. Here the costs are known only after the window, they are estimates, and
+    caps and margins exclude candidates. **No bound holds**: an adversary can charge the incumbent
+    any cost in every window, and the cell pays it in full. Measure the benefit on each cell.
 """
 
 from __future__ import annotations
@@ -59,15 +58,15 @@ TIE_TOLERANCE = 1e-9
 class WorkFunction(PricingPolicy):
     """Moves once the optimum in hindsight justifies it, with neither threshold nor dwell.
 
-    * A tie is a move: staying where the optimum would as soon have left is what an adversary
-      charges for. Among several candidates to move to, their order decides. Only a tie with
-      candidates at no distance from the incumbent (the same placement, or ``weights.switching``
-      of 0) is a hold: such equals would take turns for ever.
-    * A candidate over a cap is not eligible, as in DTP. If none is eligible, those closest to
-      their caps are compared as usual, and the reason is ``infeasible``. Caps restrict where it
-      goes, not what it remembers: r_k of a candidate over its caps enters w_k as it is, and the
-      candidate chosen minimises w_{k-1}(s) + r_k(s) + d(s, incumbent) over the eligible ones.
-    * A window that the policy is not shown leaves w_k as it is.
+    * A tie is a move, because an adversary charges a policy that stays when the optimum is
+      indifferent. The earlier of several targets wins. A tie with candidates at distance 0 from the
+      incumbent (the same placement, or ``weights.switching`` of 0) is a hold, because equal
+      candidates would alternate for ever.
+    * A candidate over a cap is not eligible, as in DTP. If no candidate is eligible, the candidates
+      closest to their caps are compared as usual, and the reason is ``infeasible``. Caps restrict
+      the choice but not the work function: r_k of every candidate enters w_k, and the chosen
+      candidate minimises w_{k-1}(s) + r_k(s) + d(s, incumbent) over the eligible candidates.
+    * w_k does not change in a window that the policy does not receive.
 
     Parameters
     ----------
@@ -86,7 +85,7 @@ class WorkFunction(PricingPolicy):
     ) -> None:
         super().__init__(candidates=candidates, initial=initial, objective=objective)
         self._index = {name: i for i, name in enumerate(self.candidates)}
-        #: Windows that a decision serves.
+        #: Windows per decision.
         self._served = 1.0
         weight = objective.weights.switching
         self._distances = tuple(
@@ -95,13 +94,13 @@ class WorkFunction(PricingPolicy):
         )
 
     def start(self, problem: Problem) -> None:
-        """Begin again; a decision serves its share of a window."""
+        """Reset the policy, and compute the share of a window per decision."""
         super().start(problem)
         self._served = 1 / problem.decisions_per_window
 
     @property
     def work(self) -> FrozenDict[str, float]:
-        """w_k less its minimum, by candidate, in units of J."""
+        """w_k minus its minimum, by candidate, in units of J."""
         return FrozenDict(zip(self.candidates, self._work, strict=True))
 
     @property
@@ -110,25 +109,24 @@ class WorkFunction(PricingPolicy):
         return self._distances[self._index[self.initial]] if work is None else work
 
     def _adopted(self) -> object:
-        """Keep w_k: it is about what was possible, not about where the cell was."""
+        """Keep w_k, which does not depend on the incumbent."""
         return self._standing.memory
 
     def _decide(
         self, observed: QoS, estimates: Mapping[str, QoS] | None
     ) -> tuple[Decision, tuple[float, ...]]:
-        """Add a window to the work function, which is remembered, and choose by it.
+        """Add a window to the work function and choose by it; `observed` has no influence.
 
-        Nothing is decided by what was observed. `delta_j` is NaN: the rule compares sums over all
-        windows, not J of one.
+        `delta_j` is NaN: the rule compares sums over all windows, not J of one window.
         """
         estimates = self._known(estimates)
         now, pricing = self.incumbent, self._pricing
         costs = pricing.estimated(estimates, now)
-        # From a candidate to itself: J of a window that no move preceded.
+        # From a candidate to itself: J without a switching term.
         served_by = (pricing.cost(estimates[name], name, name) for name in self.candidates)
         window = [cost * self._served for cost in served_by]
         served = list(map(add, self._work, window))
-        # Subtracted before distances are added: large costs then round off nothing of w_k.
+        # Subtract before adding distances: large costs would round w_k.
         least = min(served)
         reduced = [value - least for value in served]
         work = tuple(min(map(add, reduced, row)) for row in self._distances)
@@ -140,7 +138,7 @@ class WorkFunction(PricingPolicy):
         return self._move(best, reason, costs), work
 
     def _unsure(self, best: str, served: list[float], estimates: Mapping[str, QoS]) -> bool:
-        """Whether a move saves no more in the sums than the margin of this decision's share."""
+        """Return whether a move saves no more than this decision's share of the margin."""
         now = self.incumbent
         least = self._served * self._pricing.margin(estimates[best], estimates[now])
         here, there = self._index[now], self._index[best]
@@ -167,6 +165,6 @@ class WorkFunction(PricingPolicy):
         bound = min(totals.values()) + slack
         ties = [name for name, total in totals.items() if total <= bound]
         if now in ties:
-            # A distance within the slack counts as none: equals would take turns for ever.
+            # A distance within the slack counts as 0: equal candidates would alternate for ever.
             ties = [name for name in ties if distances[self._index[name]] > slack]
         return ties[0] if ties else now

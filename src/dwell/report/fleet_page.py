@@ -88,9 +88,9 @@ class _FleetPage:
 
     def _facts(self) -> Iterator[Fact]:
         worst, numbers = self.cells[0], self.numbers
-        over = sum(row["violation_rate"] > AIM for row in self.cells)
+        kept = sum(row["verdict"] == "kept" for row in self.cells)
         yield Fact("V_D of the worst cell", percent(worst["violation_rate"], 1), worst["cell"])
-        yield Fact("cells over 5 %", f"{over}", f"of {len(self.cells)}")
+        yield Fact("cells that keep the aim", f"{kept}", f"of {len(self.cells)}; under 5 %")
         yield Fact("J", write_number(numbers["cost"], 2), "mean over cells")
         most = max(row["moves"] for row in self.cells)
         yield Fact("moves", write_number(numbers["moves"], 0), f"at most {most} of a cell")
@@ -178,7 +178,8 @@ class _FleetPage:
             rows.append({**row, **shares, "page": self.links.get(cell, "")})
         columns: Columns = [
             Text("cell", "cell", "cell", "{page}"),
-            RATE,
+            RATE._replace(decimals=2),
+            Text("verdict", "verdict", "word"),
             L95,
             COST,
             MOVES,
@@ -243,7 +244,8 @@ class _FleetPage:
             ),
             Table(
                 "round-table",
-                f"Rounds that moved a cell ({len(rows)} of {asked['round'].n_unique()} played)",
+                f"Rounds that moved cells ({moved['round'].n_unique()} of "
+                f"{asked['round'].n_unique()} played)",
                 columns,
                 rows,
                 palette=self.palette,

@@ -36,6 +36,7 @@ WORDS: Mapping[str, Literal["good", "bad"]] = {
     "differs": "bad",
     "met": "good",
     "explained": "good",
+    "kept": "good",
     "missed": "bad",
     "lower": "good",
     "higher": "bad",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from dwell.kernels.random_draws import draw, stream
 from dwell.kernels.realisation import Realisation
 from dwell.model import Problem
 from dwell.model.document import disturbance_document
-from dwell.model.fleet import Fleet, FleetCell, Phases
+from dwell.model.fleet import MOST_CELLS, Fleet, FleetCell, Phases
 from dwell.model.instants import HORIZON_NS
 from dwell.model.progress import Progress
 from dwell.record import Run
@@ -176,12 +176,16 @@ def phased(fleet: Fleet, seed: int) -> Iterator[Problem]:
     """Yield the problem of every cell, with its phase, and the warm-up of the whole fleet."""
     warmup_ns = fleet.warmup_ns
     for cell, phase_ms in zip(fleet.cells, phases_ms(fleet, seed).values(), strict=True):
-        problem = cell.problem.at_phase(phase_ms)
-        windows = -(-warmup_ns // problem.window_ns)
-        # Another problem is checked as a whole again.
-        if windows != problem.warmup_windows:
-            problem = replace(problem, warmup_windows=windows)
-        yield problem
+        yield _phased(cell.problem, cell.problem.folder, phase_ms, warmup_ns)
+
+
+# A study of capacity has the same cell in many sizes, and each new problem is checked as a whole.
+@lru_cache(MOST_CELLS)
+def _phased(problem: Problem, folder: str | None, phase_ms: float, warmup_ns: int) -> Problem:
+    # Problems that differ by their folder alone are equal.
+    windows = -(-warmup_ns // problem.window_ns)
+    pipeline = replace(problem.pipeline, phase_ms=phase_ms)
+    return replace(problem, pipeline=pipeline, warmup_windows=windows, folder=folder)
 
 
 def phases_ms(fleet: Fleet, seed: int) -> dict[str, float]:
@@ -272,6 +276,7 @@ def coordinations(
             fleet.objective,
             tabled=tabled_cells(fleet, seed),
             progress=progress,
+            limit=fleet.limit,
         )
     for i, cell in enumerate(fleet.cells):
         if fleet.coordination == "ledger":

@@ -7,13 +7,14 @@ long as one makes the played Φ better. Small fleets begin again from places nea
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from dwell.control.fleet_rank import FleetRank
+from dwell.control.fleet_rank import FleetRank, fleet_rank
 from dwell.control.knapsack import cheapest
 from dwell.control.neighbours import Neighbours, Rank, descend
 from dwell.control.table_loads import Loads
@@ -129,16 +130,23 @@ def plan_fleet(fleet: Fleet, *, seed: int = 1, progress: Progress | None = None)
         for cell, one in zip(fleet.cells, priced_cells(fleet, phased(fleet, seed)), strict=True)
     ]
     table = load_table(tabled_cells(fleet, seed), fleet.shared, progress)
-    loads = Loads(table)
+    loads, rank = Loads(table), fleet_rank(fleet.objective, cells, fleet.limit)
+    priced = [prices_of(cell.problem, cell.scenario) for cell in cells]
+    terms = [CellTerms(cell.problem, fleet.shared) for cell in cells]
     alone = [
-        {
-            name: CellTerms(cell.problem, fleet.shared).cost(price.qos)
-            for name, price in prices_of(cell.problem, cell.scenario).items()
-        }
-        for cell in cells
+        {name: of.cost(price.qos) for name, price in prices_alone.items()}
+        for of, prices_alone in zip(terms, priced, strict=True)
     ]
+    aims = [
+        {name: rank.aim(costs[name], price.qos.violation_rate) for name, price in of.items()}
+        for costs, of in zip(alone, priced, strict=True)
+    ]
+    aimed, starts = loads, [tuple(best_placements(loads, alone))]
+    if rank.limit is not None:
+        aimed = Loads(table, rank.limit)
+        starts.append(tuple(best_placements(aimed, aims)))
     prices = FleetPrices(cells, fleet.shared, disturbances=fleet.disturbances)
-    best = _as_played(prices, FleetRank(fleet.objective, cells), loads, alone)
+    best = _as_played(prices, rank, aimed, aims, starts)
     cycles = min(CYCLES, MOST * len(cells))
     prices = FleetPrices(cells, fleet.shared, cycles, fleet.disturbances)
     played = prices.price(tuple(best))
@@ -148,9 +156,13 @@ def plan_fleet(fleet: Fleet, *, seed: int = 1, progress: Progress | None = None)
 
 
 def _as_played(
-    prices: FleetPrices, rank: FleetRank, loads: Loads, alone: Sequence[Mapping[str, float]]
+    prices: FleetPrices,
+    rank: FleetRank,
+    loads: Loads,
+    alone: Sequence[Mapping[str, float]],
+    starts: Sequence[tuple[str, ...]],
 ) -> tuple[str, ...]:
-    """Return the best placements of those that were played, from the table's best on."""
+    """Return the best placements of those that were played, from the better start on."""
     played: dict[tuple[str, ...], FleetPrice] = {}
     most = max(CELLS_PLAYED // len(alone), 1)
 
@@ -159,14 +171,14 @@ def _as_played(
             if len(played) >= most:
                 return None
             played[placements] = prices.price(placements)
-        return rank.of(played[placements].parts)
+        return rank.of(played[placements])
 
     near = Neighbours(prices.cells, loads)
 
     def neighbours(placements: tuple[str, ...]) -> Iterable[tuple[str, ...]]:
-        return near.of(placements, alone, played[placements].costs)
+        return near.of(placements, alone, rank.aims(played[placements]))
 
-    best = descend(tuple(best_placements(loads, alone)), neighbours, ranked)
+    best = descend(min(starts, key=lambda one: ranked(one) or (math.inf,)), neighbours, ranked)
     rng = np.random.Generator(np.random.SFC64(SEED))
     for _ in range(ENOUGH_PLAYS):
         if len(played) >= min(ENOUGH_PLAYS, most):

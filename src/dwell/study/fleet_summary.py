@@ -15,6 +15,7 @@ from dwell.record.moves import moves
 from dwell.study.family import EQUAL
 from dwell.study.judged_cost import judged_cost
 from dwell.study.summary import Summary, summarise
+from dwell.study.verdict import verdict_of
 
 #: Columns that are the sum over cells.
 TOTALS = ("migrations", "guard_moves")
@@ -69,7 +70,8 @@ def fleet_numbers(run: FleetRun) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``cells``: of each the means over its windows after the warm-up, and its moves; ``cost``,
+        ``cells``: of each the means over its windows after the warm-up, the word of its verdict
+        (see `dwell.study.verdict`), and its moves; ``cost``,
         the mean over cells; ``load`` by shared resource; ``moves``, ``guard_moves``; ``refused`` by
         who refused; ``rounds`` (each with Φ before and after it, and who moved).
     """
@@ -86,6 +88,7 @@ def fleet_numbers(run: FleetRun) -> dict[str, Any]:
         {
             "cell": row["cell"],
             "violation_rate": row["violation_rate"],
+            "verdict": _word(run, row["cell"], row["violation_rate"]),
             "l95_ms": _known(row["seen_l95_ms"]),
             "cost": _known(row["cost"]),
             "moves": by_cell[row["cell"]],
@@ -128,6 +131,10 @@ def _refusal(text: str) -> tuple[str, str]:
 def _known(mean: object) -> float:
     """Return a mean; NaN where the controller saw no window."""
     return mean if isinstance(mean, float) else math.nan
+
+
+def _word(run: FleetRun, cell: str, rate: float) -> str:
+    return verdict_of(run.cells[cell], run.fleet.problems[cell], rate).word
 
 
 def _rounds(run: FleetRun) -> list[dict[str, Any]]:

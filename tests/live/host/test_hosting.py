@@ -58,6 +58,20 @@ def test_what_a_message_makes_due_is_done_at_once(
     assert not thread.is_alive()
 
 
+def test_a_role_is_woken_at_once_from_another_thread(
+    sender: tuple[Network, MemoryTransport],
+) -> None:
+    role = Waiting(None)
+    hosted = Hosted(role, sender[0].transport("agent@E", "E"), clock=lambda: 1)
+    thread = threading.Thread(target=hosted.run, daemon=True)
+    thread.start()
+    assert role.woken.acquire(timeout=10)
+    hosted.wake_now()
+    assert role.woken.acquire(timeout=10)
+    hosted.stop()
+    thread.join(10)
+
+
 class Due:
     """Is due at some instants; the clock stands where the last one was."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
@@ -123,6 +124,36 @@ def test_what_is_removed_while_the_node_runs_is_kept_again(cell: Path, tmp_path:
     assert KeptCell.of(cell, [folder]).contents == keeper.kept.contents
     assert len(said) == 1
     stopped.set()
+
+
+def test_files_are_read_again_only_after_a_change(
+    cell: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keeper = CellKeeper(KeptCell.of(cell), tmp_path / "R1", "R1", list[str]().append)
+    keeper.look()
+    read_bytes, reads = Path.read_bytes, list[Path]()
+
+    def read(path: Path) -> bytes:
+        reads.append(path)
+        return read_bytes(path)
+
+    monkeypatch.setattr(Path, "read_bytes", read)
+    keeper.look()
+    assert reads == []
+    stages = cell.with_name("stages.py")
+    text, times = stages.read_text(), stages.stat()
+    for content, words in ((text.swapcase(), "stages.py on R1 has changed since "), (text, "")):
+        # Neither length nor time of modification differs.
+        changed_ns = stages.stat().st_ctime_ns
+        while stages.stat().st_ctime_ns == changed_ns:  # the kernel counts in ticks
+            stages.write_text(content)
+            os.utime(stages, ns=(times.st_atime_ns, times.st_mtime_ns))
+        keeper.look()
+        assert keeper.told().startswith(words)
+        assert bool(keeper.told()) == bool(words)
+    stages.unlink()
+    keeper.look()
+    assert keeper.told().startswith("stages.py on R1 has changed since ")
 
 
 def test_a_cell_that_cannot_be_kept_is_said_and_runs(cell: Path, tmp_path: Path) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -59,6 +61,40 @@ def test_a_killed_process_is_started_again(supervisor: Supervisor, said: list[st
     until(supervisor, lambda: child.starts == 2)
     assert child.pid != first
     assert said == ["worker@E was killed by SIGKILL"]
+
+
+def test_an_agent_is_woken_when_a_process_of_its_node_ends(
+    supervisor: Supervisor, tmp_path: Path, said: list[str]
+) -> None:
+    child = keep(supervisor, "worker@E", "import time; time.sleep(1000)")
+    assert supervisor.pending
+    until(supervisor, lambda: child.starts == 1)
+    second = supervise(tmp_path, said.append)
+    adopted = keep(second, "worker@E", "raise SystemExit")
+    assert not supervisor.pending
+    assert not second.pending
+    woken = [threading.Event(), threading.Event()]
+    supervisor.ends.wake, second.ends.wake = woken[0].set, woken[1].set
+    assert child.pid is not None
+    assert adopted.pid == child.pid
+    os.kill(child.pid, signal.SIGKILL)
+    assert all(event.wait(PATIENCE_S) for event in woken)
+    assert supervisor.pending
+    assert second.pending
+    until(supervisor, lambda: child.starts == 2)
+    assert not supervisor.pending
+
+
+def test_a_process_that_cannot_be_watched_is_looked_at(
+    supervisor: Supervisor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(pid: int) -> int:
+        raise OSError(errno.EMFILE, "no free descriptor")
+
+    monkeypatch.setattr(os, "pidfd_open", fail)
+    child = keep(supervisor, "worker@E", "import time; time.sleep(1000)")
+    until(supervisor, lambda: child.starts == 1)
+    assert supervisor.pending
 
 
 def test_a_state_folder_that_is_removed_is_made_again(

@@ -195,7 +195,7 @@ def test_a_stamper_that_left_numbers_out_is_believed_at_once(world: World) -> No
 def few(monkeypatch: pytest.MonkeyPatch) -> int:
     """Numbers that a stamper reserves, so few that a short time away has more cycles."""
     reserved = 32
-    for module in ("continuity", "stamper"):
+    for module in ("wire.continuity", "roles.stamper"):
         monkeypatch.setattr(f"dwell.live.{module}.RESERVED", reserved)
     return reserved
 

@@ -66,7 +66,7 @@ def campaign(
     report: Annotated[bool, flag("--report", "Measure nothing: report on what is there.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Measure every policy in every scenario again and again, in random order, and report.
+    """Measure all policies in all scenarios, in random order.
 
     What is done stays in the folder, whatever ends the work: the same command goes on. A run takes
     120 s, if neither --windows nor --seconds is given.

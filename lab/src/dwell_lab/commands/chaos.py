@@ -36,7 +36,7 @@ def chaos(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Have faults befall a cell on this machine, and watch whether it keeps its promises.
+    """Inject faults into a cell on this machine; check promises.
 
     Processes are killed and frozen, links cut, clocks set wrong, CPUs and disks taken away, one
     after the other, by a seed, for two minutes if nothing else is said.

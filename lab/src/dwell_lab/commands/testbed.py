@@ -31,7 +31,7 @@ from dwell_lab.commands.lengths import seconds_of_runs
 
 testbed = typer.Typer(
     no_args_is_help=True,
-    help="Run cells on hosts, links and CPUs of their own on this machine, and measure them.",
+    help="Run cells on emulated hosts of this machine; measure them.",
 )
 
 
@@ -50,7 +50,7 @@ def run(
     jobs: Annotated[bool, flag("--jobs", "Keep every job of the run.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Play a scenario once, and take everything down again. Needs root.
+    """Run a scenario once, then remove everything. Needs root.
 
     60 windows, if neither --windows nor --seconds is given.
     """
@@ -126,7 +126,7 @@ def doctor(
     ] = 0.0,
     as_json: Json = False,
 ) -> None:
-    """Say what this machine can do as a testbed and what it cannot, and what to install."""
+    """Check whether this machine can be a testbed."""
     import dwell
     from dwell.cli.findings import print_findings
     from dwell_lab.testbed.doctor import examine
@@ -165,7 +165,7 @@ def calibrate(
         bool, flag("--real-links", "Links are real: their delays are what was measured.")
     ] = False,
 ) -> None:
-    """Put what runs have shown of tasks and links into a cell file.
+    """Write measured tasks and links into a cell file.
 
     A run that is made takes 120 s, if neither --windows nor --seconds is given.
     """

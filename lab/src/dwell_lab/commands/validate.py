@@ -49,7 +49,7 @@ def validate(
     processes: Processes = None,
     as_json: Json = False,
 ) -> None:
-    """Set what a calibrated cell predicts beside what its runs measured, and judge it."""
+    """Compare a calibrated cell's predictions with measured runs."""
     from dwell.model.document import to_document
     from dwell_lab.pages.validation_page import validation_html, validation_text
     from dwell_lab.validation.validation import validate as validate_cell

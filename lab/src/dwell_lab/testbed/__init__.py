@@ -1,5 +1,5 @@
-"""The testbed: hosts, links and CPUs of a cell on one machine, and what disturbs them.
+"""The testbed: hosts, links and CPUs of a cell on one machine, and their disturbances.
 
-Network namespaces stand for hosts, TUN devices with a process between them for links, groups of
-processes with a quota for CPUs. On top runs the live runtime, unchanged.
+Network namespaces emulate hosts, TUN devices with a process between them emulate links, and
+control groups with a quota emulate CPUs. The live runtime runs on them unchanged.
 """

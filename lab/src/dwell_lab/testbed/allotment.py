@@ -1,7 +1,7 @@
-"""Allotment: which CPUs of this machine each node gets, and whether they are enough for all.
+"""Allotment: the CPUs of this machine for each node, and a check that they are enough.
 
-A node's quota is worth something only if it gets that time whenever it wants it. So some of every
-CPU stays free, for the links' processes, the kernel and whoever watches.
+A node must get its quota whenever it needs it. So part of every CPU stays free for the links'
+processes, the kernel and the samplers.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ from dwell.errors import LiveError
 from dwell.model import Node, Problem
 from dwell_lab.testbed.groups import Share
 
-#: Of every CPU, and of all together, what no node gets.
+#: CPU time that stays free on each CPU, and on all CPUs together.
 FREE_OF_A_CORE, FREE_CORES = 0.2, 0.4
 TOLERANCE = 1e-9
 
 
 @dataclass(slots=True)
 class _Cpus:
-    """CPUs with the share of each that is left."""
+    """CPUs with the free share of each."""
 
     left: dict[int, float] = field(default_factory=dict)
 
     def take(self, node: Node) -> tuple[int, ...] | None:
-        """Take the CPUs with most left: robots from the first on, other nodes from the last."""
+        """Take the CPUs with the largest free share; robots take low numbers first."""
         count = min(node.cores, len(self.left))
         sign = 1 if node.tier == "robot" else -1
         best = sorted(self.left, key=lambda cpu: (-self.left[cpu], sign * cpu))[:count]
@@ -38,16 +38,13 @@ class _Cpus:
 
 
 def _nodes_of(problems: Iterable[Problem]) -> dict[str, Node]:
-    """Return the nodes of some cells; those of one name are one computer.
+    """Return the nodes of some cells; nodes with the same name are one computer.
 
-    Raises
-    ------
-    LiveError
-        If two cells say different things of a node that they share.
+    Raises `LiveError` if two cells describe a shared node differently.
     """
     nodes: dict[str, Node] = {}
     faults = [
-        f"nodes.{name}: two cells share it and say different things of it"
+        f"nodes.{name}: two cells share this node and describe it differently"
         for problem in problems
         for name, node in problem.fabric.nodes.items()
         if nodes.setdefault(name, node) != node
@@ -58,16 +55,13 @@ def _nodes_of(problems: Iterable[Problem]) -> dict[str, Node]:
 
 
 def allot(problems: Sequence[Problem], cpus: Collection[int]) -> dict[str, Share]:
-    """Give every node of some cells its share of the CPUs of this machine that may be used.
+    """Give every node of some cells its share of the permitted CPUs of this machine.
 
-    Raises
-    ------
-    LiveError
-        With everything that does not fit, and what would help.
+    Raises `LiveError` with all nodes that do not fit, and remedies.
     """
     nodes = _nodes_of(problems)
     left = _Cpus(dict.fromkeys(sorted(cpus), 1.0 - FREE_OF_A_CORE))
-    # What wants most has the least choice.
+    # Large nodes fit in few places, so they choose first.
     order = sorted(nodes.values(), key=lambda node: (-node.capacity, node.tier == "robot"))
     taken = {node.name: left.take(node) for node in order}
     faults = list(_faults(nodes, taken, len(cpus)))
@@ -87,14 +81,14 @@ def _faults(
     for name, node in nodes.items():
         if taken[name] is None and node.quota is None:
             yield (
-                f"nodes.{name} has no quota, and would take {node.cores} whole; give it one, as "
+                f"nodes.{name} has no quota, and would take {node.cores} CPUs; set one: "
                 "quota: {cpu: 0.4, period_ms: 4}"
             )
         elif taken[name] is None:
             yield (
-                f"nodes.{name}: no CPU has {node.capacity:g} left of the "
-                f"{1 - FREE_OF_A_CORE:g} that nodes may have of each"
+                f"nodes.{name}: no CPU has {node.capacity:g} free of the "
+                f"{1 - FREE_OF_A_CORE:g} per CPU that nodes may use"
             )
     wanted, most = sum(node.capacity for node in nodes.values()), cpus - FREE_CORES
     if wanted > most + TOLERANCE:
-        yield f"all together want {wanted:g} of {most:g} (what there is, less {FREE_CORES:g})"
+        yield f"all nodes need {wanted:g} CPUs; {most:g} are available ({FREE_CORES:g} stay free)"

@@ -1,8 +1,8 @@
-"""Calibrate: a cell file with the execution times, delays and backgrounds that runs have shown.
+"""Calibrate: write a cell file with the execution times, delays and backgrounds of measured runs.
 
-Beside the cell ``CELL.yaml`` stand its samples, ``CELL.samples.parquet``, and
-``CELL.calibration.json``: what everything was worked out from, and how the cell predicts the very
-runs that it was made from. That is no validation; `dwell validate` refuses those runs.
+The samples go to ``CELL.samples.parquet``. ``CELL.calibration.json`` records the estimates and
+compares the cell's predictions with the runs that it was fitted to. This comparison is no
+validation, and `dwell validate` refuses these runs.
 """
 
 from __future__ import annotations
@@ -39,22 +39,22 @@ from dwell_lab.testbed.sensitivity import usual_of
 from dwell_lab.testbed.speeds import Usual, at_speed_of
 from dwell_lab.testbed.task_costs import TaskCost, messaging, task_costs
 
-#: Seed of the delays that stand for a link's own process, and of the cell's own check.
+#: Seed of the sampled link delays and of the simulations that check the cell.
 SEED = 20_260_101
-#: Delays that are drawn of each link.
+#: Number of delays to sample per link.
 ASKED = 20_000
-#: Least execution time written, ms: one of nothing is no execution time.
+#: Shortest execution time to write, ms: a cell file requires positive times.
 LEAST_MS = 1e-3
-#: Findings on a node that a cell states of nodes with a quota alone.
+#: Findings that a cell file accepts only for nodes with a quota.
 ONLY_WITH_QUOTA = ("background_beside",)
-#: Windows that the check simulates of every run at most.
+#: Largest number of windows to simulate per run in the check.
 CHECK_WINDOWS = 300
 
 
-#: What is said of a node by each of its keys, where it is nothing else's.
+#: Line of the report for each key that has no other line.
 NODE_LINES = {
-    "background_hz": "{node}: something wakes {value:.4g} times a second",
-    "interference": "{node}: stages take {value:.3g} times as long beside foreign threads",
+    "background_hz": "{node}: background threads wake {value:.4g} times a second",
+    "interference": "{node}: stages take {value:.3g} times as long under foreign threads",
 }
 
 
@@ -66,28 +66,15 @@ def calibrate(
     emulated: bool = True,
     say: Callable[[str], None] = print,
 ) -> None:
-    """Write a cell with the execution times, delays and backgrounds that runs have shown.
+    """Write a cell with the execution times, delays and backgrounds of measured runs.
 
-    Parameters
-    ----------
-    cell : Path
-        Cell file; the runs may be of another one with the same tasks and nodes.
-    runs : sequence of Path
-        Folders of runs that kept their jobs: between them every task on every node, undisturbed.
-    out : Path
-        Cell file to write.
-    emulated : bool
-        Whether links have the delays that the cell asks for, and only what they add is measured;
-        else their delays are what was measured.
-    say : callable
-        Takes the lines of the report.
+    `runs` are folders of runs with recorded jobs; together they must cover every task on every
+    node without disturbance. They may belong to another cell with the same tasks and nodes. With
+    `emulated`, links keep the delays of the cell plus the measured extra delay; otherwise they get
+    the measured delays. `say` receives the lines of the report.
 
-    Raises
-    ------
-    DwellError
-        If the cell or a run cannot be read or used, all faults at once, or `out` is the cell.
-    OSError
-        If the files cannot be written.
+    Raises `DwellError` if the cell or a run cannot be used (with all faults), or `out` is the cell;
+    `OSError` if a file cannot be written.
     """
     from dwell.cellfile import load
 
@@ -102,7 +89,7 @@ def calibrate(
     known = hops(measured, messaging_ms, problem, _asked(problem) if emulated else {})
     costs = task_costs(measured, messaging_ms, known, problem, usual)
     if not costs:
-        raise RunError("no task has enough jobs in windows that can be used")
+        raise RunError("no task has enough jobs in usable windows")
     cpus = _cpus(measured)
     columns = paired({site: of.samples for site, of in costs.items()}, cpus)
     rows = len(next(iter(columns.values())))
@@ -120,7 +107,7 @@ def calibrate(
     samples = out.with_name(f"{out.stem}.samples.parquet")
     _write_samples(samples, costs, columns, delays_ms, measured, added_ms)
     _put_in(document, Path(samples.name), costs, delays_ms, nodes)
-    head = f"# {cell.name} with what was measured of it, by `dwell testbed calibrate`.\n"
+    head = f"# {cell.name} with measured values, by `dwell testbed calibrate`.\n"
     head += f"# Runs: {', '.join(path.resolve().name for path in runs)}\n"
     write_whole(out, head + yaml_of(document))
     written = load(out)
@@ -157,7 +144,7 @@ def calibrate(
 
 
 def _cpus(measured: Sequence[Measured]) -> dict[str, tuple[int, ...]]:
-    """Return which CPUs of its computer each node had, where the runs were on a testbed's."""
+    """Return the CPUs of each node, for runs on a testbed."""
     return {
         node: tuple(about["cpus"])
         for one in measured
@@ -175,25 +162,12 @@ def make_runs(
     name: str,
     tell: Callable[[str], None] = print,
 ) -> list[Path]:
-    """Run the baseline under every candidate on a testbed, with the jobs; returns the runs.
+    """Run the baseline under every candidate on a testbed, recording jobs; return the runs.
 
-    Parameters
-    ----------
-    folder : Path
-        For the runs, a folder each.
-    seconds : float
-        Length of each, the warm-up included.
-    seed : int
-        Seed of delays and losses.
-    name : str
-        Name of the testbed.
-    tell : callable
-        Takes a line on what happens.
+    `folder` gets one folder per run. `seconds` includes the warm-up. `seed` is the seed of delays
+    and losses, `name` the name of the testbed, and `tell` receives progress lines.
 
-    Raises
-    ------
-    DwellError
-        If the cell cannot be run here, or the machine was the bottleneck of a run.
+    Raises `DwellError` if the cell cannot run here or the machine was the bottleneck of a run.
     """
     from dwell.cellfile import load
     from dwell.record import open_run
@@ -216,8 +190,8 @@ def make_runs(
         pressure = open_run(run).meta.get("pressure") or {}
         if pressure.get("failed"):
             raise RunError(
-                f"{run}: the machine was the bottleneck ({pressure.get('why')}); measure on one "
-                "that does nothing else"
+                f"{run}: the machine was the bottleneck ({pressure.get('why')}); measure on an "
+                "idle machine"
             )
         runs.append(run)
     return runs
@@ -228,7 +202,7 @@ def _measured(runs: Sequence[Path], problem: Problem) -> list[Measured]:
 
     names = [path.resolve().name for path in runs]
     if not runs:
-        raise RunError("no runs; name the folders of runs that kept their jobs")
+        raise RunError("no runs; name the folders of runs with recorded jobs")
     faults = [f"{name}: named twice" for name in sorted({n for n in names if names.count(n) > 1})]
     measured = []
     for name, path in zip(names, runs, strict=True):
@@ -242,7 +216,7 @@ def _measured(runs: Sequence[Path], problem: Problem) -> list[Measured]:
 
 
 def _asked(problem: Problem) -> dict[tuple[str, str], Floats]:
-    """Draw the delays that a cell asks of its links, but for delays that are replayed."""
+    """Sample the configured delays of a cell's links, except replayed delays."""
     rng = np.random.default_rng(SEED)
     return {
         (link.source, link.target): link.delay_ms.marginal(rng, ASKED)
@@ -259,13 +233,13 @@ def _links(
     *,
     emulated: bool,
 ) -> tuple[dict[str, float], dict[str, Floats]]:
-    """Return the time that each link adds, and the delays of so many of its messages, ms."""
+    """Return the extra time of each link, and `rows` delays of its messages, ms."""
     if not emulated:
         own = own_delays(measured, known, problem)
         return {}, {link_name(*link): np.resize(values, rows) for link, values in own.items()}
     asked_ms = {link: np.resize(values, rows) for link, values in known.asked_ms.items()}
     added_ms = floors(measured, known, problem)
-    # One that no message took adds what the others do.
+    # A link without messages gets the mean of the other links.
     usual_ms = float(np.mean(list(added_ms.values()))) if added_ms else 0.0
     added = {link_name(*link): added_ms.get(link, usual_ms) for link in asked_ms}
     return added, {
@@ -284,7 +258,7 @@ def _write_samples(
     measured: Sequence[Measured],
     added_ms: Mapping[str, float],
 ) -> None:
-    """Write all columns; those of one file share their rows in a replay."""
+    """Write all columns; the columns of one file share their rows in a replay."""
     about: dict[str, Any] = {"runs": [one.name for one in measured], **stamp()}
     measurements = [
         Measurement(
@@ -303,13 +277,13 @@ def _write_samples(
 
 
 def _document(cell: Path, out: Path) -> dict[str, Any]:
-    """Return the cell file as plain values, its traces named from where the new file will be."""
+    """Return the cell file as plain values, with trace paths relative to the new file."""
     from dwell.cellfile.document_faults import Faults
     from dwell.cellfile.yaml_text import read_yaml
 
     document = read_yaml(str(cell), Faults(str(cell)))
     if not isinstance(document, dict):
-        raise RunError(f"{cell}: no cell")
+        raise RunError(f"{cell}: not a cell file")
     document.setdefault("name", cell.stem)
     move_traces(document, Path(os.path.relpath(cell.resolve().parent, out.resolve().parent)))
     return document
@@ -322,10 +296,10 @@ def _put_in(
     delays_ms: Mapping[str, Floats],
     nodes: Mapping[str, Mapping[str, Any]],
 ) -> None:
-    """Put findings on tasks, on nodes by key, and on links into a cell's document."""
+    """Write the findings for tasks, nodes and links into a cell's document."""
     for task, node in costs:
         document["tasks"][task]["on"][node]["exec_ms"] = replay(file, task_name(task, node))
-        # The samples have what the task shares with others already.
+        # The samples include the scale shared between tasks.
         document["tasks"][task].pop("scale", None)
     for node in nodes["background"]:
         document["nodes"][node].pop("background_beside", None)
@@ -366,14 +340,14 @@ def _about(of: TaskCost) -> dict[str, Any]:
 
 
 def _short(value: Any) -> Any:
-    """Return a number, or all numbers of a mapping, with five digits."""
+    """Round a number, or all numbers of a mapping, to five digits."""
     if isinstance(value, Mapping):
         return {key: _short(each) for key, each in value.items()}
     return None if value is None else float(f"{value:.5g}")
 
 
 def _check(one: Measured, problem: Problem, usual: Usual) -> dict[str, Any] | None:
-    """Return what the new cell predicts of a run beside what the run showed."""
+    """Return the new cell's prediction for a run next to the run's measured values."""
     import polars as pl
 
     from dwell.sim import draw, simulate_realisation
@@ -423,7 +397,7 @@ def _lines(report: Mapping[str, Any]) -> list[str]:
     for key, line in NODE_LINES.items():
         lines += [line.format(node=node, value=value) for node, value in report[key].items()]
     for name, value in report["sensitivity"].items():
-        lines.append(f"{name}: takes x^{value:.3g} times as long where a CPU is x times as slow")
+        lines.append(f"{name}: takes x^{value:.3g} times as long on a CPU that is x times as slow")
     for row in report["check"]:
         pairs = (
             f"{name} {_shown(row['measured'][name])} measured, {_shown(row['predicted'][name])} "
@@ -431,7 +405,7 @@ def _lines(report: Mapping[str, Any]) -> list[str]:
             for name in ("l95_ms", "mean_ms", "violation_rate")
         )
         lines.append(f"{row['run']} ({row['scenario']}, {row['placement']}): {'; '.join(pairs)}")
-    lines += [f"{name}: not measured, as it was" for name in report["missing"]]
+    lines += [f"{name}: not measured, unchanged" for name in report["missing"]]
     return lines
 
 

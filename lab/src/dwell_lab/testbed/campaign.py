@@ -1,9 +1,9 @@
-"""Campaign: every policy in every scenario, again and again, in an order that nobody chose.
+"""Campaign: repeated runs of every policy in every scenario, in random order.
 
-A repetition is a block: every policy in every scenario once, in a random order of its own. So what
-drifts with the hours (a warm machine, a neighbour's load) meets all policies alike, and a campaign
-that is stopped is balanced but for its last block. Runs of the same scenario and repetition share
-their seed, and are compared as a pair.
+A repetition is a block: every policy in every scenario once, shuffled. So slow drift (a warm
+machine, load from other programs) affects all policies equally, and a stopped campaign is balanced
+except for its last block. Runs of the same scenario and repetition share their seed and are
+compared as pairs.
 """
 
 from __future__ import annotations
@@ -26,26 +26,20 @@ from dwell.version import __version__
 from dwell_lab.testbed.campaign_folder import TRACES
 
 PAPERS_SCENARIOS = ("baseline", "robot-cpu-stress", "edge-cpu-stress", "network-impairment")
-#: Parts of `dwell` and of this package that a measurement depends on.
+#: Parts of `dwell` and of this package that influence a measurement.
 SOURCES = ("control", "cost.py", "estimators", "live", "model", "policies")
 LABORATORY = ("testbed",)
 
 
 class Entrant(NamedTuple):
-    """A policy of a campaign, with the estimator that it believes.
-
-    Parameters
-    ----------
-    name : str
-        In tables: ``LOC``, ``atp``, ``cusum+corrected``.
-    """
+    """A policy of a campaign with its estimator; `name` is used in tables: ``cusum+corrected``."""
 
     name: str
     policy: str
     estimator: str
 
     def problem(self, problem: Problem) -> Problem:
-        """Return the cell as it is run for this policy."""
+        """Return the cell with this policy and estimator."""
         seen = with_settings(problem, {"controller.estimator": self.estimator})
         return seen.under(self.policy)
 
@@ -53,16 +47,8 @@ class Entrant(NamedTuple):
 class Planned(NamedTuple):
     """A run of a campaign.
 
-    Parameters
-    ----------
-    place : int
-        In the order of the campaign, from 1.
-    repetition : int
-        From 1.
-    policy : str
-        Name of the entrant.
-    seed : int
-        The same for all policies of a scenario and repetition.
+    `place` and `repetition` count from 1, `policy` is an entrant's name, and `seed` is the same
+    for all policies of a scenario and repetition.
     """
 
     place: int
@@ -73,31 +59,20 @@ class Planned(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of the folder of the run."""
+        """Name of the run's folder."""
         return re.sub(r"[^\w.+-]", "_", f"{self.place:04d}-{self.scenario}-{self.policy}")
 
 
 @dataclass(frozen=True, slots=True)
 class Campaign:
-    """A measurement: every policy in every scenario, so many times.
+    """A measurement: every policy in every scenario, repeated.
 
-    Parameters
-    ----------
-    seconds : float
-        Length of each run, warm-up included.
-    seed : int
-        Seed of the order, and of what is drawn in the runs.
-    where : str
-        ``testbed``, or a digest of the inventory of real hosts.
+    `seconds` is the length of each run with its warm-up, `seed` the seed of the order and of the
+    runs, and `where` is ``testbed`` or a digest of the inventory of real hosts.
 
-    Raises
-    ------
-    ProblemError
-        If a scenario is unknown, or the runs are too short to have a window after the warm-up.
-    PolicyError
-        If a policy cannot be made for this cell.
-    LiveError
-        If something is named twice, or nothing at all.
+    Raises `ProblemError` if a scenario is unknown or the runs are too short for one window after
+    the warm-up, `PolicyError` if a policy cannot be created for this cell, and `LiveError` if a
+    list is empty or has duplicates.
     """
 
     problem: Problem
@@ -129,7 +104,7 @@ class Campaign:
             )
 
     def plan(self) -> tuple[Planned, ...]:
-        """Return all runs in their order: blocks of one repetition, each shuffled by itself."""
+        """Return all runs in order: one block per repetition, each shuffled separately."""
         pairs = [(scenario, one.name) for scenario in self.scenarios for one in self.entrants]
         runs: list[Planned] = []
         for repetition in range(1, self.repetitions + 1):
@@ -142,12 +117,12 @@ class Campaign:
 
     @property
     def traces(self) -> dict[str, Path]:
-        """Trace files of the cell, by the names under which a campaign's folder has them."""
+        """Trace files of the cell, by their names in the campaign's folder."""
         folder = Path(self.problem.folder or "")
         return {kept: folder / name for name, kept in self._cell()[1].items()}
 
     def _cell(self) -> tuple[dict[str, Any], dict[str, str]]:
-        """Return the cell as the folder has it, and its own names of the trace files there."""
+        """Return the cell as stored in the folder, and the stored name of each trace file."""
         document, names = to_document(self.problem), dict[str, str]()
         rename_traces(
             document,
@@ -156,7 +131,7 @@ class Campaign:
         return document, names
 
     def describe(self) -> dict[str, Any]:
-        """Return all that the runs depend on, ready for JSON."""
+        """Return everything that the runs depend on, ready for JSON."""
         return {
             "software": {
                 "dwell": __version__,
@@ -177,24 +152,19 @@ class Campaign:
 
 
 def entrant(problem: Problem, name: str) -> Entrant:
-    """Return the policy that a name of the command line means.
+    """Return the policy for a name of the command line.
 
-    Parameters
-    ----------
-    name : str
-        ``LOC`` (a candidate, which never moves), ``dtp`` (with the estimator of the cell), or
-        ``cusum+corrected``. What estimates nothing has the profile unless it says otherwise.
+    The name is a candidate, which never moves (``LOC``), a policy with the cell's estimator
+    (``dtp``), or both (``cusum+corrected``). Policies without estimates use the profile unless the
+    name sets an estimator.
 
-    Raises
-    ------
-    PolicyError
-        If it is neither a policy nor a candidate of the cell.
+    Raises `PolicyError` if the name is neither a policy nor a candidate of the cell.
     """
     policy, estimator = problem.policy_and_estimator(name)
     if policy not in names() and policy not in problem.candidates:
         by_name(policy, problem)
     if estimator is None:
-        # With the profile no shadow jobs load the nodes.
+        # The profile adds no shadow jobs to the nodes.
         blind = not estimates(policy) or policy in problem.candidates
         estimator = "profile" if blind else estimator_of(problem, policy)
     known = Entrant(name, policy, estimator)
@@ -206,12 +176,12 @@ def entrant(problem: Problem, name: str) -> Entrant:
 
 
 def default_entrants(problem: Problem) -> tuple[Entrant, ...]:
-    """Return every candidate, ATP, DTP, and the best of ours: CUSUM with corrected estimates."""
+    """Return every candidate, ATP, DTP, and CUSUM with corrected estimates."""
     names = (*problem.candidates, "atp", "dtp", "cusum+corrected")
     return tuple(entrant(problem, name) for name in names)
 
 
 def default_scenarios(problem: Problem) -> tuple[str, ...]:
-    """Return the paper's four, as far as the cell has them; all of a cell that has none."""
+    """Return the cell's scenarios among the paper's four; all its scenarios if at most one is."""
     papers = tuple(name for name in PAPERS_SCENARIOS if name in problem.scenarios)
     return papers if len(papers) > 1 else tuple(problem.scenarios)

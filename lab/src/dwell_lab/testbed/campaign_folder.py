@@ -1,7 +1,7 @@
-"""A campaign's folder: a Run folder for every run that is done, and what attempts left that failed.
+"""A campaign's folder: a Run folder for every completed run, and the remains of failed attempts.
 
-It holds ``campaign.json`` (what campaign it is), ``traces`` (files that its cell replays), ``runs``
-and ``failed``.
+It contains ``campaign.json`` (the campaign's description), ``traces`` (files that its cell
+replays), ``runs`` and ``failed``.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dwell.errors import RunError
 from dwell.record.json_documents import read_document
 
 RUNS, FAILED, TRACES = "runs", "failed", "traces"
-#: Beside the tables of a run: when it was made, and how the machine was.
+#: Stored with the tables of a run: its time, and the state of the machine.
 ATTEMPT = "attempt.json"
 CAMPAIGN = FolderMark("campaign", "campaign.json", 1, (RUNS, FAILED, TRACES))
 
@@ -23,14 +23,8 @@ CAMPAIGN = FolderMark("campaign", "campaign.json", 1, (RUNS, FAILED, TRACES))
 class CampaignFolder(NamedTuple):
     """Content of a campaign's folder.
 
-    Parameters
-    ----------
-    description : mapping
-        See `dwell_lab.testbed.campaign.Campaign.describe`.
-    done : mapping of Path to mapping
-        Folder of every run that is done, in the order of the plan, with its record.
-    failed : tuple of mapping
-        Records of the attempts that failed.
+    `description` is the result of `Campaign.describe`, `done` maps the folder of every completed
+    run, in the order of the plan, to its record, and `failed` has the records of failed attempts.
     """
 
     description: Mapping[str, Any]
@@ -44,12 +38,9 @@ def is_campaign(folder: Path) -> bool:
 
 
 def read_campaign(folder: Path) -> CampaignFolder:
-    """Read a campaign's folder, also while the campaign goes on.
+    """Read a campaign's folder; the campaign may still be running.
 
-    Raises
-    ------
-    RunError
-        If it holds none, or what it holds cannot be read.
+    Raises `RunError` if the folder is not a campaign or cannot be read.
     """
     if not is_campaign(folder):
         raise RunError(f"{folder}: not a campaign (it has no {CAMPAIGN.file})")

@@ -1,6 +1,6 @@
-"""Doctor: finds out, by trying, whether this machine can be a testbed, and says what is missing.
+"""Doctor: test whether this machine can be a testbed, and report what is missing.
 
-Whatever is made for a trial is removed at once; nothing is changed that stays.
+Everything created for a test is removed at once.
 """
 
 from __future__ import annotations
@@ -28,38 +28,29 @@ from dwell_lab.testbed.pressure import Rule
 from dwell_lab.testbed.probe import Probe
 from dwell_lab.testbed.sampling import EVERY_S
 
-#: Periods that are tried, shortest first; with less of a CPU the kernel does not take the first.
+#: Quota periods to try, shortest first; the kernel refuses short periods with small shares.
 PERIODS_MS = (2.0, 4.0, 10.0, 20.0, 100.0)
 SHARE = 0.5
-#: Short beside tasks of some ten milliseconds; with longer periods short tasks do not notice.
+#: A longer period hardly affects short tasks; this is short for tasks of some ten milliseconds.
 SHORT_MS = 10.0
 TRIAL_S = 0.3
-#: What a group may use beyond its quota in a trial: it pays back what the kernel let pass.
+#: CPU time over quota that a test accepts: the kernel lets a group overrun and corrects it later.
 ALLOWANCE = 1.25
-# Names of the doctor's own trials: one that was killed is cleaned up by one that comes later.
+# Fixed names, so a later test can remove the remains of a killed test.
 TRIALS = tuple(f"doctor-{number}" for number in range(8))
 ALONE = "one"
 PAIR = ("one", "two")
-#: Length of the windows that a watch is divided into, where no cell says another.
+#: Window length for the watch if no cell sets it.
 WINDOW_S = 2.0
 PRIVILEGED = "run it as root; in a container, start that with --privileged"
 
 
 def examine(problems: Sequence[Problem] = (), *, watch_s: float = 0.0) -> list[Finding]:
-    """Look at all that a testbed needs of this machine.
+    """Check everything that a testbed needs from this machine.
 
-    Parameters
-    ----------
-    problems : sequence of Problem
-        Cells that are to run at the same time; their quotas have to fit.
-    watch_s : float
-        How long to watch whether the machine stands still at times, as one does whose host has
-        other things to do; not at all if 0.
-
-    Returns
-    -------
-    list of Finding
-        A testbed of these cells can run here if all are well that are needed.
+    The quotas of all `problems` must fit together. For `watch_s` seconds the check watches for
+    standstills, as on a virtual machine with a busy host; 0 skips it. The cells can run here if
+    all needed findings are good.
     """
     return [
         _root(),
@@ -68,7 +59,7 @@ def examine(problems: Sequence[Problem] = (), *, watch_s: float = 0.0) -> list[F
         *_tried(),
         _pinning(),
         _cores(problems),
-        _command(STRESS_NG[0], STRESS_NG[0], "; stress is a loop of Dwell's own", needed=False),
+        _command(STRESS_NG[0], STRESS_NG[0], "; Dwell uses its own busy loop", needed=False),
         _pressure(),
         _fifo(),
         *([_standstill(problems, watch_s)] if watch_s > 0 else ()),
@@ -76,7 +67,7 @@ def examine(problems: Sequence[Problem] = (), *, watch_s: float = 0.0) -> list[F
 
 
 def checks(problem: Problem | None, keys: Path | None) -> Iterator[Part]:
-    """Yield the part of `dwell doctor` about testbeds."""
+    """Yield the section of `dwell doctor` about testbeds."""
     found = examine([] if problem is None else [problem])
     rows = [optional(row.name, row.ok, row.found, row.remedy) for row in found]
     required = [row for row in found if row.needed]
@@ -144,7 +135,7 @@ def _quotas(name: str) -> str:
 
 def _shortest_period(name: str) -> Finding:
     what = "shortest period of a quota"
-    said = "none was taken"
+    said = "none was accepted"
     for period_ms in PERIODS_MS:
         try:
             used = _share_used(name, Quota(SHARE, period_ms))
@@ -160,7 +151,7 @@ def _shortest_period(name: str) -> Finding:
 
 
 def _share_used(name: str, quota: Quota) -> float:
-    """Return the share of a CPU that a busy process gets with a quota."""
+    """Return the share of a CPU that a busy process gets under a quota."""
     with Groups(name, {ALONE: Share(quota=quota)}) as groups:
         words = groups.inside(ALONE, ["/bin/sh", "-c", "while :; do :; done"])
         with subprocess.Popen(words, stderr=subprocess.DEVNULL) as busy:  # noqa: S603 (our own words)
@@ -230,7 +221,7 @@ def _fifo() -> Finding:
 
 
 def _standstill(problems: Sequence[Problem], watch_s: float) -> Finding:
-    """Watch idle CPUs for standstills, which would stop a run of a testbed, too."""
+    """Watch idle CPUs for standstills, which would also stop a testbed run."""
     name, rule = "no standstills", Rule()
     window_s = min((one.window_ms / 1e3 for one in problems), default=WINDOW_S)
     try:
@@ -239,22 +230,22 @@ def _standstill(problems: Sequence[Problem], watch_s: float) -> Finding:
         return Finding(name, False, str(error), needed=False)
     stalls = {at_s: ms for at_s, ms in late_ms.items() if ms > rule.stall_ms}
     windows = math.ceil(watch_s / window_s)
-    # The last look may be a little late.
+    # The last reading may be a little late.
     share = len({min(int(at_s / window_s), windows - 1) for at_s in stalls}) / windows
     watched = f"in {watch_s:g} s the longest was {max(late_ms.values(), default=0.0):.1f} ms"
     if not stalls:
         return Finding(name, True, watched, needed=False)
     found = (
-        f"{watched}; {share:.0%} of the windows of {window_s:.3g} s had one of more than "
-        f"{rule.stall_ms:g} ms, and above {rule.excluded_most:.0%} a run has failed"
+        f"{watched}; {share:.0%} of the windows of {window_s:.3g} s had one longer than "
+        f"{rule.stall_ms:g} ms; a run fails above {rule.excluded_most:.0%}"
     )
-    remedy = "an hour, or a machine, at which nobody else wants it"
+    remedy = "another time of day, or a machine without other users"
     ok = share <= rule.excluded_most
     return Finding(name, ok, found, "" if ok else remedy, needed=False)
 
 
 def _lateness(watch_s: float) -> dict[float, float]:
-    """Longest lateness of a probe on any CPU, ms, at every look, by the time of the look, s."""
+    """Largest lateness of a probe on any CPU, ms, by the time of each reading, s."""
     late_ms = {}
     with ExitStack() as stack:
         probes = [stack.enter_context(Probe(cpu)) for cpu in sorted(os.sched_getaffinity(0))]

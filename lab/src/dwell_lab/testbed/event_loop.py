@@ -1,6 +1,6 @@
-"""One thread that watches descriptors, and takes each action at its instant.
+"""A loop in one thread that watches descriptors and runs actions at given instants.
 
-It waits with `select`, whose timeouts are exact to microseconds; those of `epoll` are rounded to
+It waits with `select`, whose timeouts are exact to microseconds; timeouts of `epoll` are rounded to
 milliseconds.
 """
 
@@ -24,11 +24,11 @@ class Watched(Protocol):
     served_ns: int
 
     def ready(self) -> None:
-        """Read the descriptor, which has something to be read, or has failed."""
+        """Read the descriptor, which is readable or has failed."""
 
 
 class Loop:
-    """Descriptors to watch, and actions to take at their instants."""
+    """Descriptors to watch, and actions to run at their instants."""
 
     def __init__(self) -> None:
         self._selector = SelectSelector()
@@ -36,21 +36,21 @@ class Loop:
         self._order = count()
 
     def at(self, instant_ns: int, action: Action) -> None:
-        """Have an action taken at an instant; those of one instant, in the order of asking."""
+        """Schedule an action at an instant; simultaneous actions run in call order."""
         heapq.heappush(self._actions, (instant_ns, next(self._order), action))
 
     def watch(self, descriptor: int, owner: Watched) -> None:
-        """Call the owner whenever the descriptor can be read."""
+        """Call the owner whenever the descriptor is readable."""
         self._selector.register(descriptor, EVENT_READ, owner)
 
     def unwatch(self, descriptor: int) -> None:
-        """Watch a descriptor for nothing, errors included."""
+        """Stop watching a descriptor, including for errors."""
         self._selector.unregister(descriptor)
 
     def turn(self) -> None:
-        """Take due actions, wait for the next event or instant, and serve ready descriptors.
+        """Run due actions, wait for the next event or instant, and serve ready descriptors.
 
-        The owner that was served longest ago goes first, so that nobody starves at a full queue.
+        The owner served longest ago is served first, so a full queue cannot starve other owners.
         """
         actions = self._actions
         while actions and actions[0][0] <= time.monotonic_ns():
@@ -61,5 +61,5 @@ class Loop:
             wait_s = min(wait_s, max(0, actions[0][0] - time.monotonic_ns()) / 1e9)
         ready = [key for key, _ in self._selector.select(wait_s)]
         for key in sorted(ready, key=lambda key: key.data.served_ns):
-            if key.fd in self._selector.get_map():  # not closed by one before it
+            if key.fd in self._selector.get_map():  # an earlier call may have closed it
                 key.data.ready()

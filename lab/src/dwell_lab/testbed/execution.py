@@ -1,7 +1,7 @@
-"""Execution of a campaign: its runs, one after the other, whatever comes between.
+"""Execution of a campaign: its runs in sequence, with resume after an interruption.
 
-Nothing but its folder (`dwell_lab.testbed.campaign_folder`) says what is done, and a run's folder
-appears complete, in one step. So a campaign goes on wherever it was stopped.
+The folder alone (`dwell_lab.testbed.campaign_folder`) records the completed runs, and a run's
+folder appears complete, in one step. So a stopped campaign can always resume.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from dwell_lab.testbed.campaign import Campaign, Planned
 from dwell_lab.testbed.campaign_folder import ATTEMPT, CAMPAIGN, FAILED, RUNS
 from dwell_lab.testbed.idle import Idle, Quiet, wait_until_idle
 
-#: Where a run is kept while it is made, in a campaign's folder.
+#: Folder of the current run, in a campaign's folder.
 WORK = ".work"
-#: How often a run that failed is repeated.
+#: Number of repeats of a failed run.
 REPEATS = 2
-#: So many attempts that end with an error before any does not: nothing works.
+#: Give up the campaign if its first attempts all end with an error.
 HOPELESS = 3
-#: What a run takes beside what it plays, until one has been timed.
+#: Estimated time of a run beyond its length, until the first run has been timed.
 AROUND_S = 20.0
 
 Tell: TypeAlias = Callable[[str], None]
@@ -38,7 +38,7 @@ Wait: TypeAlias = Callable[[Quiet], Idle]
 
 
 class Play(Protocol):
-    """Makes a run, as `dwell_lab.testbed.run.run_once` does."""
+    """A function that makes a run, as `dwell_lab.testbed.run.run_once` does."""
 
     def __call__(
         self,
@@ -52,20 +52,14 @@ class Play(Protocol):
         name: str,
         jobs: bool,
     ) -> Path:
-        """Return the folder of the run, somewhere below `out`."""
+        """Return the folder of the run, below `out`."""
 
 
 class State(NamedTuple):
     """Progress of a campaign.
 
-    Parameters
-    ----------
-    planned : int
-        Runs.
-    given_up : tuple of str
-        Names of runs that failed as often as they are repeated.
-    failures : int
-        Attempts that failed, whether their run was done later or not.
+    `planned` and `done` count runs, `given_up` names runs that failed in every repeat, and
+    `failures` counts all failed attempts, including those of completed runs.
     """
 
     planned: int
@@ -75,7 +69,7 @@ class State(NamedTuple):
 
     @property
     def left(self) -> int:
-        """Runs that are neither done nor given up."""
+        """Number of runs that are neither done nor given up."""
         return self.planned - self.done - len(self.given_up)
 
 
@@ -92,34 +86,17 @@ def run_campaign(
     wait: Wait = wait_until_idle,
     clock: Callable[[], float] = time.monotonic,
 ) -> State:
-    """Make the runs of a campaign that are not there yet.
+    """Make the missing runs of a campaign.
 
-    A run that fails (its cell does not come up, or the machine was under pressure in too many of
-    its windows) is repeated after all others.
+    A run fails if its cell does not start, or if too many of its windows were under pressure.
+    Failed runs are repeated after all other runs, up to `repeats` times each. An existing folder
+    of the same campaign is resumed. `name` is the testbed's name on this machine. `quiet` sets
+    when the machine counts as idle before a run. A run that would end after `minutes` is not
+    started. `tell` receives a line per event.
 
-    Parameters
-    ----------
-    folder : Path
-        Its own; one of the same campaign is gone on with.
-    name : str
-        Name of the testbed, among others on this machine.
-    quiet : Quiet, optional
-        When the machine counts as idle before a run.
-    repeats : int
-        How often a run that fails is repeated.
-    minutes : float, optional
-        After which no run is begun that would not end in time.
-    tell : callable
-        Takes a line on everything that happens.
-
-    Raises
-    ------
-    RunError
-        If the folder holds something else, another campaign, or runs of other software.
-    SimulationError
-        If the folder cannot be written.
-    LiveError
-        If the first attempts all end with an error.
+    Raises `RunError` if the folder has other content, another campaign, or runs of other software;
+    `SimulationError` if the folder cannot be written; `LiveError` if the first attempts all end
+    with an error.
     """
     with open_work_folder(folder, CAMPAIGN, campaign.describe()):
         _keep_traces(campaign, folder)
@@ -142,7 +119,7 @@ def run_campaign(
                 tell(f"  {record['outcome']}: {record['reason']}")
             if attempts.errors == HOPELESS:
                 raise LiveError(
-                    f"the first {HOPELESS} runs ended with an error, the last with: "
+                    f"the first {HOPELESS} runs ended with an error; the last error: "
                     f"{record['reason']}; see {folder / FAILED}"
                 )
         shutil.rmtree(folder / WORK, ignore_errors=True)
@@ -150,7 +127,7 @@ def run_campaign(
 
 
 def _keep_traces(campaign: Campaign, folder: Path) -> None:
-    """Copy the trace files that the cell replays: the folder is read without the cell's."""
+    """Copy the trace files of the cell, so the folder can be read without the original cell."""
     for kept, file in campaign.traces.items():
         if not (folder / kept).exists():
             try:
@@ -160,12 +137,10 @@ def _keep_traces(campaign: Campaign, folder: Path) -> None:
 
 
 class _Attempts:
-    """The attempts at a campaign's runs, and where they are kept.
+    """The attempts at a campaign's runs, and their folders.
 
-    Attributes
-    ----------
-    errors : int
-        Attempts in a row that ended with an error, from the first on; stays where one did not.
+    `errors` counts the attempts from the start that all ended with an error; it stops increasing
+    at the first attempt without an error.
     """
 
     def __init__(
@@ -183,7 +158,7 @@ class _Attempts:
         self._worked = any(self.has(one) for one in self.plan)
 
     def in_turn(self, repeats: int) -> Iterator[Planned]:
-        """Yield runs to make: those not tried yet, then those that failed, round by round."""
+        """Yield the runs to make: first the untried runs, then the failed runs, round by round."""
         for attempts in range(repeats + 1):
             for planned in self.plan:
                 if not self.has(planned) and self.failed(planned) <= attempts:
@@ -194,11 +169,11 @@ class _Attempts:
         return (self.folder / RUNS / planned.name / ATTEMPT).is_file()
 
     def failed(self, planned: Planned) -> int:
-        """How many attempts at a run have failed."""
+        """Return the number of failed attempts at a run."""
         return len(list((self.folder / FAILED).glob(f"{planned.name}.*")))
 
     def make(self, planned: Planned, number: int) -> Mapping[str, Any]:
-        """Make a run once, and put it where it belongs."""
+        """Make a run once, and move it to its folder."""
         one = next(one for one in self.campaign.entrants if one.name == planned.policy)
         idle = self.wait(self.quiet)
         work = self.folder / WORK
@@ -235,7 +210,7 @@ class _Attempts:
     def _keep(
         self, planned: Planned, number: int, record: Mapping[str, Any], run: Path | None
     ) -> None:
-        """Move a run to the done ones, or the remains of an attempt to the failed ones."""
+        """Move a run to the done runs, or the remains of an attempt to the failed attempts."""
         source = self.folder / WORK if run is None else run
         place = self.folder / (FAILED if run is None else RUNS)
         target = place / (f"{planned.name}.{number}" if run is None else planned.name)
@@ -247,7 +222,7 @@ class _Attempts:
             raise unwritable(target, error) from None
 
     def state(self, repeats: int) -> State:
-        """Say how far the campaign is."""
+        """Return the progress of the campaign."""
         undone = [one for one in self.plan if not self.has(one)]
         return State(
             planned=len(self.plan),
@@ -258,7 +233,7 @@ class _Attempts:
 
 
 def _judged(run: Run) -> dict[str, Any]:
-    """Say whether a run counts: it has windows, and not too many of them are excluded."""
+    """Judge whether a run counts: it has windows, and few enough of them are excluded."""
     pressure = run.meta.get("pressure") or {}
     excluded, windows = len(pressure.get("excluded", ())), int((~run.windows["warmup"]).sum())
     if pressure.get("failed"):

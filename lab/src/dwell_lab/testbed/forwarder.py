@@ -1,8 +1,8 @@
-"""The process of a TUN link: reads packets from either side, and hands each over at its instant.
+"""The process of a TUN link: read packets from either side, and deliver each at its due time.
 
-Packets of one flow that follow each other closely are a burst: a message, in pieces of 64 kB. Each
-direction takes packets one after another at its rate; then they travel for a delay drawn once a
-burst. Within a flow nothing overtakes; flows do.
+Packets of one flow that follow each other closely are a burst: one message, in pieces of 64 kB.
+Each direction transmits packets in order at its rate and then adds a delay, sampled once per burst.
+Packets within a flow stay in order; flows can overtake each other.
 """
 
 from __future__ import annotations
@@ -32,33 +32,33 @@ from dwell.live.local.conditions import (
 from dwell_lab.testbed.event_loop import Loop
 from dwell_lab.testbed.packets import kind_of
 
-#: Limits of the classes of lateness, ms; the last class has none.
+#: Upper limits of the lateness classes, ms; the last class has no limit.
 LATE_MS = (0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 LATE_NS = tuple(round(each * 1e6) for each in LATE_MS)
 
-#: Pause that ends a burst: a sender that is stopped by its CPU quota in the middle of a message
-#: goes on within 4 ms.
+#: Pause that ends a burst: a sender stopped by its CPU quota in the middle of a message continues
+#: within 4 ms.
 GAP_MS = 4.0
-#: From then on a flow that never pauses draws its next delay.
+#: Longest burst: after this time a flow without pauses samples its next delay.
 LONGEST_MS = 20.0
 GAP_NS, LONGEST_NS = round(GAP_MS * 1e6), round(LONGEST_MS * 1e6)
 
 PACKET_BYTES = 65_536
-# Packets read at a time, a message of 300 kB; what is due does not wait for more.
+# Packets to read per call, a message of 300 kB; due packets must not wait for more.
 AT_ONCE = 5
-# Of one direction, waiting at the rate and on their way; more is lost, as in a full buffer.
+# Limit per direction for queued and travelling bytes; more is lost, as in a full buffer.
 WAITING_BYTES = 64 << 20
-# Flows remembered; those that have nothing on its way are forgotten where there are more.
+# Number of flows to keep; above it, flows without travelling packets are dropped.
 FLOWS = 1_024
 # Linux lets timers of ordinary processes be 50 µs late to save power.
 TIMER_SLACK = "/proc/self/timerslack_ns"
-# The shortest time slice that Linux grants; the shorter it is, the sooner a process gets the CPU.
+# Shortest time slice that Linux grants; a shorter slice gets the CPU sooner.
 SLICE_NS = 100_000
 SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 
 
 class _Settings(NamedTuple):
-    """What `TunLink` sends; all but nodes and descriptors is by source."""
+    """Settings from `TunLink`; mappings are keyed by source."""
 
     nodes: tuple[str, str]
     descriptors: list[int]
@@ -69,28 +69,14 @@ class _Settings(NamedTuple):
 
 @dataclass(slots=True)
 class Passed:
-    """Counts of the packets that have passed one direction.
+    """Counts of the packets of one direction.
 
-    Parameters
-    ----------
-    packets, bytes : int
-        Handed over.
-    bursts : int
-        Bursts of data that have begun.
-    held : int
-        Bursts that were held back for a timeout or more.
-    vanished : int
-        Packets lost to an outage, a full queue or a host that is gone.
-    ignored : int
-        Packets that are no cell's: IPv6, multicast, broadcast.
-    delay_ns, squares : int, float
-        Sums of the delays drawn for bursts of data, timeouts included, and of their squares.
-    late_max_ns : int
-        Longest time by which a packet left later than it was due.
-    late : list of int
-        Packets by lateness: the classes of `LATE_MS`, and one above.
-    cpu_s : float
-        CPU time of the process since its start, both directions.
+    `packets` and `bytes` were delivered. `bursts` counts bursts of data, and `held` those delayed
+    by at least one timeout. `vanished` packets were lost to an outage, a full queue or a missing
+    host; `ignored` packets (IPv6, multicast, broadcast) belong to no cell. `delay_ns` and
+    `squares` are the sums of the sampled delays with timeouts, and of their squares. `late_max_ns`
+    is the largest lateness, and `late` counts packets per class of `LATE_MS`, plus one class
+    above. `cpu_s` is the CPU time of the process since its start, for both directions.
     """
 
     packets: int = 0
@@ -107,12 +93,12 @@ class Passed:
 
     @property
     def delay_mean_ms(self) -> float:
-        """Mean of the delays drawn; 0 without bursts."""
+        """Mean of the sampled delays; 0 without bursts."""
         return self.delay_ns / max(self.bursts, 1) / 1e6
 
     @property
     def delay_std_ms(self) -> float:
-        """Standard deviation of the delays drawn."""
+        """Standard deviation of the sampled delays."""
         bursts = max(self.bursts, 1)
         variance = self.squares / bursts - (self.delay_ns / bursts) ** 2
         return float(max(variance, 0.0) ** 0.5) / 1e6
@@ -123,14 +109,14 @@ class Passed:
         return self.late_max_ns / 1e6
 
     def left(self, size_bytes: int, late_ns: int) -> None:
-        """Count a packet that was handed over."""
+        """Count a delivered packet."""
         self.packets += 1
         self.bytes += size_bytes
         self.late_max_ns = max(self.late_max_ns, late_ns)
         self.late[bisect_right(LATE_NS, late_ns)] += 1
 
     def began(self, delay_ns: int) -> None:
-        """Count a burst of data that has begun."""
+        """Count a new burst of data."""
         self.bursts += 1
         self.delay_ns += delay_ns
         self.squares += float(delay_ns) ** 2
@@ -138,7 +124,7 @@ class Passed:
 
 @dataclass(slots=True)
 class _Flow:
-    """Packets of one 5-tuple, and the burst that is the last of them."""
+    """A flow, identified by its 5-tuple, with its latest burst."""
 
     begun_ns: int = 0
     last_ns: int = 0
@@ -166,7 +152,7 @@ class _Direction:
         loop.watch(self._source, self)
 
     def ready(self) -> None:
-        """Read packets; all count as having come when this was called."""
+        """Read packets; all get the time of this call as their arrival."""
         self.served_ns = time.monotonic_ns()
         for _ in range(AT_ONCE):
             try:
@@ -184,7 +170,7 @@ class _Direction:
         if kind is None:
             counts.ignored += 1
             return
-        # Where every attempt is lost, the sender's own repetitions are what waits for better times.
+        # With a loss of 1 no attempt succeeds; the sender's own repetitions continue later.
         stopped = conditions.down or (kind.data and conditions.loss == 1)
         if stopped or self._waiting_bytes > WAITING_BYTES:
             counts.vanished += 1
@@ -210,7 +196,7 @@ class _Direction:
         self._loop.at(flow.due_ns, partial(self._leave, packet))
 
     def _held_back(self) -> int:
-        """Draw how long a burst is held back until an attempt to send it is not lost, ns."""
+        """Sample the time until an attempt to send a burst is not lost, ns."""
         held_ns = 0
         while held_ns < MOST_ATTEMPTS * self._retransmit_ns and self.draws.lose():
             held_ns += self._retransmit_ns
@@ -240,7 +226,7 @@ class _Direction:
 
 
 class _Link:
-    """The two directions, which change and are read as the parent's requests say."""
+    """Both directions, which serve the parent's requests."""
 
     served_ns = 0
 
@@ -253,13 +239,13 @@ class _Link:
         self.loop.watch(parent.fileno(), self)
 
     def ready(self) -> None:
-        """Carry out a request; an `EOFError` ends the process."""
+        """Serve a request; an `EOFError` ends the process."""
         what, *arguments = self._parent.receive()
         answer = self._stats(*arguments) if what == "stats" else self._set(*arguments)
         self._parent.answer(answer)
 
     def _set(self, source: str, changes: Mapping[str, Any], at_ns: int) -> int:
-        """Change conditions of a direction, from an instant on that is returned."""
+        """Change conditions of a direction from an instant on; return that instant."""
         draws, now_ns = self._directions[source].draws, time.monotonic_ns()
 
         def change(_: int) -> None:
@@ -283,11 +269,11 @@ class _Link:
 
 
 def _come_first() -> Scheduling:
-    """Get the CPU as soon as something is due, as far as the system lets this process.
+    """Give this process the highest priority that the system permits.
 
-    A real link does not wait for the CPU of a node that it connects; and foreign work is there to
-    slow nodes, not links. Real-time priority does it, where the process may have it. Anybody may
-    ask for short time slices (Linux 6.12), which halve the lateness beside busy threads.
+    A real link does not wait for the CPU of a node that it connects, and foreign work should slow
+    nodes, not links. The process asks for real-time priority. If this is refused, it asks for short
+    time slices (Linux 6.12, no privilege needed), which halve the lateness on busy CPUs.
     """
     with contextlib.suppress(OSError), open(TIMER_SLACK, "w") as slack:
         slack.write("1")
@@ -302,7 +288,7 @@ def _come_first() -> Scheduling:
 
 
 def main() -> None:
-    """Forward until the parent ends, or wants it to."""
+    """Forward packets until the parent ends or closes the pipe."""
     parent = Parent()
     with contextlib.suppress(EOFError):
         settings = _Settings(*parent.receive())

@@ -1,8 +1,8 @@
-"""Groups of processes that stand for the CPUs of nodes: a quota, which CPUs, the time used.
+"""Control groups that emulate the CPUs of nodes: a quota, a set of CPUs, and the time used.
 
 A quota is the kernel's CPU bandwidth control (Turner, Rao, Rao: CPU bandwidth control for CFS,
-Linux Symposium 2010): in every period the group runs for the quota at most. All of a testbed's
-groups are in one of its own, ``dwell-NAME``, so that what belongs to it is known from outside.
+Linux Symposium 2010): in every period the group runs for at most the quota. All groups of a
+testbed are in one group named ``dwell-NAME``, so other processes can find them.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from dwell.live.local.child import Started
 from dwell.live.roles.control_group import COUNTERS, ControlGroup
 from dwell.model import Quota
 
-#: What the kernel takes (kernel/sched/core.c: min_cfs_quota_period, max_cfs_quota_period).
+#: Limits of the kernel (kernel/sched/core.c: min_cfs_quota_period, max_cfs_quota_period).
 MIN_US = 1_000
 MAX_PERIOD_US = 1_000_000
-# How long killed processes may take to be gone; a group with a quota ends them in its own time.
+# Longest wait for killed processes; a group with a quota takes longer to end.
 GONE_S = 10.0
 CHECK_S = 0.005
 
 
 @dataclass(frozen=True, slots=True)
 class Share:
-    """Share of a node in this machine's CPUs: those that it may use (all if empty), and a quota."""
+    """Share of a node in this machine's CPUs: permitted CPUs (all if empty), and a quota."""
 
     cpus: tuple[int, ...] = ()
     quota: Quota | None = None
 
     def faults(self, node: str) -> list[str]:
-        """Return why the kernel does not take the quota; empty if it does."""
+        """Return why the kernel refuses the quota; empty if it accepts the quota."""
         if self.quota is None:
             return []
         period_us, quota_us = _microseconds(self.quota)
@@ -49,7 +49,7 @@ class Share:
         if quota_us < MIN_US:
             faults.append(
                 f"nodes.{node}.quota: {self.quota.cpu:g} CPU in every {self.quota.period_ms:g} ms "
-                f"is {quota_us / 1e3:g} ms a period; the kernel takes no less than 1 ms: use a "
+                f"is {quota_us / 1e3:g} ms per period; the kernel needs at least 1 ms: use a "
                 "longer period"
             )
         return faults
@@ -60,40 +60,30 @@ def _missing(node: str, share: Share) -> list[str]:
     if not (missing := sorted(set(share.cpus) - allowed)):
         return []
     asked, known = (", ".join(map(str, some)) for some in (missing, sorted(allowed)))
-    return [f"nodes.{node}: CPU {asked} is not there; this process may use {known}"]
+    return [f"nodes.{node}: CPU {asked} is not available; this process may use {known}"]
 
 
 def _microseconds(quota: Quota) -> tuple[int, int]:
-    """Return period and run time in it, as the kernel takes them."""
+    """Return the period and the quota in it, µs."""
     return round(quota.period_ms * 1e3), round(quota.cpu * quota.period_ms * 1e3)
 
 
-#: A group beside those of the nodes, as heavy as they are, for what watches them. No node has
-#: such a name.
+#: Group for the probes, with the same weight as a node's group. No node can have
+#: this name.
 PROBES = "~probes"
 
 
 def group_name(name: str) -> str:
-    """Return the group that all groups of a testbed are in."""
+    """Return the name of the group that contains all groups of a testbed."""
     return f"dwell-{name}"
 
 
 class Groups(Started):
-    """Groups of processes, one per node; a context manager, at whose end nothing in them lives.
+    """Groups of processes, one per node; a context manager that kills all their processes at exit.
 
-    Parameters
-    ----------
-    name : str
-        Name of the testbed.
-    shares : mapping of str to Share
-        By node.
-    cgroups : Cgroups, optional
-        Where to make them; found if left out.
+    `name` is the testbed's name. `cgroups` is where to create the groups, found if left out.
 
-    Raises
-    ------
-    LiveError
-        If this machine has no groups with quotas, or cannot have these.
+    Raises `LiveError` if this machine has no groups with quotas, or refuses these.
     """
 
     def __init__(
@@ -142,7 +132,7 @@ class Groups(Started):
                 self._limit(node, share.quota)
 
     def _hand_down(self, folder: Path) -> None:
-        """Let the groups inside a group have controllers, which version 2 does not by itself."""
+        """Enable the controllers for the groups inside a group; version 2 needs this."""
         if self._cgroups.version == 1:
             return
         control = folder / "cgroup.subtree_control"
@@ -151,11 +141,11 @@ class Groups(Started):
             _write(control, " ".join(f"+{name}" for name in wanted))
 
     def _weigh(self) -> None:
-        """Give the group of all its weight beside everything else on the machine.
+        """Set the weight of the testbed's group against all other processes of the machine.
 
-        Where every node has a quota it is the highest there is: the quotas leave the machine its
-        part, and nothing else shall decide what a node gets. Otherwise it is what the nodes' groups
-        would have by themselves.
+        If every node has a quota, the weight is the maximum: the quotas already leave the machine
+        its share, and no other process should reduce a node's quota. Otherwise it is the sum of
+        the default weights of the nodes' groups.
         """
         folder, count = self._cgroups.folders["cpu"] / self._parent, max(1, len(self._shares))
         nodes = [share for name, share in self._shares.items() if name != PROBES]
@@ -177,12 +167,9 @@ class Groups(Started):
 
     @contextmanager
     def unlimited(self) -> Iterator[None]:
-        """Lift the quotas for a while, as for processes that start.
+        """Lift the quotas for a while, as for starting processes.
 
-        Raises
-        ------
-        LiveError
-            If the kernel refuses that.
+        Raises `LiveError` if the kernel refuses.
         """
         limited = {node: share.quota for node, share in self._shares.items() if share.quota}
         try:
@@ -203,10 +190,10 @@ class Groups(Started):
     def _require(self, node: str) -> None:
         if node not in self._shares:
             known = ", ".join(self._shares)
-            raise LiveError(f"there is no group of a node {node!r}; there are {known}")
+            raise LiveError(f"node {node!r} has no group; nodes with a group: {known}")
 
     def inside(self, node: str, words: Sequence[str]) -> list[str]:
-        """Return a command that runs another in a node's group, in the same process."""
+        """Return a command that runs another command in a node's group, in the same process."""
         self._require(node)
         cpus = self._shares[node].cpus
         folders = " ".join(
@@ -219,16 +206,16 @@ class Groups(Started):
         return ["/bin/sh", "-c", enter, "sh", *pinned, *words]
 
     def used_ns(self, node: str) -> int:
-        """Return the CPU time that a node's group has used since it was made."""
+        """Return the CPU time that a node's group has used since its creation."""
         of_v1 = self._cgroups.version == 1
         controller, counter = ("cpuacct", "cgroup") if of_v1 else ("cpu", "cgroup2")
         return ControlGroup(self._folder(controller, node) / COUNTERS[counter]).used_ns()
 
     def switches(self, node: str) -> dict[int, int]:
-        """Return how often each thread of a node has gone to sleep by itself so far."""
+        """Return the number of voluntary context switches of each thread of a node."""
         counts = {}
         for pid in self.pids(node):
-            with suppress(OSError):  # it has ended meanwhile
+            with suppress(OSError):  # it has ended
                 for folder in Path(f"/proc/{pid}/task").iterdir():
                     with suppress(OSError):
                         counts[int(folder.name)] = _voluntary((folder / "status").read_text())
@@ -239,24 +226,18 @@ class Groups(Started):
         return _pids(self._folder("cpu", node))
 
     def kill(self, node: str) -> None:
-        """End all processes of a node, stopped and frozen ones too, and wait until they are gone.
+        """Kill all processes of a node, including stopped and frozen processes, and wait.
 
-        Raises
-        ------
-        LiveError
-            If some do not end.
+        Raises `LiveError` if some do not end.
         """
         self._require(node)
         _kill(self._cgroups.groups(self._parent, node))
 
 
 def remove_group(parent: str, cgroups: Cgroups) -> None:
-    """End all that is in a group and the groups in it, and remove them; nothing if there is none.
+    """Kill all processes in a group and its inner groups, and remove them; a missing group is fine.
 
-    Raises
-    ------
-    LiveError
-        If something does not end.
+    Raises `LiveError` if a process does not end.
     """
     inner = {
         group.name
@@ -273,13 +254,13 @@ def remove_group(parent: str, cgroups: Cgroups) -> None:
 
 
 def _voluntary(status: str) -> int:
-    """Return the voluntary switches that a thread's status counts (proc_pid_status(5))."""
+    """Return the voluntary switches in a thread's status file (proc_pid_status(5))."""
     _, _, behind = status.partition("\nvoluntary_ctxt_switches:")
     return int(behind.split()[0]) if behind else 0
 
 
 def _inherit_cpus(folder: Path) -> None:
-    """Give a group of v1 its parent's CPUs and memory: it has none at first."""
+    """Copy the parent's CPUs and memory to a group of v1, which starts with none."""
     for name in ("cpuset.mems", "cpuset.cpus"):
         if (folder / name).exists():
             _write(folder / name, (folder.parent / name).read_text().strip())
@@ -289,7 +270,7 @@ def _write(file: Path, value: str) -> None:
     try:
         file.write_text(value)
     except OSError as error:
-        # A write that the kernel refuses has no file name of its own.
+        # The error of a refused write has no file name.
         raise OSError(error.errno, f"{error.strerror} for {value!r}", str(file)) from None
 
 
@@ -298,28 +279,20 @@ def _pids(folder: Path) -> list[int]:
         pids = [int(pid) for pid in (folder / "cgroup.procs").read_text().split()]
     except FileNotFoundError:
         return []
-    # 0 stands for one of another PID namespace; to kill it would be to kill this process's group.
+    # 0 means a process of another PID namespace; killing 0 would kill this process's group.
     return [pid for pid in pids if pid > 0]
 
 
 def kill_all(
     pids: Callable[[], Collection[int]], place: str, thaw: Callable[[], None] = lambda: None
 ) -> None:
-    """Kill processes until there are none: whoever was started meanwhile is among them too.
+    """Kill processes until none is left, including processes started in the meantime.
 
-    Parameters
-    ----------
-    pids : callable
-        Returns the processes that are there; called again and again.
-    place : str
-        For the message: ``in the group``.
-    thaw : callable
-        Called when all have been sent the signal: frozen ones of cgroup v1 do not notice it.
+    `pids` is called repeatedly and returns the living processes. `place` completes the message:
+    ``in the group``. `thaw` is called after each round of signals, because frozen processes of
+    cgroup v1 do not receive signals.
 
-    Raises
-    ------
-    LiveError
-        If some do not end.
+    Raises `LiveError` if some processes do not end.
     """
     until = time.monotonic() + GONE_S
     while alive := pids():

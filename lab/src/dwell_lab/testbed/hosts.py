@@ -1,8 +1,8 @@
-"""Network namespaces that stand for hosts: an address each, a TUN device to each neighbour.
+"""Network namespaces that emulate hosts: one address each, and one TUN device per neighbour.
 
-Whoever holds the two descriptors of a pair of TUN devices is the link between the two: what one
-host sends is read from its device, and written to the other's. Nothing is made outside of the
-namespaces, and there is no other way out of them.
+The process that holds both descriptors of a pair of TUN devices is the link: it reads packets from
+one host's device and writes them to the other's. Nothing is created outside the namespaces, and
+they have no other connection.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from dwell.errors import LiveError
 from dwell.live.local.child import Started, run_command
 from dwell_lab.testbed.groups import kill_all
 
-#: Bytes of the largest packet: IPv4 takes 65 535, and a message of 64 kB is one packet.
+#: Bytes of the largest packet: IPv4 permits 65 535, and a message of 64 kB is one packet.
 MTU = 65_520
-#: Packets that wait in a device for whoever reads it; a message of megabytes is some tens.
+#: Queue length of a device, in packets; a message of megabytes is some tens of packets.
 QUEUE = 10_000
-#: Packets that TCP sends without having heard of the first: a message takes no round trip.
+#: TCP's initial window, in packets: a message needs no extra round trip.
 FIRST_WINDOW = 256
 FIRST_ADDRESS = IPv4Address("10.77.0.0")
 NAMESPACES = Path("/run/netns")
-# TCP's windows start at the middle value and grow to the last; without new slow starts after a
-# pause, and without memory of connections that were. Reno is in every kernel, and sends a message
-# at once: BBR would spread it over the time that it takes at the rate of the messages before.
+# TCP's windows start at the middle value and grow to the last, without slow starts after a pause
+# and without metrics saved from earlier connections. Reno is in every kernel and sends a message at
+# once; BBR would pace it at the rate measured for earlier messages.
 SETTINGS = {
     "ipv4/tcp_congestion_control": "reno",
     "ipv4/tcp_rmem": "4096 16777216 33554432",
@@ -50,30 +50,21 @@ T = TypeVar("T")
 
 
 def namespace_name(name: str, node: str) -> str:
-    """Return the network namespace of a testbed's node."""
+    """Return the name of the network namespace of a testbed's node."""
     return f"dwell-{name}-{node}"
 
 
 def namespace_path(namespace: str) -> Path:
-    """Return the file that stands for a network namespace (ip-netns(8))."""
+    """Return the file of a network namespace (ip-netns(8))."""
     return NAMESPACES / namespace
 
 
 class Hosts(Started):
     """Namespaces, addresses and TUN devices of nodes; a context manager.
 
-    Parameters
-    ----------
-    name : str
-        Name of the testbed.
-    nodes : sequence of str
-    pairs : iterable of (str, str)
-        Nodes with a link between them, each pair in either order.
+    `pairs` are nodes with a link between them, each pair in either order.
 
-    Raises
-    ------
-    LiveError
-        If a pair names a node that there is not.
+    Raises `LiveError` if a pair names an unknown node.
     """
 
     def __init__(self, name: str, nodes: Sequence[str], pairs: Iterable[tuple[str, str]]) -> None:
@@ -97,7 +88,7 @@ class Hosts(Started):
                     f"name, or remove it: ip netns delete {self.namespace(node)}"
                 )
         for node in self._nodes:
-            # Before it is made: a failed attempt may leave its file.
+            # Register the removal first: a failed attempt may leave the file.
             self._stack.callback(remove_namespace, self.namespace(node))
             _ip("netns", "add", self.namespace(node))
             self._furnish(node)
@@ -119,7 +110,7 @@ class Hosts(Started):
 
     def _index(self, node: str) -> int:
         if node not in self._nodes:
-            raise LiveError(f"there is no host {node!r}; there are {', '.join(self._nodes)}")
+            raise LiveError(f"unknown host {node!r}; hosts: {', '.join(self._nodes)}")
         return self._nodes.index(node)
 
     def address(self, node: str) -> str:
@@ -132,41 +123,35 @@ class Hosts(Started):
         return namespace_name(self._name, node)
 
     def device(self, other: str) -> str:
-        """Return the name, in any of the namespaces, of the device that leads to a node."""
+        """Return the name of the devices that lead to a node, the same in all namespaces."""
         return f"to{self._index(other)}"
 
     def tun(self, one: str, other: str) -> int:
         """Return the descriptor of the device in `one` that leads to `other`.
 
-        Packets without a header in front; closed with the hosts.
+        Packets have no extra header. The hosts close the descriptor when they stop.
 
-        Raises
-        ------
-        LiveError
-            If there is no link between the two, or the hosts have not been made.
+        Raises `LiveError` if the two have no link, or the hosts have not been created.
         """
         if (one, other) not in self._tuns:
-            raise LiveError(f"there is no device from {one!r} to {other!r}")
+            raise LiveError(f"no device leads from {one!r} to {other!r}")
         return self._tuns[one, other]
 
     def inside(self, node: str, words: Sequence[str]) -> list[str]:
-        """Return a command that runs another in a node's namespace, in the same process.
+        """Return a command that runs another command in a node's namespace, in the same process.
 
-        It has this machine's files still, those of its groups of processes among them, which
+        The process still sees this machine's files, including the control groups, which
         ``ip netns exec`` would hide.
         """
         return ["nsenter", f"--net={namespace_path(self.namespace(node))}", "--", *words]
 
 
 def within(namespace: str, act: Callable[[], T]) -> T:
-    """Call a function in a thread that is in a network namespace, and return its result.
+    """Call a function in a thread inside a network namespace, and return its result.
 
-    Sockets and devices that it opens stay there.
+    Sockets and devices that it opens stay in the namespace.
 
-    Raises
-    ------
-    LiveError
-        If the namespace cannot be entered.
+    Raises `LiveError` if the namespace cannot be entered.
     """
 
     def enter() -> T:
@@ -186,12 +171,9 @@ def within(namespace: str, act: Callable[[], T]) -> T:
 
 
 def remove_namespace(namespace: str) -> None:
-    """End all processes in a network namespace, and remove it; nothing if there is none.
+    """Kill all processes in a network namespace, and remove it; a missing namespace is fine.
 
-    Raises
-    ------
-    LiveError
-        If something does not end.
+    Raises `LiveError` if a process does not end.
     """
     if not namespace_path(namespace).exists():
         return
@@ -210,7 +192,7 @@ def _ip(*words: str, given: str = "") -> str:
 def _set() -> None:
     for name, value in SETTINGS.items():
         file = Path("/proc/sys/net", name)
-        if file.exists() or name.startswith("ipv4"):  # IPv6 may be left out of a kernel
+        if file.exists() or name.startswith("ipv4"):  # a kernel can be built without IPv6
             file.write_text(value)
 
 

@@ -1,8 +1,8 @@
-"""Idle: whether the machine does nothing else before a run begins.
+"""Idle: check that the machine is idle before a run begins.
 
-Two signs, both over a few seconds: the share of all CPUs' time that anything took, and the share of
-time in which something that could have run waited for a CPU (PSI). The load average is none: it
-remembers the run before for minutes.
+Two measures, each over a few seconds: the share of all CPUs' time in use, and the share of time in
+which a runnable task waited for a CPU (PSI). The load average is unsuitable: it includes the
+previous run for minutes.
 """
 
 from __future__ import annotations
@@ -17,14 +17,10 @@ PSI = Path("/proc/pressure/cpu")
 
 
 class Counters(NamedTuple):
-    """Counters of the machine since it was started.
+    """Counters of the machine since boot.
 
-    Parameters
-    ----------
-    busy, all : float
-        CPU time that was used and that passed, all CPUs together, seconds.
-    waited_s : float or None
-        Time in which something waited for a CPU; None where the kernel does not say.
+    `busy` and `all` are used and elapsed CPU time over all CPUs, seconds. `waited_s` is the time in
+    which some task waited for a CPU; None if the kernel does not report it.
     """
 
     at_s: float
@@ -37,16 +33,9 @@ class Counters(NamedTuple):
 class Quiet:
     """Bounds below which a machine counts as idle.
 
-    Parameters
-    ----------
-    busy : float
-        Share of the CPUs' time at most.
-    waiting : float
-        Share of the time at most in which something waits for a CPU.
-    for_s : float
-        How long both have to hold.
-    patience_s : float
-        How long that is waited for; then the run begins anyway, and its record says so.
+    `busy` is the largest share of CPU time, `waiting` the largest share of time in which a task
+    waits for a CPU, and both must hold for `for_s`. After `patience_s` the run begins anyway, and
+    its record states this.
     """
 
     busy: float = 0.15
@@ -58,14 +47,8 @@ class Quiet:
 class Idle(NamedTuple):
     """State of the machine when a run began.
 
-    Parameters
-    ----------
-    waited_s : float
-        Until it was, or until patience was over.
-    busy : float
-        Share of the CPUs' time in the last stretch.
-    waiting : float or None
-        Share of the time in which something waited for a CPU in the last stretch.
+    `waited_s` is the time until the machine was idle or patience ended. `busy` and `waiting` are
+    the shares (see `Quiet`) in the last interval.
     """
 
     idle: bool
@@ -79,13 +62,13 @@ def sample() -> Counters:
     import psutil  # what a campaign has measured is read without it
 
     times = psutil.cpu_times()
-    # Guests are in user and nice already.
+    # User and nice time already include guest time.
     passed = sum(times) - times.guest - times.guest_nice
     return Counters(time.monotonic(), passed - times.idle - times.iowait, passed, waited_s())
 
 
 def waited_s() -> float | None:
-    """Time of ``some`` in /proc/pressure/cpu."""
+    """Return the total of ``some`` in /proc/pressure/cpu, s; None if unavailable."""
     try:
         line = PSI.read_text().splitlines()[0]
     except (OSError, IndexError):
@@ -99,7 +82,7 @@ def wait_until_idle(
     read: Callable[[], Counters] = sample,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Idle:
-    """Wait until the machine has been idle for a while, or for as long as patience lasts."""
+    """Wait until the machine has been idle for a while, or until patience ends."""
     begun = before = read()
     while True:
         sleep(quiet.for_s)

@@ -1,4 +1,4 @@
-"""Inventory: which real host each node of a cell is, and how commands get there.
+"""Inventory: the real host of each node of a cell, and the command that reaches it.
 
 ```yaml
 dwell-inventory: 1
@@ -41,8 +41,8 @@ from dwell.model.semantics import nearest
 
 VERSION = 1
 FORMAT = "dwell-inventory"
-FOLDER = "/var/tmp/dwell"  # noqa: S108 - on the hosts; a folder of the testbed's own is made in it
-#: stress-ng, or as many busy loops.
+FOLDER = "/var/tmp/dwell"  # noqa: S108 - on the hosts; the testbed creates its own folder in it
+#: stress-ng, or the same number of busy loops.
 STRESS = (
     "if command -v stress-ng >/dev/null; then exec stress-ng --quiet --cpu {threads}; fi; "
     "i=0; while [ $i -lt {threads} ]; do while :; do :; done & i=$((i + 1)); done; wait"
@@ -52,23 +52,23 @@ CPUS = Pattern(r"(\d+(-\d+)?(,\d+(-\d+)?)*)?", "a list of CPUs, as 0,2-3")
 
 @declared()
 class RealHost:
-    """A host."""
+    """A computer that runs a node."""
 
     run: tuple[str, ...] = key(
-        "Words that, with a line for a shell behind them, have it done there: `ssh robot-1`."
+        "Command that runs a line of shell on the host, given as its last word: `ssh robot-1`."
     )
-    address: str = key("Where its processes are reached from the other hosts.", NOT_EMPTY)
-    port: int = key("First one.", Bound(1, 65_000, whole=True), default=7450)
+    address: str = key("Address of its processes for the other hosts.", NOT_EMPTY)
+    port: int = key("First port.", Bound(1, 65_000, whole=True), default=7450)
     python: str = key(
-        "The interpreter there that has this package, with the cell's stages.", default="python3"
+        "The interpreter on the host, with this package and the cell's stages.", default="python3"
     )
     folder: str = key(
-        "Where files may be put there.", Pattern("/.*", "a path that begins with /"), default=FOLDER
+        "Folder for files on the host.", Pattern("/.*", "a path that begins with /"), default=FOLDER
     )
     cpus: str = key("CPUs that the cell may use, as `2-7`.", CPUS, default="", usual="any")
     stress: str = key(
-        "Line for a shell that loads `{threads}` threads until it is told to end.",
-        Pattern(r"[\s\S]*{threads}[\s\S]*", "a line that says where {threads} go"),
+        "Line of shell that loads `{threads}` threads until it is terminated.",
+        Pattern(r"[\s\S]*{threads}[\s\S]*", "a line that contains {threads}"),
         default=STRESS,
         usual="stress-ng, or busy loops",
     )
@@ -76,13 +76,13 @@ class RealHost:
 
 @declared()
 class LinkCommands:
-    """Lines for a shell on the host that a link leaves from."""
+    """Lines of shell, for the source host of a link."""
 
     begin: str = key(
         "Impairs the link, with `{mean_ms}`, `{std_ms}` of the extra delay, `{loss_percent}`, "
         "`{rate_mbps}`."
     )
-    end: str = key("Takes that back.", NOT_EMPTY)
+    end: str = key("Ends the impairment.", NOT_EMPTY)
 
     def __post_init__(self) -> None:
         wrong = _wrong_places(self.begin)
@@ -90,11 +90,11 @@ class LinkCommands:
 
 
 def _wrong_places(line: str) -> str:
-    """Return what a line that impairs a link must be, or nothing where it is that."""
+    """Return the requirement that an impairment line breaks; empty if it breaks none."""
     try:
         line.format(mean_ms=0, std_ms=0, loss_percent=0, rate_mbps=0)
     except (KeyError, IndexError, ValueError) as error:
-        return f"a line that can be filled in ({error!r})"
+        return f"a line with valid placeholders ({error!r})"
     return ""
 
 
@@ -125,42 +125,31 @@ INVENTORY = FileKind.of(
     FORMAT,
     VERSION,
     "Inventory",
-    "The hosts that the nodes of a cell are.",
+    "The hosts of a cell's nodes.",
     required("hosts", MappingForm(_HOST, keeps=True), "The host of each node.", {}),
-    optional("links", MappingForm(_LINK, keeps=True), "What impairs a directed link.", "none"),
+    optional("links", MappingForm(_LINK, keeps=True), "Commands that impair a link.", "none"),
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Inventory:
-    """The hosts of a cell.
-
-    Parameters
-    ----------
-    hosts : mapping of str to RealHost
-        By node.
-    links : mapping of str to LinkCommands
-        By directed link, ``R1->E``.
-    """
+    """The hosts of a cell by node, and the commands of its directed links (``R1->E``)."""
 
     hosts: Mapping[str, RealHost]
     links: Mapping[str, LinkCommands]
 
     @property
     def digest(self) -> str:
-        """Name by which a campaign knows these hosts."""
+        """Identifier of these hosts in a campaign."""
         document = json.dumps(asdict(self), sort_keys=True)
         digest = hashlib.sha256(document.encode()).hexdigest()[:16]
         return f"hosts {digest}"
 
 
 def load_inventory(path: str | PathLike[str], problem: Problem) -> Inventory:
-    """Read an inventory for a cell, every node of which has to be in it.
+    """Read an inventory for a cell; it must have a host for every node.
 
-    Raises
-    ------
-    ProblemError
-        With every fault.
+    Raises `ProblemError` with every fault.
     """
     faults = Faults(fspath(path))
     document = read_yaml(fspath(path), faults, INVENTORY.what, INVENTORY.begin)
@@ -169,7 +158,7 @@ def load_inventory(path: str | PathLike[str], problem: Problem) -> Inventory:
     _judge("links", entry.links or {}, problem.fabric.links, "link", faults)
     for node in problem.fabric.nodes:
         if node not in entry.hosts:
-            faults.add(f"hosts.{node}", "missing; add it: every node is on a host")
+            faults.add(f"hosts.{node}", "missing; add it: every node needs a host")
     hosts: Mapping[str, RealHost] = _made(entry.hosts, faults)
     links: Mapping[str, LinkCommands] = _made(entry.links or {}, faults)
     if faults:

@@ -62,7 +62,7 @@ def dash(
     insecure: Insecure = False,
     log_format: Logs = LogFormat.TEXT,
 ) -> None:
-    """Show a live cell, or recorded runs, on a page in the browser of this computer."""
+    """Show a live cell or recorded runs in the browser."""
     from dwell.dash.pages import live_page, recorded_page
     from dwell.live.log import say
     from dwell.record import is_fleet

@@ -27,7 +27,7 @@ Days = Annotated[int, typer.Option(help="How long certificates hold.")]
 
 keys = typer.Typer(
     no_args_is_help=True,
-    help="Issue and revoke the certificates of a live cell's hosts, controller and operators.",
+    help="Issue and revoke the certificates of a live cell.",
 )
 
 
@@ -38,7 +38,7 @@ def init(
     days: Days = 365,
     as_json: Json = False,
 ) -> None:
-    """Make a cell's own authority, and keyrings for its nodes, its controller and an operator."""
+    """Make the authority of a cell, and its first keyrings."""
     import dwell
     from dwell.live.trust.authority import Authority
 
@@ -74,7 +74,7 @@ def issue(
     days: Days = 365,
     as_json: Json = False,
 ) -> None:
-    """Issue a certificate with a new key; those before hold until they end."""
+    """Issue a certificate with a new key; older ones stay valid."""
     from dwell.live.trust.authority import Authority
 
     authority = Authority.open(folder)
@@ -89,7 +89,7 @@ def request(
     ],
     out: Annotated[Path, option("FOLDER", "Where keyrings and requests go.")] = Path("keys"),
 ) -> None:
-    """Make a key here, and a request for its certificate: no private key travels."""
+    """Make a key on this computer, and a request for it."""
     from dwell.live.trust.request import request_certificate
 
     made = [request_certificate(out, name) for name in node]
@@ -112,7 +112,7 @@ def sign(
     days: Days = 365,
     as_json: Json = False,
 ) -> None:
-    """Issue the certificates that requests are for."""
+    """Issue the certificates of requests."""
     from dwell.live.trust.authority import Authority
 
     opened = Authority.open(authority)
@@ -123,7 +123,7 @@ def sign(
 
 @keys.command()
 def revoke(folder: Folder, name: Name, as_json: Json = False) -> None:
-    """Take a subject's certificates back."""
+    """Revoke the certificates of a subject."""
     from dwell.live.trust.authority import Authority
 
     authority = Authority.open(folder)
@@ -136,7 +136,7 @@ def show(
     folder: Annotated[Path, argument("FOLDER", "Folder of an authority, or a keyring.")],
     as_json: Json = False,
 ) -> None:
-    """List the subjects, with what they may do and until when."""
+    """List the subjects, their roles and expiry dates."""
     from dwell.live.trust.authority import AUTHORITY, Authority
     from dwell.live.trust.keyring import Keyring
 

@@ -51,9 +51,7 @@ Owner = Annotated[int | None, option("PID", "Process that this one ends with.", 
 
 NodeArgument = Annotated[str, typer.Argument(metavar="NODE", autocompletion=nodes)]
 
-live = typer.Typer(
-    no_args_is_help=True, help="Look at live cells, and have a hand in what their controller does."
-)
+live = typer.Typer(no_args_is_help=True, help="Run live cells; show and steer them.")
 
 
 def agent(
@@ -89,7 +87,7 @@ def agent(
         bool, typer.Option("--renews", help="Restart what it takes over.", hidden=True)
     ] = False,
 ) -> None:
-    """Run a node of a live cell: its workers, and on the right nodes stamper and sinks."""
+    """Run a node of a live cell: each stage in a process."""
     from dwell.live.host import node_command
 
     begin_log(log_format, f"agent@{node}")
@@ -134,7 +132,7 @@ def controller(
     owner: Owner = None,
     continues: Annotated[str, option("JSON", "Runs that it continues.", hidden=True)] = "{}",
 ) -> None:
-    """Decide where the stages of live cells run."""
+    """Decide where the stages of live cells run; record it."""
     from dwell.live.host import node_command
 
     begin_log(log_format, "controller")
@@ -179,7 +177,7 @@ def status(
     insecure: Insecure = False,
     as_json: Json = False,
 ) -> None:
-    """Show how a cell is, and first what is wrong with it."""
+    """Show the state of a cell, faults first."""
     if check and watch:
         raise typer.BadParameter("--check looks once; leave --watch out")
     from dwell.live.host.kept_cell import cell_here
@@ -236,7 +234,7 @@ def pin(
     insecure: Insecure = False,
     as_json: Json = False,
 ) -> None:
-    """Have a cell stay on one candidate, whatever its policy would do."""
+    """Keep a cell on one candidate, against its policy."""
     _ask(cell, "pin", candidate, keys, insecure=insecure, as_json=as_json)
 
 
@@ -256,7 +254,7 @@ def drain(
     insecure: Insecure = False,
     as_json: Json = False,
 ) -> None:
-    """Have no stage run on a node, so that it can be stopped or its code changed."""
+    """Move all stages off a node, to stop or change it."""
     _ask(cell, "drain", node, keys, insecure=insecure, as_json=as_json)
 
 
@@ -301,7 +299,7 @@ def run(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Run a cell on this machine, without root: its stages, links and disturbances; and report."""
+    """Run a cell on this machine, with emulated links; report."""
     from dwell.live.commands.live_run import run_live
 
     run_live(
@@ -352,7 +350,7 @@ def up(
     keys: Keys = None,
     insecure: Insecure = False,
 ) -> None:
-    """Start a cell's part on this computer in the background: agents, and its controller here."""
+    """Start a cell's agents and controller on this computer."""
     from dwell.live.commands import background
     from dwell.live.host.kept_cell import cell_here
     from dwell.live.host.security import environment
@@ -386,7 +384,7 @@ def up(
 
 @live.command()
 def down(cell: CellArgument, state: Root = None) -> None:
-    """End what `up` has started, in order: the robot's actuators are told to stop."""
+    """End the processes of `up`; actuators stop in order."""
     from dwell.live.commands import background
     from dwell.live.host.kept_cell import cell_here, forget
 
@@ -412,7 +410,7 @@ def log(
     ] = None,
     state: Root = None,
 ) -> None:
-    """Print what a process of a cell on this computer has printed."""
+    """Print the log of a process on this computer."""
     from dwell.cellfile import load_without_traces
     from dwell.live.commands import background
 
@@ -433,7 +431,7 @@ def units(
     keys: Keys = None,
     insecure: Insecure = False,
 ) -> None:
-    """Write the systemd units of a node: of its agent, and of the controller where it is there."""
+    """Write the systemd units of a node."""
     from dwell.cellfile import load_without_traces
     from dwell.live.commands.units import write_units
 

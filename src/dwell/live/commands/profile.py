@@ -58,7 +58,7 @@ def measure(
     out: Out = None,
     as_json: Json = False,
 ) -> None:
-    """Time tasks on this computer, and keep the samples for cells to replay.
+    """Time tasks on this computer; cells can replay the samples.
 
     Without a subcommand it measures: every task is a Python function, run again and again on
     pinned cores. The highest core is taken, and the file is profiles/NODE.parquet, if not given.
@@ -95,7 +95,7 @@ def merge(
     out: Annotated[Path, option("FILE", "Parquet file to write.")],
     as_json: Json = False,
 ) -> None:
-    """Put the profiles of several nodes and links into one file."""
+    """Merge the profiles of several nodes and links."""
     from dwell.calibration.profile_file import merge_profiles, write_profile
 
     merged = merge_profiles(files)
@@ -135,7 +135,7 @@ def link(
     out: Out = None,
     as_json: Json = False,
 ) -> None:
-    """Time round trips to a peer: a message without payload and one with it, in turns.
+    """Time round trips to a peer, with and without payload.
 
     The file is profiles/FROM-TO.parquet if not given.
     """

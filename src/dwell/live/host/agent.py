@@ -25,8 +25,9 @@ from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import roles
 from dwell.model.instants import NEVER_NS
 
-#: Time between two looks at the processes, and between two reports of what the CPU does.
-LOOK_NS = 20_000_000
+#: Time between two looks at the processes: while all run, and while one has to be started.
+LOOK_NS, LOOK_SOON_NS = 200_000_000, 20_000_000
+#: Time between two reports of the CPU.
 LOAD_NS = 250_000_000
 #: Time between two looks at the memory of the processes, and at how long their logs are.
 HOUSEKEEPING_NS = 1_000_000_000
@@ -125,12 +126,12 @@ class Agent:
         self._relays = place.node == place.problem.relay_node
         # What is done again and again, every so often; and when each is due.
         self._chores: dict[Callable[[int], None], int] = {
-            lambda _: supervisor.step(): LOOK_NS,
             lambda _: supervisor.tend(): HOUSEKEEPING_NS,
             self._count: REPORT_NS,
             self._report: LOAD_NS,
         }
         self._due_ns = dict.fromkeys(self._chores, 0)
+        self._looked_ns = -NEVER_NS
         self._carried = RelayBatch()
         self._carry_ns = NEVER_NS
         self._gathered = RelayBatch(MOST_MESSAGES // 2)
@@ -173,8 +174,12 @@ class Agent:
         """Look after the processes, report the load, beat; returns what is due next."""
         if self._setback.back_ns(now_ns):
             self._due_ns = dict.fromkeys(self._chores, now_ns)
+            self._looked_ns = -NEVER_NS
             self._gather_ns = self._beats_ns = now_ns
             self._carry_ns = min(self._carry_ns, now_ns + self.place.period_ns // 4)
+        if now_ns >= self._look_due_ns():
+            self._looked_ns = now_ns
+            self._try(lambda _: self.supervisor.step(), now_ns)
         for chore, every_ns in self._chores.items():
             if now_ns >= self._due_ns[chore]:
                 self._try(chore, now_ns)
@@ -182,13 +187,17 @@ class Agent:
         if now_ns >= self._carry_ns:
             self._carry_ns = NEVER_NS
             self._put(self.place.keys.carried(), self._carried.taken())
-        wakes = [self.pulse.wake(now_ns), *self._due_ns.values(), self._carry_ns]
+        wakes = [self.pulse.wake(now_ns), self._look_due_ns(), *self._due_ns.values()]
+        wakes.append(self._carry_ns)
         if self._relays:
             if now_ns >= self._gather_ns:
                 self._tell(now_ns)
                 self._gather_ns = now_ns + self.place.period_ns
             wakes.append(self._gather_ns)
         return min(wakes)
+
+    def _look_due_ns(self) -> int:
+        return self._looked_ns + (LOOK_SOON_NS if self.supervisor.pending else LOOK_NS)
 
     def _try(self, chore: Callable[[int], None], now_ns: int) -> None:
         """Do a chore, or leave it for the next time where strangers hold all descriptors."""

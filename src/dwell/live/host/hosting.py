@@ -156,6 +156,12 @@ class Hosted:
             latest_ns = now_ns + round(LONGEST_SLEEP_S * 1e9)
             self._due_ns = min(self.role.wake(now_ns), latest_ns)
 
+    def wake_now(self) -> None:
+        """Have `run` wake the role at once; any thread may call it."""
+        with self.lock:
+            self._due_ns = min(self._due_ns, self.clock())
+        self.hurry.set()
+
     def run(self) -> None:
         """Wake the role whenever it is due, until `stop`."""
         take_turns([self])

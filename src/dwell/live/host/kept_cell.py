@@ -14,7 +14,7 @@ import shutil
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
@@ -160,6 +160,10 @@ class KeptCell:
         sys.path.insert(0, str(self.file.parent))
         sys.meta_path.insert(0, _KeptModules(self))
 
+    def paths(self) -> Iterator[Path]:
+        """Return the paths of the files whose bytes these are."""
+        return map(self.file.parent.joinpath, self.contents)
+
     def changed(self) -> list[str]:
         """Return the names of the files that are other ones now."""
         now = _contents(self.file)
@@ -241,6 +245,7 @@ class CellKeeper:
         #: Whether the agent has to replace itself, as another version of Dwell is installed.
         self.replaced = False
         self._sentence = self._trouble = ""
+        self._marks: tuple[object, ...] = ()
 
     def told(self) -> str:
         """Return which files have changed, or are not kept; empty where all is well."""
@@ -289,6 +294,7 @@ class CellKeeper:
     def _keep(self, kept: KeptCell) -> None:
         kept.write(self.folder)
         self.kept = replace(kept, folder=self.folder)
+        self._marks = ()
 
     def look(self) -> None:
         """Keep the bytes where they are not kept yet, or no more; see what has changed."""
@@ -304,7 +310,11 @@ class CellKeeper:
             trouble = f"{self.kept.file.name} cannot be kept: {error}"
         # What cannot be read now may be what it was.
         with suppress(OSError):
-            sentence = self.kept.told(self._where)
+            # Read again at midnight, too: the sentence then has a date.
+            marks = (time.localtime()[:3], *map(_mark, self.kept.paths()))
+            if marks != self._marks:
+                sentence = self.kept.told(self._where)
+                self._marks = marks
         for line, before in ((trouble, self._trouble), (sentence, self._sentence)):
             if line and line != before:
                 self._say(f"warning: {line}")
@@ -375,6 +385,18 @@ def _contents(file: Path) -> dict[str, bytes]:
         with suppress(FileNotFoundError, PermissionError):
             contents[str(path.relative_to(home))] = path.read_bytes()
     return contents
+
+
+def _mark(path: Path) -> tuple[int, int, int] | None:
+    """Return values of a file that differ after each change of it; None where there is no file.
+
+    Programs can set `st_mtime_ns` back, but not `st_ctime_ns`.
+    """
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_ctime_ns, status.st_size, status.st_ino
 
 
 def _this_boot() -> str:

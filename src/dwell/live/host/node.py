@@ -146,6 +146,7 @@ def run_agent(
         agent = Agent(place, supervisor, busy_ns, gauge, stages, changed)
         clock, complain = platform.clock(problem, node), place.complain
         hosted = Hosted(agent, transport, clock, stopped=stopped, complain=complain)
+        supervisor.ends.wake = hosted.wake_now
         each_turn = [service.step]
         if source is not None:
             from dwell.live.host.key_renewal import KeyRenewal

@@ -21,6 +21,7 @@ import psutil
 from dwell.errors import LiveError
 from dwell.files import write_whole
 from dwell.live.host.launcher import UNKNOWN_CODE, ForkServer, Running, Survivor
+from dwell.live.host.process_ends import ProcessEnds
 from dwell.live.host.process_group import ProcessGroup
 from dwell.live.host.state_files import InFlight, make_folder, open_own
 from dwell.live.log import printable
@@ -133,6 +134,7 @@ class Supervisor:
         self.folder = folder
         self._warm_s, self._growth_bytes, self._log_bytes = warm_s, growth_bytes, log_bytes
         self.children: list[SupervisedProcess] = []
+        self.ends = ProcessEnds()
         self._say = say
         self._oom_kills = _oom_kills()
         self._launcher = launcher
@@ -157,6 +159,7 @@ class Supervisor:
         if (process := survivor(child.file("pid"))) is None:
             return False
         child.process, child.group = Survivor(process.pid), marked_group(child.file("pid"))
+        self.ends.watch(process.pid)
         self._say(f"{child.who}: goes on (process {process.pid})")
         child.started_s = time.monotonic()
         return True
@@ -181,6 +184,12 @@ class Supervisor:
                 self._start(child)
 
         self._take_turn()
+
+    @property
+    def pending(self) -> bool:
+        """Whether a process has ended or has to be started: `step` is due soon."""
+        pids = [child.pid for child in self.children]
+        return self.restarting or None in pids or self.ends.pending(pids)
 
     @property
     def restarting(self) -> bool:
@@ -218,6 +227,7 @@ class Supervisor:
             return False
         code = child.process.poll()
         if code is not None:
+            self.ends.forget(child.process.pid)
             child.process = None
             self._died(child, _reason(code))
         return code is None
@@ -286,6 +296,7 @@ class Supervisor:
                 child.log_begins = log.tell()
                 child.process = self._launcher.start(child.command, log)
                 child.group = ProcessGroup.of(child.process.pid)
+                self.ends.watch(child.process.pid)
         except OSError as error:
             self._died(child, f"could not be started ({error.strerror})")
             return
