@@ -20,7 +20,7 @@ def test_the_help_has_each_command_under_its_heading() -> None:
     found = {heading: re.findall(r"^  (\S+)", rows, re.MULTILINE) for heading, rows in headings}
     for heading, names in GROUPS.items():
         assert found[heading] == list(names)
-    assert found["Other"] == ["schema", "completion"]
+    assert found["Other"] == ["completion"]
     assert len(found["Examples"]) == 3
 
 

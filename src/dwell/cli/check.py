@@ -34,6 +34,7 @@ def check(
             help="Check instead that this computer can be that node of the live cell: import and "
             "make its stages and actuators.",
             autocompletion=nodes,
+            hidden=True,
         ),
     ] = None,
     scenario: Scenario = "baseline",

@@ -30,7 +30,7 @@ GROUPS = {
     "Simulate": ("new", "check", "run", "study", "demo"),
     "See": ("report", "dash"),
     "Fleet": ("fleet",),
-    "Live": ("live", "keys", "agent", "controller", "doctor"),
+    "Live": ("live", "keys", "doctor"),
     "Measure": ("profile", "testbed", "validate"),
 }
 EXAMPLES = """\
@@ -133,14 +133,18 @@ def doctor(
 #: Commands of dwell-lab.
 OF_LAB = ("testbed", "validate")
 
-for command in (check, run, study, report, new, schema, demo, doctor, completion):
+#: Commands that the help leaves out; `dwell live agent` and `dwell live controller` are in it.
+HIDDEN = ("agent", "controller", "schema")
+
+for command in (check, run, study, report, new, demo, doctor, completion):
     app.command()(command)
+app.command(hidden=True)(schema)
 app.add_typer(fleet, name="fleet")
 for name, command in added(COMMANDS).items():
     if isinstance(command, typer.Typer):
         app.add_typer(command, name=name)
     else:
-        app.command(name)(command)
+        app.command(name, hidden=name in HIDDEN)(command)
 
 
 def _missing(name: str) -> Callable[[], None]:

@@ -53,7 +53,7 @@ def _cell(context: typer.Context) -> Mapping[str, Any]:
     from dwell.cellfile.yaml_text import read_yaml
     from dwell.errors import ProblemError
 
-    given = context.params.get("cell")
+    given = context.params.get("of_cell") or context.params.get("cell")
     named = given if isinstance(given, list) else [given] if given else []
     # Arguments before an option without its value are not taken apart yet.
     for path in (*named, *context.args):
@@ -75,6 +75,15 @@ def _keys(section: str) -> Callable[[typer.Context], list[str]]:
 
 
 candidates, nodes = _keys("candidates"), _keys("nodes")
+
+
+def with_old_cell(offered: Callable[[typer.Context], list[str]]) -> Callable[..., list[str]]:
+    """Offer words for an argument CELL if the option --cell names the cell; paths otherwise."""
+
+    def words(context: typer.Context) -> list[str]:
+        return offered(context) if context.params.get("of_cell") else []
+
+    return words
 
 
 def scenarios(context: typer.Context) -> list[str]:

@@ -65,7 +65,6 @@ def flag(name: str, sentence: str, **more: Any) -> Any:
 
 
 CellArgument = Annotated[Path, argument("CELL", "Cell file (YAML).")]
-CellOption = Annotated[Path, option("FILE", "Cell file (YAML).", "--cell")]
 Node = Annotated[
     str,
     typer.Option(help="Node of the cell that this computer is.", autocompletion=nodes),

@@ -1,8 +1,8 @@
-"""Failures: no exception in a callback or a thread of the live parts ends something in silence.
+"""Failures: every exception in a callback or thread of the live runtime is reported.
 
-Whoever hands messages on tells of one that could not be handled, and goes on with the next. A
-thread that has failed has no next: its process ends with exit code 1, and whoever keeps that
-running, an agent or an init system, starts it again.
+If a callback fails, its caller reports the error and continues with the next message. If a thread
+fails, its process ends with exit code 1, and its supervisor, an agent or an init system, starts it
+again.
 """
 
 from __future__ import annotations
@@ -17,21 +17,16 @@ from typing import NoReturn
 
 from dwell.errors import describe_raised
 
-#: Exit code of a process that cannot go on.
+#: Exit code of a process that cannot continue.
 FAILED = 1
 
 
 def end_process(what: str, error: BaseException) -> NoReturn:
-    """End this process at once because something cannot go on, and say on stderr what.
+    """End this process at once after the failure of one of its parts, and report it on stderr.
 
-    Nothing is tidied up: a thread that hangs must not keep it alive.
-
-    Parameters
-    ----------
-    what : str
-        Part of the process that has failed.
+    The process ends without cleanup, because a hanging thread must not keep it alive.
     """
-    # There may be no memory left to say it, and no room where it is said.
+    # Reporting may fail too, without memory or on a full disk.
     with suppress(BaseException):
         traceback.print_exception(error)
         print(
@@ -45,12 +40,12 @@ def end_process(what: str, error: BaseException) -> NoReturn:
 
 
 def start_thread(name: str, run: Callable[..., object], *arguments: object) -> threading.Thread:
-    """Start a thread that ends its process where it fails, and with the process."""
+    """Start a daemon thread that ends the process if it fails."""
 
     def watched() -> None:
         try:
             run(*arguments)
-        except BaseException as error:  # also a SystemExit, which threads pass over in silence
+        except BaseException as error:  # also SystemExit, which threads otherwise ignore
             end_process(f"thread {name!r}", error)
 
     thread = threading.Thread(target=watched, name=name, daemon=True)

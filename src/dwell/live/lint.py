@@ -1,4 +1,4 @@
-"""Warns of settings of a live cell that are allowed and seldom meant."""
+"""Warnings about settings of a live cell that are valid but rarely intended."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from dwell.model import Problem
 
 
 def lint(problem: Problem) -> Iterator[Fault]:
-    """Yield what a live cell does not do as its file says, or not as well as it could.
+    """Yield settings that a live cell does not follow, or that reduce its performance.
 
-    A cell for the simulator alone, with neither hosts nor stages, gets no warning.
+    A cell without hosts and stages, which is only for the simulator, gets no warning.
     """
     if problem.live.hosts or any(task.run for task in problem.pipeline.tasks.values()):
         yield from _side_by_side(problem)
@@ -19,7 +19,7 @@ def lint(problem: Problem) -> Iterator[Fault]:
 
 
 def _side_by_side(problem: Problem) -> Iterator[Fault]:
-    """Yield tasks whose jobs overlap in the simulator, and not in the one worker of a live node."""
+    """Yield tasks whose jobs overlap in the simulator, but not in the single worker of a node."""
     for task in problem.pipeline.tasks.values():
         for node, execution in task.on.items():
             if execution.workers > 1:
@@ -31,7 +31,7 @@ def _side_by_side(problem: Problem) -> Iterator[Fault]:
 
 
 def _early_closes(problem: Problem) -> Iterator[Fault]:
-    """Yield a grace within which the guard has not spoken of a window's last cycles."""
+    """Yield a `close_grace_ms` that ends before the guard can act on a window's last cycles."""
     settings = problem.controller
     patience_ms = settings.guard_cycles * problem.pipeline.period_ms
     if settings.fallbacks and settings.close_grace_ms < patience_ms:

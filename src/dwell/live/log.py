@@ -1,4 +1,4 @@
-"""Log: what went wrong, without its floods, and as it can be shown on a terminal."""
+"""Log: lines of a process on stderr, limited in rate and safe to show on a terminal."""
 
 from __future__ import annotations
 
@@ -13,14 +13,9 @@ from datetime import UTC, datetime
 
 
 def printable(text: str, keep: str = "") -> str:
-    """Return a text with escapes in place of all that a terminal may take for something else.
+    """Return a text with characters that are not printable escaped, except for those in `keep`.
 
-    Parameters
-    ----------
-    text : str
-        Text of a user's code, or from the network.
-    keep : str
-        Characters that stay.
+    A terminal could interpret them as commands; the text may come from the network.
     """
     if text.isprintable():
         return text
@@ -31,7 +26,7 @@ def printable(text: str, keep: str = "") -> str:
 
 
 class _Escaping(io.TextIOWrapper):
-    """Writes printable lines."""
+    """Escapes characters that are not printable, except for newlines and tabs."""
 
     def write(self, text: str) -> int:
         super().write(printable(text, keep="\n\t"))
@@ -39,7 +34,7 @@ class _Escaping(io.TextIOWrapper):
 
 
 def escape_output() -> None:
-    """Have all that this process prints from now on escaped, at once and line by line."""
+    """Escape all later output of this process, and write it without a buffer."""
     for name in ("stdout", "stderr"):
         before = getattr(sys, name)
         with suppress(OSError):
@@ -49,7 +44,7 @@ def escape_output() -> None:
 
 
 class _Unfinished(threading.local):
-    """What a thread has written of its line."""
+    """Text of a thread's unfinished line."""
 
     text = ""
 
@@ -77,25 +72,19 @@ class _JsonLines(io.TextIOWrapper):
 
 
 def log_as_json(who: str) -> None:
-    """Have all that this process prints on stderr from now on be JSON, one document per line."""
+    """Write all later output on stderr as JSON, one document per line."""
     sys.stderr.flush()
     sys.stderr = _JsonLines(io.FileIO(sys.stderr.fileno(), "wb", closefd=False), who)
 
 
 def say(line: str) -> None:
-    """Print a line on stderr; a log on a disk that is full does not end its writer."""
+    """Print a line on stderr; errors such as a full disk are ignored."""
     with suppress(OSError):
         print(line, file=sys.stderr, flush=True)
 
 
 class Log:
-    """Passes on a line a second at most, and says how many it has left out.
-
-    Parameters
-    ----------
-    clock : callable
-        Seconds.
-    """
+    """Passes on at most one line per `every_s` seconds, with the number of lines left out."""
 
     def __init__(
         self,
@@ -109,7 +98,7 @@ class Log:
         self._lock = threading.Lock()
 
     def __call__(self, line: str) -> None:
-        """Take a line."""
+        """Log a line, unless the last one was too recent."""
         with self._lock:
             now_s = self._clock()
             if now_s < self._next_s:
@@ -117,6 +106,6 @@ class Log:
                 return
             more = f" (and {self._left_out} lines before it)" if self._left_out else ""
             self._next_s, self._left_out = now_s + self._every_s, 0
-        # A log on a disk that is full must not end who writes it.
+        # A full disk must not end the process.
         with suppress(OSError):
             self._say(printable(f"{line}{more}"))

@@ -1,4 +1,4 @@
-"""Stages: the user's code, and its messages."""
+"""Stages and actuators: the interfaces of the user's code, and its messages."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """Input of a stage from a task before it, and its output.
+    """Input or output of a stage.
 
     Parameters
     ----------
     payload : bytes, numpy array, msgspec.Struct, or None
-        An array that arrives may not be written to: copy it first.
+        A received array is read-only: copy it before changing it.
     cycle : int
-        Filled in for messages that arrive.
+        Number of the cycle, set in received messages.
     released_ns : int
-        Release of the cycle on this node's clock, as ``time.monotonic_ns`` counts it.
+        Release of the cycle on this node's clock, as in ``time.monotonic_ns``.
     age_ms : float
         Time since the release when the stage was called.
     """
@@ -49,53 +49,53 @@ class Message:
 
 
 class Stage(Protocol):
-    """A task's code. It may also have what else `CellStage` has."""
+    """A task's code. It may also have the other members of `CellStage`."""
 
     def process(self, inputs: Mapping[str, Message]) -> Message:
-        """Turn a cycle's inputs, by the task they come from, into its output.
+        """Compute a cycle's output from its inputs, which are keyed by source task.
 
-        A source task gets an empty mapping's worth: one message from ``stamper`` without payload.
+        A source task gets one message without payload, from ``stamper``.
         """
 
 
 @runtime_checkable
 class Stateful(Protocol):
-    """A stage whose state moves with it."""
+    """A stage with a state, which moves with its task."""
 
     def snapshot(self) -> bytes:
-        """Write the state as it is after the last call of `process`."""
+        """Return the state after the last call of `process`."""
 
     def restore(self, state: bytes) -> None:
-        """Take a state over."""
+        """Replace the state with one from `snapshot`."""
 
 
 class Actuator(Protocol):
-    """Applies commands; it is called behind the gate. It may also have ``inputs`` and ``stop()``.
+    """Applies the commands that pass the gate. It may also have ``inputs`` and ``stop()``.
 
-    What raises is called again (docs/deploy.md).
+    A call of ``hold``, ``zero`` or ``stop`` that raises is repeated (docs/deploy.md).
     """
 
     def apply(self, command: Message) -> None:
         """Apply a command."""
 
     def hold(self) -> None:
-        """Stay as it is: no command came for too long."""
+        """Hold the current state, because no command has arrived for too long."""
 
     def zero(self) -> None:
-        """Stop: no command came for too long."""
+        """Stop, because no command has arrived for too long."""
 
 
 class CellStage(ABC):
-    """A stage as a worker calls it: all that a user's need not have has a default.
+    """Base class of stages, with defaults for the optional methods.
 
     Attributes
     ----------
     inputs : mapping of str to type
-        By source task, the `msgspec.Struct` that arrives; without, structs arrive as dicts.
+        Type of the `msgspec.Struct` from each source task; other structs become dicts.
     stateful : bool
-        Whether its state moves with it: it has `snapshot` of its own.
+        Whether it has a state: it overrides `snapshot`.
     has_frames : bool
-        Whether it can wait for a frame: it has `wait` of its own.
+        Whether it can wait for a frame: it overrides `wait`.
     """
 
     inputs: Mapping[str, type] = {}
@@ -112,15 +112,15 @@ class CellStage(ABC):
         """As `Stage.process`."""
 
     def start(self) -> None:
-        """Get ready, before the first cycle."""
+        """Prepare for the first cycle."""
         return
 
     def stop(self) -> None:
-        """Let go of what it has, after the last cycle."""
+        """Release all resources after the last cycle."""
         return
 
     def wait(self) -> object:
-        """Return when there is a new frame, which begins a cycle."""
+        """Wait for a new frame, which begins a cycle."""
         raise LiveError("no method wait(), though live.release is frames")
 
     def snapshot(self) -> bytes:
@@ -133,12 +133,12 @@ class CellStage(ABC):
 
 
 class CellActuator(ABC):
-    """An actuator as a sink calls it: all that a user's need not have has a default.
+    """Base class of actuators, with defaults for the optional methods.
 
     Attributes
     ----------
     inputs : mapping of str to type
-        By its task, the `msgspec.Struct` that commands are.
+        Type of the `msgspec.Struct` of commands, by its task.
     """
 
     inputs: Mapping[str, type] = {}
@@ -156,12 +156,12 @@ class CellActuator(ABC):
         return
 
     def stop(self) -> None:
-        """Let go of what it has; called after `zero` where its process is told to end."""
+        """Release all resources; called after `zero` when its process ends in order."""
         return
 
 
 class _UserStage(CellStage):
-    """A user's stage, or one that is a function, and what it does without."""
+    """Adapter for a user's stage or function without the base class."""
 
     def __init__(self, given: object, process: Callable[[Mapping[str, Message]], Message]) -> None:
         self._process = process
@@ -174,7 +174,7 @@ class _UserStage(CellStage):
 
 
 class _UserActuator(CellActuator):
-    """A user's actuator, or one that is a function, and what it does without."""
+    """Adapter for a user's actuator or function without the base class."""
 
     def __init__(self, given: object, apply: Callable[[Message], None]) -> None:
         self._apply = apply
@@ -185,26 +185,26 @@ class _UserActuator(CellActuator):
 
 
 def _take(own: CellStage | CellActuator, given: object, members: Sequence[str]) -> None:
-    """Have those of these members that a user's object has stand before the defaults."""
+    """Replace the defaults of some members by the members that a user's object has."""
     for name in members:
         if (member := getattr(given, name, None)) is not None:
             setattr(own, name, member)
 
 
 def load_stage(name: str, where: str) -> CellStage:
-    """Import a stage and make it.
+    """Import a stage; if it is a class, make an instance.
 
     Parameters
     ----------
     name : str
         ``package.module:Name``, from the local cell file.
     where : str
-        Field it stands in, for messages.
+        Field with this name, for messages.
 
     Raises
     ------
     LiveError
-        If it is not there, cannot be imported or made, or is no stage.
+        If it does not exist, its import or creation fails, or it is not a stage.
     """
     found = _made(name, where)
     if isinstance(found, CellStage):
@@ -216,7 +216,7 @@ def load_stage(name: str, where: str) -> CellStage:
 
 
 def load_actuator(name: str, where: str) -> CellActuator:
-    """Import an actuator and make it; see `load_stage`."""
+    """Import an actuator; if it is a class, make an instance; see `load_stage`."""
     found = _made(name, where)
     if isinstance(found, CellActuator):
         return found
@@ -231,7 +231,7 @@ def load_actuator(name: str, where: str) -> CellActuator:
 
 
 def load_function(name: str, where: str) -> Callable[[], float]:
-    """Import a function that returns a number, or an object that is called like one."""
+    """Import a function that returns a number, or an object that can be called like it."""
     if ":" not in name:
         raise LiveError(f"{where}: {name!r} is not of the form package.module:function")
     found = _made(name, where)
@@ -246,7 +246,7 @@ def _is_function(found: object) -> bool:
 
 
 def _made(name: str, where: str) -> object:
-    """Return the function or object that a name stands for; a class is called."""
+    """Import the object with a name; call it if it is a class."""
     module_name, _, path = name.partition(":")
     try:
         found: object = importlib.import_module(module_name)

@@ -111,9 +111,12 @@ def test_a_cell_comes_up_is_looked_at_and_goes_down(cell: Cell) -> None:
     assert "is up already" in error
     assert cell.running("*.pid") == running
 
-    code, _, error = cell.dwell("log", "nobody@E")
+    code, told, _ = cell.dwell("log", cell.file)
+    assert code == 0
+    assert {"agent@E", "controller@E", "sink.control@R2"} <= set(told.split())
+    code, _, error = cell.dwell("log", cell.file, "nobody@E")
     assert code == 2
-    assert "no process 'nobody@E'; there are agent@E, " in error
+    assert "no process 'nobody@E' of " in error
     assert "sink.control@R2" in error
     code, told, _ = cell.dwell("log", "controller@E", "--cell", cell.file)
     assert code == 0
@@ -133,7 +136,8 @@ def test_a_cell_comes_up_is_looked_at_and_goes_down(cell: Cell) -> None:
 
 
 def follows_until_interrupted(cell: Cell, who: str) -> None:
-    words = [sys.executable, "-m", "dwell", "live", "log", who, "-f", "--state", str(cell.root)]
+    words = [sys.executable, "-m", "dwell", "live", "log", str(cell.file), who, "-f"]
+    words += ["--state", str(cell.root)]
     with subprocess.Popen(
         words, env=environment(), stdout=subprocess.PIPE, text=True, bufsize=1
     ) as following:
@@ -243,8 +247,8 @@ def test_other_code_is_taken_over_node_by_node(cell: Cell) -> None:
     assert cell.up()[0] == 0
     cell.cell.until(lambda status: status["window"] and not status["silent"])
     # Perception is on E; R1 and R2 have what every candidate needs.
-    assert invoke("live", "pin", "SO", "--cell", cell.file)[0] == 0
-    assert invoke("live", "unpin", "--cell", cell.file)[0] == 0
+    assert invoke("live", "pin", cell.file, "SO")[0] == 0
+    assert invoke("live", "pin", cell.file, "--off")[0] == 0
     before = cell.running("**/*.pid")
     cell.cell.module.write_text(MOODY.replace("the old code", "the new code"))
     code, told, error = cell.up("--again")

@@ -187,8 +187,8 @@ def test_a_drained_node_gets_other_code(cell: RealCell) -> None:
     cell.module.write_text(MOODY.replace("the old code", "the new code"))
     cell.agent("E")
     cell.until(lambda status: status["processes"]["agent@E"]["age_ms"] < 1_000)
-    assert invoke("live", "undrain", "E", "--cell", cell.file)[0] == 0
-    assert invoke("live", "pin", "SO", "--cell", cell.file)[0] == 0
+    assert invoke("live", "drain", cell.file, "E", "--off")[0] == 0
+    assert invoke("live", "pin", cell.file, "SO")[0] == 0
     # Its run will have such a window.
     status = cell.until(in_window("SO"))
     assert status["drained"] == []

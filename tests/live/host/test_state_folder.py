@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from dwell.errors import ProblemError
-from dwell.live.commands.background import log_of
+from dwell.live.commands.background import log_of, logs_of
 from dwell.live.host.state_folder import logs, state_root
 
 
@@ -20,18 +20,17 @@ def test_it_is_where_the_desktop_says(tmp_path: Path, monkeypatch: pytest.Monkey
     assert state_root(tmp_path / "other") == tmp_path / "other"
 
 
-def test_a_log_is_found_by_its_process_and_where_needed_by_its_cell(tmp_path: Path) -> None:
+def test_a_log_is_found_by_its_cell_and_process(tmp_path: Path) -> None:
     names = ("hall/agent@E.log", "hall/E/plan@E.log", "yard/agent@E.log", "yard/E/plan@E.log.1")
     for name in names:
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
     assert set(logs(tmp_path)) == {"agent@E", "plan@E"}
-    assert log_of(tmp_path, "plan@E", None) == tmp_path / "hall/E/plan@E.log"
+    assert log_of(tmp_path, "plan@E", "hall") == tmp_path / "hall/E/plan@E.log"
     assert log_of(tmp_path, "agent@E", "yard") == tmp_path / "yard/agent@E.log"
-    with pytest.raises(ProblemError, match="several cells, hall, yard"):
-        log_of(tmp_path, "agent@E", None)
-    with pytest.raises(ProblemError, match="no process 'plan@E'; there are agent@E"):
+    assert logs_of(tmp_path, "hall").keys() == {"agent@E", "plan@E"}
+    with pytest.raises(ProblemError, match="no process 'plan@E' of yard"):
         log_of(tmp_path, "plan@E", "yard")
-    with pytest.raises(ProblemError, match="there is no log in"):
-        log_of(tmp_path / "nothing", "plan@E", None)
+    with pytest.raises(ProblemError, match="no log in"):
+        log_of(tmp_path / "nothing", "plan@E", "hall")

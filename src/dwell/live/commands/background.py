@@ -530,27 +530,24 @@ def _end(processes: Mapping[str, psutil.Process]) -> list[str]:
 # ------------------------------------------------------------------------- log
 
 
-def log_of(root: Path, who: str, cell: str | None) -> Path:
-    """Return the log of a process.
+def logs_of(root: Path, cell: str) -> dict[str, Path]:
+    """Return the logs of a cell's processes on this computer, by process."""
+    return {name: paths[cell] for name, paths in logs(root).items() if cell in paths}
+
+
+def log_of(root: Path, who: str, cell: str) -> Path:
+    """Return the log of a process of a cell.
 
     Raises
     ------
     ProblemError
-        If there is none, or several cells have one.
+        If it does not exist.
     """
-    known = {
-        name: paths
-        for name, of in logs(root).items()
-        if (paths := {one: path for one, path in of.items() if cell in (None, one)})
-    }
+    known = logs_of(root, cell)
     if who not in known:
-        there = f"there are {', '.join(known)}" if known else f"there is no log in {root}"
-        raise ProblemError(f"no process {who!r}; {there}")
-    if len(known[who]) > 1:
-        cells = ", ".join(known[who])
-        raise ProblemError(f"{who} is a process of several cells, {cells}: say which by --cell")
-    (path,) = known[who].values()
-    return path
+        listed = f"processes with a log: {', '.join(known)}" if known else f"no log in {root}"
+        raise ProblemError(f"no process {who!r} of {cell}; {listed}")
+    return known[who]
 
 
 def print_log(path: Path, *, follow: bool) -> None:

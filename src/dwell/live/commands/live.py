@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from dwell.cli.completion import candidates, nodes, scenarios
+from dwell.cli.completion import candidates, nodes, scenarios, with_old_cell
 from dwell.cli.options import (
     CellArgument,
-    CellOption,
     Estimator,
     Insecure,
     Json,
@@ -49,14 +48,27 @@ Cpus = Annotated[
 
 Owner = Annotated[int | None, option("PID", "Process that this one ends with.", hidden=True)]
 
-NodeArgument = Annotated[str, typer.Argument(metavar="NODE", autocompletion=nodes)]
+Cell = Annotated[Path | None, argument("CELL", "Cell file (YAML).")]
+#: With it, the first argument is the candidate, node or process.
+OldCell = Annotated[Path | None, option("FILE", "Cell file (YAML).", "--cell", hidden=True)]
+
+
+def _first(offered: Any) -> Any:
+    """Return the argument CELL of a command with a word after it."""
+    return argument("CELL", "Cell file (YAML).", autocompletion=with_old_cell(offered))
+
+
+def _second(metavar: str, offered: Any) -> Any:
+    return typer.Argument(metavar=metavar, autocompletion=offered)
+
 
 live = typer.Typer(no_args_is_help=True, help="Run live cells; show and steer them.")
 
 
 def agent(
     node: Node,
-    cell: CellOption,
+    cell: Cell = None,
+    of_cell: OldCell = None,
     state: Annotated[
         Path | None,
         option("FOLDER", "Where processes keep their files; by default below ~/.local."),
@@ -94,7 +106,7 @@ def agent(
     with _bad_parameters():
         node_command.agent(
             node,
-            cell,
+            _the_cell(cell, of_cell),
             state=state,
             cpus=cpus,
             cpus_of=cpus_of or (),
@@ -108,7 +120,10 @@ def agent(
 
 
 def controller(
-    cell: Annotated[list[Path], option("FILE", "Cell file; may be repeated.", "--cell")],
+    cell: Annotated[list[Path] | None, argument("CELL", "Cell files (YAML).")] = None,
+    of_cell: Annotated[
+        list[Path] | None, option("FILE", "Cell file (YAML).", "--cell", hidden=True)
+    ] = None,
     out: Annotated[Path, option("FOLDER", "Where the runs' folders go.")] = Path("runs"),
     state: Annotated[
         Path | None,
@@ -138,7 +153,7 @@ def controller(
     begin_log(log_format, "controller")
     with _bad_parameters():
         node_command.controller(
-            cell,
+            [_the_cell(one, None) for one in (*(cell or ()), *(of_cell or ())) or [None]],
             out,
             state=state,
             policy=policy,
@@ -163,9 +178,52 @@ def _bad_parameters() -> Iterator[None]:
         raise typer.BadParameter(str(error)) from None
 
 
+live.command()(agent)
+live.command()(controller)
+
+
+def _the_cell(cell: Path | None, of_cell: Path | None) -> Path:
+    """Return the cell file, given as an argument or by the hidden option --cell."""
+    if cell is not None and of_cell is not None:
+        raise typer.BadParameter(f"name one cell, {cell} or {of_cell}")
+    found = cell or of_cell
+    if found is None:
+        raise typer.BadParameter("missing argument CELL")
+    return found
+
+
+def _cell_and(
+    name: str, cell: Path | None, word: str | None, of_cell: Path | None
+) -> tuple[Path, str]:
+    """Return the cell file and the word after it, which is the first argument with --cell."""
+    if of_cell is not None and word is None:
+        cell, word = None, None if cell is None else str(cell)
+    found = _the_cell(cell, of_cell)
+    if word is None:
+        raise typer.BadParameter(f"missing argument {name}")
+    return found, word
+
+
+@live.command()
+def check(
+    cell: CellArgument,
+    node: Node,
+    keys: Keys = None,
+    insecure: Insecure = False,
+    as_json: Json = False,
+) -> None:
+    """Check that this computer can be a node of a live cell."""
+    import dwell
+    from dwell.live.commands.check_node import check_node
+
+    if not check_node(dwell.load(cell), cell, node, keys, insecure=insecure, as_json=as_json):
+        raise typer.Exit(ExitCode.WRONG)
+
+
 @live.command()
 def status(
-    cell: CellOption,
+    cell: Cell = None,
+    of_cell: OldCell = None,
     check: Annotated[bool, flag("--check", "Exit with 1 unless the cell's health is ok.")] = False,
     watch: Annotated[
         bool, flag("--watch", "Look again every second; with --json, a line each time.")
@@ -185,7 +243,7 @@ def status(
     from dwell.live.host.security import environment
     from dwell.live.wire.local_addresses import running_elsewhere
 
-    problem = cell_here(cell, state_root()).problem()
+    problem = cell_here(_the_cell(cell, of_cell), state_root()).problem()
     with OperatorClient(problem, environment(keys, insecure=insecure)) as visitor:
         if watch:
             _watch(visitor, stages=stages, as_json=as_json)
@@ -228,46 +286,62 @@ def _drawn(lines: list[str]) -> str:
 
 @live.command()
 def pin(
-    candidate: Annotated[str, typer.Argument(metavar="CANDIDATE", autocompletion=candidates)],
-    cell: CellOption,
+    cell: Annotated[Path | None, _first(candidates)] = None,
+    candidate: Annotated[str | None, _second("CANDIDATE", candidates)] = None,
+    of_cell: OldCell = None,
+    off: Annotated[bool, flag("--off", "Let the policy decide again.")] = False,
     keys: Keys = None,
     insecure: Insecure = False,
     as_json: Json = False,
 ) -> None:
     """Keep a cell on one candidate, against its policy."""
-    _ask(cell, "pin", candidate, keys, insecure=insecure, as_json=as_json)
+    if off:
+        unpin(cell, of_cell, keys, insecure, as_json)
+        return
+    file, name = _cell_and("CANDIDATE", cell, candidate, of_cell)
+    _ask(file, "pin", name, keys, insecure=insecure, as_json=as_json)
 
 
-@live.command()
+@live.command(hidden=True)
 def unpin(
-    cell: CellOption, keys: Keys = None, insecure: Insecure = False, as_json: Json = False
+    cell: Cell = None,
+    of_cell: OldCell = None,
+    keys: Keys = None,
+    insecure: Insecure = False,
+    as_json: Json = False,
 ) -> None:
     """Let the policy decide again."""
-    _ask(cell, "unpin", "", keys, insecure=insecure, as_json=as_json)
+    _ask(_the_cell(cell, of_cell), "unpin", "", keys, insecure=insecure, as_json=as_json)
 
 
 @live.command()
 def drain(
-    node: NodeArgument,
-    cell: CellOption,
+    cell: Annotated[Path | None, _first(nodes)] = None,
+    node: Annotated[str | None, _second("NODE", nodes)] = None,
+    of_cell: OldCell = None,
+    off: Annotated[bool, flag("--off", "Let stages run on the node again.")] = False,
     keys: Keys = None,
     insecure: Insecure = False,
     as_json: Json = False,
 ) -> None:
     """Move all stages off a node, to stop or change it."""
-    _ask(cell, "drain", node, keys, insecure=insecure, as_json=as_json)
+    file, name = _cell_and("NODE", cell, node, of_cell)
+    what = "undrain" if off else "drain"
+    _ask(file, what, name, keys, insecure=insecure, as_json=as_json)
 
 
-@live.command()
+@live.command(hidden=True)
 def undrain(
-    node: NodeArgument,
-    cell: CellOption,
+    cell: Annotated[Path | None, _first(nodes)] = None,
+    node: Annotated[str | None, _second("NODE", nodes)] = None,
+    of_cell: OldCell = None,
     keys: Keys = None,
     insecure: Insecure = False,
     as_json: Json = False,
 ) -> None:
     """Let stages run on a node again."""
-    _ask(cell, "undrain", node, keys, insecure=insecure, as_json=as_json)
+    file, name = _cell_and("NODE", cell, node, of_cell)
+    _ask(file, "undrain", name, keys, insecure=insecure, as_json=as_json)
 
 
 @live.command()
@@ -398,24 +472,28 @@ def down(cell: CellArgument, state: Root = None) -> None:
 
 @live.command()
 def log(
+    cell: Annotated[Path | None, _first(processes)] = None,
     process: Annotated[
-        str,
+        str | None,
         argument("PROCESS", "As agent@R1, controller@E, perception@E.", autocompletion=processes),
-    ],
+    ] = None,
     follow: Annotated[
         bool, typer.Option("--follow", "-f", help="Go on with what is added, until interrupted.")
     ] = False,
-    cell: Annotated[
-        Path | None, option("FILE", "Its cell's file, where there are several cells.")
-    ] = None,
+    of_cell: OldCell = None,
     state: Root = None,
 ) -> None:
-    """Print the log of a process on this computer."""
+    """Print the log of a process on this computer, or list them."""
     from dwell.cellfile import load_without_traces
     from dwell.live.commands import background
 
-    name = None if cell is None else load_without_traces(cell).name
-    background.print_log(background.log_of(state_root(state), process, name), follow=follow)
+    if of_cell is not None and process is None and cell is not None:
+        cell, process = None, str(cell)
+    name, root = load_without_traces(_the_cell(cell, of_cell)).name, state_root(state)
+    if process is None:
+        typer.echo("\n".join(background.logs_of(root, name)))
+    else:
+        background.print_log(background.log_of(root, process, name), follow=follow)
 
 
 @live.command()

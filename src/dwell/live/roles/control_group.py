@@ -1,4 +1,4 @@
-"""Reads the kernel's counters of this process's control group."""
+"""CPU time of this process's control group, from the kernel's counters."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from dwell.errors import LiveError
 
 UNKNOWN = -1
 PROCESS = Path("/proc/self")
-#: What counts CPU time in a group's folder: of version 1 and 2.
+#: File with the CPU time in a group's folder, in versions 1 and 2.
 COUNTERS = {"cgroup": "cpuacct.usage", "cgroup2": "cpu.stat"}
-#: Version 1 also counts by CPU.
+#: File with the CPU time per CPU, only in version 1.
 BY_CPU = "cpuacct.usage_percpu"
 
 
 class Counts(NamedTuple):
-    """CPU time that others than a process have taken, ns; `UNKNOWN` where that is not counted.
+    """CPU time used by others than this process, ns; `UNKNOWN` if the kernel does not count it.
 
     Parameters
     ----------
     others_ns : int
         CPU time of the other processes of its group.
     outside_ns : int
-        CPU time of processes outside any group, on the CPUs that it may run on; version 2 does
-        not count it.
+        CPU time of processes outside the group, on the CPUs that this process may use; version 2
+        does not count it.
     group_ns : int
-        CPU time of its group, itself included.
+        CPU time of its group, including this process.
     """
 
     others_ns: int = UNKNOWN
@@ -37,7 +37,7 @@ class Counts(NamedTuple):
     group_ns: int = UNKNOWN
 
     def since(self, before: Counts) -> tuple[int, int]:
-        """Return what others of the group, and those outside of it, have taken since."""
+        """Return the CPU time since then of others in the group, and of processes outside, ns."""
         others_ns, outside_ns = (
             UNKNOWN if UNKNOWN in (then, now) else max(now - then, 0)
             for then, now in zip(before[:2], self[:2], strict=True)
@@ -46,20 +46,14 @@ class Counts(NamedTuple):
 
 
 class _Counter:
-    """A file of the kernel's that is read again and again: it stays open."""
+    """A counter file of the kernel; it stays open between reads."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._file: int | None = None
 
     def read(self) -> bytes:
-        """Return what it says now.
-
-        Raises
-        ------
-        OSError
-            If it cannot be read.
-        """
+        """Return the current content; raise an OSError if it cannot be read."""
         if self._file is None:
             self._file = os.open(self._path, os.O_RDONLY | os.O_CLOEXEC)
         return os.pread(self._file, 1 << 16, 0)
@@ -70,16 +64,14 @@ class _Counter:
 
 
 class ControlGroup:
-    """A control group.
-
-    Workers ask it twice a job: all that it reads stays open.
+    """A control group; its files stay open, because workers read them twice per job.
 
     Parameters
     ----------
     counter : Path
         ``cpuacct.usage`` (version 1, nanoseconds) or ``cpu.stat`` (version 2, microseconds).
     root : Path
-        Folder of the group that all are in.
+        Folder of the root group.
     """
 
     def __init__(self, counter: Path, root: Path = Path()) -> None:
@@ -88,14 +80,11 @@ class ControlGroup:
         self._by_cpu = [_Counter(folder / BY_CPU) for folder in (root, counter.parent)]
 
     def used_ns(self) -> int:
-        """CPU time that its processes have taken, those that have ended included.
+        """Return the CPU time of all its processes, including ended ones, ns.
 
-        Raises
-        ------
-        LiveError
-            If that cannot be read.
+        Raises a LiveError if it cannot be read.
         """
-        # This clock brings the group's counter up to date with the thread that asks.
+        # Reading this clock first adds this thread's CPU time to the group's counter.
         time.process_time_ns()
         try:
             text = self._used.read()
@@ -106,14 +95,14 @@ class ControlGroup:
             raise LiveError(f"{self._path}: cannot be read ({error})") from None
 
     def taken_ns(self) -> int:
-        """As `used_ns`; `UNKNOWN` where that cannot be read."""
+        """Return `used_ns`, or `UNKNOWN` if it cannot be read."""
         try:
             return self.used_ns()
         except LiveError:
             return UNKNOWN
 
     def counts(self) -> Counts:
-        """Return the CPU time that others have taken by now."""
+        """Return the CPU time of others up to now."""
         own_ns = time.process_time_ns()
         group_ns = self.taken_ns()
         if group_ns == UNKNOWN:
@@ -132,7 +121,7 @@ class ControlGroup:
 
 
 def own_group(process: Path = PROCESS) -> ControlGroup | None:
-    """Return the control group of this process; None where that is the root, or nothing counts."""
+    """Return this process's control group; None for the root group or if counters are missing."""
     try:
         groups = _groups((process / "cgroup").read_text())
         mounts = list(cgroup_mounts((process / "mountinfo").read_text()))
@@ -163,7 +152,7 @@ def _groups(text: str) -> dict[str, str]:
 
 
 def cgroup_mounts(text: str) -> Iterator[tuple[str, list[str], str, Path]]:
-    """Yield kind, options, root and place of each mounted hierarchy (proc_pid_mountinfo(5))."""
+    """Yield kind, options, root and folder of each mounted hierarchy (proc_pid_mountinfo(5))."""
     for line in text.splitlines():
         before, _, after = line.partition(" - ")
         words = after.split()

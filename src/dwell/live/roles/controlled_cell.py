@@ -1,6 +1,6 @@
-"""ControlledCell: one live cell as its controller sees it: windows in, orders out.
+"""ControlledCell: closes the windows of a live cell and sends orders to its stamper.
 
-The decisions are those of `dwell.control.Controller`, the object that the simulator runs.
+`dwell.control.Controller` makes the decisions, here and in the simulator.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ from dwell.live.wire.messages import (
 from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import roles
 
-#: Time between two looks at the stamper, and two sendings of an order that is not answered.
+#: Time between two status requests to the stamper, and between two copies of an unanswered order.
 ASK_NS = 250_000_000
 RESEND_NS = 40_000_000
-#: Stamps in a row that say that the cell has been moved, where no answer says so.
+#: Number of stamps in a row that confirm a move without an answer to its order.
 CONFIRMATIONS = 3
 
-#: A state on its way has this share of its link, as 1 / share.
+#: Factor on the transfer time of a state, which shares its link.
 TRANSFER_SHARE = 2
 
-#: Why a cell is moved: the policy's reasons, the guard, a person's wish, an unknown order.
+#: Reasons of moves: the policy's, the guard, an operator's (pinned, drained), an unknown order.
 MOVED_BY = ("migrate", "capped", "infeasible", "guard", "pinned", "drained", "ordered")
 
 Phase: TypeAlias = Literal["fork", "state", "order"]
@@ -57,24 +57,24 @@ class Recorder(Protocol):
 
     @property
     def trouble(self) -> str:
-        """Why the rows cannot be written; empty where they can."""
+        """Reason that the rows cannot be written; empty if they can."""
         ...
 
     def open(self, run: int) -> Resume:
-        """Begin to keep a run, or go on; returns where."""
+        """Start or continue the record of a run; return its next window and cycle."""
         ...
 
     def append(self, rows: Rows, **meta: object) -> None:
-        """Keep rows that belong together, and the run's metadata from now on."""
+        """Record rows that belong together, and update the run's metadata."""
         ...
 
 
 @dataclass(slots=True)
 class _Move:
-    """A migration on its way.
+    """A migration under way.
 
-    A task with a state goes first: its inputs are forked to where it will run, its state follows,
-    and only when all have said that they are ready is the placement ordered.
+    Tasks with a state move first: their inputs are forked to the new nodes, then the states are
+    sent. The placement is ordered when all workers have restored their states.
     """
 
     name: str
@@ -87,21 +87,17 @@ class _Move:
     order: Order | None = None
     sent_ns: int = 0
     refused: str = ""
-    # Whether its order has been refused for now, and is to be asked for anew.
+    # Whether its order was refused for now, so that the next one needs a new number.
     anew: bool = False
-    # What it carries out, where the policy has decided it.
+    # The policy's proposal; None for an operator's move.
     proposal: Proposal | None = None
 
 
 class ControlledCell:
     """See the module.
 
-    Parameters
-    ----------
-    name : str
-        Name of this controller, by which others that would take charge tell it apart.
-    changed : callable
-        Returns which files have changed since it began; empty for none.
+    `name` distinguishes this controller from others of the cell. `changed` returns the files that
+    have changed since the start, or an empty string.
     """
 
     def __init__(
@@ -117,21 +113,22 @@ class ControlledCell:
         self._recorder, self._changed = recorder, changed
         self.offsets = place.offsets()
         self.windows: LiveWindows | None = None
-        # Of the others the relay's agent tells it now and then. What beats say of the clocks is
-        # what they have heard themselves: it is as good when it comes late, by way of others.
+        # Other processes' beats arrive in batches of the relay's agent. Beats carry their own
+        # times of sending and arrival, so a delay on the detour does not harm clock comparisons.
         relay = place.problem.relay_node
         agent = relay, f"agent@{relay}"
         self.pulse = Pulse(place, lambda: (True, recorder.trouble), hears=[agent], every=AGENT_BEAT)
         self._keys = place.keys
-        # Where the cell is, by the stamper's answers and stamps; and its last answer in this term.
+        # Run, term and placement from the stamper's answers and stamps; its last answer, or None
+        # if only stamps have confirmed the current term.
         self.course = controller.course
         self._told: Accepted | None = None
-        # The cycles that are believed; and the numbers of the last orders that were sent before the
-        # newest cycle, and before the term that holds, were heard of.
+        # Checks the order of cycles. Numbers of the last orders sent before the newest cycle, and
+        # the current term, were known.
         self.continuity = Continuity(place.period_ns)
         self._cycle_asked = self._term_asked = 0
-        # What a stamp says of a term that nobody has confirmed, whether the order under way asks
-        # for it, and how many stamps in a row say so.
+        # Run, term and placement of stamps that no answer has confirmed, whether they match the
+        # open order, and the number of such stamps in a row.
         self._unconfirmed: tuple[tuple[int, int, str], bool, int] | None = None
         self._doubted_until_ns: int | None = None
         self.refused = ""
@@ -142,27 +139,27 @@ class ControlledCell:
         self._setback = SetbackDetector()
         self._began_ns: int | None = None
         self._ask_ns = 0
-        # How often the cell has been moved, by reason (see `MOVED_BY`).
+        # Number of moves by reason (see `MOVED_BY`).
         self.moves = Counter(dict.fromkeys(MOVED_BY, 0))
         self._window: dict[str, Any] = {}
         self._window_ns = 0
-        # Whether a window has closed that is not recorded.
+        # Whether there are rows to record.
         self._unwritten = False
 
     @property
     def guard_moves(self) -> int:
-        """How often the guard has moved the cell."""
+        """Number of moves by the guard."""
         return self.moves["guard"]
 
     @property
     def migrations(self) -> int:
-        """How often it has been moved by order."""
+        """Number of moves by order."""
         return self.moves.total() - self.guard_moves
 
-    # ------------------------------------------------------------------------ hearing
+    # ---------------------------------------------------------------------- receiving
 
     def subscriptions(self) -> Iterable[str]:
-        """Key expressions that it wants to hear."""
+        """Key expressions to subscribe to."""
         keys = self.place.keys
         yield from self.pulse.subscriptions()
         yield from (keys.done("*"), keys.ended(), keys.accepted(), keys.load("*"))
@@ -171,13 +168,13 @@ class ControlledCell:
         yield from (keys.ask(), keys.look())
 
     def receive(self, sample: Arrival, now_ns: int) -> int:
-        """Take a message in; returns what is due next."""
+        """Process a message; return the instant of the next call of `wake`."""
         self._follow_clock(now_ns)
         self._take(sample, now_ns)
         return self._due_ns(now_ns)
 
     def _due_ns(self, now_ns: int) -> int:
-        """Return when a window closes, an order is sent again, or the stamper is asked."""
+        """Return when a decision, a copy of an unanswered order or a status request is due."""
         due_ns = self._ask_ns
         if self._move is not None:
             due_ns = min(due_ns, self._move.sent_ns + RESEND_NS)
@@ -185,7 +182,7 @@ class ControlledCell:
         return due_ns if close_ns is None else min(due_ns, close_ns)
 
     def _follow_clock(self, now_ns: int) -> None:
-        """Put what is due, and what was heard, back with a clock that has been set back."""
+        """Shift due times and times of arrival if the clock was set back."""
         back_ns = self._setback.back_ns(now_ns)
         if not back_ns:
             return
@@ -211,7 +208,7 @@ class ControlledCell:
             if beat is not None:
                 self._compare_clocks(beat, now_ns, direct=keys.came_directly(sample.key))
                 if beat.moving and self._move is not None:
-                    # Its stage writes or reads the state.
+                    # A stage is writing or restoring its state.
                     self._move.since_ns = now_ns
             return
         windows = self.windows
@@ -222,7 +219,7 @@ class ControlledCell:
                 case "done" | "ended" if windows is not None:
                     done = self.place.completion(sample)
                     who = f"{done.sink}@{done.node}"
-                    # A source's guess counts where the stamper has released such a cycle.
+                    # A source's guess counts if the stamper has released such a cycle.
                     guess = not done.stamp.term
                     if guess or self._goes_on(done.stamp, who, now_ns, alone=True):
                         windows.completed(done, now_ns)
@@ -243,7 +240,7 @@ class ControlledCell:
             self.place.complain(error)
 
     def _compare_clocks(self, beat: Beat, now_ns: int, *, direct: bool) -> None:
-        """Learn what a beat tells of the clocks; over the detour, of others than this node's."""
+        """Compare clocks by a beat; from the detour, only by its sender's own receptions."""
         if direct:
             self.offsets.hear(beat, now_ns)
         else:
@@ -251,7 +248,7 @@ class ControlledCell:
                 self.offsets.sample(heard.node, beat.node, heard.beat_ns, heard.at_ns)
 
     def _require_candidate(self, placement: str) -> None:
-        """Raise a LiveError unless the stamper can have said that a placement holds."""
+        """Raise a LiveError if the stamper's placement is not a candidate here."""
         known = self.place.problem.candidates
         if placement not in known:
             raise LiveError(
@@ -260,7 +257,7 @@ class ControlledCell:
             )
 
     def _goes_on(self, stamp: Stamp, who: str, now_ns: int, *, alone: bool = False) -> bool:
-        """Whether a cycle goes on from those before it; complains of the first that does not."""
+        """Whether a cycle can follow the known cycles; complain about the first that cannot."""
         continuity, cycle = self.continuity, stamp.key
         newest, ahead = continuity.newest, continuity.ahead(now_ns)
         course = self.course
@@ -295,9 +292,9 @@ class ControlledCell:
         reported = stamp.run, stamp.term, stamp.placement
         known, ordered, count = self._unconfirmed or (None, False, 0)
         if known != reported:
-            # An order that is sent later has not brought it about.
+            # Only an order that was sent before this stamp can have caused the move.
             ordered, count = self._has_ordered(stamp), 0
-            # The answer says who has moved the cell, too.
+            # Request an answer, which shows whether the guard or an order moved the cell.
             self._ask_ns = now_ns
         count += 1
         self._unconfirmed = reported, ordered, count
@@ -305,7 +302,7 @@ class ControlledCell:
             self._now_at(*reported, by_guard=not ordered)
 
     def _has_ordered(self, stamp: Stamp) -> bool:
-        """Whether a stamp's term is what the order that has no answer yet asks for."""
+        """Whether a stamp's term and placement match the order that has no answer yet."""
         move = self._move
         return (
             move is not None
@@ -315,7 +312,7 @@ class ControlledCell:
         )
 
     def _now_at(self, run: int, term: int, placement: str, *, by_guard: bool) -> None:
-        """Take note of the placement that holds since a term began."""
+        """Enter a new term: end the migration under way, and count and adopt the move."""
         controller, course, move = self.controller, self.course, self._move
         left = course.placement
         self._unconfirmed = self._told = None
@@ -330,7 +327,7 @@ class ControlledCell:
             self._stay(f"the placement became {placement} meanwhile")
             self.moves["guard" if by_guard else "ordered"] += 1
             if by_guard and move is not None:
-                # It may be where the move led, but no state has come along.
+                # The placement may be the migration's target, but the states were not sent.
                 self.refused = (
                     f"the guard moved the cell to {placement} before the move to {move.name}"
                 )
@@ -340,27 +337,27 @@ class ControlledCell:
             controller.adopt(placement, left=left)
         else:
             if placement != course.placement:
-                # A person's choice, not the policy's.
+                # An operator's choice, not the policy's.
                 controller.resume(placement)
             course.credit(by_guard=False)
         course.enter(run, term)
 
     def _begin_run(self, answer: Accepted) -> None:
-        """Begin where the stamper says that the cell is."""
+        """Start with the run and placement of the stamper's first answer."""
         self._term_asked = self._number
         resume = self._recorder.open(answer.run)
         self._follow(answer)
         self.windows = LiveWindows(self.place.problem, self.offsets, self.controller, resume=resume)
 
     def _follow(self, answer: Accepted) -> None:
-        """Be where the stamper says."""
+        """Adopt run, term and placement of the stamper's answer."""
         self.controller.resume(answer.placement, fallback=answer.fallback)
         self.course.enter(answer.run, answer.term)
         self._told = answer
 
     @property
     def _proven(self) -> str:
-        """Candidate that the stamper has said is proven; none where empty."""
+        """Candidate that the stamper has proven; empty if none."""
         return "" if self._told is None else self._told.proven
 
     # ------------------------------------------------------------------------- orders
@@ -376,17 +373,17 @@ class ControlledCell:
             self._begin_run(answer)
         elif not self._corrected(answer, now_ns):
             return
-        # One that asked before had a clock that is ahead of this one.
+        # The clock of an earlier controller may have been ahead of this controller's.
         self._number = max(self._number, answer.newest)
         if begins:
             return
         course, move, proven = self.course, self._move, self._proven
         of_move = move is not None and move.order is not None and answer.number == move.order.number
         if (answer.run, answer.term) > (course.run, course.term):
-            # What was accepted may be an order before the one that waits for its answer.
+            # The stamper may have accepted an earlier order than the unanswered order.
             self._now_at(answer.run, answer.term, answer.placement, by_guard=answer.fallback)
         else:
-            # A stamp says where the cell is, and not who has moved it.
+            # Stamps show the placement; only the answer shows whether the guard moved the cell.
             course.credit(by_guard=answer.fallback)
         self._told = answer
         if self._move is None and answer.proven and answer.proven != proven:
@@ -402,10 +399,10 @@ class ControlledCell:
             self._ask_for_states(move, answer)
 
     def _corrected(self, answer: Accepted, now_ns: int) -> bool:
-        """Believe the stamper's own word over what was heard before; False where it is an old one.
+        """Correct the known term and cycle by the stamper's answer; return False for an old answer.
 
-        An answer to an order that was sent after something was heard is later than that: where it
-        says less, what was heard was wrong.
+        An answer is newer than a message that arrived before its order was sent. If its term or
+        cycle is nevertheless lower, the earlier message was wrong.
         """
         if (answer.run, answer.term) < (self.course.run, self.course.term):
             if answer.number <= self._term_asked:
@@ -429,7 +426,7 @@ class ControlledCell:
         return True
 
     def _take_back(self, answer: Accepted) -> None:
-        """Go back to the placement that the stamper says: the term that was believed was false."""
+        """Return to the stamper's term and placement, because the known term was false."""
         self.place.complain(
             LiveError(
                 f"the stamper is in term {answer.term}, at {answer.placement}; so it was not moved"
@@ -440,7 +437,7 @@ class ControlledCell:
         self._follow(answer)
 
     def _stay(self, why: str) -> None:
-        """Go on with the placement that holds: no migration has come about."""
+        """End the migration under way and keep the current placement."""
         move, self._move = self._move, None
         if move is not None and move.proposal is not None:
             self.controller.reject(move.proposal, why)
@@ -450,7 +447,7 @@ class ControlledCell:
 
     def _send(self, order: Order) -> None:
         if self.place.stamper[1] in self.pulse.strangers:
-            # Its candidates may be others, of the same names.
+            # Its cell file differs, so its candidates may differ under the same names.
             return
         self.place.put(self.place.keys.order(), order)
 
@@ -459,7 +456,7 @@ class ControlledCell:
         return self._number
 
     def _order(self, placement: str, now_ns: int) -> Order:
-        """Return an order; whatever it is for, it says what is forked, and what is to be proven."""
+        """Return an order; every order also has the forks and the candidate to prove."""
         course, move = self.course, self._move
         where = course.run, course.term
         fraction = self.controller.shadow_fractions[placement or course.placement]
@@ -468,10 +465,10 @@ class ControlledCell:
         return Order(self._next_number(), self.name, *where, placement, fraction, forks, want)
 
     def _desired(self, now_ns: int) -> str:
-        """Return what the guard's fallback shall be left for: people's choice, else the policy's.
+        """Return the candidate to replace the guard's fallback: the operator's, else the policy's.
 
-        It lasts until the cell is there, whatever windows close and orders are given up meanwhile:
-        without it the stamper counts its probes anew.
+        It must stay the same until the cell has moved, even if windows end and orders are given
+        up: without it the stamper restarts the count of its probes.
         """
         here, wanted = self.course.placement, self.course.wanted
         if not self.course.by_guard:
@@ -482,7 +479,7 @@ class ControlledCell:
         return wanted if wanted is not None and self._clear(wanted) else ""
 
     def _begin(self, name: str, now_ns: int, proposal: Proposal | None = None) -> None:
-        """Begin a migration that the policy has proposed or a person has asked for."""
+        """Begin a migration that the policy has proposed or an operator has requested."""
         if self._move is not None:
             self._stay(self._overruled())
         problem = self.place.problem
@@ -505,7 +502,7 @@ class ControlledCell:
         self._push(self._move, now_ns)
 
     def _transfer_ns(self, forks: tuple[tuple[str, str], ...]) -> int:
-        """Return the time that states on their way take, which share their links."""
+        """Return the time to send the states of some tasks, ns, on links that they share."""
         problem = self.place.problem
         here, transfer_s = problem.candidates[self.course.placement], 0.0
         for task, to in forks:
@@ -516,7 +513,7 @@ class ControlledCell:
         return round(transfer_s * 1e9)
 
     def _push(self, move: _Move, now_ns: int) -> None:
-        """Send what the present phase of a migration asks for."""
+        """Send the order of a migration's current phase, if it has one."""
         move.sent_ns = now_ns
         if move.phase == "state":
             return
@@ -524,13 +521,13 @@ class ControlledCell:
             placement = move.name if move.phase == "order" else ""
             move.order = self._order(placement, now_ns)
         elif move.anew:
-            # An order that was refused for now is asked for anew; one without answer, again.
+            # A refused order is sent with a new number; an unanswered order is sent again as it is.
             move.order = self._order(move.order.placement, now_ns)
             move.anew = False
         self._send(move.order)
 
     def _ask_for_states(self, move: _Move, answer: Accepted) -> None:
-        """Have the states follow the inputs, which are forked."""
+        """Request the states of the tasks whose inputs are forked."""
         move.phase = "state"
         keys = self.place.keys
         old = self.place.problem.candidates[answer.placement]
@@ -538,7 +535,7 @@ class ControlledCell:
             number = self._next_number()
             move.awaited[number] = task
             asked = Snapshot(number, task, old[task], to, answer.run, answer.cycle)
-            # Where it goes, a state is taken for what is known to have been asked for alone.
+            # The receiving worker must know the request: it accepts only a requested state.
             for node in (to, old[task]):
                 self.place.put(keys.snapshot(task, node), asked)
 
@@ -556,7 +553,7 @@ class ControlledCell:
             self._push(move, now_ns)
 
     def _give_up(self, now_ns: int) -> None:
-        """End a migration that has not come about: the cell is where it was."""
+        """Give up the migration under way, if any, and end its forks."""
         move = self._move
         if move is None:
             return
@@ -567,7 +564,7 @@ class ControlledCell:
     # ------------------------------------------------------------------------- windows
 
     def wake(self, now_ns: int) -> int:
-        """Make the decisions that are due, push a migration on, beat; returns what is due next."""
+        """Make due decisions, send due orders and beats; return the instant of the next call."""
         self._follow_clock(now_ns)
         if self._began_ns is None:
             self._began_ns = now_ns
@@ -587,10 +584,10 @@ class ControlledCell:
                 self._push(move, now_ns)
         if now_ns >= self._ask_ns:
             self._ask_ns = now_ns + ASK_NS
-            # Also says that this controller is there, and what it would have proven.
+            # This order also renews the lease and names the candidate to prove.
             self._send(self._order("", now_ns))
         due_ns = min(self.pulse.wake(now_ns), self._due_ns(now_ns))
-        # At once, but after all that has been due before: no order waits for a disk.
+        # Record in the next call, after this call's orders are sent: no order waits for a disk.
         return min(due_ns, now_ns) if self._unwritten else due_ns
 
     def _close(self, windows: LiveWindows, now_ns: int) -> None:
@@ -599,9 +596,9 @@ class ControlledCell:
         closed = windows.close(unix_ns=time.time_ns())
         self._unwritten = self._unwritten or windows.last is not before
         windows.spent(self.place.node, now_ns, self.place.who, time.process_time_ns())
-        # The order before has not come about within a whole window.
+        # A migration that is still under way at the next decision is given up.
         self._give_up(now_ns)
-        # Less than half of the cycles say little. A decision is late if the next one is due, too.
+        # Miss the decision if less than half of its cycles are known, or the next one is due too.
         next_ns = windows.due_ns(now_ns) if windows.often else None
         late = next_ns is not None and next_ns <= now_ns
         looked = windows.looked
@@ -631,13 +628,13 @@ class ControlledCell:
             self._begin(target, now_ns, proposal if target == wanted else None)
 
     def write(self) -> None:
-        """Record the windows that have closed since the last time."""
+        """Record the rows that are new or have changed since the last call."""
         self._unwritten = False
         if self.windows is not None:
             self._recorder.append(self.windows.record.rows(), origin_ns=self.windows.origin_ns)
 
     def finish(self) -> Rows | None:
-        """Return the rows that are left; an order without answer counts as carried out."""
+        """Return the remaining rows; an order without an answer counts as carried out."""
         if self.windows is None:
             return None
         if self._move is not None and self._move.proposal is not None:
@@ -646,7 +643,7 @@ class ControlledCell:
         return self.windows.record.rows(last=True)
 
     def _allowed(self, wanted: str, now_ns: int) -> str:
-        """Return what people let the policy have."""
+        """Return the placement that pins, drains and the mode allow for a wanted placement."""
         here, problem = self.course.placement, self.place.problem
         if self.pinned:
             return self.pinned
@@ -666,19 +663,19 @@ class ControlledCell:
         return not self.drained.intersection(self.place.problem.candidates[name].values())
 
     def _workers_ready(self, name: str, now_ns: int) -> bool:
-        """Whether all workers of a candidate were heard lately, and ready."""
+        """Whether all workers of a candidate have sent a recent beat and are ready."""
         detector, silent_ns = self.pulse.detector, silent_after_ns(self.place.problem)
         workers = [f"{task}@{node}" for task, node in self.place.problem.candidates[name].items()]
         beats = [detector.last(who) for who in workers if detector.fresh(who, now_ns, silent_ns)]
         return len(beats) == len(workers) and all(beat is not None and beat.ready for beat in beats)
 
     def _overruled(self) -> str:
-        """Return why a decision is not followed."""
+        """Return the reason that a decision is not followed."""
         if self.pinned:
             return f"pinned to {self.pinned}"
         return f"{', '.join(sorted(self.drained))} drained" if self.drained else "not proven"
 
-    # -------------------------------------------------------------------------- people
+    # ----------------------------------------------------------------------- operators
 
     def _asked(self, ask: Ask, now_ns: int) -> None:
         refused = self._do(ask, now_ns)
@@ -713,7 +710,7 @@ class ControlledCell:
         return ""
 
     def _follow_operators(self, now_ns: int) -> None:
-        """Begin to move where people want the cell; from a fallback, once that is proven."""
+        """Begin an operator's move; from a fallback only to a proven candidate."""
         if self.windows is None:
             return
         here = self.course.placement
@@ -737,7 +734,7 @@ class ControlledCell:
         return ""
 
     def status(self, now_ns: int) -> dict[str, Any]:
-        """Return how the cell is, as plain values."""
+        """Return the status of the cell, as plain values."""
         known, course, told, move = self.windows is not None, self.course, self._told, self._move
         began_ns = now_ns if self._began_ns is None else self._began_ns
         age_ms = round((now_ns - self._window_ns) / 1e6, 1)
@@ -779,7 +776,7 @@ class ControlledCell:
         return {"health": health, "headline": headline, **status}
 
     def _proving(self, now_ns: int) -> dict[str, Any] | None:
-        """Return how far the proof is that the guard's fallback is waiting for."""
+        """Return the progress of the proof that lets the cell leave the guard's fallback."""
         told, desired = self._told, self._desired(now_ns)
         if not desired or self._move is not None:
             return None
@@ -788,7 +785,7 @@ class ControlledCell:
         return {"candidate": desired, "done": done, "needed": needed}
 
     def _processes(self, now_ns: int) -> dict[str, dict[str, Any]]:
-        """Return what is known of everybody that was ever heard."""
+        """Return age and state of the last beat, by process."""
         silent_ns = silent_after_ns(self.place.problem)
         return {
             who: {
@@ -801,11 +798,12 @@ class ControlledCell:
         }
 
     def _certificates(self, now_ns: int) -> dict[str, dict[str, Any]]:
-        """Return until when the certificates hold that the nodes and this controller use."""
+        """Return the ends of the certificates in use, by node and for this controller."""
         if self.place.seals is None:
             return {}
         keyring, silent_ns = self.place.seals.keyring, silent_after_ns(self.place.problem)
-        # The oldest that a process of the node uses; processes that are heard come first.
+        # Oldest certificate that a process of the node uses; silent processes count only if all
+        # are silent.
         used = {CONTROLLER: (False, keyring.own.generation)}
         for _, beat, age_ns in self.pulse.detector.everybody(now_ns):
             found = age_ns > silent_ns, beat.generation
@@ -823,7 +821,7 @@ class ControlledCell:
         return certificates
 
     def _missing(self, now_ns: int) -> dict[str, Any]:
-        """Return who is not heard: those that differ, with why, and those that say nothing."""
+        """Return rejected processes with the reason, and processes that have never sent a beat."""
         strangers = self.pulse.strangers
         differ = {
             who: why for who, (why, at_ns) in strangers.items() if now_ns - at_ns < REPEATED_NS

@@ -1,8 +1,8 @@
-"""LiveCycle: the messages about one cycle; Ledger: its latency, jobs and evidence by them.
+"""LiveCycle: the messages about one cycle; Ledger: latency, jobs and evidence from them.
 
-A job's instants travel with its output, so that of a cycle that never arrives nothing is told of
-where it went: unless a worker has said that it replaced it by a newer one, the first message to
-another node of which nothing is known is taken to have been lost.
+A job's instants travel with its output. If a cycle never arrives at a sink, its jobs are unknown,
+unless a worker reports that a newer cycle replaced it. The ledger then assumes that the first
+unconfirmed message between two nodes was lost.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from dwell.model.instants import NEVER_NS
 from dwell.model.number_arrays import Floats, Ints
 from dwell.record import Values
 
-#: Whether it is the shadow's; task and node.
+#: Whether the job belongs to the shadow; task and node.
 JobName: TypeAlias = tuple[bool, str, str]
 Jobs: TypeAlias = dict[JobName, Hop]
 
 UNKNOWN = -1
-#: Shadow completions remembered of one cycle.
+#: Largest number of shadow completions kept per cycle.
 MAX_SHADOWS = 16
-#: Share of a window for which a hook has to have said how busy an accelerator was.
+#: Least share of a window in which a hook must have measured an accelerator.
 HOOKED_SHARE = 0.5
-#: Outcomes of what came to its end before a sink.
+#: Outcomes of jobs that ended before a sink.
 SHADOW, REPLACED = "shadow", "replaced"
 
 
@@ -49,8 +49,8 @@ class Shift(msgspec.Struct, frozen=True, gc=False):
 class LiveCycle(msgspec.Struct, eq=False, gc=False):
     """One cycle of a live run.
 
-    A controller remembers tens of thousands. The garbage collector, which stops everything, need
-    not look at them: they are in no circle, and what they hold is none of its business either.
+    A controller keeps tens of thousands of cycles. They are in no reference cycle, so the garbage
+    collector, which pauses the process, does not track them.
 
     Parameters
     ----------
@@ -59,38 +59,38 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
     origin_ns : int
         First release of the run, on the stamper's clock.
     heard : bool
-        Whether its stamp is known, and not only its neighbours'.
+        Whether a message with its stamp has arrived; if not, only its neighbours are known.
 
     Attributes
     ----------
     stamped_ns : int or None
-        When its stamp was heard, on the controller's clock.
+        Arrival of its stamp, on the controller's clock.
     group_ns : int
-        CPU time that the control group of the stamper's node had taken when it was released.
+        CPU time that the control group on the stamper's node had used at its release.
     reports : dict of str to Completion
-        By sink.
+        Completions by sink.
     heard_ns : dict of str to int
-        When they were heard, where that is known.
+        Arrivals of the completions on the controller's clock, if known, by sink.
     replaced : dict of str to Completion
-        By task where a newer cycle took its place.
+        Reports of jobs that a newer cycle replaced, by task.
     latency_ns : int
-        `NEVER_NS` while it has not completed.
+        `NEVER_NS` until all sinks have reported.
     parts_ns : tuple of int, or None
         Compute, queue, network.
     bound_ns : int
-        Bound of the error of its latency, by the clocks.
+        Error bound of the latency, from the clocks.
     interval_ns : int or None
-        From its stamp to its last completion, as both arrived at the controller.
+        Time from the arrival of its stamp to the arrival of its last completion, at the controller.
     stamper_interval_ns : int or None
-        From its release to its last completion, by the stamper's clock alone.
+        Time from its release to its last completion, on the stamper's clock alone.
     told : bool
-        Whether its latency is that, because its sinks' own words have not come here.
+        Whether its latency is `stamper_interval_ns`, because not all sinks have reported here.
     deaf : bool
-        Whether nothing was heard of it, or of the next one: it may have completed unheard.
+        Whether all messages of this cycle or of the next are missing: its completion may be lost.
     row : int
-        In the record; -1 while it is in no closed window.
+        Row in the record; -1 until the cycle is recorded.
     close_ns : int or None
-        Close of its window since the origin; None where it belongs to none.
+        End of its window since the origin; None for a cycle outside windows.
     """
 
     run: int
@@ -122,36 +122,36 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
 
     @classmethod
     def of(cls, stamp: Stamp, origin_ns: int) -> LiveCycle:
-        """Return the cycle that a stamp is about."""
+        """Return the cycle of a stamp."""
         at_ns = stamp.released_ns - origin_ns
         who = stamp.run, stamp.cycle, stamp.term, stamp.placement, stamp.shadow
         return cls(*who, at_ns, origin_ns, heard=True)
 
     @property
     def key(self) -> tuple[int, int]:
-        """Its place among all cycles."""
+        """Run and cycle number, which order all cycles."""
         return self.run, self.number
 
     @property
     def hops(self) -> Iterator[Hop]:
-        """All that was told of its own jobs; of one job by everybody downstream."""
+        """Reported jobs of this cycle, not of its shadow; several sinks may report one job."""
         for done in (*self.replaced.values(), *self.reports.values()):
             yield from done.hops
 
     @property
     def segment(self) -> tuple[int, int, str]:
-        """Run, term and placement, which a migration changes."""
+        """Run, term and placement; a migration changes them."""
         return self.run, self.term, self.placement
 
     def identify(self, stamp: Stamp) -> None:
-        """Take in the stamp of a cycle that was known by its neighbours only."""
+        """Add the stamp to a cycle that was known only from its neighbours."""
         self.heard = True
         self.term, self.placement, self.shadow = stamp.term, stamp.placement, stamp.shadow
         if self.row < 0:
             self.at_ns = stamp.released_ns - self.origin_ns
 
     def take(self, completion: Completion, at_ns: int | None) -> bool:
-        """Take in a completion; False if it is a copy."""
+        """Add a completion; return False if it is a copy."""
         if completion.outcome == SHADOW:
             new = len(self.shadows) < MAX_SHADOWS and completion not in self.shadows
             if new:
@@ -167,35 +167,35 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
         return True
 
     def heard_before(self, back_ns: int) -> None:
-        """Put what was heard back, with the controller's clock."""
+        """Shift the times of arrival after the controller's clock was set back."""
         if self.stamped_ns is not None:
             self.stamped_ns -= back_ns
         self.heard_ns = {sink: at_ns - back_ns for sink, at_ns in self.heard_ns.items()}
 
     @property
     def actuated(self) -> bool:
-        """Whether all its commands were applied, as far as is known."""
+        """Whether all known reports say that a command was applied."""
         reports = self.reports.values()
         return bool(reports) and all(done.outcome == ACTUATED for done in reports)
 
     @property
     def silences(self) -> int:
-        """How often an actuator was at rest before it applied a command of this cycle."""
+        """Number of applied commands of this cycle that found their actuator at rest."""
         return sum(done.rested and done.outcome == ACTUATED for done in self.reports.values())
 
     def came_to(self, *outcomes: str) -> bool:
-        """Whether a sink has said that a command of it came to one of these."""
+        """Whether a sink has reported one of these outcomes."""
         return any(done.outcome in outcomes for done in self.reports.values())
 
     @property
     def untold(self) -> bool:
-        """Whether nobody knows whether it has completed."""
+        """Whether it is unknown if the cycle has completed."""
         return self.deaf and not (self.reports or self.replaced or self.told)
 
     def missed(self, deadline_ns: int) -> bool:
-        """Whether it was later than D, unfinished when its window closed, or not applied.
+        """Whether it was later than D, unfinished at the end of its window, or not applied.
 
-        Of one that the gate found stale the clocks may say something else.
+        A command that the gate found stale counts as missed, even if its latency is below D.
         """
         if self.untold:
             return False
@@ -206,17 +206,17 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
 
 
 def told(cycles: Sequence[LiveCycle]) -> Sequence[LiveCycle]:
-    """Return the cycles of a window whose end is known; all where there are none."""
+    """Return the cycles of a window whose outcome is known; all cycles if none is known."""
     return [cycle for cycle in cycles if not cycle.untold] or cycles
 
 
 def violation_rate(cycles: Sequence[LiveCycle], deadline_ns: int) -> float:
-    """V_D: share of cycles that missed."""
+    """Return V_D, the share of cycles that missed their deadline."""
     return sum(cycle.missed(deadline_ns) for cycle in cycles) / len(cycles)
 
 
 class Ledger:
-    """Puts what messages say of cycles on the stamper's clock, and adds it up."""
+    """Converts reported instants to the stamper's clock and computes latencies and evidence."""
 
     def __init__(self, problem: Problem, offsets: Offsets) -> None:
         pipeline = problem.pipeline
@@ -224,7 +224,7 @@ class Ledger:
         self._pipeline, self._candidates, self._offsets = pipeline, problem.candidates, offsets
         self._stamper_node = problem.stamper_node
         self._nodes, self._resources = problem.fabric.nodes, problem.fabric.resources
-        #: By node.
+        #: CPU and accelerator time by node.
         self.loads = {node: NodeLoad() for node in self._nodes}
         self._tasks = {name: column for column, name in enumerate(pipeline.tasks)}
         self._flows = {(f.source, f.target): column for column, f in enumerate(pipeline.flows)}
@@ -236,7 +236,7 @@ class Ledger:
         self._accelerated: dict[str, frozenset[str]] = {}
 
     def tells(self, completion: Completion) -> bool:
-        """Whether a completion is about a task that can say so."""
+        """Whether a completion's task can have its outcome: before a sink any task, else a sink."""
         early = completion.outcome in {SHADOW, REPLACED}
         return completion.sink in (self._every if early else self.sinks)
 
@@ -247,15 +247,11 @@ class Ledger:
         return len(cycle.reports) == len(self.sinks)
 
     def settle(self, cycle: LiveCycle, *, most_ns: int | None = None) -> None:
-        """Work out latency and parts of a cycle that is complete.
+        """Compute latency and parts of a complete cycle.
 
-        Completions have a second way to the controller: the stamper hears them, and says so. What
-        the sinks say themselves counts more, whenever it comes.
-
-        Parameters
-        ----------
-        most_ns : int, optional
-            Leave it for later where the clocks' bound is above that; the bound may tighten.
+        The stamper receives completions too, and reports the interval that it measured. Reports of
+        the sinks have precedence, even if they arrive later. If the clocks' error bound exceeds
+        `most_ns`, the cycle is left for later, when the bound may be tighter.
         """
         if not self.complete(cycle):
             if cycle.stamper_interval_ns is not None and most_ns is None:
@@ -279,14 +275,14 @@ class Ledger:
             cycle.latency_ns = max(done_ns - cycle.at_ns, 0)
             cycle.parts_ns = self._split(cycle, last)
         else:
-            # Clocks have not been compared: what one alone shows is all there is.
+            # The clocks have not been compared, so only intervals of one clock are left.
             own_ns = (cycle.interval_ns, cycle.stamper_interval_ns, cycle.latency_ns)
             cycle.latency_ns = next(ns for ns in own_ns if ns is not None)
 
     def _since_origin(self, cycle: LiveCycle, node: str, instant_ns: int) -> int:
-        """Put an instant of a node's clock on the stamper's, since the origin.
+        """Convert an instant of a node's clock to the stamper's, since the origin.
 
-        All instants of a cycle on a node are moved alike: clocks part by microseconds in that time.
+        All instants of a cycle on a node get one shift: in this time clocks drift by microseconds.
         """
         shift = cycle.shifts.get(node)
         if shift is None:
@@ -295,11 +291,11 @@ class Ledger:
         return instant_ns + shift.by_ns - cycle.origin_ns
 
     def _doubt(self, cycle: LiveCycle, done: Completion) -> None:
-        """Take clocks for not compared by which a cycle's instants cannot be.
+        """Mark the clocks as not compared if a cycle's instants are impossible with them.
 
-        Nothing of a cycle ends before its release, or after that was heard; no message arrives
-        before it was sent, and no job ends before it is ready. Where that is so, beyond the bounds,
-        a clock has been set since it was compared last.
+        Jobs end after the release and before their report arrives, messages arrive after they are
+        sent, and jobs end after they are ready. If instants contradict this by more than the error
+        bounds, a clock was set after the last comparison.
         """
         known = [(done.node, done.done_ns)]
         hops = {hop.task: hop for hop in done.hops}
@@ -333,7 +329,7 @@ class Ledger:
                 self._disbelieve(cycle, node)
 
     def _within(self, cycle: LiveCycle, node: str, instant_ns: int) -> tuple[int, int]:
-        """Earliest and latest that an instant of a node's clock can have been, since the origin."""
+        """Earliest and latest true time of an instant of a node's clock, since the origin."""
         at_ns = self._since_origin(cycle, node, instant_ns)
         bound_ns = cycle.shifts[node].bound_ns
         return at_ns - bound_ns, at_ns + bound_ns
@@ -344,7 +340,7 @@ class Ledger:
             cycle.shifts[node] = Shift(0 if known is None else known.by_ns, UNBOUNDED_NS)
 
     def span_ns(self, node: str, first: LiveCycle, close_ns: int) -> tuple[int, int]:
-        """Begin and end of a window on a node's clock."""
+        """Start and end of a window on a node's clock."""
         begin_ns, end_ns = (
             self._offsets.from_reference(node, first.origin_ns + at_ns).instant_ns
             for at_ns in (first.at_ns, close_ns)
@@ -352,10 +348,10 @@ class Ledger:
         return begin_ns, end_ns
 
     def _split(self, cycle: LiveCycle, last: Completion) -> tuple[int, int, int] | None:
-        """Part a latency into compute, queue and network along its critical path.
+        """Split a latency into compute, queue and network along its critical path.
 
-        Going back from the sink, each job waited for the input that came last. What messages take
-        on one node counts as queueing, as do the ways to the first job and to the actuator.
+        The path runs backwards from the sink, to the input that arrived last at each job. Messages
+        within a node count as queueing, and so do the ways to the first job and to the actuator.
         """
         hops = {hop.task: hop for hop in last.hops}
         hop = hops.pop(last.sink, None)
@@ -370,7 +366,7 @@ class Ledger:
                 network_ns += self._since_origin(cycle, hop.node, arrived_ns)
                 network_ns -= self._since_origin(cycle, sender.node, sender.ended_ns)
             hop = sender
-        # Clocks that are a little off must not make a part negative, or the sum wrong.
+        # Small clock errors must not make a part negative or the sum wrong.
         compute_ns = min(compute_ns, cycle.latency_ns)
         network_ns = min(max(network_ns, 0), cycle.latency_ns - compute_ns)
         return compute_ns, cycle.latency_ns - compute_ns - network_ns, network_ns
@@ -378,12 +374,13 @@ class Ledger:
     # --------------------------------------------------------------------------- jobs
 
     def core_ns(self, cycles: Sequence[LiveCycle], close_ns: int) -> Floats:
-        """Core-nanoseconds of every resource in a window, shape (3, resources).
+        """Core-nanoseconds of every resource in a window: all, own, shadows; shape (3, resources).
 
-        A node's own work is what its jobs took, where any tell: what their processes take beside
-        that, messages and beats, is in no candidate's own work, and would be missing from the
-        estimates of all. Accelerators are as busy as a hook says, where their node has one kind of
-        them; elsewhere as busy as the cell's jobs keep them. NaN where none of these is known.
+        A node's own work is the CPU time of its jobs, if jobs report it. Messages and beats of
+        their processes do not count as own work, because no candidate's estimate contains them.
+        The busy time of accelerators comes from a hook if their node has one kind of accelerator
+        and the hook measured it long enough; otherwise from the cell's jobs. Unknown values are
+        NaN.
         """
         jobs_ns = self.spent_ns(cycles)
         by_jobs = self.accelerator_ns(cycles) if len(self._resources) > len(self.loads) else {}
@@ -408,18 +405,18 @@ class Ledger:
         return used
 
     def forget(self, before: LiveCycle) -> None:
-        """Drop the reports of loads that only earlier cycles need."""
+        """Drop load reports that only earlier cycles need."""
         for node, load in self.loads.items():
             load.forget(self.span_ns(node, before, before.at_ns)[0])
 
     def spent_ns(self, cycles: Sequence[LiveCycle]) -> Counter[str]:
-        """CPU time that the jobs of some cycles took, by node; of those that told it.
+        """Return the reported CPU time of the cycles' jobs, by node.
 
-        Nothing of tasks on an accelerator, whose CPU time is no work of theirs to a profile.
+        Tasks on an accelerator are left out: profiles do not count their CPU time as work.
         """
         spent = Counter[str]()
         for cycle in cycles:
-            # What several sinks tell of is one job.
+            # Several sinks may report one job.
             for hop in {(hop.task, hop.node): hop for hop in cycle.hops}.values():
                 execution = self._execution(hop)
                 on_cpu = execution is not None and execution.accelerator is None
@@ -428,10 +425,10 @@ class Ledger:
         return spent
 
     def accelerator_ns(self, cycles: Iterable[LiveCycle]) -> dict[str, tuple[float, float]]:
-        """Time that the jobs of some cycles, and of their shadows, had accelerators.
+        """Return the time that jobs of the cycles, and of their shadows, used each accelerator.
 
-        It is that from their start to their end, waiting for the accelerator included. By resource,
-        of those that they can have used; of the cycles' own NaN where none of them told it.
+        Waiting for the accelerator counts, as the time runs from start to end of the job. The
+        first value is NaN for an accelerator of the placement for which no job reported a time.
         """
         own, shadow, placed = Counter[str](), Counter[str](), set[str]()
         for cycle in cycles:
@@ -451,7 +448,7 @@ class Ledger:
         }
 
     def _accelerators_of(self, candidate: str) -> frozenset[str]:
-        """Names of the kinds of accelerators that a candidate's tasks run on."""
+        """Resource names of the accelerators that a candidate's tasks run on."""
         known = self._accelerated.get(candidate)
         if known is None:
             placed = self._candidates[candidate].items()
@@ -461,12 +458,12 @@ class Ledger:
         return known
 
     def _execution(self, hop: Hop) -> Execution | None:
-        """Execution of a job; None where its task does not run there."""
+        """Return the execution of a job's task on its node, or None."""
         task = self._pipeline.tasks.get(hop.task)
         return None if task is None else task.on.get(hop.node)
 
     def _work_ns(self, hop: Hop) -> int:
-        """CPU time of a job that has ended, or the time that it had an accelerator."""
+        """CPU time of a job that has ended, or its time on an accelerator; else `UNKNOWN`."""
         execution = self._execution(hop)
         if execution is None or hop.ended_ns == UNKNOWN:
             return UNKNOWN
@@ -475,7 +472,7 @@ class Ledger:
         return max(hop.ended_ns - hop.started_ns, 0)
 
     def jobs(self, cycle: LiveCycle) -> list[Values]:
-        """Return rows of ``jobs``: all known to have become ready for a cycle or its shadow."""
+        """Return the rows of ``jobs`` for the known jobs of a cycle and its shadow."""
         jobs = self._jobs(cycle)
         order = sorted(jobs, key=lambda key: (key[0], self._tasks[key[1]]))
         rows = (self._job_values(cycle, jobs, key) for key in order)
@@ -496,7 +493,7 @@ class Ledger:
         return jobs
 
     def _handover_ns(self, cycle: LiveCycle, jobs: Jobs, hop: Hop, *, shadow: bool) -> int:
-        """CPU time that a node took between a release, or its job before, and a job of it."""
+        """CPU time of a node's control group between the release or the previous job, and a job."""
         flows = self._pipeline.inputs(hop.task)
         before_ns = UNKNOWN
         if not flows and hop.node == self._stamper_node:
@@ -506,7 +503,7 @@ class Ledger:
         return _between(before_ns, hop.group_ns[0])
 
     def _ending_ns(self, cycle: LiveCycle, hop: Hop) -> int:
-        """CPU time that a node took between the job of a sink on it and the command's hand-over."""
+        """CPU time of a node's control group between a sink's job and the hand-over to the sink."""
         done = cycle.reports.get(hop.task)
         if done is None or done.node != hop.node:
             return UNKNOWN
@@ -518,7 +515,7 @@ class Ledger:
         if cycle.shifts[hop.node].bound_ns >= UNBOUNDED_NS:
             return None
         if not self._pipeline.inputs(hop.task):
-            # Its stamp may have been there before the cycle began.
+            # The stamp may have arrived before the cycle began.
             offset_ns = round(self._pipeline.tasks[hop.task].offset_ms * 1e6)
             ready_ns = max(ready_ns, cycle.at_ns + offset_ns)
         ended = hop.ended_ns != UNKNOWN
@@ -549,12 +546,9 @@ class Ledger:
     def evidence(
         self, cycles: Sequence[LiveCycle], release_ns: Ints, close_ns: int, *, shadows: bool
     ) -> Evidence:
-        """Return the instants of a window's jobs and messages, as known at its close.
+        """Return the instants of a window's jobs and messages that are known at its end.
 
-        Parameters
-        ----------
-        shadows : bool
-            Whether cycles may have been sent through alternatives.
+        `shadows` tells whether the result has the shadows' instants.
         """
         known, of_shadows = self._unknown(len(cycles)), self._unknown(len(cycles))
         through = np.full(len(cycles), -1, np.int64)
@@ -565,7 +559,7 @@ class Ledger:
                 for report in cycle.shadows:
                     self._doubt(cycle, report)
                     self._enter(of_shadows, row, cycle, report.hops, apart)
-                    # What both went through, should the cycle itself not have come so far.
+                    # Jobs that the shadow shares with the cycle, whose own report may be missing.
                     self._enter(known, row, cycle, report.hops, self._every - apart)
             for report in (*cycle.replaced.values(), *cycle.reports.values()):
                 self._doubt(cycle, report)
@@ -583,12 +577,12 @@ class Ledger:
             cycles=Instants(**known),
             shadow_placement=through,
             shadows=Instants(**of_shadows) if shadows else None,
-            # Agents put shadow jobs into the system's lowest scheduling class.
+            # Agents run shadow jobs in the lowest scheduling class of the system.
             shadows_share=False,
         )
 
     def _unknown(self, cycles: int) -> dict[str, Ints]:
-        """Return what `Instants` are made of, with nothing known."""
+        """Return the fields of `Instants`, filled with `UNKNOWN`."""
         columns = dict.fromkeys(("ready_ns", "start_ns", "end_ns", "work_ns"), len(self._tasks))
         columns["arrived_ns"] = len(self._flows)
         return {name: np.full((cycles, n), UNKNOWN, np.int64) for name, n in columns.items()}
@@ -614,7 +608,7 @@ class Ledger:
                 known["start_ns"][row, column] = max(hop.started_ns + shift_ns, 0)
                 known["end_ns"][row, column] = max(hop.ended_ns + shift_ns, 0)
                 known["work_ns"][row, column] = self._work_ns(hop)
-            # Where a shadow stops, its last messages arrive for a job that never runs.
+            # A shadow's last messages arrive at a sink whose job never runs.
             if not hop.warmup and (hop.ended_ns != UNKNOWN or hop.task not in self.sinks):
                 known["ready_ns"][row, column] = max(ready_ns, 0)
             for source, arrived_ns in hop.inputs:
@@ -623,7 +617,7 @@ class Ledger:
                     known["arrived_ns"][row, flow] = max(arrived_ns + shift_ns, 0)
 
     def _mark_lost(self, known: Mapping[str, Ints], row: int, cycle: LiveCycle) -> None:
-        """Take the first message to another node that is not known to have arrived as lost."""
+        """Mark the first unconfirmed message between two nodes as lost."""
         nodes = self._candidates[cycle.placement]
         for flow in self._forward:
             column = self._flows[flow.source, flow.target]
@@ -634,15 +628,11 @@ class Ledger:
                 return
 
     def unreached(self, cycle: LiveCycle, through: str) -> tuple[str, str] | None:
-        """Return source and target of the first message that is not known to have arrived.
+        """Return source and target of the first unconfirmed message between two nodes.
 
-        Only those to other nodes count, and an image before all others: beats, which small messages
-        share their lane with, say nothing of it. A task whose inputs were replaced sends nothing.
-
-        Parameters
-        ----------
-        through : str
-            Its placement, or the candidate that its shadow goes through.
+        Images have precedence: beats share the lane of small messages and do not test the lane of
+        images. A task whose inputs were replaced sends nothing. `through` is the cycle's placement,
+        or the candidate of its shadow.
         """
         nodes = self._candidates[through]
         hops = [*cycle.hops, *(hop for done in cycle.shadows for hop in done.hops)]
@@ -675,9 +665,9 @@ class Ledger:
         return self._apart[pair]
 
     def shadow_bytes(self, cycles: Iterable[LiveCycle]) -> tuple[int, int]:
-        """Cycles that were sent through an alternative, and the bytes that this put on links.
+        """Return the number of cycles with a shadow, and the bytes that shadows sent over links.
 
-        Only the messages that are known to have been sent are counted.
+        Only messages of jobs that are known to have ended count.
         """
         sent = total = 0
         for cycle in cycles:
@@ -698,6 +688,6 @@ class Ledger:
 
 
 def _between(before_ns: int, after_ns: int) -> int:
-    """Difference of two counts; `UNKNOWN` where one of them is, or the counter began anew."""
+    """Difference of two counts; `UNKNOWN` if one is unknown or the counter has restarted."""
     known = UNKNOWN not in (before_ns, after_ns) and after_ns >= before_ns
     return after_ns - before_ns if known else UNKNOWN

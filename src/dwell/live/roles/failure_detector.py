@@ -1,7 +1,7 @@
-"""Failure detector: whose beats have come lately, directly or over the detour.
+"""Failure detector: age of the last beat of each process, received directly or over the detour.
 
-Every process sends a beat each period. A beat says which beats of others its sender heard last, so
-that a node learns of links that it is no end of, and clocks can be compared (see `offsets`).
+Every process sends one beat per period. A beat lists the last beats that its sender has received.
+With this list other nodes detect failed links, and compare clocks (see `offsets`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dwell.live.wire.messages import Beat, Heard
 
 @dataclass(slots=True)
 class _HeardProcess:
-    """The last that was heard of a process."""
+    """Last beat of a process."""
 
     beat: Beat
     at_ns: int
@@ -23,19 +23,13 @@ class _HeardProcess:
     overshoot: OvershootDetector = field(default_factory=OvershootDetector)
 
     def age_ns(self, now_ns: int) -> int:
-        """Time since it was heard; where the clock has been set back, since then."""
+        """Time since the last beat, or since the clock was set back."""
         self.at_ns = min(self.at_ns, now_ns)
         return now_ns - self.at_ns
 
 
 class FailureDetector:
-    """Beats as one process has heard them.
-
-    Parameters
-    ----------
-    patience_ns : int
-        Age beyond which what was heard counts no more; g periods.
-    """
+    """Beats received by a process; they are fresh for `patience_ns` (g periods)."""
 
     def __init__(self, who: str, patience_ns: int) -> None:
         self.who = who
@@ -44,7 +38,7 @@ class FailureDetector:
         self._joined_ns: int | None = None
 
     def hear(self, beat: Beat, now_ns: int, *, direct: bool = True) -> bool:
-        """Take a beat in; False if it is no news: an older one, or its second copy."""
+        """Process a beat; return False if it is an old beat or a second copy."""
         if beat.who == self.who:
             return False
         process, order = self._processes.get(beat.who), (beat.life, beat.sent_ns)
@@ -62,8 +56,8 @@ class FailureDetector:
                 and order < (last[0], last[1] - LATENESS_NS)
                 and process.overshoot.behind(*order)
             ):
-                # A connection keeps the order, and so does the detour where all comes over it:
-                # what was believed was false, or its node's clock has been set back.
+                # A connection keeps the order of beats, and so does the detour if there is no
+                # direct connection. The last beat was false, or its node's clock was set back.
                 process.beat, process.at_ns = beat, now_ns
             elif not news:
                 return False
@@ -77,25 +71,25 @@ class FailureDetector:
         return process.beat if process is not None else None
 
     def age_ns(self, who: str, now_ns: int) -> int | None:
-        """Time since a process was last heard; None if never."""
+        """Time since the last beat of a process; None before its first beat."""
         process = self._processes.get(who)
         return process.age_ns(now_ns) if process is not None else None
 
     def joined_age_ns(self, now_ns: int) -> int | None:
-        """Time since somebody was heard for the first time; None if nobody was."""
+        """Time since the last process sent its first beat; None before the first beat."""
         if self._joined_ns is None:
             return None
         self._joined_ns = min(self._joined_ns, now_ns)
         return now_ns - self._joined_ns
 
     def fresh(self, who: str, now_ns: int, patience_ns: int | None = None) -> bool:
-        """Whether a process was heard within the patience."""
+        """Whether the last beat of a process is at most `patience_ns` old."""
         age_ns = self.age_ns(who, now_ns)
         limit = self.patience_ns if patience_ns is None else patience_ns
         return age_ns is not None and age_ns <= limit
 
     def heard(self) -> tuple[Heard, ...]:
-        """Return what the next beat says: the last direct beat of everybody."""
+        """Return the last direct beat of every process, for the next beat."""
         return tuple(
             Heard(who, process.beat.node, process.direct_beat_ns, process.direct_ns)
             for who, process in self._processes.items()
@@ -103,5 +97,5 @@ class FailureDetector:
         )
 
     def everybody(self, now_ns: int) -> list[tuple[str, Beat, int]]:
-        """Return who was heard: name, last beat, and its age."""
+        """Return name, last beat and its age of every process."""
         return [(who, v.beat, v.age_ns(now_ns)) for who, v in self._processes.items()]

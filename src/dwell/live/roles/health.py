@@ -1,19 +1,20 @@
-"""Health of a live cell: what is wrong with it, in a word and a line, from a controller's status.
+"""Health of a live cell, and a headline that names its faults, from a controller's status.
 
 ============  ====================================================================================
-``health``    what it means
+``health``    Condition
 ============  ====================================================================================
-``ok``        all processes are heard and ready, windows close, and cycles are completed; the
-              headline may warn of certificates that end
-``degraded``  windows close, but a process is silent, not ready, or has another cell file or
-              version, too many cycles miss, a sink applies nothing, a candidate's shadows fail, or
-              a certificate has ended or does so within an hour
-``stalled``   no window has closed for too long, or no cycle of the last one was completed
-``silent``    the controller hears no process of the cell
-``absent``    no controller answers; only who asks can tell (`dwell.live.host.operator_client`)
+``ok``        All processes are ready and send beats, windows close, cycles complete. The headline
+              may warn of certificates that end soon.
+``degraded``  Windows close, but a process is silent, not ready, or has another cell file or
+              version; or too many cycles miss, a sink applies no commands, a candidate's shadows
+              fail, the run is not recorded, or a certificate has ended or ends within an hour.
+``stalled``   No window has closed for too long, or all cycles of the last window are incomplete.
+``silent``    The controller receives no beats from the cell.
+``absent``    No controller answers; the operator's client reports this state
+              (`dwell.live.host.operator_client`).
 ============  ====================================================================================
 
-Processes on a node that is drained may be silent, or differ: an operator has taken it out.
+Processes on a drained node may be silent or differ, because an operator has taken the node out.
 """
 
 from __future__ import annotations
@@ -29,50 +30,41 @@ from dwell.model.bounds import counted
 
 Health: TypeAlias = Literal["ok", "degraded", "stalled", "silent", "absent"]
 
-#: Nobody is called silent sooner: a machine that is busy is no fault.
+#: Least age at which a process counts as silent; a busy machine may be late without a fault.
 LEAST_NS = 1_000_000_000
-#: Time after which a migration that does not come about is given up; it delays a window as long.
+#: Time after which an unfinished migration is given up; until then it may delay a window.
 PATIENCE_NS = 2_000_000_000
-#: Faults of single processes that the headline names.
+#: Largest number of faults that the headline names.
 NAMED = 3
-#: Time before a certificate's end from which a cell is degraded.
+#: Time before the end of a certificate at which the cell becomes degraded.
 LAST_MS = 3_600e3
-#: Number of the last windows with a silence or too few commands that degrades a cell.
+#: Number of recent windows with silences or too few commands that degrades a cell.
 BAD_WINDOWS = 2
 
 
 def silent_after_ns(problem: Problem) -> int:
-    """Return the age from which a process that was heard is silent.
+    """Return the age of the last beat above which a process is silent.
 
-    The guard's g periods, and what the controller is behind by: who beats seldom does so every
-    `AGENT_BEAT` periods, and the relay's agent tells of beats as often.
+    The age is the guard's g periods plus the controller's delay: agents beat every `AGENT_BEAT`
+    periods, and the relay's agent passes beats on at the same interval.
     """
     periods = problem.controller.guard_cycles + 2 * AGENT_BEAT
     return max(round(periods * problem.pipeline.period_ms * 1e6), LEAST_NS)
 
 
 def window_late_ns(problem: Problem, release_ratio: float | None = None) -> int:
-    """Return the age from which the last window is too old, at a ratio of releases.
+    """Return the age above which the last window is too old, at a ratio of releases.
 
-    A window that a move interrupts begins anew.
+    It permits two windows, because a window that a move interrupts starts again.
     """
     windows_ms = 2 * problem.window_ms / min(release_ratio or 1.0, 1.0)
     return round((windows_ms + problem.controller.close_grace_ms) * 1e6) + PATIENCE_NS
 
 
 def diagnose(problem: Problem, status: Mapping[str, Any]) -> tuple[Health, str | None]:
-    """Return a cell's health, and the headline that says what is wrong.
+    """Return a cell's health, and a headline with its faults and warnings, or None.
 
-    Parameters
-    ----------
-    status : mapping
-        As `dwell.live.roles.controlled_cell.ControlledCell.status` returns it.
-
-    Returns
-    -------
-    str
-    str or None
-        None where nothing is wrong, and no certificate ends soon.
+    `status` is the result of `dwell.live.roles.controlled_cell.ControlledCell.status`.
     """
     members = [
         role
@@ -103,7 +95,7 @@ def diagnose(problem: Problem, status: Mapping[str, Any]) -> tuple[Health, str |
 
 
 def _certificates(status: Mapping[str, Any]) -> tuple[list[str], list[str]]:
-    """Return which certificates have ended or do so within `LAST_MS`, and which end soon."""
+    """Return faults and warnings: certificates that end within `LAST_MS`, or later but soon."""
     named: tuple[dict[str, list[str]], dict[str, list[str]]] = {}, {}
     for name, certificate in status["certificates"].items():
         left_ms = certificate["days"] * 86_400e3
@@ -137,7 +129,8 @@ def _no_window(problem: Problem, status: Mapping[str, Any]) -> str | None:
     if window:
         age_ms = window["age_ms"]
     else:
-        # A cell that starts has as long from its first cycle on, and to that from its last process.
+        # A starting cell gets this time from its last new process to its first cycle, and again
+        # from its first cycle to its first window.
         age_ms = status["joined_ms"] if begun_ms is None else begun_ms
     if age_ms * 1e6 <= window_late_ns(problem, status.get("release_ratio")):
         return None
@@ -145,7 +138,7 @@ def _no_window(problem: Problem, status: Mapping[str, Any]) -> str | None:
 
 
 def _window_was_due(problem: Problem, status: Mapping[str, Any]) -> bool:
-    """Whether the first window has closed, or ought to have."""
+    """Whether the first window has closed, or its time is over."""
     if status["window"]:
         return True
     due_ms = problem.window_ms + problem.controller.close_grace_ms
@@ -156,7 +149,7 @@ def _no_cycle(status: Mapping[str, Any]) -> str | None:
     if not status["window"] or status["done_cycles"] or not status["heard_cycles"]:
         return None
     heard = [(who, one) for who, one in status["processes"].items() if one["heard"] and one["note"]]
-    # First those that cannot work; an agent's note is about its node.
+    # Processes that are not ready first; agents last, because their notes are about the node.
     heard.sort(key=lambda item: (item[1]["ready"], item[0].startswith("agent@")))
     notes = [one["note"] for _, one in heard[:1]]
     return f"no cycle of the last window was completed{_because(notes)}"
@@ -165,7 +158,7 @@ def _no_cycle(status: Mapping[str, Any]) -> str | None:
 def _symptoms(
     problem: Problem, status: Mapping[str, Any], members: Sequence[Role]
 ) -> Iterator[str]:
-    """Yield what the cell's cycles say, though its processes may be well."""
+    """Yield the faults that the cell's cycles show, even if all processes are ready."""
     sinks = [role for role in members if role.kind == "sink"]
     patience_ms = (problem.controller.guard_cycles + 1) * problem.pipeline.period_ms
     limit_ms = max(patience_ms, problem.max_age_ms)
@@ -174,7 +167,7 @@ def _symptoms(
         sink = status["sinks"][role.task]
         age_ms = status["begun_ms"] if sink["applied_age_ms"] is None else sink["applied_age_ms"]
         if _heard(status, role) and age_ms > limit_ms:
-            # By its last outcome, the gate lets no command through.
+            # The last outcome shows that the gate rejects the commands.
             late = [*slow, _stale(problem, sink["stale_ms"])] if sink["outcome"] == STALE else []
             why = [*late, *_notes(status, [role.who])]
             yield f"{role.who} has applied nothing since {_time(age_ms)}{_because(why)}"
@@ -200,7 +193,7 @@ def _symptoms(
 
 
 def _slow(problem: Problem, status: Mapping[str, Any]) -> Iterator[str]:
-    """Yield which stages take longer than a period, and what this costs."""
+    """Yield the stages that take longer than a period, and their replaced inputs."""
     for one in status["slow"]:
         lost = f": {one['replaced']} of {one['inputs']} inputs were replaced"
         takes = f"{one['stage']} takes {one['exec_ms']:.0f} ms of {problem.pipeline.period_ms:.0f}"
@@ -208,12 +201,9 @@ def _slow(problem: Problem, status: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _stale(problem: Problem, age_ms: float | None) -> str:
-    """Say whether commands are old, or only the clocks say so.
+    """Return a reason for stale commands: their age, or only the comparison of clocks.
 
-    Parameters
-    ----------
-    age_ms : float or None
-        Age of the last stale command by the controller's clock alone, if known.
+    `age_ms` is the age of the last stale command by the controller's clock alone, if known.
     """
     limit = f"max_age_ms ({problem.max_age_ms:g})"
     if age_ms is None or age_ms <= problem.max_age_ms:
@@ -222,7 +212,7 @@ def _stale(problem: Problem, age_ms: float | None) -> str:
 
 
 def _uneven(problem: Problem, status: Mapping[str, Any], why: list[str]) -> Iterator[str]:
-    """Yield how releases differ from one per period, and which commands the actuators lacked."""
+    """Yield a wrong rate of releases, and silences or too few commands at the actuators."""
     live, recent, ratio = problem.live, status["recent"], status["release_ratio"]
     period_ms = problem.pipeline.period_ms
     if ratio is not None and abs(ratio - 1) > live.degraded_at:
@@ -248,7 +238,7 @@ def _uneven(problem: Problem, status: Mapping[str, Any], why: list[str]) -> Iter
 
 
 def _notes(status: Mapping[str, Any], names: Sequence[str]) -> list[str]:
-    """Return what some processes say of themselves, of those that are heard."""
+    """Return the notes in the beats of some processes, except for silent processes."""
     known = [status["processes"][who] for who in names if who in status["processes"]]
     return [one["note"] for one in known if one["heard"] and one["note"]]
 
@@ -256,7 +246,7 @@ def _notes(status: Mapping[str, Any], names: Sequence[str]) -> list[str]:
 def _unreached(
     problem: Problem, status: Mapping[str, Any], ways: tuple[str, str] | None
 ) -> Iterator[str]:
-    """Yield which messages do not arrive; where an end is not heard, its own fault says so."""
+    """Yield messages that do not arrive; a silent end is a fault that `_faults` reports."""
     heard = status["processes"]
     if ways is None or not all(who in heard and heard[who]["heard"] for who in ways):
         return
@@ -267,7 +257,7 @@ def _unreached(
 
 
 def _faults(status: Mapping[str, Any], members: Sequence[Role]) -> Iterator[str]:
-    """Yield what is wrong with processes; of a node that is not heard at all, once."""
+    """Yield the faults of processes; a silent node is one fault."""
     heard = status["processes"]
     for node in dict.fromkeys(role.node for role in members):
         there = [role for role in members if role.node == node]
@@ -298,7 +288,7 @@ def _because(notes: Sequence[str]) -> str:
 
 
 def _time(ms: float) -> str:
-    """Return a time in words, to two digits or so."""
+    """Return a time as text with a unit, to about two digits."""
     seconds = ms / 1e3
     if seconds < 9.95:
         return f"{seconds:.1f} s"

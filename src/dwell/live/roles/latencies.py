@@ -1,12 +1,13 @@
-"""Intervals: how long cycles took, by the clock of the stamper's node alone.
+"""Intervals: durations of cycles, measured with the clock of the stamper's node alone.
 
-A cycle begins with its stamp, here, and ends with the arrival of its last completion, here, less
-what the completion's way back took. For that way half of the best round trip to the sink's node is
-taken, of those of the last minute or two: a beat says which beat of the stamper's its sender has
-heard last and how long ago, so that what is left of the time since is the way there and back.
+A cycle begins with its release by the stamper. It ends when the stamper receives its last
+completion, minus the transmission time of the completion. This time is estimated as half of the
+best round trip to the sink's node in the last one or two minutes. A beat gives the round trip: it
+states which beat of the stamper its sender received last, and how long before. The rest of the time
+since the stamper's beat is the round trip.
 
-It needs no clock but one. It assumes that the best way back takes half of the best round trip, and
-that the completion had such a way: what it was late is part of the interval.
+Other clocks are not needed. The estimate assumes that the best way back takes half of the best
+round trip, and that the completion took the best way; any extra delay becomes part of the interval.
 """
 
 from __future__ import annotations
@@ -16,16 +17,16 @@ from dataclasses import dataclass, field
 
 from dwell.live.wire.messages import Beat, Completion
 
-#: Time after one to two of which a round trip is forgotten.
+#: Length of a span; a best round trip counts in its own span and in the next one.
 SPAN_NS = 60_000_000_000
-#: Cycles that are waited for at a time, and intervals that wait to be told.
+#: Largest numbers of incomplete cycles, and of intervals to report.
 MOST_WAITING = 256
 MOST_REPORTED = 16
 
 
 @dataclass(slots=True)
 class _Best:
-    """Best round trip to a node: of this span, and of the one before."""
+    """Best round trip to a node, in this span and in the previous span."""
 
     begun_ns: int
     now_ns: int | None = None
@@ -51,13 +52,7 @@ class _Waiting:
 
 
 class Intervals:
-    """See the module.
-
-    Parameters
-    ----------
-    who : str
-        The stamper.
-    """
+    """See the module; `who` is the name of the stamper."""
 
     def __init__(self, who: str, sinks: Collection[str]) -> None:
         self._who, self._sinks = who, frozenset(sinks)
@@ -66,7 +61,7 @@ class Intervals:
         self._unreported: list[tuple[int, int]] = []
 
     def hear(self, beat: Beat, now_ns: int) -> None:
-        """Learn from a beat that came directly how far its node is."""
+        """Measure the round trip to a node by a direct beat."""
         for heard in beat.heard:
             if heard.who == self._who:
                 held_ns = beat.sent_ns - heard.at_ns
@@ -74,17 +69,17 @@ class Intervals:
                 best.take(max(now_ns - heard.beat_ns - held_ns, 0), now_ns)
 
     def return_ns(self, node: str) -> int | None:
-        """Return the best time, ns, of a message from a node to here; None if it is not known."""
+        """Return the estimated best transmission time from a node to here, ns; None if unknown."""
         best = self._best.get(node)
         round_trip_ns = None if best is None else best.value_ns
         return None if round_trip_ns is None else round_trip_ns // 2
 
     def completed(self, done: Completion, now_ns: int, *, newest: int, direct: bool) -> None:
-        """Take in a sink's completion, or its second copy.
+        """Process a sink's completion, or its second copy.
 
-        A cycle that was first heard of over the detour has no interval, as its way back is not
-        known; nor has a cycle beyond the last `MOST_WAITING` up to `newest`, the last that may
-        have been sent: such a number is old or false.
+        If a sink's completion arrives first over the detour, the cycle has no interval, because the
+        transmission time is unknown. Only the last `MOST_WAITING` cycles up to `newest`, the last
+        cycle that may have been sent, count; other numbers are old or false.
         """
         cycle = done.stamp.cycle
         waiting = self._waiting.get(cycle)
@@ -107,6 +102,6 @@ class Intervals:
             del self._unreported[:-MOST_REPORTED]
 
     def take_unreported(self) -> tuple[tuple[int, int], ...]:
-        """Return cycles and their intervals, ns, that have not been returned before."""
+        """Return the cycles and intervals, ns, that are new since the last call."""
         reported, self._unreported = tuple(self._unreported), []
         return reported

@@ -1,19 +1,19 @@
-"""LiveWindows: stamps, completions and loads of a running cell in, closed windows out.
+"""LiveWindows: turns the stamps, completions and loads of a running cell into closed windows.
 
 All instants are on the stamper's clock (see `offsets`), from the first release of the run. A window
-is W consecutive cycles. It closes `close_grace_ms` after the release of the next cycle, or D after
-its last release if that is later. When the term or the placement changes within a window, or while
-an order is under way, the window starts again with the first cycle of the new stamp. The cycles
-before it are lead and belong to no window.
+is W consecutive cycles. It ends `close_grace_ms` after the release of the next cycle, or D after
+its last release if that is later. If the term or the placement changes within a window, or an order
+is under way, the window starts again with the first cycle of the new term. The cycles before it are
+lead and belong to no window.
 
 If `decide_cycles` is below W, this rule applies to the cycles between two decisions. Windows then
 continue over ordered moves. They start again with a move of the guard and after an outage of the
 stamper, and the next decision records them. Overdue decisions are missed.
 
-Messages are lost, late and doubled. A stamp or a completion makes a cycle known. An unknown cycle
-between two known cycles counts as released between them. Whether it has completed is unknown, and
-so is the completion of the cycle before it: neither counts, and the window is unproven. Numbers
-that a restarted stamper has left out were never cycles: fewer periods have passed than numbers.
+Messages may be lost, late or doubled. A stamp or a completion makes a cycle known. An unknown cycle
+between two known cycles counts as released between them. Completions of this cycle and of the cycle
+before it may be lost; without a report neither counts, and the window is unproven. Numbers that a
+restarted stamper has skipped were never cycles: too little time has passed for them.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ from dwell.live.wire.messages import Completion, Load, Stamp, Stamped
 from dwell.model import Problem
 from dwell.model.window_close import window_close_ns
 
-#: A window whose latencies may be off by more than this share of D is marked unproven.
+#: Largest error bound of latencies in a proven window, as a share of D.
 PROVEN_SHARE = 0.2
-#: Numbers between two cycles were cycles if they had this share of a period each.
+#: Time per number, in periods, at which unknown numbers between two cycles count as cycles.
 NEAR_PERIOD = (0.75, 1.25)
-#: Where the stamper's clock and the controller's disagree by this much on the time since the last
-#: stamp, one of them has begun anew.
+#: Disagreement of the stamper's clock with the controller's about the time since the last stamp,
+#: from which on one of them must have restarted.
 CLOCK_BREAK_NS = 60_000_000_000
-#: Cycles remembered beyond some windows.
+#: Number of cycles kept in addition to some windows.
 KEPT_CYCLES = 1_000
 
 
@@ -53,14 +53,8 @@ KEPT_CYCLES = 1_000
 class _Stretch:
     """Consecutive cycles of the line: the next window, or the evidence of the next decision.
 
-    Parameters
-    ----------
-    size : int
-        Number of cycles.
-    at : int
-        Place in the line of the first cycle after the previous stretch.
-    begun : (int, bool), optional
-        Its first place, and whether an order is awaited, while nothing has changed either.
+    `at` is the place in the line of the first cycle after the previous stretch. `begun` caches the
+    place at which the stretch starts, and whether it waits for an order.
     """
 
     size: int
@@ -71,8 +65,7 @@ class _Stretch:
 class LiveWindows:
     """Closes the windows of one cell.
 
-    Every window that `close` returns goes to the controller's `propose` or `miss`, one for one;
-    what it saw is kept beside the window.
+    After each `close`, the controller's `propose` or `miss` must be called once.
 
     Parameters
     ----------
@@ -82,14 +75,14 @@ class LiveWindows:
     Attributes
     ----------
     origin_ns : int or None
-        First release of the run, on the stamper's clock; None before a stamp was heard.
+        First release of the run, on the stamper's clock; None before the first stamp.
     last, looked : LiveWindow or None
         The last window, and the cycles that the last decision looked at. They are the same if
         the cell decides once per window.
     heard : int
-        Number of heard cycles since the previous decision.
+        Number of known cycles since the previous decision.
     ignored : int
-        Messages about unknown placements, sinks or nodes, or cycles of long ago.
+        Number of messages about unknown placements, sinks or nodes, or about old cycles.
     """
 
     def __init__(
@@ -116,38 +109,32 @@ class LiveWindows:
         self._deadline_ns = problem.pipeline.deadline_ns
         self._proven_ns = int(PROVEN_SHARE * self._deadline_ns)
         self._longest = 8 * self._size + KEPT_CYCLES
-        #: What is recorded.
+        #: Rows to record.
         self.record = RunRows(
             *(controller, self._ledger, self._processes),
             resume=resume,
             kept=4 * self._size + KEPT_CYCLES,
         )
-        #: Whether decisions come more often than windows close.
+        #: Whether decisions are more frequent than windows.
         self.often = problem.decide_cycles < self._size
         self._window = _Stretch(self._size)
         self._stretch = _Stretch(problem.decide_cycles) if self.often else self._window
-        # The last decided cycles that the next decision may look at, then the cycles that are in no
-        # closed window yet, by release; and all that are remembered.
+        # In order of release: decided cycles that the next decision may look at, then cycles that
+        # no closed window contains. `_by_key` has all cycles that are kept.
         self._line: list[LiveCycle] = []
         self._by_key: dict[tuple[int, int], LiveCycle] = {}
         self._newest: tuple[LiveCycle, int | None] | None = None
-        # The term that a migration leaves, while it is under way.
+        # Run and term that the migration under way will end.
         self._left: tuple[int, int] | None = None
         # The term of the guard's last move, and the term that the controller knows.
         self._fell = self._entered = (0, 0)
         self._lead = 0
         self._next_window = resume.window
 
-    # ------------------------------------------------------------------ what is heard
+    # ------------------------------------------------------------------------ messages
 
     def stamped(self, stamp: Stamp, at_ns: int | None = None) -> None:
-        """A cycle was released.
-
-        Parameters
-        ----------
-        at_ns : int, optional
-            When this was heard, on the controller's clock.
-        """
+        """Add a released cycle; its stamp arrived at `at_ns` on the controller's clock."""
         cycle = self._note(stamp, at_ns)
         if cycle is not None and cycle.stamped_ns is None:
             cycle.stamped_ns = at_ns
@@ -155,18 +142,14 @@ class LiveWindows:
                 cycle.group_ns = stamp.group_ns
 
     def completed(self, completion: Completion, at_ns: int | None = None) -> None:
-        """A sink has had a cycle's command, or a cycle or its shadow has ended before that.
+        """Add a report: a cycle's command reached a sink, or a job ended before a sink.
 
-        Parameters
-        ----------
-        completion : Completion
-            With the outcome ``replaced`` it is a worker's: a newer cycle has taken its place. Its
-            `sink` is the task, and its last hop says when that was ready, and nothing more.
-        at_ns : int, optional
-            When this was heard, on the controller's clock.
+        With the outcome ``replaced`` the report is from a worker: a newer cycle has replaced its
+        job. `sink` is then the worker's task, and the last hop has only its time of arrival. The
+        report arrived at `at_ns` on the controller's clock.
         """
         stamp = completion.stamp
-        # Of term 0 is a source's own guess: it counts where the stamper has released such a cycle.
+        # Term 0 is a source's guess; it counts if the stamper has released such a cycle.
         guessed = not stamp.term and stamp.key not in self._by_key
         if guessed or not self._ledger.tells(completion):
             self.ignored += 1
@@ -178,13 +161,13 @@ class LiveWindows:
             self._symptoms.completed(completion, at_ns)
         if self._ledger.complete(cycle):
             self.record.newest_done = max(self.record.newest_done, cycle.key)
-        # Before its window closes, rather than all at once then, where the clocks' bound allows.
+        # Settle cycles one by one, not all at the end of the window, if the error bound permits.
         settled = cycle.row >= 0 or cycle.told
         self._ledger.settle(cycle, most_ns=None if settled else self._proven_ns)
         self.record.touch(cycle)
 
     def measured(self, run: int, intervals: Iterable[tuple[int, int]]) -> None:
-        """The stamper has measured how long cycles took, ns."""
+        """Add the intervals of cycles, ns, that the stamper has measured."""
         for number, interval_ns in intervals:
             cycle = self._by_key.get((run, number))
             if cycle is not None:
@@ -195,13 +178,7 @@ class LiveWindows:
                     self.record.touch(cycle)
 
     def loaded(self, load: Load, at_ns: int = 0) -> None:
-        """A node's agent has read its counters.
-
-        Parameters
-        ----------
-        at_ns : int, optional
-            When this was heard, on the controller's clock.
-        """
+        """Add an agent's report of its node, which arrived at `at_ns` on the controller's clock."""
         if load.node in self._ledger.loads:
             if self._newest is not None:
                 self._stages.take(load, self._newest[0].key, at_ns)
@@ -212,33 +189,27 @@ class LiveWindows:
             self.ignored += 1
 
     def spent(self, node: str, at_ns: int, who: str, cpu_ns: int) -> None:
-        """Take note of what a process has taken of its node's CPU since it was started."""
+        """Record the CPU time that a process has used since its start."""
         if self._keeps_jobs:
             self._processes.report(node, at_ns, [(who, cpu_ns)])
 
     def ordered(self, run: int, term: int) -> None:
-        """A migration is under way: the next window begins with it, or goes on when `refused`.
+        """Record a migration that will end a term; the next window begins with the new term.
 
-        Parameters
-        ----------
-        run, term : int
-            The term that it leaves.
+        If `refused` is called, the window continues.
         """
         self._left = run, term
         self._begin_again()
 
     def refused(self) -> None:
-        """The migration will not come about: windows go on where they were."""
+        """Continue the window, because the migration was refused or given up."""
         self._left = None
         self._begin_again()
 
     def fell(self, run: int, term: int) -> LookedAt:
-        """Begin the next window with a move of the guard; returns its place in the record.
+        """Begin the next window with a move of the guard, which began a term of a run.
 
-        Parameters
-        ----------
-        run, term : int
-            The term that begins with it.
+        Return the window and the last cycle before the move, as numbers in the record.
         """
         self._fell = run, term
         self._begin_again()
@@ -247,13 +218,13 @@ class LiveWindows:
         return LookedAt(self._next_window, self.record.next_row + count - 1, 0)
 
     def forget(self, run: int, cycle: int) -> None:
-        """Take a cycle, and those after it, for never released: what told of them was wrong."""
+        """Remove a cycle and all later cycles: a wrong message reported their release."""
         key = run, cycle
         self._line = [known for known in self._line if known.key < key]
         for known in [known for known in self._by_key if known >= key]:
             del self._by_key[known]
         last = max(self._by_key.values(), key=lambda known: known.key, default=None)
-        # The stamp that was wrong may have moved the origin. Only later stamps show that it was.
+        # The wrong stamp may have moved the origin; only later stamps show this.
         heard_ns = (one.stamped_ns for one in self._by_key.values() if one.stamped_ns is not None)
         self._newest = None if last is None else (last, max(heard_ns, default=None))
         if last is not None:
@@ -264,7 +235,7 @@ class LiveWindows:
         self._begin_again()
 
     def set_back(self, back_ns: int) -> None:
-        """The controller's clock has been set back: what was heard by it was heard before that."""
+        """Shift the times of arrival after the controller's clock was set back."""
         for cycle in self._line:
             cycle.heard_before(back_ns)
         self._symptoms.set_back(back_ns)
@@ -285,7 +256,7 @@ class LiveWindows:
         elif (line := self._line[max(self._window.at, self._stretch.at) :]) and key > line[0].key:
             return self._insert(stamp)
         else:
-            # Before the first one heard, or of long ago.
+            # The cycle is before the first known cycle, or too old.
             self.ignored += 1
         return known
 
@@ -294,7 +265,7 @@ class LiveWindows:
         if cycle.row < 0:
             line = self._line
             place = bisect.bisect_left(line, cycle.key, key=lambda other: other.key)
-            # Releases never decrease; a stamp that says otherwise is damaged.
+            # Releases increase with the cycles' numbers; keep a damaged stamp between them.
             around = [other.at_ns for other in line[max(place - 1, 0) : place + 2]]
             cycle.at_ns = sorted((around[0], cycle.at_ns, around[-1]))[1]
             self._begin_again()
@@ -304,7 +275,7 @@ class LiveWindows:
         if at_ns is not None:
             self._symptoms.begun(at_ns)
         if self.origin_ns is None or (self._newest is None and stamp.released_ns < self.origin_ns):
-            # A clock that is behind the run's beginning has begun anew since.
+            # The stamper's clock is behind the origin of the run, so it has restarted.
             self.origin_ns = stamp.released_ns
         if self._newest is not None:
             self._follow(*self._newest, stamp, at_ns)
@@ -316,7 +287,7 @@ class LiveWindows:
         self._add(cycle)
         self._newest = cycle, at_ns
         if len(line) > self._longest:
-            # Nobody has said what became of an order.
+            # An order has remained without an answer for too long.
             self._leave(len(line) - self._size)
         return cycle
 
@@ -330,7 +301,7 @@ class LiveWindows:
     def _follow(
         self, newest: LiveCycle, heard_ns: int | None, stamp: Stamp, at_ns: int | None
     ) -> None:
-        """Begin a window anew where the stamper's clock has begun anew, with its node."""
+        """Shift the origin and begin a new window if the stamper's clock has restarted."""
         passed_ns = stamp.released_ns - newest.origin_ns - newest.at_ns
         own_ns = passed_ns if heard_ns is None or at_ns is None else at_ns - heard_ns
         if passed_ns >= 0 and abs(passed_ns - own_ns) < CLOCK_BREAK_NS:
@@ -340,7 +311,7 @@ class LiveWindows:
         self._leave(len(self._line))
 
     def _between(self, last: LiveCycle, following: LiveCycle) -> Iterable[LiveCycle]:
-        """Cycles nobody heard of between two that are known."""
+        """Yield the unknown cycles between two known cycles."""
         steps, span_ns = following.number - last.number, following.at_ns - last.at_ns
         least, most = (steps * self._period_ns * share for share in NEAR_PERIOD)
         if last.run != following.run or not 1 < steps <= self._longest:
@@ -352,7 +323,7 @@ class LiveWindows:
                 yield LiveCycle(*who, at_ns, last.origin_ns, heard=False)
 
     def _insert(self, stamp: Stamp) -> LiveCycle | None:
-        """Put a cycle where it belongs, among numbers that seemed to have been left out."""
+        """Insert a cycle whose number seemed to have been skipped, if its release fits."""
         line = self._line
         cycle = LiveCycle.of(stamp, line[-1].origin_ns)
         place = bisect.bisect(line, cycle.key, key=lambda other: other.key)
@@ -364,14 +335,14 @@ class LiveWindows:
         self._begin_again()
         return cycle
 
-    # -------------------------------------------------------------- when a window closes
+    # --------------------------------------------------------------- ends of windows
 
     def _begin_again(self) -> None:
-        """Forget where window and stretch begin."""
+        """Clear the cached starts of window and stretch."""
         self._window.begun = self._stretch.begun = None
 
     def _begin(self, one: _Stretch) -> tuple[int, bool]:
-        """Place in the line where a stretch starts, and whether an order is awaited."""
+        """Return the place in the line at which a stretch starts, and whether an order is open."""
         course = self._controller.course
         if self._entered != (course.run, course.term):
             self._entered = course.run, course.term
@@ -389,7 +360,7 @@ class LiveWindows:
         return one.begun or (start, True)
 
     def _is_begun(self, one: _Stretch, first: LiveCycle, place: int) -> bool:
-        """Whether a stretch that has begun with a cycle begins again at a place in the line."""
+        """Whether a stretch that began with `first` must begin again at a place in the line."""
         before, cycle = self._line[place - 1 : place + 1]
         if self.often and (cycle.run != before.run or cycle.number > before.number + 1):
             # The stamper was down.
@@ -399,10 +370,10 @@ class LiveWindows:
         return cycle.segment != first.segment
 
     def _waits(self, one: _Stretch, cycle: LiveCycle) -> bool:
-        """Whether a cycle has a term that a migration leaves, or an earlier term.
+        """Whether a cycle is in a term that a migration will end, or in an earlier term.
 
-        If decisions are more frequent than windows, a cycle also waits if the controller does not
-        know its term.
+        If decisions are more frequent than windows, cycles in a term that the controller does not
+        know wait too.
         """
         term = cycle.run, cycle.term
         if self.often and (one is self._window or term != self._entered):
@@ -410,13 +381,7 @@ class LiveWindows:
         return self._left is not None and term <= self._left
 
     def due_ns(self, now_ns: int) -> int | None:
-        """Return when the next decision is due, on the controller's clock; None if not known.
-
-        Parameters
-        ----------
-        now_ns : int
-            The clock's time: a cycle that has been heard of has been released.
-        """
+        """Return when the next decision is due, on the controller's clock; None if unknown."""
         end = self._end()
         if end is None:
             return None
@@ -431,29 +396,22 @@ class LiveWindows:
         return min(released_ns, beyond.stamped_ns) + self._close_ns(end) - beyond.at_ns
 
     def _end(self) -> int | None:
-        """Place in the line of the first cycle after the next decision's."""
+        """Place in the line of the first cycle after the next decision's cycles."""
         start, ordered = self._begin(self._stretch)
         end = start + self._stretch.size
         return None if ordered or len(self._line) <= end else end
 
     def _close_ns(self, end: int) -> int:
-        """Close of the window that ends before a place in the line, since the origin."""
+        """Return the end, since the origin, of the window before a place in the line."""
         last, beyond = self._line[end - 1 : end + 1]
         return int(window_close_ns(self.problem, last.at_ns, beyond.at_ns))
 
     def close(self, *, unix_ns: int | None = None) -> ClosedWindow:
         """Close the windows that have ended, and return the cycles of the decision.
 
-        Returns
-        -------
-        ClosedWindow
-            Its instants count from the first release of the run; more is in `looked`.
-
-        Raises
-        ------
-        LiveError
-            If none is due: fewer than `decide_cycles` + 1 cycles are known, or a migration is under
-            way.
+        Instants count from the first release of the run; `looked` has more about the cycles.
+        Raises a LiveError if no decision is due: fewer than `decide_cycles` + 1 cycles are known,
+        or a migration is under way.
         """
         end = self._end()
         if end is None:
@@ -479,7 +437,7 @@ class LiveWindows:
             cycle.window, cycle.close_ns = self._next_window, closed.close_ns
         self.last = last = self._seen(cycles, closed, self._line[end].at_ns, unix_ns)
         if self.often and 2 * last.heard >= self._size:
-            # The cycle before it shows whether a move takes effect with its first cycle.
+            # The cycle before the window shows whether a move takes effect with its first cycle.
             names = [cycle.placement for cycle in self._line[max(start - 1, 0) : end]]
             last.seen = self._controller.seen(closed, names)
         self._take_off(end)
@@ -501,7 +459,7 @@ class LiveWindows:
         return self._seen(line[first:end], closed, line[end].at_ns), closed
 
     def _closed(self, begin: int, end: int) -> ClosedWindow:
-        """Return the cycles between two places in the line as policies and estimators get them."""
+        """Return the cycles between two places in the line as input of policies and estimators."""
         cycles, close_ns = self._line[begin:end], self._close_ns(end)
         for cycle, following in pairwise(self._line[max(begin, self._window.at) : end + 1]):
             self._ledger.settle(cycle)
@@ -528,7 +486,7 @@ class LiveWindows:
         beyond_ns: int,
         unix_ns: int | None = None,
     ) -> LiveWindow:
-        """Return cycles as the record and the status show them."""
+        """Return cycles in the form of the record and the status."""
         bound_ns = max(cycle.bound_ns for cycle in cycles)
         return LiveWindow(
             number=closed.looked.window,
@@ -549,7 +507,7 @@ class LiveWindows:
         self._drop(self._stretch.at)
 
     def _leave(self, end: int) -> None:
-        """Leave the cycles before a place in the line out of windows and decisions."""
+        """Exclude the cycles before a place in the line from windows and decisions."""
         self._drop(end)
         self._stretch.at = max(self._stretch.at, end)
         self._forget_line(end)
@@ -563,7 +521,7 @@ class LiveWindows:
         self._take_off(end)
 
     def _take_off(self, end: int) -> None:
-        """Move cycles up to a place in the line to the record, and forget those of long ago."""
+        """Record the cycles before a place in the line, and forget the oldest cycles."""
         cycles = self._line[self._window.at : end]
         for old in self.record.add(cycles):
             if self._by_key.get(old.key) is old:
@@ -572,7 +530,7 @@ class LiveWindows:
         self._begin_again()
 
     def _forget_line(self, count: int) -> None:
-        """Drop the first cycles of the line, which no decision needs any more."""
+        """Drop the first cycles of the line; no decision needs them."""
         del self._line[:count]
         self._window.at -= count
         if self.often:
@@ -580,7 +538,7 @@ class LiveWindows:
         self._begin_again()
 
     def symptoms(self, now_ns: int) -> dict[str, object]:
-        """Return what the cycles say of the cell's health, as plain values (see `Symptoms`)."""
+        """Return symptoms of the cell's cycles and counts of its stages, as plain values."""
         found = self._symptoms.status(list(reversed(self._by_key.values())), now_ns)
         if self._newest is None:
             return {**found, "stages": {}, "flows": {}, "slow": [], "counted_cycles": None}
@@ -595,14 +553,14 @@ class LiveWindows:
         return {**found, **stages, "slow": list(slow)}
 
     def _span_ns(self, run: int, begin: int, end: int) -> int:
-        """Time between the releases of two cycles; by the period where one is not known."""
+        """Time between the releases of two cycles; a multiple of P if a cycle is not known."""
         first, last = (self._by_key.get((run, number)) for number in (begin, end))
         if first is None or last is None or last.at_ns <= first.at_ns:
             return (end - begin) * self._period_ns
         return last.at_ns - first.at_ns
 
     def status(self) -> dict[str, object]:
-        """Return how the windows are, as plain values."""
+        """Return the counts and the last window for the status, as plain values."""
         last = self.last
         status: dict[str, object] = {
             "windows": self._next_window,

@@ -1,4 +1,4 @@
-"""Loads: CPU counters of nodes and of processes at any instant between two reports."""
+"""Loads: CPU counters of nodes and processes, interpolated between two reports."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from dwell.live.wire.continuity import OvershootDetector
 from dwell.live.wire.messages import Load
 from dwell.model.number_arrays import Floats
 
-#: Reports remembered of a node.
+#: Largest number of reports kept per node or process.
 KEPT = 4_096
-#: Processes of a node that are remembered; more are none of the cell's.
+#: Largest number of processes per node; more are not from the cell.
 MOST_PROCESSES = 256
 
 
 class NodeLoad:
-    """Work of a node over its own time.
+    """Work of a node by its own clock.
 
-    Core-nanoseconds of all work, of the cell's jobs and of its shadows; the nanoseconds that its
-    accelerator was busy, and those in which a hook said so.
+    Core-nanoseconds of all work, of the cell's processes and of its shadows; nanoseconds for which
+    its accelerator was busy, and for which a hook measured it.
     """
 
     def __init__(self) -> None:
@@ -33,7 +33,7 @@ class NodeLoad:
         self._overshoot = OvershootDetector()
 
     def report(self, load: Load) -> None:
-        """Take a report in; copies and late ones change nothing."""
+        """Add a report; copies and late reports are ignored."""
         last_ns = self._at_ns[-1] if self._at_ns else -1
         if (load.life, load.at_ns) <= (self._life, last_ns):
             if not self._overshoot.behind(load.life, load.at_ns):
@@ -47,7 +47,7 @@ class NodeLoad:
             grown = np.maximum(read - self._read, 0.0)
             total = total + np.append(grown, (load.accelerator * told_ns, told_ns))
         elif load.at_ns <= last_ns:
-            # Not only the agent began anew, but its node's clock; or that instant was false.
+            # The node's clock has restarted too, or the last instant was false.
             self._at_ns.clear()
             self._total.clear()
         self._life, self._read = load.life, read
@@ -55,10 +55,10 @@ class NodeLoad:
         self._total.append(total)
 
     def at(self, instant_ns: int) -> Floats:
-        """Core-nanoseconds, and those of the accelerator, at an instant; shape (5,).
+        """Return the work up to an instant, as in the class; shape (5,).
 
-        In proportion between two reports; beyond the first or last one for no longer than from one
-        report to the next, so that a node that falls silent counts as idle.
+        Values between two reports are interpolated. Values outside are extrapolated by at most one
+        interval between reports, after which a silent node counts as idle.
         """
         at_ns, total = self._at_ns, self._total
         if len(at_ns) < 2:
@@ -70,14 +70,14 @@ class NodeLoad:
         return found
 
     def forget(self, before_ns: int) -> None:
-        """Drop the reports that only instants before this one need."""
+        """Drop the reports that only earlier instants need."""
         while len(self._at_ns) > 2 and self._at_ns[1] < before_ns:
             self._at_ns.popleft()
             self._total.popleft()
 
 
 class ProcessLoads:
-    """CPU time that processes have taken, each over its node's own time."""
+    """CPU time of processes, by the clock of their node."""
 
     def __init__(self) -> None:
         self._of: dict[tuple[str, str], tuple[deque[int], deque[int]]] = {}
@@ -85,7 +85,7 @@ class ProcessLoads:
         self._count: Counter[str] = Counter()
 
     def report(self, node: str, at_ns: int, processes: Iterable[tuple[str, int]]) -> None:
-        """Take in the CPU time of a node's processes since each was started."""
+        """Add the CPU time of a node's processes since their starts, ns."""
         for who, cpu_ns in processes:
             key = node, who
             if key not in self._of:
@@ -95,22 +95,22 @@ class ProcessLoads:
                 self._of[key] = deque(maxlen=KEPT), deque(maxlen=KEPT)
             at, total = self._of[key]
             if at and at_ns < at[-1]:
-                # Its node's clock began anew.
+                # The node's clock has restarted.
                 at.clear()
                 total.clear()
             elif at and at_ns == at[-1]:
                 continue
             before = self._read.get(key, 0)
-            # One that was started again counts from 0 again.
+            # A restarted process counts from 0.
             grown = cpu_ns - before if cpu_ns >= before else cpu_ns
             at.append(at_ns)
             total.append((total[-1] if total else 0) + grown)
             self._read[key] = cpu_ns
 
     def between(self, node: str, begin_ns: int, end_ns: int) -> dict[str, float]:
-        """CPU time, nanoseconds, of every process of a node between two instants of its clock.
+        """Return the CPU time, ns, of every process of a node between two instants of its clock.
 
-        In proportion between two reports; nothing before the first and after the last.
+        Values between two reports are interpolated; outside the reports there is no use of CPU.
         """
         spent_ns = {}
         for (where, who), (at, total) in self._of.items():

@@ -1,4 +1,4 @@
-"""Recording: the folder of a live run, written while it goes on."""
+"""Recording: the folder of a live run, written during the run."""
 
 from __future__ import annotations
 
@@ -17,34 +17,34 @@ from dwell.record import seal_run
 from dwell.record.journal import Journal
 from dwell.version import __version__
 
-#: Rows that wait in memory while the folder cannot be written, some 25 MB; of more, those of the
-#: oldest windows are dropped.
+#: Largest number of rows that wait in memory until the folder can be written, about 25 MB; then
+#: the oldest are dropped.
 MOST_WAITING = 50_000
-#: Folders that are tried for one run, of which others may be in use.
+#: Largest number of folders to try for one run, as some may be in use.
 MOST_FOLDERS = 100
 
 
 class RunRecorder:
-    """Keeps the rows of a cell's runs, one folder a run id.
+    """Records the rows of a cell's runs, with one folder per run id.
 
-    A folder that cannot be written costs no decision: rows wait in memory, and are written when it
-    can be; that is tried whenever there are new ones, which is once a window.
+    A folder that cannot be written does not affect decisions: rows wait in memory, and every
+    `append` tries to write them.
 
     Parameters
     ----------
     jobs : bool
-        Whether to keep the jobs, and what each process took of the CPUs, too.
+        Whether to record jobs and the CPU time of processes too.
     continues : str
-        Name of the folder of the run before, which had other settings; empty for none.
+        Folder name of the previous run, which had other settings; empty if none.
 
     Attributes
     ----------
     folder : Path or None
-        Folder of the run that is kept; None until it could be made.
+        Folder of the current run; None until it is created.
     trouble : str
-        Why it cannot be written; empty where it can.
+        Reason that the folder cannot be written; empty if it can.
     waiting, dropped : int
-        Rows that wait, and that found no room any more.
+        Number of rows that wait, and of rows dropped because too many waited.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class RunRecorder:
         return None if self._journal is None else self._journal.folder
 
     def open(self, run: int) -> Resume:
-        """Begin to keep a run, or go on with it; returns where."""
+        """Start or continue the record of a run; return its next window and cycle."""
         self.finish()
         self._run = run
         self._journal = journal = self._opened(run)
@@ -83,10 +83,10 @@ class RunRecorder:
         return Resume(window, cycle, journal.meta.get("origin_ns"), self.jobs)
 
     def _opened(self, run: int, *, new: bool = False) -> Journal | None:
-        """Open a run's journal; None where it cannot be written.
+        """Open a run's journal; return None if no folder can be written.
 
-        In a further folder where a controller before has sealed it, or another one writes it, or it
-        is of another cell file; also where it has rows, and has to be new.
+        It skips folders that are sealed, in use by another controller, from another cell file, or,
+        with `new`, not empty.
         """
         columns = columns_of(self.controller, jobs=self.jobs)
         for count in range(1, MOST_FOLDERS + 1):
@@ -111,7 +111,7 @@ class RunRecorder:
         return None
 
     def append(self, rows: Rows, **meta: object) -> None:
-        """Keep rows; a disk that is full costs at most the rows, and not the control."""
+        """Record rows; if the disk is full, rows may be lost, but control continues."""
         if self._run is None:
             return
         self._rows.append((rows, meta))
@@ -123,7 +123,7 @@ class RunRecorder:
             self.dropped += count
 
     def _write(self) -> None:
-        """Write what waits, as far as it can be written."""
+        """Write the waiting rows until a write fails."""
         if self._journal is None and self._run is not None:
             self._journal = self._opened(self._run, new=True)
         if self._journal is None:
@@ -145,7 +145,7 @@ class RunRecorder:
             self.trouble, self.dropped = "", 0
 
     def _complain(self, error: RunError) -> None:
-        """Have the log say once that a folder cannot be written."""
+        """Log once that a folder cannot be written."""
         if self.trouble != str(error):
             self._say(
                 f"error: {error}; decisions go on, and the run's last {self._most} rows wait for it"
@@ -153,7 +153,7 @@ class RunRecorder:
         self.trouble = str(error)
 
     def finish(self, rows: Rows | None = None) -> Path | None:
-        """Write the tables of the run; returns its folder, None where there was none."""
+        """Write the tables of the run; return its folder, or None if no run is open."""
         if rows is not None:
             self.append(rows)
         if self._rows:

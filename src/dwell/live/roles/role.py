@@ -1,4 +1,4 @@
-"""RolePlace, RoleLogic and Pulse: every process of a cell hears, wakes and beats."""
+"""RolePlace, RoleLogic and Pulse: what all processes of a cell share, and their beats."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ from dwell.model.document import digests
 from dwell.model.instants import NEVER_NS
 from dwell.version import __version__
 
-#: What PTP and chrony on one network keep to.
+#: Error bound of clocks that PTP or chrony synchronises on one network.
 SYSTEM_BOUND_NS = 1_000_000
-#: Different complaints that are counted; a new one takes the place of the oldest.
+#: Largest number of different complaints counted; a new complaint replaces the oldest.
 MAX_COMPLAINTS = 100
-#: Processes that are remembered for not belonging to the cell as this one knows it.
+#: Largest number of processes remembered with another version or cell file.
 MAX_STRANGERS = 256
-#: How long a beat repeats a complaint, and a stranger who has fallen silent is remembered.
+#: Time for which beats repeat a complaint, and a silent stranger stays in the status.
 REPEATED_NS = 10_000_000_000
-#: Beats of an earlier life, one after another, that no late message explains.
+#: Number of beats from an earlier life that shows two running processes with one name.
 RIVAL_BEATS = 5
 #: Periods between two beats of an agent, and between two reports of another process's beats.
 AGENT_BEAT = 5
@@ -66,34 +66,26 @@ class BeatState(NamedTuple):
 class RoleLogic(Protocol):
     """A process of a cell, without its threads, sockets and clock.
 
-    Its host calls one method at a time: `receive` for every message under its
-    `subscriptions`, `wake` when the instant has come that the last call returned.
+    The host calls one method at a time: `receive` for every message under its `subscriptions`,
+    and `wake` at the instant that the last call returned.
     """
 
     def subscriptions(self) -> Iterable[str]:
-        """Key expressions that it wants to hear."""
+        """Key expressions to subscribe to."""
 
     def receive(self, sample: Arrival, now_ns: int) -> int | None:
-        """Take a message in; returns an instant at which something is due since, if that is so."""
+        """Process a message; return the next instant for `wake` if it has changed, or None."""
 
     def wake(self, now_ns: int) -> int:
-        """Do what is due; returns the next instant at which something is."""
+        """Do the work that is due; return the instant of the next call."""
 
 
 @dataclass(slots=True)
 class RolePlace:
-    """Where a role runs.
+    """Name, node and transport of a process; reads, writes, signs and checks its messages.
 
-    Parameters
-    ----------
-    who, node : str
-        Name of the process, unique in the cell, and its node.
-    life : int
-        Grows with every start of the process.
-    complaints : dict of str to int
-        How often something arrived that could not be used, by what was wrong with it.
-    seals : Seals, optional
-        Signs what it says and checks what it hears; without, nothing is signed.
+    `who` is unique in the cell; `life` grows with every start of the process. `complaints` counts
+    unusable messages by reason. Without `seals` messages are not signed.
     """
 
     problem: Problem
@@ -118,12 +110,12 @@ class RolePlace:
 
     @property
     def patience_ns(self) -> int:
-        """Age beyond which what was heard counts no more: g periods."""
+        """Age beyond which a received message no longer counts: g periods."""
         return self.problem.controller.guard_cycles * self.period_ns
 
     @property
     def hang_ns(self) -> int:
-        """Time from which on a call of a user's code hangs."""
+        """Time after which a call of the user's code counts as hanging."""
         return max(10 * self.period_ns, 1_000_000_000)
 
     @property
@@ -133,7 +125,7 @@ class RolePlace:
         return node, f"stamper@{node}"
 
     def offsets(self) -> Offsets:
-        """Make what compares clocks with that of the stamper's node."""
+        """Return new offsets of the nodes' clocks from the clock of the stamper's node."""
         system = self.problem.live.clock == "system"
         return Offsets(
             self.node,
@@ -142,7 +134,7 @@ class RolePlace:
         )
 
     def put(self, key: str, message: msgspec.Struct) -> None:
-        """Send a small message, signed where there are keys."""
+        """Send a small message, signed if there are keys."""
         self.transport.put(key, self._sealed(key, message))
 
     def _sealed(self, key: str, message: msgspec.Struct) -> bytes:
@@ -152,15 +144,8 @@ class RolePlace:
     def read(self, sample: Arrival, kind: type[T], by: Callable[[T], str]) -> T:
         """Read a message that `put` or `put_twice` has sent.
 
-        Parameters
-        ----------
-        by : callable
-            Returns the subject who has to have signed it: a node, or the controller.
-
-        Raises
-        ------
-        LiveError
-            If it is anything else, or signed by anybody else.
+        `by` returns the required signer: a node or the controller. Raises a LiveError if the
+        message is of another kind or the signature is not from this signer.
         """
         if self.seals is None:
             return decode(sample.payload, kind)
@@ -169,7 +154,7 @@ class RolePlace:
         return message
 
     def _require(self, sample: Arrival, name: str) -> None:
-        """Raise a LiveError unless a message was signed by a subject."""
+        """Raise a LiveError unless the named subject has signed a message."""
         if self.seals is not None:
             try:
                 self.seals.require(self.keys.word(sample.key), name, sample.payload)
@@ -177,13 +162,13 @@ class RolePlace:
                 raise LiveError(str(error)) from None
 
     def stamped(self, stamp: Stamp) -> bytes:
-        """Return the signature of a stamp that this process has made; nothing without keys."""
+        """Return this process's signature of a stamp; empty without keys."""
         if self.seals is None:
             return b""
         return self.seals.seal("stamp", encode(stamp))[:SIGNATURE_BYTES]
 
     def _require_stamped(self, seals: Seals, header: Header) -> None:
-        """Raise a TrustError unless the stamper has stamped a cycle, or its source guessed it."""
+        """Raise a TrustError unless the stamper, or for a guess a source's node, signed a stamp."""
         names = {self.stamper[0]}
         if not header.stamp.term:
             pipeline = self.problem.pipeline
@@ -197,12 +182,9 @@ class RolePlace:
         raise TrustError(f"stamp: cycle {header.stamp.cycle} is not signed by who may stamp it")
 
     def completion(self, sample: Arrival) -> Completion:
-        """Read what a sink, or a task where a cycle ended, says of a cycle.
+        """Read the completion of a cycle, from a sink or from the task at which the cycle ended.
 
-        Raises
-        ------
-        LiveError
-            If it is none, or about a task that does not run where it says.
+        Raises a LiveError if it is not a completion, or if its task cannot run on its node.
         """
         done = self.read(sample, Completion, lambda done: done.node)
         task = self.problem.pipeline.tasks.get(done.sink)
@@ -212,12 +194,9 @@ class RolePlace:
         return done
 
     def load(self, sample: Arrival) -> Load:
-        """Read what an agent says of its node.
+        """Read an agent's report of the load of its node.
 
-        Raises
-        ------
-        LiveError
-            If it is none, or about another node than its key says.
+        Raises a LiveError if it is not a load, or if its node differs from the node in its key.
         """
         load = self.read(sample, Load, lambda load: load.node)
         if not sample.key.endswith(f"/{load.node}"):
@@ -225,15 +204,10 @@ class RolePlace:
         return load
 
     def beat(self, sample: Arrival) -> Beat:
-        """Read a beat.
+        """Read a beat; raise a LiveError if it is not a beat, or if its sender is not in its key.
 
-        A beat that came directly was let through for its sender's certificate; a beat that was
-        carried here is believed for its signature.
-
-        Raises
-        ------
-        LiveError
-            If it is none, or another's than its key says.
+        Access control has checked the certificate of a direct beat's sender. The signature is
+        checked only for a beat from the detour.
         """
         signed = 0 if self.seals is None else SIGNATURE_BYTES
         beat = decode(sample.payload[signed:], Beat)
@@ -245,17 +219,17 @@ class RolePlace:
         return beat
 
     def put_twice(self, key: str, message: msgspec.Struct) -> None:
-        """Send a small message directly, and over the detour; signed where there are keys.
+        """Send a small message directly and over the detour, signed if there are keys.
 
-        Processes on the relay's own node do so, too: the detour reaches processes that have no
-        connection of their own to the sender.
+        Processes on the relay's own node do this too: the detour reaches processes without a
+        direct connection to the sender.
         """
         payload = self._sealed(key, message)
         self.transport.put(key, payload)
         self.transport.put(self.keys.relay(key), payload)
 
     def around(self, sample: Arrival) -> list[Arrival]:
-        """Return the messages that came over the detour together."""
+        """Return the messages that the relay has sent in one batch."""
         try:
             carried = decode(sample.payload, Carried)
         except LiveError as error:
@@ -269,7 +243,7 @@ class RolePlace:
         return fit
 
     def complain(self, error: LiveError) -> None:
-        """Count a message that could not be used; a flood of them takes no memory."""
+        """Count an unusable message; at most `MAX_COMPLAINTS` different reasons are kept."""
         what = printable(str(error))[:300]
         if what not in self.complaints and len(self.complaints) >= MAX_COMPLAINTS:
             del self.complaints[next(iter(self.complaints))]
@@ -280,10 +254,10 @@ class RolePlace:
             self.say(what)
 
     def header(self, sample: Arrival) -> Header | None:
-        """Read the header of a data message; None, and a complaint, where it is none.
+        """Read the header of a data message; complain and return None if it is invalid.
 
-        So it is where nobody has stamped the cycle who may: a cycle with too high a number would
-        keep all others from the actuator.
+        A stamp needs a valid signature, because a false cycle with too high a number would block
+        all later cycles at the actuator.
         """
         try:
             header = decode(sample.header, Header, limit=MAX_HEADER_BYTES)
@@ -296,18 +270,11 @@ class RolePlace:
 
 
 class Pulse:
-    """Beats of a process: its own, and those that it hears.
+    """Beats that a process sends and receives.
 
-    Parameters
-    ----------
-    state : callable
-        Returns whether the process is ready, and what keeps it from that or went wrong last.
-    holds : callable, optional
-        Returns the rest of the beat.
-    hears : iterable of (str, str), optional
-        Nodes and processes, or ``*``, whose beats it wants; by default the stamper's only.
-    every : int
-        Periods between two of its beats.
+    `state` returns whether the process is ready, and the reason if not or its last problem; `holds`
+    returns the optional fields of the beat. `hears` names the nodes and processes (or ``*``)
+    whose beats it receives, by default the stamper's only. It sends one beat per `every` periods.
     """
 
     def __init__(
@@ -328,7 +295,7 @@ class Pulse:
         self._nodes = frozenset(place.problem.fabric.nodes)
         self._known = {role.who: role.node for role in roles(place.problem)}
         self._next_ns = self._sent_ns = -NEVER_NS
-        #: Who is not heard because of its cell file or version: why, and when it beat last.
+        #: Rejected senders, by name: the reason, and the time of the last beat.
         self.strangers: dict[str, tuple[str, int]] = {}
         self._rivals: dict[str, int] = {}
         self._complained = 0
@@ -338,16 +305,16 @@ class Pulse:
         self._returned = keys.detour(self._key)
         direct = keys.beat("", "").removesuffix("/")
         self._prefix = direct, keys.detour(direct)
-        # Beats as they came directly: their copies say nothing new, and need not be read.
+        # Last direct beat by sender: an equal copy from the detour is skipped without decoding.
         self._detoured: dict[str, bytes] = {}
 
     def subscriptions(self) -> tuple[str, ...]:
-        """Key expressions of beats."""
+        """Key expressions of the beats to subscribe to."""
         keys = self.place.keys
         return tuple(keys.beat(node, who) for node, who in self._hears)
 
     def receive(self, sample: Arrival, now_ns: int) -> Beat | None:
-        """Take a beat in; None where it is none, or no news."""
+        """Process a beat; return it if it is valid and new, else None."""
         if not sample.key.startswith(self._prefix):
             return None
         if self._is_copy(sample):
@@ -369,7 +336,7 @@ class Pulse:
         return beat if self.detector.hear(beat, now_ns, direct=direct) else None
 
     def _is_copy(self, sample: Arrival) -> bool:
-        """Whether a beat is the copy of the last that came directly, or of one of its own."""
+        """Whether a beat is a copy of the sender's last direct beat, or this process's own beat."""
         direct, detour = self._prefix
         if sample.key == self._returned:
             return True
@@ -381,7 +348,7 @@ class Pulse:
         return False
 
     def _differs(self, beat: Beat) -> str:
-        """Return why a beat is not heard, or nothing."""
+        """Return the reason to reject a beat; empty if there is none."""
         place = self.place
         same = beat.version in ("", __version__)
         if not same and _series(beat.version) != _series(__version__):
@@ -400,7 +367,7 @@ class Pulse:
         return ""
 
     def _note_stranger(self, who: str, differs: str, now_ns: int) -> None:
-        """Remember who is not heard, and say it once."""
+        """Remember a rejected sender, and complain once per reason."""
         known = self.strangers.get(who)
         if known is None and len(self.strangers) >= MAX_STRANGERS:
             del self.strangers[next(iter(self.strangers))]
@@ -409,7 +376,7 @@ class Pulse:
             self.place.complain(LiveError(differs))
 
     def _look_for_rival(self, beat: Beat) -> None:
-        """Notice two processes of one name: the earlier one of two lives goes on beating."""
+        """Complain if two processes have one name: beats of an earlier life keep arriving."""
         last = self.detector.last(beat.who)
         if last is None or beat.life >= last.life:
             return
@@ -421,7 +388,7 @@ class Pulse:
         self._rivals[beat.who] = count
 
     def compare_clocks(self, sample: Arrival, now_ns: int, offsets: Offsets) -> None:
-        """Take a beat in, and what it tells of the clocks if it came directly."""
+        """Process a beat; if it came directly, use it to compare the clocks."""
         beat = self.receive(sample, now_ns)
         if beat is not None and self.place.keys.came_directly(sample.key):
             offsets.hear(beat, now_ns)
@@ -431,8 +398,8 @@ class Pulse:
         return sample.key.startswith(self._prefix)
 
     def wake(self, now_ns: int) -> int:
-        """Send the beat that is due; returns when the next is."""
-        # Due later than after a whole interval: the clock has been set back.
+        """Send the beat if it is due; return the instant of the next one."""
+        # If the next beat is due later than one interval from now, the clock was set back.
         back = self._next_ns > now_ns + self._every_ns
         if back or now_ns >= self._next_ns:
             self.send(now_ns)
@@ -441,7 +408,7 @@ class Pulse:
         return self._next_ns
 
     def put_off(self, due_ns: int) -> None:
-        """Send the next beat at an instant instead, but half an interval late at most."""
+        """Move the next beat to an instant, at most half an interval late."""
         self._next_ns = min(due_ns, self._sent_ns + self._every_ns * 3 // 2)
 
     def send(self, now_ns: int) -> None:
@@ -451,7 +418,7 @@ class Pulse:
         self._put(now_ns, ready, note or self._repeated(now_ns), self.detector.heard())
 
     def send_alone(self, now_ns: int, *, ready: bool, note: str) -> None:
-        """Send a beat without a look at the role: from another thread, while the role is busy."""
+        """Send a beat from another thread while the role is busy, without its state."""
         self._put(now_ns, ready, note, ())
 
     def _put(self, now_ns: int, ready: bool, note: str, heard: tuple[Heard, ...]) -> None:
@@ -466,7 +433,7 @@ class Pulse:
         place.put_twice(self._key, beat)
 
     def _repeated(self, now_ns: int) -> str:
-        """Return the last complaint, for a while after it was made."""
+        """Return the last complaint if it is at most `REPEATED_NS` old; else an empty string."""
         place = self.place
         if place.complained != self._complained:
             self._complained = place.complained
@@ -475,5 +442,5 @@ class Pulse:
 
 
 def _series(version: str) -> str:
-    """Return what two versions that understand each other have in common: major and minor."""
+    """Return major and minor version; they must be equal for processes to work together."""
     return ".".join(version.split(".")[:2])

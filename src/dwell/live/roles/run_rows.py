@@ -1,9 +1,8 @@
-"""Rows of a live run's tables (`dwell.record.schema` says what their columns are).
+"""Rows of a live run's tables (`dwell.record.schema` defines their columns).
 
-Cycles and windows count from 0 without gaps, as in any run; what the stamps say stands beside it.
-``jobs`` and ``processes`` are kept on request. A cycle that never reached a sink tells of none of
-its jobs, unless a newer one took its place on the way; a job that was replaced has no instants but
-that of its readiness.
+Cycles and windows count from 0 without gaps, as in any run; extra columns have the stamps' numbers.
+``jobs`` and ``processes`` are optional. If a cycle never reached a sink, its jobs are unknown,
+unless a newer cycle replaced it. A replaced job has only the time at which it was ready.
 """
 
 from __future__ import annotations
@@ -31,16 +30,11 @@ Rows: TypeAlias = dict[str, list[Row]]
 
 @dataclass(frozen=True, slots=True)
 class Resume:
-    """Where a run is gone on with, after its controller has been restarted.
+    """Point in a run from which a controller, perhaps restarted, records it.
 
-    Parameters
-    ----------
-    window, cycle : int
-        Numbers of the first window and cycle that will be recorded.
-    origin_ns : int, optional
-        First release of the run, on the stamper's clock; that of the first stamp heard where None.
-    jobs : bool
-        Whether the jobs, and what each process took of the CPUs, are recorded, too.
+    `window` and `cycle` are the numbers of the first window and cycle to record. `origin_ns` is the
+    first release of the run on the stamper's clock; None takes it from the first stamp. `jobs`
+    records jobs and the CPU time of processes too.
     """
 
     window: int = 0
@@ -51,29 +45,29 @@ class Resume:
 
 @dataclass(eq=False, slots=True)
 class LiveWindow:
-    """A closed window as it is recorded, or the cycles that a decision has looked at.
+    """A closed window for the record, or the cycles that a decision has looked at.
 
     Parameters
     ----------
     span_ns : int
-        Time from its first release to the first release beyond it.
+        Time from its first release to the first release after it.
     close_ns : int
-        Since the origin.
+        End of the window since the origin.
     lead : int
-        Cycles between the window before and this one.
+        Number of cycles between the previous window and this one.
     heard : int
-        Cycles of which anything was heard. Of a window with none nothing is known, and it is none
-        to decide on (`Controller.miss`).
+        Number of cycles with a known stamp. The controller misses a decision if less than
+        half of its cycles are known (`Controller.miss`).
     bound_ns : int
-        Bound of the error of its latencies, by the clocks; `UNBOUNDED_NS` where it is not known.
+        Error bound of its latencies, from the clocks; `UNBOUNDED_NS` if unknown.
     unproven : bool
-        Whether that is more than 20 % of D, or nobody knows of a cycle whether it has completed.
+        Whether the bound exceeds 20 % of D, or the outcome of a cycle is unknown.
     rate_at_close : float
-        V_D by what was known when it closed.
-    used : float64 array, shape (3, nodes)
-        Busy, own and shadow share of the cores.
+        V_D as known at the end of the window.
+    used : float64 array, shape (3, resources)
+        Utilisation by all work, by the cell's jobs, and by shadows.
     seen : tuple of float or None
-        What was decided on: L95 (ms), violation rate and cost; None where nobody has looked.
+        L95 (ms), violation rate and cost as the controller saw them, or None.
     """
 
     number: int
@@ -90,7 +84,7 @@ class LiveWindow:
     seen: tuple[float | None, ...] = (None, None, None)
 
     def shown(self, proposal: Proposal, controller: Controller) -> dict[str, Any]:
-        """Return a proposal and its cycles as the status shows them."""
+        """Return a proposal and its cycles for the status."""
         decision, names = proposal.decision, controller.problem.candidates
         l95_ms, _, cost = proposal.seen
         columns = controller.decision_columns[-len(proposal.priced) :]
@@ -117,23 +111,17 @@ class LiveWindow:
         }
 
     def violation_rate(self, deadline_ns: int) -> float:
-        """V_D: share of its cycles that missed, of those whose end is known by now."""
+        """Return V_D, the share of missed cycles among the cycles with a known outcome."""
         return violation_rate(told(self.cycles), deadline_ns)
 
 
 def sends_shadows(controller: Controller) -> bool:
-    """Whether cycles may be sent through alternatives: to measure them, or to prove them."""
+    """Whether cycles may have shadows, to measure or to prove other candidates."""
     return controller.sends_shadows or bool(controller.problem.controller.fallbacks)
 
 
 def columns_of(controller: Controller, *, jobs: bool = False) -> Columns:
-    """Type of every column of the tables that a live run under this controller has.
-
-    Parameters
-    ----------
-    jobs : bool
-        Whether it keeps those that are kept on request.
-    """
+    """Return the type of every column in the tables of a live run, with or without ``jobs``."""
     features: list[Feature] = ["live", *controller.features]
     if sends_shadows(controller):
         features.append("shadows")
@@ -142,12 +130,9 @@ def columns_of(controller: Controller, *, jobs: bool = False) -> Columns:
 
 
 class RunRows:
-    """Keeps what is to be recorded of a run, and tells which rows are new or have changed.
+    """Makes the rows of a run that are new or have changed.
 
-    Parameters
-    ----------
-    kept : int
-        Cycles that are remembered, so that late completions may change their rows.
+    `kept` is the number of recorded cycles whose rows late completions may still change.
     """
 
     def __init__(
@@ -167,9 +152,9 @@ class RunRows:
         self._sends_shadows = sends_shadows(controller)
         self._jobs = resume.jobs
         self._columns = columns_of(controller, jobs=resume.jobs)
-        #: Row of the next cycle, and last cycle that is known to have completed.
+        #: Row of the next cycle, and the last cycle that is known to be complete.
         self.next_row, self.newest_done = resume.cycle, (-1, -1)
-        # First cycle whose jobs are not recorded yet, and windows whose processes are not.
+        # First cycle without recorded jobs, and windows without recorded processes.
         self._next_jobs = resume.cycle
         self._unwritten: deque[LiveWindow] = deque()
         self._recorded: deque[LiveCycle] = deque()
@@ -179,7 +164,7 @@ class RunRows:
         self._in_flight: dict[int, LiveCycle] = {}
 
     def add(self, cycles: Iterable[LiveCycle]) -> Iterator[LiveCycle]:
-        """Record cycles; yields those of long ago, which are forgotten."""
+        """Record cycles; yield old cycles, which are then forgotten."""
         for cycle in cycles:
             cycle.row = self.next_row
             self.next_row += 1
@@ -200,20 +185,17 @@ class RunRows:
             self._unwritten.append(window)
 
     def touch(self, cycle: LiveCycle) -> None:
-        """Take note that more is known of a cycle; its row changes where it has one."""
+        """Mark the rows of a cycle and of its window as changed, if the cycle is recorded."""
         if cycle.row >= 0:
             self._changed[cycle.row] = cycle
             if cycle.window is not None:
                 self._changed_windows.add(cycle.window)
 
     def rows(self, *, last: bool = False) -> Rows:
-        """Return the rows that are new, or have changed since the last call.
+        """Return the rows that are new or have changed since the last call.
 
-        Parameters
-        ----------
-        last : bool
-            Whether no more will be asked for. Jobs, and what processes took, are told a window
-            late: of some it is not known earlier.
+        Rows of jobs and processes are one window late, because reports of some arrive later.
+        `last` returns them at once.
         """
         for row, cycle in self._in_flight.items():
             if self._outcome(cycle) != cycle.outcome:
@@ -230,14 +212,14 @@ class RunRows:
             **(self._job_values(last=last) if self._jobs else {}),
         }
         rows = {name: [row_of(self._columns[name], of) for of in values[name]] for name in values}
-        # What is recorded is not kept: a controller runs for months.
+        # Drop recorded decisions, because a controller runs for months.
         del self._controller.decisions[: len(rows["decisions"])]
         self._changed.clear()
         self._changed_windows.clear()
         return rows
 
     def _is_recorded(self, decision: Values) -> bool:
-        """Whether the record has the cycles of a decision."""
+        """Whether the cycles of a decision are recorded."""
         last = decision["last_cycle"]
         return isinstance(last, int) and last < self.next_row
 
@@ -334,11 +316,11 @@ class RunRows:
 
 
 def decision_values(controller: Controller, row: Sequence[object]) -> Values:
-    """Return a row of ``decisions``, with why it was not carried out."""
+    """Return a row of ``decisions``, with the reason if it was not carried out."""
     columns = *controller.decision_columns, "refused"
     return dict(zip(columns, map(_known, row), strict=True))
 
 
 def _known(value: object) -> object:
-    """Return None for what is not a number."""
+    """Return the value, or None if it is NaN."""
     return None if isinstance(value, float) and math.isnan(value) else value

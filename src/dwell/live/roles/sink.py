@@ -1,4 +1,4 @@
-"""Sink: the gate before the actuator, and its watchdog."""
+"""Sink: the gate before the actuator, and the watchdog."""
 
 from __future__ import annotations
 
@@ -14,24 +14,25 @@ from dwell.live.wire.payloads import read_payload
 from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import longest_bytes
 
-#: Methods of an actuator that bring it to rest.
+#: Methods that bring an actuator to rest.
 Rest: TypeAlias = Literal["hold", "zero", "stop"]
 
 
 class Highest(Protocol):
-    """Remembers, across restarts, the highest cycle that was actuated."""
+    """Stores the highest actuated cycle across restarts."""
 
     def load(self) -> tuple[int, int]:
-        """Return run and cycle; (-1, -1) if there is none."""
+        """Return run and cycle; (-1, -1) before the first cycle."""
 
     def store(self, run: int, cycle: int) -> None:
-        """Remember them before the actuator is called."""
+        """Store run and cycle; called before the actuator."""
 
 
 class Sink:
-    """Lets each command through once, in order and fresh; tells the actuator when none comes.
+    """Passes each fresh command to the actuator once and in order; without commands, stops it.
 
-    Nothing of the user's runs before the gate has decided and remembered.
+    The gate decides and stores the cycle before any user code runs. The cell's `silence` names the
+    method that is called without commands: `hold` or `zero`.
     """
 
     def __init__(
@@ -46,27 +47,27 @@ class Sink:
         self.max_age_ns = round(place.problem.max_age_ms * 1e6)
         self.newest = highest.load()
         self.offsets = place.offsets()
-        #: What its node has taken, where something counts it.
+        #: CPU time that this process's control group has used, if the kernel counts it.
         self.group_clock: Callable[[], int] = lambda: UNKNOWN
         self.pulse = Pulse(place, self._state, self._passed)
         self.counts = {ACTUATED: 0, NOT_APPLIED: 0, "behind": 0, STALE: 0, "silences": 0}
-        # Of the last command, and of the last silence: what the actuator has raised.
+        # Errors of the actuator at the last command, and at the last call of `hold` or `zero`.
         self.trouble = self._restless = ""
         self._alarm_ns: int | None = None
         # Whether `hold` or `zero` was called since the last command.
         self._rests = False
-        # The call of the actuator that has not returned yet, and its begin.
+        # Call of the actuator that has not returned yet, and its start.
         self._call: tuple[str, int] | None = None
-        # One that takes over from another is as impatient for the next command as that one was.
+        # After a restart the watchdog runs at once, without waiting for a first command.
         self._takes_over = self.newest >= (0, 0)
 
     def subscriptions(self) -> Iterable[str]:
-        """Key expressions that it wants to hear."""
+        """Key expressions to subscribe to."""
         yield from self.pulse.subscriptions()
         yield self.place.keys.command(self.task)
 
     def receive(self, sample: Arrival, now_ns: int) -> None:
-        """Take a command or a beat in."""
+        """Process a command or a beat."""
         if self.pulse.hears(sample):
             self.pulse.compare_clocks(sample, now_ns, self.offsets)
             return
@@ -88,7 +89,7 @@ class Sink:
         self.place.put_twice(self.place.keys.done(self.task), done)
 
     def age_ns(self, header: Header, now_ns: int) -> int:
-        """Longest time that can have passed since a cycle's release, for all the clocks say."""
+        """Upper bound of the time since a cycle's release, with the clocks' error bound."""
         here_ns, bound_ns = self.offsets.to_reference(self.place.node, now_ns)
         return here_ns + bound_ns - header.stamp.released_ns
 
@@ -103,9 +104,9 @@ class Sink:
         return ACTUATED
 
     def _apply(self, header: Header, payload: bytes, now_ns: int) -> bool:
-        """Hand a command to the actuator; returns whether it took it.
+        """Pass a command to the actuator; return whether it accepted the command.
 
-        One that it did not take is no command to the watchdog, which begins with the first.
+        The first command starts the watchdog, and only accepted commands reset it.
         """
         stamp = header.stamp
         alarm_ns = now_ns + self.max_age_ns
@@ -127,7 +128,7 @@ class Sink:
         return True
 
     def rest(self, how: Rest) -> bool:
-        """Tell the actuator to hold, or to stop; returns whether it did not raise."""
+        """Call an actuator's method that brings it to rest; return False if it raised."""
         try:
             getattr(self.actuator, how)()
         except (Exception, SystemExit) as error:  # the user's code
@@ -141,7 +142,7 @@ class Sink:
         return f"sink of {self.task} on {self.place.node}"
 
     def watch(self, now_ns: int) -> None:
-        """Beat while the actuator does not return; called by a thread of its own."""
+        """Send beats while a call of the actuator runs; a separate thread calls this."""
         call = self._call
         if call is None or (waits_ns := now_ns - call[1]) < self.place.period_ns:
             return
@@ -161,14 +162,15 @@ class Sink:
         return BeatState(run=max(self.newest[0], 0))
 
     def wake(self, now_ns: int) -> int:
-        """Beat, and call the watchdog where no command came; returns when something is due.
+        """Send due beats, run the watchdog, and return the instant of the next call.
 
-        An actuator that raises is told again after the same time, until the next command.
+        If the actuator raises, the watchdog calls it again after the same time, until the next
+        command.
         """
         if self._takes_over:
             self._takes_over = False
             self._alarm_ns = self._alarm_ns or now_ns + self.max_age_ns
-        # An alarm further off than it was ever set: the clock has been set back.
+        # If the alarm is further away than it is ever set, the clock was set back.
         back = self._alarm_ns is not None and self._alarm_ns > now_ns + self.max_age_ns
         if self._alarm_ns is not None and (back or now_ns >= self._alarm_ns):
             self.counts["silences"] += not self._restless

@@ -1,9 +1,9 @@
 """Times and counts of stages: workers write them, agents read them, a controller adds them up.
 
-A worker keeps a row per cycle in mapped memory, which outlives it: the state of each input, and the
-bytes of each output; and the times of its last jobs. Once a second its agent adds up the last two
-blocks of cycles and sends the sums. A block begins at a multiple of its length, so both ends of a
-flow count the same messages, and no clocks are compared.
+A worker keeps one row per cycle in mapped memory, which outlives the worker: the state of each
+input and the bytes of each output. It also keeps the times of its last jobs. Once per second its
+agent adds up the last two blocks of cycles and sends the sums. A block begins at a multiple of its
+length, so both ends of a flow count the same messages without a comparison of clocks.
 """
 
 from __future__ import annotations
@@ -25,50 +25,43 @@ from dwell.model.number_arrays import Ints
 #: Run and number of a cycle or of a block.
 Key: TypeAlias = tuple[int, int]
 
-#: States of an input: not there, waiting for a job, and the ends that it may come to.
+#: States of an input: missing, waiting for a job, and three final states.
 ABSENT, WAITING, TAKEN, REPLACED, DROPPED = range(5)
-#: What the status calls the last three.
+#: Names of the final states in the status.
 ENDS = "taken", "replaced", "dropped"
 #: Time between two reports of an agent.
 REPORT_NS = 1_000_000_000
-#: Blocks that a worker keeps the rows of, and a controller the sums of.
+#: Number of blocks kept by a worker (rows) and by a controller (sums).
 BLOCKS, KEPT_BLOCKS = 4, 6
-#: Jobs from which on their median is the reason of a headline.
+#: Least number of jobs from which their median may be the reason in a headline.
 LEAST_JOBS = 3
-#: Numbers before all others: run and newest cycle, how many inputs came to each end (at the places
-#: of these states), and how many jobs have run.
+#: Places in the head: run, newest cycle, number of inputs in each final state (at the places of
+#: these states), and number of jobs.
 RUN, NEWEST, *_, JOBS, HEAD = range(7)
-#: Column of the cycle; those of outputs and inputs follow.
+#: Column of the cycle; the columns of outputs and inputs follow.
 CYCLE = 0
 
 
 def block_cycles(problem: Problem) -> int:
-    """Return the length of a block: a window, but no less than the cycles between two reports."""
+    """Return the length of a block: a window, or the cycles between two reports if that is more."""
     return max(problem.window_cycles, math.ceil(REPORT_NS / problem.pipeline.period_ns))
 
 
 def book_path(folder: Path, who: str) -> Path:
-    """Return the file of a worker's book."""
+    """Return the file with a worker's rows."""
     return folder / f"{who}.stages"
 
 
 def _stages(problem: Problem, tasks: Iterable[str]) -> list[str]:
-    """Return ``TASK@NODE`` of some tasks, wherever they may run."""
+    """Return ``TASK@NODE`` for some tasks and all nodes that may run them."""
     return [f"{task}@{node}" for task in tasks for node in problem.pipeline.tasks[task].on]
 
 
 class StageBook:
     """Rows of one worker; see the module.
 
-    Parameters
-    ----------
-    memory : callable
-        Returns the buffer of a given size that has the rows.
-
-    Raises
-    ------
-    ValueError
-        If the buffer has another size.
+    `memory` returns the buffer of the rows, by its size in bytes. Raises a ValueError if the
+    buffer has another size.
     """
 
     def __init__(
@@ -84,12 +77,12 @@ class StageBook:
         sizes = HEAD, len(ends), 2 * count, count * width
         numbers = np.frombuffer(memory(8 * sum(sizes)), np.int64)
         self._head, self._sent_bytes, jobs, rows = np.split(numbers, np.cumsum(sizes[:3]))
-        #: Of the last jobs: the newest cycle that was known when they ended, and their times.
+        #: Newest known cycle at the end of each of the last jobs, and the time of the job.
         self._jobs: Ints = jobs.reshape(count, 2)
         self._rows: Ints = rows.reshape(count, width)
 
     def begin(self) -> None:
-        """Give up the inputs that waited for a worker that has died."""
+        """Clear the inputs that a previous worker, which has died, left waiting."""
         states = self._rows[:, self._first_input :]
         states[states == WAITING] = ABSENT
 
@@ -107,7 +100,7 @@ class StageBook:
         return row
 
     def arrived(self, header: Header) -> None:
-        """Count an input that is there; a copy of it changes nothing."""
+        """Count an input that has arrived; copies are ignored."""
         column, row = self._inputs.get(f"{header.source}@{header.node}"), self._row(header.stamp)
         if column is not None and row is not None:
             self._head[NEWEST] = header.stamp.cycle
@@ -115,7 +108,7 @@ class StageBook:
                 row[column] = WAITING
 
     def ended(self, headers: Iterable[Header], state: int) -> None:
-        """Count inputs that have been taken, or of those that wait the replaced and dropped."""
+        """Count the final state of inputs; only waiting inputs become replaced or dropped."""
         for header in headers:
             column = self._inputs.get(f"{header.source}@{header.node}")
             if column is None:
@@ -128,7 +121,7 @@ class StageBook:
             self._head[state] += 1
 
     def ran(self, stamp: Stamp, exec_ns: int) -> None:
-        """Count a job that has run."""
+        """Count a job and its time."""
         head = self._head
         self._row(stamp)
         head[NEWEST] = max(head[NEWEST], stamp.cycle)
@@ -143,7 +136,7 @@ class StageBook:
         self._sent_bytes[column - 1] += payload_bytes
 
     def report(self, who: str) -> Iterator[StageCounts]:
-        """Yield the sums of the block before the newest one, and of the newest."""
+        """Yield the sums of the second newest block, then of the newest block."""
         run, newest = self._head[RUN].item(), self._head[NEWEST].item()
         blocks, of_jobs = self._rows[:, CYCLE] // self._block, self._jobs[:, 0] // self._block
         for block in range(max(newest // self._block - 1, 0), newest // self._block + 1):
@@ -175,11 +168,11 @@ class StageBook:
 
 
 def read_books(problem: Problem, there: Iterable[Role], folder: Path) -> Iterator[StageCounts]:
-    """Yield the sums of the workers among a node's processes, by the files in its state folder."""
+    """Yield the sums of a node's workers and standbys from the files in its state folder."""
     for role in there:
         if role.kind in ("worker", "standby"):
             memory = _reads(book_path(folder, role.who))
-            # The file may not be there yet, or be that of another cell file.
+            # The file may not exist yet, or be from another cell file.
             with suppress(OSError, ValueError):
                 yield from StageBook(problem, role.task, role.node, memory).report(role.who)
 
@@ -189,17 +182,17 @@ def _reads(path: Path) -> Callable[[int], bytes]:
 
 
 class StageTable:
-    """Sums of all workers of a cell, by block, as their agents have sent them.
+    """Sums of all workers of a cell by block, from the agents' reports.
 
-    A worker and its standbys count together. The newest cycle is given as run and number.
+    A worker and its standbys count together. `newest` is run and number of the newest cycle.
     """
 
     def __init__(self, problem: Problem) -> None:
         self._size, self._period_ns = block_cycles(problem), problem.pipeline.period_ns
-        #: Time after the report of a message from which on it is lost if the other end lacks it: D,
-        #: and until that end has reported again.
+        #: Time after the report of a sent message until the message counts as lost if it has not
+        #: arrived: D, plus the time until the receiver's next report.
         self._settled_ns = problem.pipeline.deadline_ns + 5 * REPORT_NS // 4
-        #: Node of each worker, and where it may send its outputs.
+        #: Node of each worker, and the possible targets of its outputs.
         self._known: dict[str, tuple[str, list[str]]] = {}
         self._workers: dict[str, list[str]] = defaultdict(list)
         for role in roles(problem):
@@ -208,11 +201,11 @@ class StageTable:
                 self._known[role.who] = role.node, _stages(problem, outputs)
                 self._workers[f"{role.task}@{role.node}"].append(role.who)
         self._of: dict[Key, dict[str, StageCounts]] = {}
-        # When the outputs of a worker in a block changed last.
+        # Last change of a worker's outputs in a block.
         self._sent_ns: dict[tuple[Key, str], int] = {}
 
     def take(self, load: Load, newest: Key, at_ns: int) -> None:
-        """Take the sums of a node's workers; those far from the newest cycle are left out."""
+        """Add the sums of a node's workers, except for blocks far from the newest cycle."""
         run, latest = newest[0], newest[1] // self._size
         for one in load.stages:
             key = one.run, one.block
@@ -229,7 +222,7 @@ class StageTable:
                 del self._sent_ns[key, who]
 
     def slow(self, placement: Placement, newest: Key) -> Iterator[dict[str, Any]]:
-        """Yield the stages of a placement whose jobs take longer than a period."""
+        """Yield the stages of a placement whose median job takes longer than a period."""
         for name in (f"{task}@{node}" for task, node in placement.items()):
             one = next(self._recent(name, newest), None)
             if one is not None and one.median_ns > self._period_ns:
@@ -238,16 +231,16 @@ class StageTable:
                 yield {**took, "replaced": one.replaced, "inputs": inputs}
 
     def withholds(self, source: str, target: str, newest: Key) -> bool:
-        """Whether jobs of ``TASK@NODE`` have ended lately without an output to a task."""
+        """Whether recent jobs of ``TASK@NODE`` have ended without an output to a task."""
         for one in self._recent(source, newest):
             outputs = (end for end in one.outputs if end.target.partition("@")[0] == target)
-            # The agent may have read between a job's end and its output.
+            # The agent may have read the rows between a job's end and its output.
             if one.jobs > 1 + sum(end.sent for end in outputs):
                 return True
         return False
 
     def _recent(self, name: str, newest: Key) -> Iterator[StageCounts]:
-        """Yield the sums of ``TASK@NODE`` of the last blocks, the newest first."""
+        """Yield the sums of ``TASK@NODE`` in the last blocks with enough jobs, newest first."""
         run, latest = newest[0], newest[1] // self._size
         for block in range(latest + 1, latest - 2, -1):
             of = self._of.get((run, block), {})
@@ -259,10 +252,7 @@ class StageTable:
     ) -> dict[str, Any]:
         """Return times and counts of the last block that all agents have reported.
 
-        Parameters
-        ----------
-        span_ns : callable
-            Returns the time from the release of a cycle to that of another one.
+        `span_ns` returns the time between the releases of two cycles, by their numbers.
         """
         lag = math.ceil((REPORT_NS + self._settled_ns) / self._period_ns)
         key = newest[0], (newest[1] - lag) // self._size - 1
@@ -292,7 +282,7 @@ class StageTable:
 
 
 def _stage(sums: Sequence[StageCounts]) -> dict[str, Any]:
-    """Return a stage as the status shows it; its times are those of the worker with most jobs."""
+    """Return a stage for the status; its times come from the worker with the most jobs."""
     most = max(sums, key=lambda one: one.jobs)
     totals = np.sum([one.totals for one in sums], axis=0).tolist()
     return {
@@ -308,7 +298,7 @@ def _stage(sums: Sequence[StageCounts]) -> dict[str, Any]:
 def _flow(
     outputs: Sequence[OutputCounts], inputs: Sequence[InputCounts], *, settled: bool
 ) -> dict[str, int]:
-    """Return what came of the messages of a flow: what is not there is lost once it is settled."""
+    """Return the states of a flow's messages; `settled` counts missing messages as lost."""
     ends = {
         "taken": sum(one.taken for one in inputs),
         "replaced": sum(one.replaced for one in inputs),
@@ -316,7 +306,7 @@ def _flow(
     }
     waiting = sum(one.waiting for one in inputs)
     there = sum(ends.values()) + waiting
-    # The other end may have reported later than the sender.
+    # The receiver may have reported later than the sender.
     sent = max(sum(one.sent for one in outputs), there)
     missing = sent - there
     return {

@@ -1,4 +1,4 @@
-"""Stamper: releases the cycles of a cell, each with its placement, and hosts the guard."""
+"""Stamper: releases the cycles of a cell with their placements, and runs the guard."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ from dwell.live.wire.messages import (
 from dwell.live.wire.routing import STAMPER, Destination, Routes
 from dwell.live.wire.transport import Arrival
 
-#: Time after which a controller that is silent is in charge no more.
+#: Time without orders after which another controller may take over.
 LEASE_NS = 1_000_000_000
-#: Time that a new run waits for its placement; then it begins on any fallback that is whole.
+#: Time that a new run waits for its placement; then it may start on a complete fallback.
 START_NS = 10_000_000_000
-#: Completions of a cycle by some sinks that are kept until the others come.
+#: Largest number of cycles that only some sinks have completed.
 MAX_PARTIAL = 1_024
 
 
@@ -44,14 +44,8 @@ MAX_PARTIAL = 1_024
 class StamperState:
     """State of the stamper that outlives its process.
 
-    Parameters
-    ----------
-    reserved : int
-        No cycle from this number on has been stamped.
-    on_fallback : bool
-        Whether the placement is the guard's.
-    boot : str
-        Kernel's boot in which it was written. After a loss of power the disk may have an old one.
+    All stamped cycles have numbers below `reserved`. `boot` is the id of the kernel's boot in
+    which the state was written: after a loss of power the disk may have an old state.
     """
 
     run: Count
@@ -63,33 +57,29 @@ class StamperState:
 
 
 class Book(Protocol):
-    """Keeps the `StamperState` of a cell."""
+    """Stores the `StamperState` of a cell."""
 
     def read(self) -> StamperState | None:
-        """Return it; None if there is none."""
+        """Return the stored state, or None."""
         ...
 
     def write(self, entry: StamperState) -> None:
-        """Keep it, before anything that it says happens."""
+        """Store the state; called before any cycle uses it."""
         ...
 
 
 class Stamper:
     """Owns run, term and placement of a cell.
 
-    Parameters
-    ----------
-    run : int
-        Time of day: number of a new run, unless a later run is known.
-    boot : str
-        Id of the kernel's present boot.
+    `run` is the time of day, the number of a new run unless a later run is known. `boot` is the id
+    of the kernel's current boot.
     """
 
     def __init__(self, place: RolePlace, book: Book, run: int, now_ns: int, boot: str = "") -> None:
         self.place, self._book, self._boot = place, book, boot
         problem = place.problem
         entry = book.read()
-        # Without a book of this boot, other processes may know a later run.
+        # Without a saved state from this boot, other processes may know a later run.
         self._unsure = entry is None or entry.boot != boot
         self._claims = RunClaims(CLAIMS if place.seals is None else 1)
         if entry is None or entry.placement not in problem.candidates:
@@ -104,7 +94,7 @@ class Stamper:
         self.guard = CellGuard(problem, entry.placement)
         if entry.on_fallback:
             self.guard.adopt(entry.placement, fallback=True)
-        #: Where the cell is.
+        #: Run, term and placement of the cell.
         self.course = self.guard.course
         self.course.enter(entry.run, entry.term)
         self.pulse = Pulse(place, self._ready, self._holds, hears=[("*", "*")])
@@ -112,9 +102,9 @@ class Stamper:
         self._next_ns = now_ns + place.period_ns
         self._framed_ns = now_ns - place.period_ns
         self._setback = SetbackDetector()
-        # A run that goes on does so at once; a new one waits until its placement is there.
+        # A continued run releases cycles at once; a new run waits for the workers of its placement.
         self._begun, self._since_ns = entry.reserved > 0, now_ns
-        # Sources on other nodes get their stamps a cycle early.
+        # Sources on other nodes get their stamps one cycle early.
         self._early = any(node != place.node for _, node, _ in self._sources())
         self._ahead: Stamp | None = None
         self._names = tuple(problem.candidates)
@@ -128,33 +118,33 @@ class Stamper:
         self._charge = ""
         self._charged_ns = 0
         self._answered: tuple[str, int, Accepted] | None = None
-        #: Highest number of an order that was carried out; numbers grow from controller to
-        #: controller, as they begin with the time of day.
+        #: Highest number of an accepted order; a new controller's numbers are higher, because they
+        #: begin with the time of day.
         self._newest = 0
-        #: CPU time that the node's control group has taken, where something counts it.
+        #: CPU time that this process's control group has used, if the kernel counts it.
         self.group_clock: Callable[[], int] = lambda: UNKNOWN
         self.skipped = 0
         self.moves: list[tuple[int, str, str]] = []
 
     @property
     def run(self) -> int:
-        """The run."""
+        """Current run."""
         return self.course.run
 
     @property
     def term(self) -> int:
-        """The term that holds."""
+        """Current term."""
         return self.course.term
 
     @property
     def placement(self) -> str:
-        """The candidate that holds."""
+        """Current candidate."""
         return self.course.placement
 
-    # ------------------------------------------------------------------------ hearing
+    # ---------------------------------------------------------------------- receiving
 
     def subscriptions(self) -> Iterable[str]:
-        """Key expressions that it wants to hear."""
+        """Key expressions to subscribe to."""
         keys = self.place.keys
         yield from self.pulse.subscriptions()
         yield from (keys.done("*"), keys.ended(), keys.carried())
@@ -162,7 +152,7 @@ class Stamper:
         yield keys.frame()
 
     def receive(self, sample: Arrival, now_ns: int) -> None:
-        """Take a message in."""
+        """Process a message."""
         if sample.key == self.place.keys.carried():
             for arrival in self.place.around(sample):
                 self.receive(arrival, now_ns)
@@ -189,7 +179,7 @@ class Stamper:
             self.place.complain(error)
 
     def _frame(self, now_ns: int) -> None:
-        """Release a cycle, because the source has a frame; of a flood of them, two a period."""
+        """Release a cycle, because the source has a frame; skip more than two frames per period."""
         if self.timer or not self._begun:
             return
         if now_ns - self._framed_ns < self.place.period_ns // 2:
@@ -211,7 +201,7 @@ class Stamper:
             presence.heard(f"{heard.node}->{beat.node}", now_ns - age_ns)
         worker, _, extra = beat.who.partition(".")
         if beat.moving and self._forks and beat.who in self._workers():
-            # An order asked for its state, so its cycles wait.
+            # The worker is saving its state for a migration, so its cycles wait.
             self.guard.restart()
         if extra in ("", "1") and "@" in worker:
             if beat.ready:
@@ -220,12 +210,12 @@ class Stamper:
                 presence.gone(worker)
 
     def _claimed(self, who: str, run: int) -> None:
-        """Begin a run beyond one that another process names, unless the book is whole."""
+        """Without a saved state from this boot, begin a later run than another process claims."""
         if not self._unsure or not self._claims.believed(who, run) or run <= self.run:
             return
         self._ahead, self._answered = None, None
         self._partial.clear()
-        # Cycles of the run before never complete: processes downstream know a later one.
+        # Cycles of the previous run never complete: processes downstream know a later run.
         self.guard.restart()
         self.guard.failures.restart()
         self.course.enter(run + 1, self.term + 1)
@@ -239,7 +229,7 @@ class Stamper:
             if done.sink in self._sinks and stamp.shadow in self._names:
                 self.guard.shadow_arrived(stamp.cycle, now_ns, stamp.shadow)
             return
-        # What the actuator refused has come as far as under any other placement.
+        # A command that the actuator refused counts: the placement has delivered it.
         handed_over = done.outcome in HANDED_OVER and done.sink in self._sinks
         if not handed_over or stamp.cycle < self.guard.newest:
             return
@@ -254,7 +244,7 @@ class Stamper:
                 del self._partial[cycle]
 
     def _complete(self, stamp: Stamp, now_ns: int) -> None:
-        """All sinks have had a cycle's command."""
+        """Record a cycle whose commands have reached all sinks."""
         if stamp.placement in self._names:
             self.guard.arrived(stamp.cycle, now_ns, stamp.placement)
         if stamp.placement == self.placement:
@@ -263,7 +253,7 @@ class Stamper:
     # ------------------------------------------------------------------------- orders
 
     def _order(self, order: Order, now_ns: int) -> None:
-        """Answer an order; the same one twice gets the same answer."""
+        """Answer an order; a copy of the last order gets the same answer."""
         self._claimed(CONTROLLER, order.run)
         answered = self._answered
         if answered is not None and answered[:2] == (order.controller, order.number):
@@ -278,7 +268,7 @@ class Stamper:
 
     @property
     def _next(self) -> int:
-        """The next cycle to be stamped: one that other nodes know already is."""
+        """The next cycle without a stamp; a stamp sent early to other nodes counts."""
         return self.cycle + (self._ahead is not None)
 
     def _answer(self, order: Order, refused: str, now_ns: int) -> Accepted:
@@ -302,7 +292,7 @@ class Stamper:
         )
 
     def _refusal(self, order: Order, now_ns: int) -> str:
-        """Return why an order is not accepted, or nothing."""
+        """Return the reason to refuse an order; empty if it is accepted."""
         other = self._charge not in ("", order.controller)
         if other and now_ns - self._charged_ns < LEASE_NS:
             return f"{OTHER}: {self._charge} is in charge"
@@ -348,7 +338,7 @@ class Stamper:
             self._move(order.placement, by_guard=False)
 
     def _settle(self, order: Order) -> None:
-        """Take over what an order says beside the placement; an earlier one changes none of it."""
+        """Adopt the shadow fraction, the forks and the wanted candidate of the newest order."""
         self._fraction = order.shadow_fraction
         self._forks = order.forks
         if self.course.by_guard:
@@ -356,11 +346,11 @@ class Stamper:
             self.guard.probation.want(order.want if known else None)
 
     def _move(self, placement: str, *, by_guard: bool) -> None:
-        """Change the placement: a new term, known to the book before any cycle has it."""
+        """Change the placement: begin a new term, saved before any cycle has it."""
         if by_guard:
             self._ahead = None
             self._forks = ()
-            # Only the controller knows the share of the fallback; its next order has it.
+            # The next order of the controller sets the shadow fraction of the fallback.
             self._fraction = 0.0
         self.moves.append((self._next, placement, "guard" if by_guard else "order"))
         del self.moves[:-1_000]
@@ -377,7 +367,7 @@ class Stamper:
     # -------------------------------------------------------------------------- cycles
 
     def wake(self, now_ns: int) -> int:
-        """Release the cycle that is due, let the guard look, beat; returns what is due next."""
+        """Release due cycles, run the guard and send due beats; return when to call again."""
         if not self._begun and not self._begin(now_ns):
             return min(self.pulse.wake(now_ns), now_ns + self.place.period_ns)
         if self._setback.back_ns(now_ns) > self.place.period_ns // 4:
@@ -396,18 +386,18 @@ class Stamper:
         if self.timer:
             due_ns = min(due_ns, self._next_ns)
         guard_ns = self.guard.due_ns
-        # Where no fallback is whole, the guard looks again every quarter of a period.
+        # While no fallback is complete, the guard looks again every quarter of a period.
         again_ns = now_ns + self.place.period_ns // 4
         return due_ns if guard_ns is None else min(due_ns, max(guard_ns, again_ns))
 
     def _begin_anew(self, now_ns: int) -> None:
-        """The clock has been set back: instants noted so far mean nothing any more."""
+        """Restart timer and guard after the clock was set back."""
         self._next_ns, self._framed_ns = now_ns, now_ns - self.place.period_ns
         for noted in (self.guard.presence, self.guard.failures, self.guard):
             noted.restart()
 
     def _begin(self, now_ns: int) -> bool:
-        """Look whether the first cycle can be released."""
+        """Begin the run if a placement is complete; return whether it has begun."""
         whole = [self.placement]
         if now_ns - self._since_ns > START_NS:
             whole += self.place.problem.controller.fallbacks
@@ -423,12 +413,12 @@ class Stamper:
         return True
 
     def _workers(self) -> Iterator[str]:
-        """Names of the workers under the placement that holds."""
+        """Yield the names of the workers of the current placement."""
         placed = self.place.problem.candidates[self.placement]
         return (f"{task}@{node}" for task, node in placed.items())
 
     def _gates(self) -> Iterator[str]:
-        """Names of the sinks' processes under the placement that holds."""
+        """Yield the names of the sinks' processes of the current placement."""
         placed = self.place.problem.candidates[self.placement]
         return (f"sink.{task}@{placed[task]}" for task in self._sinks)
 
@@ -437,7 +427,7 @@ class Stamper:
         group_ns = self.group_clock()
         if self.cycle + 1 >= self._reserved:
             self._reserved = self.cycle + RESERVED
-        # At every cycle: a state folder that was removed and made again has no book.
+        # At every cycle, because the state folder may have been removed and created again.
         self._write()
         early, self._ahead = self._ahead, None
         stamp = early or self._stamp(self.cycle, released_ns)
@@ -446,7 +436,7 @@ class Stamper:
         if stamp.shadow:
             self.guard.shadow_sent(stamp.cycle, released_ns, stamp.shadow)
         self._send(stamp, here=True, elsewhere=early is None)
-        # A beat wakes every process, and would take the source's turn.
+        # Beats wake every process and would delay the source, so send the next one mid-period.
         self.pulse.put_off(released_ns + self.place.period_ns // 2)
         intervals = self.intervals.take_unreported()
         stamped = Stamped(**asdict(stamp), intervals=intervals, group_ns=group_ns)
@@ -456,12 +446,12 @@ class Stamper:
             self._send(self._ahead, here=False, elsewhere=True)
 
     def _sources(self) -> Iterator[Destination]:
-        """Source tasks wherever some candidate has them."""
+        """Yield the source tasks of all candidates, with their nodes."""
         for name in self.place.problem.candidates:
             yield from self.routes.destinations(STAMPER, Stamp(0, 0, 1, name, 0))
 
     def _send(self, stamp: Stamp, *, here: bool, elsewhere: bool) -> None:
-        """Send a stamp to the sources on this node, or on the others."""
+        """Send a stamp to the sources on this node, on other nodes, or both."""
         place = self.place
         header = encode(Header(stamp, STAMPER, place.node, "none", seal=place.stamped(stamp)))
         for task, node, kind in self.routes.destinations(STAMPER, stamp):
@@ -476,7 +466,7 @@ class Stamper:
         return Stamp(self.run, cycle, self.term, self.placement, released_ns, shadow, self._forks)
 
     def _shadowed(self, cycle: int) -> str:
-        """Return the candidate that the estimator's plan sends this cycle through, too."""
+        """Return the candidate of this cycle's shadow by the estimator's plan; empty if none."""
         if not self._fraction:
             return ""
         code = self._names.index(self.placement)

@@ -1,7 +1,7 @@
-"""Symptoms: what the cycles of a live cell say of its health, beside what its processes say.
+"""Symptoms: signs in the cycles of a live cell that it is not healthy.
 
-A beat travels apart from the images, and comes from a worker whose stage fails all the same: what
-counts here is what arrived, was applied, and came in time.
+Beats are not sufficient: they do not share the lane of the images, and a worker whose stage fails
+still sends them. Symptoms count messages that arrived, commands that were applied, and deadlines.
 """
 
 from __future__ import annotations
@@ -17,14 +17,13 @@ from dwell.live.wire.messages import ACTUATED, STALE, Completion
 from dwell.model import Problem
 from dwell.model.live import RECENT_WINDOWS
 
-#: Windows' worth of cycles without a shadow through a candidate, after which those before it that
-#: failed say nothing more.
+#: Time without shadows through a candidate, in windows, after which its failed shadows are ignored.
 SILENT_WINDOWS = 2
 
 
 @dataclass(slots=True)
 class _Lead:
-    """Cycles between two windows: the first, how many, and how the actuators were served."""
+    """Cycles between two windows: the first one, their number, applied commands and silences."""
 
     first: LiveCycle | None = None
     count: int = 0
@@ -33,7 +32,7 @@ class _Lead:
 
 
 class Symptoms:
-    """See the module; instants are of the controller's clock."""
+    """See the module; instants are on the controller's clock."""
 
     def __init__(self, problem: Problem, ledger: Ledger) -> None:
         self._ledger, self._size = ledger, problem.window_cycles
@@ -43,32 +42,32 @@ class Symptoms:
         self._period_ns = problem.pipeline.period_ns
         self._begun_ns: int | None = None
         self._recent: deque[LiveWindow] = deque(maxlen=RECENT_WINDOWS)
-        # The cycles before each of them, and before the next.
+        # Cycles before each of these windows, and before the next window.
         self._leads: deque[_Lead] = deque([_Lead()], maxlen=RECENT_WINDOWS + 1)
-        # By sink: when a command was heard to be applied last, and what came of the last command.
+        # By sink: arrival of the last report of an applied command, and the last outcome.
         self._applied_ns: dict[str, int] = {}
         self._outcomes: dict[str, str] = {}
         self._silences = 0
 
     def begun(self, at_ns: int) -> None:
-        """A cycle was heard of."""
+        """Record the first message about a cycle."""
         if self._begun_ns is None:
             self._begun_ns = at_ns
 
     def completed(self, completion: Completion, at_ns: int) -> None:
-        """A sink has had a command."""
+        """Record a sink's report of a command."""
         self._outcomes[completion.sink] = completion.outcome
         if completion.outcome == ACTUATED:
             self._applied_ns[completion.sink] = at_ns
             self._silences += completion.rested
 
     def closed(self, window: LiveWindow) -> None:
-        """A window has closed."""
+        """Add a closed window."""
         self._recent.append(window)
         self._leads.append(_Lead())
 
     def led(self, cycles: Sequence[LiveCycle]) -> None:
-        """Cycles belong to no window: they count with the next."""
+        """Add cycles outside windows; they count with the next window."""
         lead = self._leads[-1]
         if lead.first is None and cycles:
             lead.first = cycles[0]
@@ -77,31 +76,23 @@ class Symptoms:
         lead.silences += sum(cycle.silences for cycle in cycles)
 
     def set_back(self, back_ns: int) -> None:
-        """Go on by a clock that has been set back."""
+        """Shift the times of arrival after the clock was set back."""
         if self._begun_ns is not None:
             self._begun_ns -= back_ns
         self._applied_ns = {sink: at_ns - back_ns for sink, at_ns in self._applied_ns.items()}
 
     def status(self, newest: Sequence[LiveCycle], now_ns: int) -> dict[str, Any]:
-        """Return them as plain values.
+        """Return the symptoms as plain values; `newest` has the last cycle first.
 
-        Parameters
-        ----------
-        newest : sequence of LiveCycle
-            Cycles, the last one first.
-
-        Returns
-        -------
-        dict
-            ``begun_ms``: time since the first cycle was heard of, None before. ``silences``: calls
-            of ``hold`` or ``zero`` that a command has followed. ``release_ratio``: cycles released
-            per period, over the time of three windows; None before the first has passed.
-            ``recent``: V_D and `_commands` of the last windows, and the message that most of their
-            lost cycles lack. ``sinks``: age of
-            the last command that was applied, or None, what came of the last one, and the time
-            from stamp to completion of the last stale one, as both came here, or None. ``failing``:
-            by candidate, how many of its last shadows failed in a row, at most g + 1, and the
-            message that the last one lacks. Messages are source and target, as ``task@node``.
+        ``begun_ms``: time since the first message about a cycle, or None. ``silences``: number of
+        calls of ``hold`` or ``zero`` before an applied command. ``release_ratio``: released cycles
+        per period, over at most three windows; None before the first. ``recent``: V_D and
+        `_commands` of the last windows, and the message that most of their lost cycles lack.
+        ``sinks``: age of the last applied command, or None; outcome of the last command; if that is
+        stale, the time between arrivals of its stamp and its completion here. ``failing``: by
+        candidate whose last shadows have all failed, the number of these shadows
+        (``failures_in_a_row``), and the message that the last of them lacks. Messages are source
+        and target, as ``task@node``.
         """
         begun_ns = self._begun_ns
         return {
@@ -138,8 +129,8 @@ class Symptoms:
     def _commands(self) -> dict[str, list[Any]]:
         """Return silences, applied commands and cycles of the last windows and of their leads.
 
-        ``applied`` is the number of commands per period that are known to have been applied,
-        ``cycles`` the first and the last cycle.
+        ``applied`` is the known number of applied commands per period; ``cycles`` has the numbers
+        of the first and the last cycle.
         """
         found: dict[str, list[Any]] = {"silences": [], "applied": [], "cycles": []}
         for window, lead in zip(self._recent, self._leads, strict=False):
@@ -179,7 +170,7 @@ class Symptoms:
         return max(counts, key=counts.__getitem__, default=None)
 
     def _failing(self, newest: Sequence[LiveCycle]) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Yield candidates whose last shadows all failed; cycles within g of the newest may not."""
+        """Yield candidates whose last shadows all failed; the g newest cycles do not count."""
         most = self._failures
         fails: dict[str, list[LiveCycle]] = {}
         succeeded = set()

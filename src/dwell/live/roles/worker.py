@@ -1,4 +1,4 @@
-"""Worker: joins a task's inputs, runs its stage, and sends the output where the stamp says."""
+"""Worker: joins a task's inputs, runs its stage, and sends the output as the stamp directs."""
 
 from __future__ import annotations
 
@@ -32,28 +32,22 @@ from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import SPARE, lane_of, longest_bytes
 from dwell.model.instants import EVIDENCE_NS, NEVER_NS
 
-#: Cycles that may wait for the rest of their inputs.
+#: Largest number of cycles that wait for the rest of their inputs.
 MAX_JOINS = 64
 #: Periods between two beats of a shadow worker.
 SHADOW_BEAT = 10
-#: Cost of a checkpoint, multiplied by this, passes before the next one.
+#: Least time between two checkpoints, as a multiple of the cost of a checkpoint.
 CHECKPOINT_SPACING = 20
-#: Longest time that others wait for a call of snapshot() or restore() that an order asked for.
+#: Longest time that a migration waits for a call of snapshot() or restore().
 MOVING_NS = 10_000_000_000
-#: By source task: header, payload, and when it was handed over.
+#: Header, payload and time of arrival by source task.
 Inputs: TypeAlias = dict[str, tuple[Header, bytes, int]]
 NOT_COUNTED = Counts(), UNKNOWN, Counts()
 
 
 @dataclass(slots=True)
 class Job:
-    """A complete set of inputs of one cycle.
-
-    Parameters
-    ----------
-    header : Header
-        Header of any of the inputs; its stamp is the cycle's.
-    """
+    """A complete set of inputs of one cycle; `header` is the header of one of them."""
 
     header: Header
     inputs: Inputs
@@ -61,12 +55,12 @@ class Job:
 
     @property
     def arrived_ns(self) -> int:
-        """When the last input was there."""
+        """Arrival of the last input."""
         return max(at_ns for _, _, at_ns in self.inputs.values())
 
     @property
     def order(self) -> tuple[int, int]:
-        """Run and cycle: what later jobs have more of."""
+        """Run and cycle; they grow with every job."""
         return self.header.stamp.key
 
     @property
@@ -75,23 +69,17 @@ class Job:
         return (header for header, _, _ in self.inputs.values())
 
     def hops(self) -> tuple[Hop, ...]:
-        """All jobs behind it, each once."""
+        """Return all jobs upstream in this cycle, each once."""
         hops = (hop for header, _, _ in self.inputs.values() for hop in header.hops)
         return tuple({(hop.task, hop.node): hop for hop in hops}.values())
 
 
 @dataclass(frozen=True, slots=True)
 class Chore:
-    """A call of the stage between two jobs: snapshot() for other nodes, or restore().
+    """A call of the stage between two jobs: snapshot() for the nodes `to`, or restore().
 
-    Parameters
-    ----------
-    to : tuple of str
-        Nodes that get the snapshot.
-    number : int
-        Number of the request; 0 for a checkpoint.
-    state : State, optional
-        State to take over, with its bytes.
+    `number` is the number of the request, 0 for a checkpoint; `state` and `data` are the state to
+    restore.
     """
 
     to: tuple[str, ...] = ()
@@ -107,12 +95,9 @@ class Chore:
 
 @dataclass(slots=True)
 class _Joins:
-    """Inputs of cycles that wait for the rest; a later complete cycle evicts the earlier ones.
+    """Inputs of incomplete cycles; when a later cycle is complete, earlier cycles are evicted.
 
-    Parameters
-    ----------
-    drop : callable
-        Takes the headers of inputs that come too late, or are evicted.
+    `drop` gets the headers of inputs that are too late or evicted.
     """
 
     sources: frozenset[str]
@@ -121,7 +106,7 @@ class _Joins:
     newest: tuple[int, int] = (-1, -1)
 
     def add(self, header: Header, payload: bytes, at_ns: int) -> Inputs | None:
-        """Take an input; returns the complete set that it completes."""
+        """Add an input; return the set of its cycle's inputs if it is now complete."""
         cycle = header.stamp.key
         if cycle <= self.newest or header.source not in self.sources:
             self.drop([header])
@@ -143,10 +128,10 @@ class _Joins:
 
 
 class _Source:
-    """Stamps of a source task, each until the instant at which its cycle begins here.
+    """Stamps of a source task; each waits for the instant at which its cycle begins here.
 
-    On another node than the stamper's they come a cycle early. Where one does not come, the source
-    goes on by itself for a while, with a guess that everybody who may need it gets.
+    If the source's node is not the stamper's, stamps arrive one cycle early. If a stamp is missing
+    and cycles are released by a timer, the source guesses up to g stamps in a row.
     """
 
     def __init__(self, place: RolePlace, offsets: Offsets, offset_ns: int) -> None:
@@ -158,7 +143,7 @@ class _Source:
         self._guessed = 0
 
     def stamped(self, header: Header, now_ns: int) -> None:
-        """Take a stamp in; of one cycle the one with the highest term counts."""
+        """Store a stamp; of several stamps of one cycle, the highest term counts."""
         cycle = header.stamp.key
         if self._last is not None and cycle <= self._last.stamp.key:
             return
@@ -173,7 +158,7 @@ class _Source:
 
     @property
     def due_ns(self) -> int:
-        """Instant at which the next cycle begins, or is guessed."""
+        """Instant at which the next cycle begins, or its stamp is guessed."""
         if self._waiting:
             header, _ = self._waiting[min(self._waiting)]
             return self._begins_ns(header) + self._offset_ns
@@ -183,7 +168,7 @@ class _Source:
         return self._begins_ns(self._last) + self._offset_ns + period_ns + period_ns // 4
 
     def due(self, now_ns: int) -> Job | None:
-        """Return the cycle that begins now, if one does."""
+        """Return the job of the cycle that begins now; None if no cycle does."""
         if now_ns < self.due_ns:
             return None
         if self._waiting:
@@ -205,15 +190,9 @@ class _Source:
 class Worker:
     """A task on a node, for cycles or for their shadows.
 
-    A standby hears what the worker that it stands by hears, and takes over when that one's beats
-    stay out; everybody behind it drops what comes twice.
-
-    Parameters
-    ----------
-    stands_by : str
-        Process that it stands by for; empty for none.
-    book : StageBook, optional
-        Counts its jobs and messages, those of shadows excluded.
+    A standby receives the same inputs as the process `stands_by`, and takes over when the beats
+    of this process are missing; downstream processes drop messages that arrive twice. `book` counts
+    jobs and messages, but ignores shadows.
     """
 
     def __init__(
@@ -231,14 +210,14 @@ class Worker:
         problem = place.problem
         self.routes = Routes(problem)
         self.offsets = place.offsets()
-        #: Declared bytes of what it takes from each task before it, sends to each behind it, and
-        #: of its state: they say the lanes, and how long a payload may be.
+        #: Declared bytes of inputs (by source), outputs (by target) and state; they determine the
+        #: lanes and the longest payloads.
         self._input_bytes = {f.source: f.payload_bytes for f in problem.pipeline.inputs(task)}
         self._output_bytes = {f.target: f.payload_bytes for f in problem.pipeline.outputs(task)}
         self._state_bytes = problem.pipeline.tasks[task].state_bytes
         self._nodes = frozenset(problem.pipeline.tasks[task].on)
         sources = frozenset(self._input_bytes) or frozenset([STAMPER])
-        #: Whether its stage's frames begin the cycles: those of the first source do.
+        #: Whether frames of this stage start the cycles; only frames of the first source do.
         first = next(name for name in problem.pipeline.tasks if not problem.pipeline.inputs(name))
         frames = problem.live.release == "frames" and task == first
         self.triggers = frames and not shadow and not stands_by
@@ -252,11 +231,11 @@ class Worker:
             MAIN: _Joins(sources, lambda headers: self.book.ended(headers, DROPPED)),
             SHADOW: _Joins(sources, lambda _: None),
         }
-        #: What is read at a job's start and after the stage was called; a stage that is said to use
-        #: several threads is charged with all that its process does meanwhile.
+        #: CPU clock of a job: this thread's, or the process's if the cell file gives the stage
+        #: several threads.
         alone = problem.pipeline.tasks[task].on[place.node].threads == 1
         self.cpu_clock: Callable[[], int] = time.thread_time_ns if alone else time.process_time_ns
-        #: What others have taken of the node, where something counts it.
+        #: CPU time that other processes have used, if the kernel counts it.
         self.group_clock: Callable[[], Counts] = Counts
         self._counted: tuple[Counts, int, Counts] = NOT_COUNTED
         self._jobs: deque[Job] = deque()
@@ -264,34 +243,35 @@ class Worker:
         self._source = _Source(place, self.offsets, offset_ns) if STAMPER in sources else None
         self._stateful = stage.stateful and not shadow
         self._asked: Snapshot | None = None
-        #: The state that shall come here, and by its node what has come, with a number and without.
+        #: Request for a state to be sent here; received states and checkpoints by sending node.
         self._awaited: Snapshot | None = None
         self._answers: dict[str, tuple[State, bytes]] = {}
         self._checkpoints: dict[str, tuple[State, bytes]] = {}
-        #: Run and cycle of the newest stamp that has come with an input.
+        #: Run and cycle of the newest stamp that has arrived with an input.
         self._newest = (-1, -1)
-        # What came because the state comes here, too; of that, what is to be worked on.
+        # Jobs forked to here ahead of a migration; jobs to process after restoring the state.
         self._forked: deque[Job] = deque(maxlen=10 * MAX_JOINS)
         self._replay: deque[Job] = deque(maxlen=10 * MAX_JOINS)
         self._follows = False
         self._restored: Restored | None = None
-        # Run and cycle: the last in the state, in one taken over, worked on by order.
+        # Run and cycle of the last job in the state, of the restored state, and of the last job
+        # that the placement assigned to this worker.
         self.state_at = self._restored_at = self._worked_at = (-1, -1)
         self.started = False
         self.trouble = ""
         self.busy_since_ns: int | None = None
         self._busy_cycle = 0
         self._chore: Chore | None = None
-        # Nodes that a checkpoint is due for; cost of the last snapshot, here or by its header, and
-        # when it ended here.
+        # Nodes for which a checkpoint is due; duration of the last snapshot, made here or received,
+        # and the end of the last one made here.
         self._checkpoint_to: tuple[str, ...] = ()
         self._cost_ns, self._snapshot_ns = 0, -NEVER_NS
         self.replaced = 0
         self.failures = 0
-        # Calls of process() in a row that brought nothing that could be sent; when the last ended.
+        # Number of calls of process() in a row without an output to send; end of the last one.
         self._failed_in_a_row, self._failed_ns = 0, 0
         self._now_ns = 0
-        # Of each link that its inputs may take, and of the stamper, whose clock counts.
+        # Sender of each link that the inputs may take. The stamper's beats compare the clocks.
         before = [
             (node, f"{source}@{node}")
             for source in sources - {STAMPER}
@@ -300,15 +280,15 @@ class Worker:
         ]
         primary = [(place.node, stands_by)] if stands_by else []
         hears = [] if shadow else [*before, *primary]
-        # The guard waits for no shadow worker.
+        # The guard ignores shadow workers, so they can beat less often.
         slow = SHADOW_BEAT if shadow else 1
         hears = [place.stamper, *hears]
         self.pulse = Pulse(place, self._state, self._moves, hears=hears, every=slow)
 
-    # ------------------------------------------------------------------------ hearing
+    # ---------------------------------------------------------------------- receiving
 
     def subscriptions(self) -> Iterable[str]:
-        """Key expressions that it wants to hear."""
+        """Key expressions to subscribe to."""
         keys, node = self.place.keys, self.place.node
         yield from self.pulse.subscriptions()
         if self.shadow:
@@ -322,7 +302,7 @@ class Worker:
             yield keys.state(self.task, node)
 
     def receive(self, sample: Arrival, now_ns: int) -> None:
-        """Take a message in."""
+        """Process a message."""
         if self.pulse.hears(sample):
             self.pulse.compare_clocks(sample, now_ns, self.offsets)
             return
@@ -339,7 +319,7 @@ class Worker:
         header = self.place.header(sample)
         if header is None:
             return
-        if header.stamp.term:  # a guess is nobody's word
+        if header.stamp.term:  # not a source's guess
             self._newest = max(self._newest, header.stamp.key)
         if header.source == STAMPER and self._source is not None:
             self._source.stamped(header, now_ns)
@@ -356,11 +336,11 @@ class Worker:
         complete = self._joins[kind].add(header, sample.payload, now_ns)
         if complete is None:
             return
-        # A stamp of term 0 is a source's own guess; one that came from the stamper knows better.
+        # Term 0 marks a source's guess; a stamp from the stamper has precedence.
         stamped = max((one for one, _, _ in complete.values()), key=lambda one: one.stamp.term)
         job = Job(stamped, complete, kind == SHADOW)
         if self.is_sink and job.shadow:
-            # A shadow ends where the sink begins.
+            # A shadow ends before its sink.
             self._end(job, "shadow")
         elif self._is_forked(job):
             self.book.ended(job.headers, TAKEN)
@@ -373,14 +353,14 @@ class Worker:
                 self._replace(self._jobs.popleft())
 
     def _replace(self, job: Job) -> None:
-        """A later cycle has taken a job's place."""
+        """Report a job that a later cycle has replaced."""
         self.replaced += 1
         if not job.shadow:
             self.book.ended(job.headers, REPLACED)
         self._end(job, "shadow" if job.shadow else "replaced")
 
     def _end(self, job: Job, outcome: str) -> None:
-        """Report a job that is here and will not run, with all that is known of its cycle."""
+        """Report a job that has arrived and will not run, with all jobs upstream of it."""
         place, at_ns = self.place, job.arrived_ns
         inputs = tuple((source, at_ns) for source, (_, _, at_ns) in job.inputs.items())
         times = at_ns, UNKNOWN, UNKNOWN
@@ -392,7 +372,7 @@ class Worker:
     # -------------------------------------------------------------------------- state
 
     def _is_forked(self, job: Job) -> bool:
-        """Whether a job is here only because the state comes here."""
+        """Whether a job was sent here only because the state will move here."""
         runs_here = self.routes.runs(self.task, self.place.node, job.header.stamp)
         return self._stateful and not runs_here and not job.shadow
 
@@ -418,9 +398,9 @@ class Worker:
 
     @property
     def _restoring(self) -> tuple[State, bytes] | None:
-        """What has come of the state that is awaited, once its last cycle is known here.
+        """The requested state, if it has arrived and the stamp of its last cycle is known here.
 
-        The inputs of that cycle are forked, and come by themselves.
+        Inputs of later cycles are forked to here.
         """
         asked = self._awaited
         found = None if asked is None else self._answers.get(asked.node)
@@ -429,7 +409,7 @@ class Worker:
         return found if (asked.run, asked.cycle - 1) <= found[0].key <= self._newest else None
 
     def next_chore(self, now_ns: int) -> Chore | None:
-        """Return the chore before the next job; `do_chore` and `finish_chore` have to follow."""
+        """Return the chore before the next job; `do_chore` and `finish_chore` must follow."""
         if self.busy_since_ns is not None or not self.started:
             return None
         asked = self._asked
@@ -446,12 +426,12 @@ class Worker:
         self._checkpoint_to = ()
         self._chore, self.busy_since_ns, self._now_ns = chore, now_ns, now_ns
         if chore.number:
-            # The guard must not take this silence for a fault.
+            # The beat announces the pause, which the guard must not count as a fault.
             self.pulse.send(now_ns)
         return chore
 
     def do_chore(self, chore: Chore) -> tuple[bytes, str]:
-        """Call the stage; returns the snapshot, and why it failed or nothing."""
+        """Call the stage; return the snapshot, and the error or an empty string."""
         state = chore.state
         if state is None:
             try:
@@ -468,7 +448,7 @@ class Worker:
     def finish_chore(
         self, chore: Chore, data: bytes, failed: str, started_ns: int, ended_ns: int
     ) -> None:
-        """Send a snapshot, or follow with a state that was taken over."""
+        """Send the snapshot, or queue the forked jobs that follow a restored state."""
         self.busy_since_ns = self._chore = None
         state = chore.state
         if state is None:
@@ -505,7 +485,7 @@ class Worker:
             place.transport.put(key, data, header, lane=lane)
 
     def _take_over(self, state: State, data: bytes) -> str:
-        """Restore a state; returns what went wrong, or nothing."""
+        """Restore a state; return the error, or an empty string."""
         if not self.stage.stateful:
             return f"{self.task} has no restore()"
         try:
@@ -517,11 +497,11 @@ class Worker:
         return ""
 
     def _recover(self, job: Job) -> int:
-        """After a failover: the last checkpoint, if it is newer than this state; its age."""
+        """Restore the last checkpoint if it is newer than this state; return its age in cycles."""
         if not self._checkpoints:
             return UNKNOWN
         kept, self._checkpoints = self._checkpoints.values(), {}
-        # Of this run, and of no cycle beyond its stamp: no other one can be where this job begins.
+        # This job can only continue a checkpoint of an earlier cycle of its run.
         past = (max(self.state_at, (job.header.stamp.run, -1)), job.order)
         fit = [(state, data) for state, data in kept if past[0] < state.key < past[1]]
         if not fit:
@@ -533,7 +513,7 @@ class Worker:
 
     @property
     def _checkpoint_nodes(self) -> tuple[str, ...]:
-        """Nodes of the fallbacks that get checkpoints from here."""
+        """Other nodes on which fallbacks run this task; they get checkpoints."""
         problem = self.place.problem
         if not (self._stateful and problem.live.checkpoint_cycles):
             return ()
@@ -542,11 +522,11 @@ class Worker:
 
     @property
     def _too_slow(self) -> bool:
-        """Whether a checkpoint would keep cycles waiting until the guard moves."""
+        """Whether a checkpoint takes so long that the guard would move the cell."""
         return self._cost_ns > self.place.patience_ns
 
     def _plan_checkpoint(self, job: Job, now_ns: int) -> None:
-        """Have a checkpoint follow a job, every so many cycles, at most a 20th of the time."""
+        """Plan a checkpoint every `checkpoint_cycles`, if they use at most 1/20 of the time."""
         nodes = self._checkpoint_nodes
         if not nodes or job.header.stamp.cycle % self.place.problem.live.checkpoint_cycles:
             return
@@ -558,7 +538,7 @@ class Worker:
 
     @property
     def active(self) -> bool:
-        """Whether it works: it stands by for nobody, or for somebody who is silent."""
+        """Whether it runs jobs: it is no standby, or its primary is silent or not ready."""
         if not self.stands_by:
             return True
         detector = self.pulse.detector
@@ -570,12 +550,12 @@ class Worker:
 
     @property
     def warms_up(self) -> bool:
-        """Whether its jobs are the first ones, which say nothing of the others."""
+        """Whether its next job is a warm-up job; their times are not representative."""
         return self._warmup > 0
 
     def rest_s(self, now_ns: int) -> float:
-        """Seconds after which there may be something to do without any message."""
-        # A standby has to notice silence.
+        """Seconds after which a job may be due without a message."""
+        # A standby must notice silence.
         rest_s = 0.01 if self.stands_by else 0.2
         if self._source is None:
             return rest_s
@@ -596,7 +576,7 @@ class Worker:
         return bool(waits) and self.busy_since_ns is None
 
     def next_job(self, now_ns: int) -> Job | None:
-        """Return the job to run now, if there is one; `run` has to follow."""
+        """Return the job to run now, or None; `run` and `finish` must follow."""
         self._now_ns = now_ns
         if self.busy_since_ns is not None or not self.started:
             return None
@@ -606,7 +586,7 @@ class Worker:
             return self._taken(self._replay.popleft(), now_ns)
         self._say_restored()
         while self._jobs and not self._jobs[0].shadow and self._jobs[0].order <= self._restored_at:
-            # It is in the state that was taken over.
+            # The restored state already contains this job.
             self._replace(self._jobs.popleft())
         if not self.active:
             horizon_ns = now_ns - 2 * self.place.period_ns
@@ -625,18 +605,17 @@ class Worker:
         return job
 
     def retry(self, shadow: bool, inputs: list[tuple[Header, bytes]], now_ns: int) -> None:
-        """Put a job that another process has not finished before all others."""
+        """Put a job that another process has not finished at the head of the queue."""
         if inputs:
             by_source = {header.source: (header, data, now_ns) for header, data in inputs}
             self._jobs.appendleft(Job(inputs[0][0], by_source, shadow))
 
     def run(self, job: Job, started_ns: int) -> tuple[Message | None, int]:
-        """Call the stage; returns its output, None if it failed, and the state's age.
+        """Call the stage; return its output (None if it failed) and the age of its checkpoint.
 
-        The CPU time from its start on, what it takes to read the inputs included, goes into the
-        job's hop: that of this thread, or of the whole process where the cell gives the task
-        several threads on this node. So does what others of the node took meanwhile, where
-        something counts it.
+        The hop of the job gets the CPU time of the call and of reading its inputs: the time of this
+        thread, or of the process if the cell gives the task several threads on this node. It
+        also gets the CPU time of other processes during the call, if the kernel counts it.
         """
         before, begun_ns = self.group_clock(), self.cpu_clock()
         stamp = job.header.stamp
@@ -670,7 +649,7 @@ class Worker:
     def finish(
         self, job: Job, output: Message | None, started_ns: int, ended_ns: int, state_age: int = -1
     ) -> None:
-        """Send a job's output where its stamp says."""
+        """Send a job's output to the destinations of its stamp."""
         self.busy_since_ns = None
         self.state_at = max(self.state_at, job.order)
         place, stamp = self.place, job.header.stamp
@@ -684,7 +663,7 @@ class Worker:
             self._follows = False
             self._awaited = None
             self._forked.clear()
-        # Until it is known that there is something to send.
+        # Counts as failed until there is an output to send.
         self._failed_in_a_row, self._failed_ns = self._failed_in_a_row + 1, ended_ns
         if output is None:
             return
@@ -726,12 +705,12 @@ class Worker:
             self._plan_checkpoint(job, ended_ns)
 
     def framed(self, now_ns: int) -> None:
-        """Ask the stamper for a cycle: the source has a frame."""
+        """Request a cycle from the stamper, because the source has a frame."""
         self._framed_ns = now_ns
         self.place.transport.put(self.place.keys.frame(), b"")
 
     def no_frame(self, error: Exception) -> None:
-        """Take note that waiting for a frame has failed."""
+        """Record that waiting for a frame has failed."""
         known = isinstance(error, LiveError)
         self._failed(str(error) if known else f"wait() raised {type(error).__name__}: {error}")
 
@@ -775,13 +754,13 @@ class Worker:
         return f"no checkpoints: {call} takes {cost_s:.2g} s of a period of {period_ms:g} ms"
 
     def _moves(self) -> BeatState:
-        """Tell others to wait while a state that an order asked for is written or read."""
+        """Return `moving`, set while a call of snapshot() or restore() for a migration runs."""
         since_ns, chore = self.busy_since_ns, self._chore
         called = chore is not None and chore.number > 0 and since_ns is not None
         return BeatState(moving=called and self._now_ns - (since_ns or 0) <= MOVING_NS)
 
     def wake(self, now_ns: int) -> int:
-        """Beat; returns when the next beat is due."""
+        """Send the beat if it is due; return the instant of the next one."""
         self._now_ns = max(self._now_ns, now_ns)
         return self.pulse.wake(now_ns)
 

@@ -1,19 +1,19 @@
-"""Continuity: numbers that one message alone does not move.
+"""Continuity: protects growing numbers from a single false message.
 
-Cycles, terms, lives and instants only grow: a single number that is far too high, damaged or made
-up, would make all that come later old ones.
+Cycles, terms, lives and instants only grow. If a single false number, damaged or forged, were
+accepted and far too high, all later messages would count as old.
 
-`Continuity`: a cycle's number may be `RESERVED` ahead, which a stamper leaves out when it starts
-again, and as many more as can have been released since. One that is further ahead, or of a later
-run, leaps: it is believed once `CONFIRMATIONS` in a row, over some periods, have gone on from one
-another, and none between them went on from what was believed.
+`Continuity`: a cycle's number may be ahead by `RESERVED`, the numbers that a restarted stamper may
+skip, plus the cycles that can have been released since the last message. A number further ahead, or
+of a later run, is a leap. It is accepted after `CONFIRMATIONS` messages in a row, over some
+periods, if each follows the previous one and none follows the accepted number.
 
-`OvershootDetector`: a life or an instant may be any time ahead, as a computer may have slept. But
-where `CONFIRMATIONS` in a row grow behind the one that is believed, that one was false.
+`OvershootDetector`: a life or an instant may be ahead by any time, because a computer may have
+slept. But if `CONFIRMATIONS` messages grow in a row below the accepted number, it was false.
 
-`RunClaims`: a stamper without the book of its last run learns that run from others.
+`RunClaims`: a stamper without the saved state of its last run learns the run from others.
 
-`SetbackDetector`: what was due on a clock that has been set back would be due too late.
+`SetbackDetector`: after a clock was set back, due times must be shifted, or they would be too late.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from typing import TypeAlias
 
 from dwell.model.instants import NEVER_NS
 
-#: Cycle numbers that the stamper reserves at a time; after a restart the rest of them stays unused.
+#: Cycle numbers that the stamper reserves at a time; a restart skips the rest.
 RESERVED = 1_024
-#: Messages in a row that are believed, though they do not go on from what was believed before.
+#: Number of messages in a row that confirm a leap.
 CONFIRMATIONS = 5
-#: How much sooner than the message before it a message may have been heard, for all its delay.
+#: Largest difference between the delays of two messages.
 LATENESS_NS = 2_000_000_000
-#: Cycles that may be released in a period (`release: frames`).
+#: Largest number of cycles released per period (`release: frames`).
 MOST_A_PERIOD = 2
 
-#: Equal claims in a row that are believed of a sender that signs nothing.
+#: Number of equal claims in a row that an unsigned claim needs.
 CLAIMS = 3
-#: No claimed run is believed from here on: the last quarter of the range stays free.
+#: Claimed runs from here on are ignored: the last quarter of the range stays free.
 CLAIMED_RUN_LIMIT = 3 << 60
 
 #: Run and number.
@@ -41,14 +41,10 @@ Cycle: TypeAlias = tuple[int, int]
 
 
 class Continuity:
-    """Tells cycles that go on from those believed before from those that leap.
+    """Distinguishes cycles that follow the accepted cycles from leaps.
 
-    Attributes
-    ----------
-    newest : (int, int) or None
-        Highest run and cycle believed; None before the first.
-    leaps : int
-        Messages that were not believed.
+    `newest` is the highest accepted run and cycle, None before the first; `leaps` counts the
+    messages with a leap.
     """
 
     def __init__(self, period_ns: int) -> None:
@@ -63,12 +59,12 @@ class Continuity:
         self._since_ns = self._confirmations = 0
 
     def believe(self, cycle: Cycle, now_ns: int) -> None:
-        """Go on from a cycle, whatever was believed before."""
+        """Accept a cycle as the newest, even if it is lower than the newest one before."""
         self.newest, self._heard_ns = cycle, now_ns
         self._forget()
 
     def ahead(self, now_ns: int) -> int:
-        """Numbers that a cycle heard now may be ahead of the newest."""
+        """Return how far a cycle that arrives now may be ahead of the newest."""
         return self._ahead(self._heard_ns, now_ns)
 
     def _ahead(self, heard_ns: int, now_ns: int) -> int:
@@ -76,16 +72,10 @@ class Continuity:
         return RESERVED + MOST_A_PERIOD * passed_ns // self._period_ns
 
     def takes(self, cycle: Cycle, now_ns: int, *, alone: bool = False) -> bool:
-        """Whether a cycle is believed; a later one than the newest becomes that.
+        """Whether a cycle (run and number) is accepted; it becomes the newest if it is later.
 
-        Parameters
-        ----------
-        cycle : (int, int)
-            Run and number.
-        now_ns : int
-            When it was heard, on this node's clock.
-        alone : bool
-            Whether it never counts as company for others.
+        It arrived at `now_ns` on this node's clock. With `alone` a leap never counts as a
+        confirmation of other leaps.
         """
         newest = self.newest
         if newest is None or self._follows(newest, self._heard_ns, cycle, now_ns):
@@ -115,63 +105,51 @@ class Continuity:
 
 
 class RunClaims:
-    """Runs that other processes name, each with its number of equal claims in a row.
-
-    Parameters
-    ----------
-    needed : int
-        Number of claims that are believed: 1 where they are signed.
-    """
+    """Runs that other processes claim; `needed` equal claims in a row are accepted."""
 
     def __init__(self, needed: int) -> None:
         self._needed = needed
         self._claims: dict[str, tuple[int, int]] = {}
 
     def believed(self, who: str, run: int) -> bool:
-        """Note a claim; whether it is believed now."""
+        """Record a claim; return whether it is now accepted."""
         known, count = self._claims.get(who, (run, 0))
         self._claims[who] = run, count + 1 if known == run else 1
         return self._claims[who][1] >= self._needed and run < CLAIMED_RUN_LIMIT
 
     def below(self, run: int, who: str) -> bool:
-        """Whether a process has named a run, and none beyond this one."""
+        """Whether a process has claimed a run, and its last claim is not above this run."""
         return self._claims.get(who, (NEVER_NS, 0))[0] <= run
 
 
 class SetbackDetector:
-    """Notices that the clock of its own node has been set back."""
+    """Detects that the clock of its own node was set back."""
 
     def __init__(self) -> None:
         self._seen_ns = -NEVER_NS
 
     def back_ns(self, now_ns: int) -> int:
-        """Return by how much the clock has gone back since the last call; 0 where it has not."""
+        """Return the time by which the clock was set back since the last call, or 0."""
         seen_ns, self._seen_ns = self._seen_ns, now_ns
         return max(seen_ns - now_ns, 0)
 
 
 class OvershootDetector:
-    """Notices that an instant that was believed had been too high.
+    """Detects that the accepted instant was too high.
 
-    Late messages and copies are behind what is believed, too: but they do not go on.
+    Late messages and copies are below the accepted instant too, but they do not grow in a row.
     """
 
     def __init__(self) -> None:
         self.advanced()
 
     def advanced(self) -> None:
-        """Something went on from what is believed."""
+        """Record a message at or above the accepted instant."""
         self._behind: tuple[int, ...] | None = None
         self._confirmations = 0
 
     def behind(self, *order: int) -> bool:
-        """Whether so many in a row go on behind what is believed that this was wrong.
-
-        Parameters
-        ----------
-        *order : int
-            Instant that grows, or life and instant.
-        """
+        """Record a lower instant (or life and instant); return whether the accepted was false."""
         if self._behind is None or order > self._behind:
             self._behind = order
             self._confirmations += 1

@@ -1,11 +1,11 @@
-"""The keys under which the processes of a cell send and hear."""
+"""Keys of the messages between the processes of a cell."""
 
 from __future__ import annotations
 
 MAIN, SHADOW = "main", "shadow"
-#: Who orders, among those who have keys; all others of a cell go by their node's name.
+#: Signing name of the controller; other processes sign with the name of their node.
 CONTROLLER = "controller"
-#: First words of the keys of what is sent twice: nothing else takes the detour.
+#: First words of the keys of messages that are sent twice, directly and over the detour.
 TWICE = frozenset({"accepted", "beat", "done", "ended", "load"})
 
 
@@ -17,7 +17,7 @@ class Keys:
         self._below, self._detoured = f"{self.root}/", f"{self.root}/detour/"
 
     def inputs(self, task: str, node: str, kind: str = MAIN) -> str:
-        """Inputs of a task's worker; of its shadow worker where `kind` is `SHADOW`."""
+        """Inputs of a task's worker, or of its shadow worker if `kind` is `SHADOW`."""
         return f"{self.root}/in/{task}/{node}/{kind}"
 
     def command(self, task: str) -> str:
@@ -37,7 +37,7 @@ class Keys:
         return f"{self.root}/beat/{node}/{who}"
 
     def stamped(self) -> str:
-        """The stamp of every cycle."""
+        """Stamps of all cycles."""
         return f"{self.root}/stamped"
 
     def frame(self) -> str:
@@ -49,7 +49,7 @@ class Keys:
         return f"{self.root}/order"
 
     def accepted(self) -> str:
-        """Answers to them."""
+        """Answers to the orders."""
         return f"{self.root}/accepted"
 
     def load(self, node: str) -> str:
@@ -61,31 +61,31 @@ class Keys:
         return f"{self.root}/snapshot/{task}/{node}"
 
     def state(self, task: str, node: str, source: str = "*") -> str:
-        """States on their way to a worker from the one on another node; ``*`` for all nodes."""
+        """States sent to a task's worker from its worker on a source node; ``*`` for all nodes."""
         return f"{self.root}/state/{task}/{node}/{source}"
 
     def restored(self) -> str:
-        """Reports that a state has arrived."""
+        """Reports that a state was restored."""
         return f"{self.root}/restored"
 
     def ask(self) -> str:
-        """Questions and wishes of a person to the controller."""
+        """Requests of operators to the controller."""
         return f"{self.root}/ask"
 
     def look(self) -> str:
-        """Questions for the controller's status, and nothing else."""
+        """Requests for the controller's status only."""
         return f"{self.root}/look"
 
     def answer(self, number: str) -> str:
-        """Answers to them; ``*`` for all."""
+        """Answers to requests, by their number; ``*`` for all."""
         return f"{self.root}/answer/{number}"
 
     def relay(self, key: str) -> str:
-        """The copy of a message for the relay; ``**`` below the root for all."""
+        """Copy of a message, sent to the relay; ``**`` below the root for all."""
         return f"{self.root}/relay/{key.removeprefix(self.root + '/')}"
 
     def detour(self, key: str) -> str:
-        """The copy as it arrives."""
+        """Copy of a message, received over the detour."""
         return f"{self.root}/detour/{key.removeprefix(self.root + '/')}"
 
     def came_directly(self, key: str) -> bool:
@@ -93,13 +93,13 @@ class Keys:
         return not key.startswith(self._detoured)
 
     def word(self, key: str) -> str:
-        """Return the first word of a key, whichever way its message came: its kind."""
+        """Return the kind of a message, the first word of its key after any ``detour``."""
         return key.removeprefix(self._below).removeprefix("detour/").partition("/")[0]
 
     def carried(self) -> str:
-        """All copies of a while, together."""
+        """Batches of copies from the relay."""
         return f"{self.root}/carried"
 
     def gathered(self) -> str:
-        """The same for the controller, less often."""
+        """Batches of copies for the controller, less frequent."""
         return f"{self.root}/gathered"

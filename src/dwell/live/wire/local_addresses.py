@@ -1,4 +1,4 @@
-"""Addresses and ports of this computer: which of them a process can listen on, and who does."""
+"""Addresses and ports of this computer, and the processes that listen on them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LISTENS = "0A"
 
 
 def is_here(address: str) -> bool:
-    """Return whether an address, or the name of one, is this computer's."""
+    """Return whether an address or host name belongs to this computer."""
     try:
         _bind(address, 0)
     except OSError:
@@ -28,12 +28,9 @@ def is_here(address: str) -> bool:
 
 
 def why_not_listen(address: str, port: int) -> str:
-    """Return what keeps a process from listening at an address, and what to do; empty if nothing.
+    """Return the reason that a process cannot listen at an address, and a fix; empty if it can.
 
-    Parameters
-    ----------
-    address : str
-        An IP address or a host's name, as in `live.hosts`.
+    `address` is an IP address or a host name, as in `live.hosts`.
     """
     try:
         _bind(address, port)
@@ -60,13 +57,13 @@ def why_not_listen(address: str, port: int) -> str:
 def _bind(address: str, port: int) -> None:
     kind, *_, place = socket.getaddrinfo(address, port, type=socket.SOCK_STREAM)[0]
     with socket.socket(kind) as probe:
-        # Connections of a process that has ended keep nobody from its port.
+        # Old connections of an ended process do not block its port.
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         probe.bind(place)
 
 
 def listening_ports() -> dict[int, str]:
-    """Return the ports that somebody listens on, with the inode of the socket (proc_net(5))."""
+    """Return the ports in use by listeners, with the inodes of their sockets (proc_net(5))."""
     inodes = {}
     for file in ("/proc/net/tcp", "/proc/net/tcp6"):
         with suppress(OSError):
@@ -78,7 +75,7 @@ def listening_ports() -> dict[int, str]:
 
 
 def owners_of(inodes: Iterable[str]) -> dict[str, str]:
-    """Return the process that has each socket, by its inode, as far as this user may see it."""
+    """Return the process of each socket, by inode; other users' processes may be hidden."""
     wanted, owners = set(inodes), {}
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
@@ -93,9 +90,9 @@ def owners_of(inodes: Iterable[str]) -> dict[str, str]:
 
 
 def running_elsewhere(problem: Problem) -> str:
-    """Return a sentence that names the file by which a cell runs here with other addresses.
+    """Return a sentence with the cell file of a cell that runs here with other addresses, or "".
 
-    `dwell live run CELL` gives the cell ports of its own. Empty if no cell of this name runs here.
+    `dwell live run CELL` gives a cell different ports from those in its file.
     """
     for file in _controlled_cells():
         with suppress(DwellError, OSError):
@@ -106,7 +103,7 @@ def running_elsewhere(problem: Problem) -> str:
 
 
 def _controlled_cells() -> Iterator[Path]:
-    """Yield the cell files of the controllers that run here, in this network namespace."""
+    """Yield the cell files of the controllers that run in this network namespace."""
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError, ValueError):
             words = (process / "cmdline").read_bytes().decode(errors="replace").split("\0")
@@ -115,7 +112,7 @@ def _controlled_cells() -> Iterator[Path]:
 
 
 def taken_ports(wanted: Iterable[int]) -> str:
-    """Return which of some ports are taken, and by whom: ``7450, 7451 by NAME (process 7)``."""
+    """Return the ports in use and their processes: ``7450, 7451 by NAME (process 7)``."""
     wanted = set(wanted)
     taken = {port: inode for port, inode in listening_ports().items() if port in wanted}
     owners = owners_of(taken.values())

@@ -1,8 +1,8 @@
-"""Messages of the processes of a live cell, and how they are written.
+"""Messages between the processes of a live cell, and their encoding.
 
-Everything but a stage's payload is a MessagePack array of one of the types below. Decoding checks
-length, types and bounds, allocates no more than the message is long, and names what is wrong; it
-never imports or executes anything.
+All messages are MessagePack arrays of the types below; only the payload of a stage is not. Decoding
+checks length, types and bounds, allocates no more memory than the message is long, and names the
+error. It never imports or executes anything.
 """
 
 from __future__ import annotations
@@ -14,27 +14,27 @@ import msgspec
 from dwell.errors import LiveError
 from dwell.model.instants import NEVER_NS
 
-#: Longer headers and control messages are refused before anything of them is read.
+#: Longest header and control message; longer messages are rejected unread.
 MAX_HEADER_BYTES = 16_384
 MAX_CONTROL_BYTES = 262_144
-#: Outcomes of a command that the gate lets through: the actuator took it, or raised.
+#: Outcomes of a command that passes the gate: the actuator applied it, or raised.
 ACTUATED, NOT_APPLIED = HANDED_OVER = "actuated", "not_applied"
-#: Outcome of one that it keeps back, because it may be older than `max_age_ms`.
+#: Outcome of a command that the gate stops, because it may be older than `max_age_ms`.
 STALE = "stale"
-#: Begins the refusal of an order while another controller is in charge.
+#: Start of the refusal of an order while another controller is in charge.
 OTHER = "another controller"
-#: Signatures stand before what they are of (Ed25519).
+#: Length of a signature (Ed25519), which precedes the signed bytes.
 SIGNATURE_BYTES = 64
 
 Name: TypeAlias = Annotated[str, msgspec.Meta(min_length=1, max_length=120)]
 Count: TypeAlias = Annotated[int, msgspec.Meta(ge=0, lt=NEVER_NS)]
-#: Number of an order that is believed to have been carried out: a quarter of the range is left for
-#: those that follow, whatever one message says.
+#: Number of an accepted order: a quarter of the range remains for later orders, even if a message
+#: has a false number.
 Passed: TypeAlias = Annotated[int, msgspec.Meta(ge=0, lt=3 << 60)]
-#: Name of a candidate, or nothing.
+#: Name of a candidate, or an empty string.
 MaybeName: TypeAlias = Annotated[str, msgspec.Meta(max_length=120)]
 Hops: TypeAlias = "Annotated[tuple[Hop, ...], msgspec.Meta(max_length=64)]"
-#: CPU time; -1 where it is not known.
+#: CPU time, ns; -1 if unknown.
 Spent: TypeAlias = Annotated[int, msgspec.Meta(ge=-1, lt=NEVER_NS)]
 Instant: TypeAlias = Annotated[int, msgspec.Meta(ge=-NEVER_NS, lt=NEVER_NS)]
 Forks: TypeAlias = Annotated[tuple[tuple[Name, Name], ...], msgspec.Meta(max_length=16)]
@@ -46,20 +46,20 @@ class _Array(msgspec.Struct, array_like=True, frozen=True, gc=False):
 
 
 class Stamp(_Array, frozen=True):
-    """Placement of a cycle, by the stamper; every process downstream routes by it.
+    """Placement of a cycle, set by the stamper; every process downstream routes by it.
 
     Parameters
     ----------
     run : int
-        Run id; later runs have larger ones.
+        Run id; it grows from run to run.
     term : int
-        Grows at every change of placement.
+        Grows at every change of placement; 0 for a guess of a source task.
     released_ns : int
         Release on the stamper's clock.
     shadow : str
         Candidate that the cycle is also sent through; empty for none.
     forks : tuple of (str, str)
-        Tasks and nodes that get their inputs as well, because their state is on the way there.
+        Tasks and nodes that also get the inputs, because their state will be sent there.
     """
 
     run: Count
@@ -72,21 +72,21 @@ class Stamp(_Array, frozen=True):
 
     @property
     def key(self) -> tuple[int, int]:
-        """Run and cycle: what later cycles have more of."""
+        """Run and cycle; they grow with every cycle."""
         return self.run, self.cycle
 
 
 class Stamped(Stamp, frozen=True):
-    """A stamp as the controller gets it.
+    """A stamp for the controller, with measurements.
 
     Parameters
     ----------
     intervals : tuple of (int, int)
-        Earlier cycles of the run, and how long they took by the stamper's clock alone, ns (see
-        `dwell.live.roles.latencies`), each once.
+        Earlier cycles of the run and their durations by the stamper's clock alone, ns (see
+        `dwell.live.roles.latencies`); each cycle is sent once.
     group_ns : int
-        CPU time that the control group of the stamper's node had taken at the release; -1 where
-        that is not known.
+        CPU time that the control group on the stamper's node had used at the release; -1 if
+        unknown.
     """
 
     intervals: Annotated[tuple[tuple[Count, Count], ...], msgspec.Meta(max_length=64)] = ()
@@ -94,27 +94,26 @@ class Stamped(Stamp, frozen=True):
 
 
 class Hop(_Array, frozen=True):
-    """One job of a cycle, on the clock of the node it ran on.
+    """One job of a cycle, with instants on the clock of its node.
 
     Parameters
     ----------
     arrived_ns : int
-        When the last of its inputs was there.
+        Arrival of its last input.
     inputs : tuple of (str, int)
-        For every flow into the task: its source, and when its message was handed over here.
+        Source and arrival of every input.
     state_age : int
-        Cycles that the restored state behind it lacked, where it was the first after a failover;
-        -1 otherwise.
+        Age in cycles of the checkpoint restored before it, for the first job after a failover; -1
+        otherwise.
     cpu_ns : int
-        CPU time that the job took from its start on (see `Worker.run`); -1 where the stage was not
-        called.
+        CPU time from its start on (see `Worker.run`); -1 if the stage was not called.
     others_ns, outside_ns : int
-        CPU time that other processes of the node's control group took meanwhile, and on its CPUs
-        those of no such group; -1 where that is not known.
+        CPU time during the call of other processes in the worker's control group, and of processes
+        outside it on the worker's CPUs; -1 if unknown.
     group_ns : tuple of int
-        CPU time that the group had taken when the job started, and when the stage returned.
+        CPU time that the group had used at the start of the job and when the stage returned.
     warmup : bool
-        Whether its worker had not completed its `warmup_jobs` yet.
+        Whether it is one of its worker's first `warmup_jobs`.
     """
 
     task: Name
@@ -132,20 +131,20 @@ class Hop(_Array, frozen=True):
 
 
 class Header(_Array, frozen=True):
-    """Travels beside the payload of every message between stages.
+    """Sent with the payload of every message between stages.
 
     Parameters
     ----------
     source : str
         Task that sent it.
     node : str
-        Where that task ran.
+        Node of that task.
     kind : str
-        How the payload is written; see `dwell.live.wire.payloads`.
+        Encoding of the payload; see `dwell.live.wire.payloads`.
     hops : tuple of Hop
-        All jobs behind it, each once.
+        All jobs upstream in the cycle, each once.
     shadow : bool
-        Whether this is the shadow of the cycle and not the cycle itself.
+        Whether the message belongs to the shadow of the cycle.
     seal : bytes
         Signature of the stamp by its maker; empty without keys.
     """
@@ -160,24 +159,23 @@ class Header(_Array, frozen=True):
 
 
 class Completion(_Array, frozen=True):
-    """End of a cycle: at a sink, or at a task where it ended before.
+    """End of a cycle at a sink, or of one of its jobs before a sink.
 
     Parameters
     ----------
     done_ns : int
-        When the command was handed to the actuator, on the sink's clock.
+        Arrival of the command at the gate, on the sink's clock.
     outcome : str
         ``actuated``, ``not_applied`` (the actuator raised), ``behind`` (a later cycle had been
-        actuated), ``stale`` (older than `max_age_ms`); ``shadow`` where a shadow ended;
-        ``replaced`` where a later cycle took its place.
+        actuated), ``stale`` (older than `max_age_ms`); ``shadow`` at the end of a shadow;
+        ``replaced`` if a later cycle replaced the job.
     node : str
-        Node of the sink, or where a shadow stopped.
+        Node of the sink or of the job.
     group_ns : int
-        CPU time that the control group of the sink's node had taken by `done_ns`; -1 where that is
-        not known.
+        CPU time that the control group on the sink's node had used at `done_ns`; -1 if unknown.
     rested : bool
-        Whether the actuator was at rest when the command came: the sink had called `hold` or
-        `zero` since the last command that was applied.
+        Whether the actuator was at rest when the command arrived: the sink had called `hold` or
+        `zero` since the last applied command.
     """
 
     stamp: Stamp
@@ -191,14 +189,14 @@ class Completion(_Array, frozen=True):
 
 
 class Heard(_Array, frozen=True):
-    """Last beat of another process that the sender of a beat has heard.
+    """Last beat that the sender of a beat has received from another process.
 
     Parameters
     ----------
     beat_ns : int
-        When that beat was sent, on its sender's clock.
+        Time at which that beat was sent, on its sender's clock.
     at_ns : int
-        When it was heard, on the listener's clock.
+        Its arrival, on the receiver's clock.
     """
 
     who: Name
@@ -208,7 +206,7 @@ class Heard(_Array, frozen=True):
 
 
 class Beat(_Array, frozen=True):
-    """Heartbeat: its process is there, and last heard these others; so clocks can be compared.
+    """Heartbeat of a process, with the last beats that it received, to compare clocks.
 
     Parameters
     ----------
@@ -217,20 +215,19 @@ class Beat(_Array, frozen=True):
     ready : bool
         Whether it can do its work: its stage has started and does not hang.
     term : int
-        The stamper's current term; 0 from anybody else.
+        The stamper's current term; 0 from other processes.
     placement : str
-        The stamper's current placement; empty from anybody else.
+        The stamper's current placement; empty from other processes.
     cell : str
-        Digest of the cell file, so that different files are noticed.
+        Digest of the cell file, to detect different files.
     note : str
-        Why it is not ready, or the last failure.
+        Reason that it is not ready, or the last failure.
     run : int
-        Run of the last command that a sink let through; 0 from other processes.
+        Run of the last command that passed a sink's gate; 0 from other processes.
     moving : bool
-        Whether a worker writes or reads a state that an order asked for.
+        Whether a worker is saving or restoring a state for a migration.
     generation, roster : int
-        Generation of the certificate that the process uses, and number of its roster; 0 without
-        keys.
+        Generation of the process's certificate, and number of its roster; 0 without keys.
     """
 
     who: Name
@@ -256,18 +253,18 @@ class Order(_Array, frozen=True):
     Parameters
     ----------
     number : int
-        Grows with every order of this controller; a repeated one is the same order.
+        Grows with every order of this controller; a copy of an order keeps its number.
     run, term : int
-        Run and term it was computed on; 0 and 0 only to ask how things are (`placement` empty).
+        Run and term it was computed on; both 0 in a request for the state, with an empty
+        `placement`.
     placement : str
         Candidate; empty to change nothing.
     shadow_fraction : float
-        Share of the cycles sent through each alternative, under the placement that the order leads
-        to.
+        Share of the cycles sent through each alternative, under the placement of the order.
     forks : tuple of (str, str)
-        For `Stamp.forks` from now on.
+        Value of `Stamp.forks` from now on.
     want : str
-        Candidate that the guard's fallback shall be left for, so that probes are sent through it.
+        Candidate that shall replace the guard's fallback, to be proven by probes.
     """
 
     number: Count
@@ -281,12 +278,12 @@ class Order(_Array, frozen=True):
 
 
 class Carried(_Array, frozen=True):
-    """Small messages that the detour carries on together.
+    """Batch of small messages on the detour.
 
     Parameters
     ----------
     messages : tuple of (str, bytes)
-        Keys, and what was sent under them.
+        Keys and payloads.
     """
 
     messages: Annotated[
@@ -296,12 +293,12 @@ class Carried(_Array, frozen=True):
 
 
 class Ask(_Array, frozen=True):
-    """Question or wish of a person to a cell's controller.
+    """Request of an operator to a cell's controller.
 
     Parameters
     ----------
     number : str
-        Chosen by the asker; the answer goes to the key of that name.
+        Chosen by the sender; the key of the answer ends with it.
     what : str
         ``status``, ``pin``, ``unpin``, ``drain`` or ``undrain``.
     about : str
@@ -319,7 +316,7 @@ class Answer(_Array, frozen=True):
     Parameters
     ----------
     refused : str
-        Why it was not done; empty if it was.
+        Reason that the request was refused; empty if it was not.
     status : dict
         State of the cell; see `dwell.live.roles.controlled_cell.ControlledCell.status`.
     """
@@ -345,7 +342,7 @@ class OutputCounts(_Array, frozen=True):
     Parameters
     ----------
     total_bytes : int
-        Payloads of all blocks.
+        Sum of the payloads of all blocks.
     """
 
     target: Name
@@ -362,9 +359,9 @@ class StageCounts(_Array, frozen=True):
     median_ns, p95_ns : int
         Time of a job from start to end; 0 without jobs.
     replaced, dropped : int
-        Cycles of which an input was replaced, or dropped.
+        Number of cycles with a replaced or a dropped input.
     totals : tuple of int
-        Inputs of all blocks that were taken, replaced and dropped.
+        Number of taken, replaced and dropped inputs in all blocks.
     """
 
     who: Name
@@ -381,22 +378,22 @@ class StageCounts(_Array, frozen=True):
 
 
 class Load(_Array, frozen=True):
-    """Work of a node's CPU since its agent began to count.
+    """Work of a node's CPU since the start of its agent's count.
 
     Parameters
     ----------
     life : int
-        Life of the agent that counts; another life counts from another beginning.
+        Life of the agent; the counts of different lives have different starts.
     at_ns : int
-        On the node's clock.
+        Time of the report on the node's clock.
     busy_ns, own_ns, shadow_ns : int
-        Core-nanoseconds of everything, of the cell's own processes, and of its shadow workers.
+        Core-nanoseconds of all processes, of the cell's own processes, and of its shadow workers.
     accelerator : float
-        Utilisation of the node's accelerators where a hook measures it; -1 otherwise.
+        Utilisation of the node's accelerators if a hook measures it; -1 otherwise.
     processes : tuple of (str, int)
-        CPU time of each of the cell's processes there, the agent's included, since it was started.
+        CPU time of each of the cell's processes on the node, including the agent, since its start.
     stages : tuple of StageCounts
-        Once a second, the last two blocks of each worker; empty between.
+        The last two blocks of each worker, once per second; empty in other reports.
     """
 
     node: Name
@@ -411,16 +408,16 @@ class Load(_Array, frozen=True):
 
 
 class Snapshot(_Array, frozen=True):
-    """Request to a task's worker to send its state to another node's, who is told of it, too.
+    """Request to a task's worker to send its state to another node; the worker there gets a copy.
 
     Parameters
     ----------
     number : int
-        Comes back in `Restored`.
+        Returned in `Restored`.
     task, node, to : str
-        Task, where its state is, and where it shall go.
+        Task, node of its state, and new node of its state.
     run, cycle : int
-        The first cycle whose inputs are forked: the state has to have all before it.
+        The first cycle whose inputs are forked; the state must contain all earlier cycles.
     """
 
     number: Count
@@ -432,18 +429,18 @@ class Snapshot(_Array, frozen=True):
 
 
 class State(_Array, frozen=True):
-    """Header of a task's state on its way; the payload is what the stage wrote.
+    """Header of a message with a task's state; the payload is the result of `snapshot`.
 
     Parameters
     ----------
     run, cycle : int
-        The last cycle that is in it.
+        The last cycle in the state.
     task, node : str
-        Task, and where the state comes from.
+        Task, and node of the sender.
     number : int
-        Number of the `Snapshot` it answers; 0 for a checkpoint, which waits until it is needed.
+        Number of the `Snapshot` it answers; 0 for a checkpoint, which is kept for a failover.
     cost_ns : int
-        Time that `snapshot` took.
+        Duration of the last call of `snapshot`.
     """
 
     run: Count
@@ -460,12 +457,12 @@ class State(_Array, frozen=True):
 
 
 class Restored(_Array, frozen=True):
-    """Report that a state has arrived and the inputs since then are replayed.
+    """Report that a state is restored and the later inputs are replayed, or that this failed.
 
     Parameters
     ----------
     run, cycle : int
-        The last cycle that is in the state now.
+        The last cycle in the restored state.
     failed : str
         Failure; empty for none.
     """
@@ -486,23 +483,22 @@ class Accepted(_Array, frozen=True):
     controller : str
         Sender of the order that it answers.
     refused : str
-        Empty where it was accepted; else ``stale term``, ``stale run``, ``stale order``,
-        ``infeasible``, ``not ready``, ``not proven`` (probes are missing), ``another controller``,
-        with details.
+        Empty if accepted; else ``stale term``, ``stale run``, ``stale order``, ``infeasible``,
+        ``not ready``, ``not proven`` (probes are missing) or ``another controller``, with details.
     cycle : int
-        The next one that will be stamped, with what was ordered.
+        The next cycle to be stamped, with the ordered placement and forks.
     fallback : bool
-        Whether the guard's placement holds.
+        Whether the current placement is a fallback of the guard.
     proven : str
-        Candidate that enough probes have completed through; empty for none.
+        Candidate with enough completed probes; empty for none.
     newest : int
-        Highest number of an order that was carried out.
+        Highest number of an accepted order.
     resting : bool
         Whether the guard rests after its own move.
     probed : str
-        Candidate that probes are sent through, so that the guard's fallback can be left for it.
+        Candidate of the probes, which may replace the guard's fallback.
     probes, needed : int
-        Probes that count by now, and how many have to: `needed` are enough.
+        Number of probes that count now, and number needed.
     """
 
     number: Count
@@ -524,8 +520,8 @@ class Accepted(_Array, frozen=True):
 T = TypeVar("T", bound=msgspec.Struct)
 
 _ENCODER = msgspec.msgpack.Encoder()
-# All made here, by one thread: msgspec crashes where a message is decoded in one thread while
-# another makes a decoder of a type that is part of both.
+# Create all decoders here, in one thread: msgspec crashes if one thread decodes a message while
+# another thread creates a decoder for a type that both use.
 _KINDS: tuple[type[msgspec.Struct], ...] = (*_Array.__subclasses__(), Stamped)
 _DECODERS: dict[type[msgspec.Struct], msgspec.msgpack.Decoder[Any]] = {
     kind: msgspec.msgpack.Decoder(kind) for kind in _KINDS
@@ -533,18 +529,12 @@ _DECODERS: dict[type[msgspec.Struct], msgspec.msgpack.Decoder[Any]] = {
 
 
 def encode(message: msgspec.Struct) -> bytes:
-    """Write a message."""
+    """Encode a message."""
     return _ENCODER.encode(message)
 
 
 def decode(data: bytes, kind: type[T], *, limit: int = MAX_CONTROL_BYTES) -> T:
-    """Read a message.
-
-    Raises
-    ------
-    LiveError
-        If it is longer, or no such message.
-    """
+    """Decode a message; raise a LiveError if it exceeds `limit` bytes or is not of this kind."""
     if len(data) > limit:
         raise LiveError(f"a {kind.__name__} of {len(data)} bytes; at most {limit} are read")
     try:

@@ -1,9 +1,9 @@
-"""Payloads of stages: written, and read again without trusting them.
+"""Payloads of stages: encoding, and decoding of untrusted bytes.
 
-A payload travels raw, beside its header, and the header says its kind: ``none``, ``bytes``,
-``array:<dtype>:<shape>`` or ``struct:<name>``. An array is read where it arrived, without a copy.
-A struct is MessagePack; it becomes the type that the stage declares, and plain values otherwise.
-NumPy's scalars in its fields travel as the numbers that they are.
+A payload is sent as raw bytes next to its header, which has its kind: ``none``, ``bytes``,
+``array:<dtype>:<shape>`` or ``struct:<name>``. An array is read in the received buffer, without a
+copy. A struct is MessagePack; it becomes the type that the stage declares, or plain values.
+NumPy's scalars in its fields are sent as plain numbers.
 """
 
 from __future__ import annotations
@@ -21,29 +21,20 @@ from dwell.errors import LiveError
 
 Payload: TypeAlias = "bytes | NDArray[Any] | msgspec.Struct | dict[str, Any] | list[Any] | None"
 
-#: Kinds of numbers that arrays may hold: no objects, no records.
+#: NumPy kinds of arrays that can be sent: numbers only, no objects or records.
 NUMBERS = "biufc"
 MAX_DIMENSIONS = 8
-#: Levels of a struct down to which it is said what cannot be sent.
+#: Depth in a struct to which an error names the part that cannot be sent.
 MAX_DEPTH = 16
-#: A description of an array as `write_payload` makes it. NumPy reads much more as a dtype, some of
-#: it as Python.
+#: Description of an array from `write_payload`. NumPy accepts more strings as a dtype, and
+#: evaluates some as Python.
 ARRAY = re.compile(r"([<>|=]?[biufc][0-9]{1,2}|\?):((?:[0-9]{1,18}(?:x[0-9]{1,18})*)?)")
 
 
 def write_payload(payload: object) -> tuple[str, bytes | memoryview]:
-    """Return the kind of a payload, and its bytes.
+    """Return the kind of a payload, and its bytes; raise a LiveError if it cannot be sent.
 
-    Returns
-    -------
-    kind : str
-    data : bytes or memoryview
-        A view of an array's own memory where it is contiguous.
-
-    Raises
-    ------
-    LiveError
-        If it is anything else.
+    The bytes of a contiguous array are a view of its memory.
     """
     if payload is None:
         return "none", b""
@@ -75,7 +66,7 @@ def write_payload(payload: object) -> tuple[str, bytes | memoryview]:
 
 
 def _flat(view: memoryview) -> bytes | memoryview:
-    """Return a view's bytes, without a copy where they lie one after another."""
+    """Return a view's bytes; only a view that is not contiguous is copied."""
     try:
         return view.cast("B")
     except (TypeError, ValueError):  # with gaps, empty, or of another byte order
@@ -83,7 +74,7 @@ def _flat(view: memoryview) -> bytes | memoryview:
 
 
 def _number(value: object) -> bool | int | float:
-    """Return the number that a scalar of NumPy's is."""
+    """Return a NumPy scalar as a plain number."""
     if isinstance(value, np.bool_):
         return bool(value)
     if isinstance(value, np.integer) and not isinstance(value, np.timedelta64):
@@ -94,7 +85,7 @@ def _number(value: object) -> bool | int | float:
 
 
 def _unsendable(payload: msgspec.Struct, error: Exception) -> str:
-    """Return which part of a struct cannot be sent."""
+    """Return an error that names the part of a struct that cannot be sent."""
     place, value = type(payload).__name__, cast("object", payload)
     for _ in range(MAX_DEPTH):
         for name, part in _parts(value):
@@ -110,7 +101,7 @@ def _unsendable(payload: msgspec.Struct, error: Exception) -> str:
 
 
 def _parts(value: object) -> Iterator[tuple[str, object]]:
-    """Yield what a value of a struct consists of, by its place there."""
+    """Yield the fields or items of a value, with their places in it."""
     if isinstance(value, msgspec.Struct):
         for name in type(value).__struct_fields__:
             yield f".{name}", getattr(value, name, None)
@@ -123,19 +114,10 @@ def _parts(value: object) -> Iterator[tuple[str, object]]:
 
 
 def read_payload(kind: str, data: bytes, expected: type | None = None) -> Payload:
-    """Read a payload.
+    """Read a payload of the kind in its header.
 
-    Parameters
-    ----------
-    kind : str
-        As its header says.
-    expected : type, optional
-        Struct that the stage declares for this input.
-
-    Raises
-    ------
-    LiveError
-        If the bytes are not what the header says, or not what the stage expects.
+    `expected` is the struct that the stage declares for this input. Raises a LiveError if the bytes
+    do not fit the kind or the struct.
     """
     word, _, rest = kind.partition(":")
     if word == "none":

@@ -1,7 +1,7 @@
-"""Relay batch: small messages that the detour carries together.
+"""Relay batch: small messages that the relay sends together.
 
-The receiver of a bundle reads a bounded length of it (`MAX_CONTROL_BYTES`), or nothing. So a sender
-that sends too much, or too often, must leave room for the messages of others.
+A receiver rejects a batch above a length limit (`MAX_CONTROL_BYTES`). Limits per key and per batch
+leave room for other senders if one sends too much or too often.
 """
 
 from __future__ import annotations
@@ -10,31 +10,23 @@ from collections import Counter
 
 from dwell.live.wire.messages import MAX_HEADER_BYTES
 
-#: In one bundle at most; more within the time that it is gathered in are dropped.
+#: Largest number of messages in a batch; more are dropped.
 MOST_MESSAGES = 1_000
-#: Of all of them, keys included: two bundles put together are still read.
+#: Largest size of a batch with its keys; two batches together are still below the limit.
 MOST_BYTES = 100_000
-#: Of one key: no sender's messages take the room of all others.
+#: Largest number of messages with one key, to leave room for other keys.
 MOST_OF_A_KEY = 32
-#: Longer ones are not carried. `Carried` takes no longer keys either.
+#: Longest message and key of a batch. `Carried` limits keys to the same length.
 LONGEST_MESSAGE = MAX_HEADER_BYTES
 LONGEST_KEY = 400
 
 
 class RelayBatch:
-    """See the module.
-
-    Parameters
-    ----------
-    most : int
-        Messages in it.
-    newest : bool
-        Whether only the newest of each key counts.
-    """
+    """See the module; at most `most` messages, with `newest` only the newest of each key."""
 
     def __init__(self, most: int = MOST_MESSAGES, *, newest: bool = False) -> None:
         self._most, self._newest = most, newest
-        # By key and number; one number is enough where the newest of a key counts.
+        # By key and number; the number is always 0 if only the newest of a key counts.
         self._messages: dict[tuple[str, int], bytes] = {}
         self._of_key: Counter[str] = Counter()
         self._bytes = 0
@@ -43,7 +35,7 @@ class RelayBatch:
         return len(self._messages)
 
     def add(self, key: str, payload: bytes) -> bool:
-        """Add a message; False where it is not carried on."""
+        """Add a message; return False if it is dropped."""
         if len(key) > LONGEST_KEY or len(payload) > LONGEST_MESSAGE:
             return False
         place = key, 0 if self._newest else self._of_key[key]
@@ -58,7 +50,7 @@ class RelayBatch:
         return True
 
     def taken(self) -> list[tuple[str, bytes]]:
-        """Return the messages, oldest first, and be empty."""
+        """Return the messages, oldest first, and clear the batch."""
         taken = [(key, payload) for (key, _), payload in self._messages.items()]
         self._messages.clear()
         self._of_key.clear()

@@ -10,14 +10,14 @@ from dwell.live.wire.keys import MAIN, SHADOW
 from dwell.live.wire.messages import Stamp
 from dwell.model import Problem
 
-#: Routes that are remembered at most.
+#: Largest number of cached routes.
 MAX_KNOWN = 1_024
-#: Source of the input that a source task gets.
+#: Sender of the input of a source task.
 STAMPER = "stamper"
 
 
 class Destination(NamedTuple):
-    """A worker: of a task on a node, its shadow worker where `kind` says so."""
+    """A task's worker on a node; its shadow worker if `kind` is `SHADOW`."""
 
     task: str
     node: str
@@ -25,10 +25,10 @@ class Destination(NamedTuple):
 
 
 class Routes:
-    """Destinations of every task's output; the stamp is all they depend on.
+    """Destinations of every task's output; they depend only on the stamp.
 
-    A shadow shares with its cycle what both placements run alike. Behind the first task that they
-    run on different nodes it has messages of its own, down to the sinks' nodes.
+    A shadow shares the tasks that both placements run on the same nodes with the same inputs. From
+    the first task on different nodes it has separate messages, down to the sinks' nodes.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -50,26 +50,10 @@ class Routes:
     def destinations(
         self, task: str, stamp: Stamp, *, shadow: bool = False
     ) -> tuple[Destination, ...]:
-        """Where a task's output goes.
+        """Return the destinations of a task's output; none for a sink task.
 
-        Parameters
-        ----------
-        task : str
-            Sender; `STAMPER` for the stamp itself.
-        stamp : Stamp
-            The cycle's stamp; its placements are candidates. Term 0 is a source's own guess.
-        shadow : bool
-            Whether it is the shadow's output and not the cycle's.
-
-        Returns
-        -------
-        tuple of Destination
-            Empty for a sink task.
-
-        Raises
-        ------
-        LiveError
-            If the stamp names a placement that is no candidate.
+        `task` is the sender, `STAMPER` for the stamp itself. `shadow` is set for the output of a
+        shadow. Raises a LiveError if the stamp's placement or shadow is not a candidate.
         """
         key = (task, stamp.placement, stamp.shadow, stamp.forks, shadow, stamp.term == 0)
         known = self._known.get(key)
@@ -90,7 +74,7 @@ class Routes:
 
     def _routed(self, task: str, stamp: Stamp, shadow: bool) -> Iterable[Destination]:
         if not stamp.term:
-            # Nobody has said where the cycle runs: whoever may need it gets it.
+            # The stamp is a guess, so all workers that may run the target get the output.
             for target in self._targets[task]:
                 for node in self._pipeline.tasks[target].on:
                     yield Destination(target, node, MAIN)
@@ -98,7 +82,7 @@ class Routes:
         active = self._candidates[stamp.placement]
         other = self._candidates.get(stamp.shadow) if stamp.shadow else None
         apart = self._pipeline.diverging(active, other) if other is not None else frozenset()
-        # What the two do not share sends to the shadow by itself.
+        # The cycle's tasks also send to the shadow, except for tasks that run twice.
         shares = shadow or task not in apart
         for target in self._targets[task]:
             if not shadow:

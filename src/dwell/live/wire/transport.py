@@ -1,8 +1,8 @@
-"""The protocol of transports, whatever carries the messages.
+"""Transport: the interface between the roles of a cell and the network.
 
-A key is chunks with ``/`` between them; in an expression that subscribers match keys with, a chunk
-``*`` stands for any one chunk and ``**`` for any number of them. That is the part of Zenoh's key
-expressions that is used here.
+A key is a sequence of chunks with ``/`` between them. In the key expression of a subscriber a chunk
+``*`` matches any single chunk, and ``**`` any number of chunks. This is a subset of Zenoh's key
+expressions.
 """
 
 from __future__ import annotations
@@ -16,24 +16,18 @@ from typing import Literal, Protocol, TypeAlias
 
 from dwell.errors import LiveError
 
-#: `control` is for what is small and must not wait; `images` for payloads, newest first.
+#: `control` carries small, urgent messages; `images` carries large payloads, newest first.
 Lane: TypeAlias = Literal["control", "images"]
 
-# What Zenoh forbids, and `@` in front, which no wildcard of Zenoh's would match. Names of cells and
-# tasks are chunks as they are, with single spaces between their words.
+# Excludes the characters that Zenoh forbids, and a leading `@`, which Zenoh's wildcards do not
+# match. Names of cells and tasks are chunks, with single spaces between their words.
 _WORD = r"[^/*$?#\s]+"
 _CHUNK = re.compile(rf"(?!@){_WORD}(?: {_WORD})*")
 
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """A message as it arrives.
-
-    Parameters
-    ----------
-    header : bytes
-        Empty where none was sent.
-    """
+    """A received message; `header` is empty if it was sent without a header."""
 
     key: str
     payload: bytes
@@ -46,35 +40,30 @@ Receive: TypeAlias = Callable[[Arrival], None]
 class Transport(Protocol):
     """Carries messages by key between the processes of a cell.
 
-    A message is delivered at most once, to every subscriber whose key expression matches and that
-    can be reached, or is lost without a word; messages of one sender under one key and on one lane
-    arrive in order.
-    Nobody is handed what it has put itself, nor what was put before it subscribed. Keys and key
-    expressions that are none raise a LiveError.
+    A message is delivered at most once to every reachable subscriber with a matching key
+    expression, or is lost without an error. Messages of one sender, key and lane arrive in order.
+    A process does not receive its own messages, nor messages from before its subscription. Invalid
+    keys and key expressions raise a LiveError.
     """
 
     def put(
         self, key: str, payload: bytes | memoryview, header: bytes = b"", *, lane: Lane = "control"
     ) -> None:
-        """Send a message; returns at once, whatever the receivers do.
-
-        Does nothing once it is closed.
-        """
+        """Send a message and return without waiting for receivers; no effect after `close`."""
 
     def subscribe(self, key: str, receive: Receive) -> None:
-        """Have `receive` called with every message under a key expression (``*``, ``**``).
+        """Call `receive` with every message under a key expression (``*``, ``**``).
 
-        It is called from a thread of the transport's, one message after another for one lane, and
-        must not block.
+        A thread of the transport calls it, with one message at a time per lane. It must not block.
         """
 
     def close(self) -> None:
-        """Send and deliver nothing more; safe to call twice."""
+        """Stop sending and delivering messages; safe to call twice."""
 
 
 @lru_cache(1_024)
 def require_key(key: str) -> None:
-    """Raise a LiveError unless a message can be sent under a key."""
+    """Raise a LiveError if a key is invalid."""
     for chunk in key.split("/"):
         if not _CHUNK.fullmatch(chunk):
             raise LiveError(
@@ -84,7 +73,7 @@ def require_key(key: str) -> None:
 
 
 def require_expression(expression: str) -> None:
-    """Raise a LiveError unless an expression can be subscribed to."""
+    """Raise a LiveError if a key expression is invalid."""
     chunks = expression.split("/")
     for chunk in chunks:
         if chunk not in ("*", "**") and not _CHUNK.fullmatch(chunk):

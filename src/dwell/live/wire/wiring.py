@@ -1,7 +1,7 @@
-"""Who is there in a live cell, where each listens, and who connects to whom.
+"""Wiring of a live cell: its processes, their ports and their connections.
 
-Everything here follows from the cell file alone, so that every process of a cell works it out for
-itself and all come to the same answer.
+The wiring depends only on the cell file. Every process of a cell computes it and gets the same
+result.
 """
 
 from __future__ import annotations
@@ -21,17 +21,18 @@ from dwell.model import FrozenDict, Problem
 Kind: TypeAlias = Literal[
     "stamper", "sink", "agent", "worker", "shadow", "standby", "controller", "visitor"
 ]
-#: `control` carries what is small, `images` payloads to other nodes, `local` those that stay.
+#: `control` carries small messages, `images` large payloads to other nodes, `local` large payloads
+#: within a node.
 Session: TypeAlias = Literal["control", "images", "local"]
 
 SESSIONS: tuple[Session, ...] = ("control", "images", "local")
-#: Flows with at least this much declared go over the lane `images`.
+#: Least declared size of a flow on the lane `images`.
 IMAGE_BYTES = 16_384
-#: How much longer a payload may be than the cell file says.
+#: Longest payload as a multiple of the size in the cell file.
 SPARE = 4
-#: Of a message: its key, its signature, and what Zenoh writes with it.
+#: Bytes of a message for its key, its signature and Zenoh's overhead.
 ENVELOPE_BYTES = 4_096
-#: A process listens on its first port for `control`, and on the next ones for the other sessions.
+#: A process has one port per session; the first port is for `control`.
 PORTS_PER_ROLE = len(SESSIONS)
 
 _LAST_PORT = 65_535
@@ -44,7 +45,7 @@ class Role:
     Parameters
     ----------
     who : str
-        Its name, unique in the cell: ``perception@E``, ``perception@E.shadow``, ``control@R2.1``,
+        Unique name in the cell: ``perception@E``, ``perception@E.shadow``, ``control@R2.1``,
         ``sink.control@R2``, ``stamper@R1``, ``agent@E``, ``controller@E``.
     task : str
         Task of a worker or sink; empty for the other kinds.
@@ -66,26 +67,23 @@ class Role:
 
 @dataclass(frozen=True, slots=True)
 class Locator:
-    """Where a session listens, or is reached."""
+    """Address and port at which a session listens, or is reached."""
 
     address: str
     port: int
     protocol: str = "tcp"
 
     def __str__(self) -> str:
-        """Return the locator that Zenoh takes."""
+        """Return the locator in Zenoh's format."""
         host = f"[{self.address}]" if ":" in self.address else self.address
         return f"{self.protocol}/{host}:{self.port}"
 
 
 @dataclass(frozen=True, slots=True)
 class Wire:
-    """A connection between two processes; messages travel it both ways.
+    """A connection between two processes, for messages in both directions.
 
-    Parameters
-    ----------
-    source, target : str
-        Process that connects, and process that listens.
+    The process `source` connects, and the process `target` listens.
     """
 
     session: Session
@@ -95,14 +93,9 @@ class Wire:
 
 @dataclass(frozen=True, slots=True)
 class WiringEntry:
-    """Endpoints that a process opens.
+    """Endpoints of a process, by session: its own in `listen`, others' in `connect`.
 
-    Parameters
-    ----------
-    listen : mapping of str to Locator
-        Endpoint by session; sessions that no process connects to are missing.
-    connect : mapping of str to tuple of Locator
-        Endpoints of others, by session.
+    `listen` lacks the sessions that no process connects to.
     """
 
     role: Role
@@ -115,19 +108,13 @@ class WiringEntry:
 
     @property
     def sessions(self) -> tuple[Session, ...]:
-        """Sessions that the process has to open."""
+        """Sessions that the process must open."""
         return tuple(name for name in SESSIONS if name in self.listen or name in self.connect)
 
 
 @dataclass(frozen=True, slots=True)
 class Wiring:
-    """Ports and connections of all processes.
-
-    Parameters
-    ----------
-    entries : mapping of str to WiringEntry
-        By name of the process.
-    """
+    """Ports and connections of all processes; `entries` is by name of the process."""
 
     cell: str
     entries: Mapping[str, WiringEntry]
@@ -137,13 +124,7 @@ class Wiring:
         object.__setattr__(self, "entries", FrozenDict(self.entries))
 
     def entry(self, who: str) -> WiringEntry:
-        """Return the endpoints of a process.
-
-        Raises
-        ------
-        LiveError
-            If the cell has no such process.
-        """
+        """Return the endpoints of a process; raise a LiveError if the cell has no such process."""
         if who not in self.entries:
             known = ", ".join(self.entries)
             raise LiveError(f"cell {self.cell!r} has no process {who!r}; there are {known}")
@@ -154,12 +135,12 @@ class Wiring:
         return tuple(entry.role for entry in self.entries.values() if entry.role.node == node)
 
     def peers(self, who: str) -> int:
-        """Return how many processes a process is connected to, in the session with most of them."""
+        """Return the number of connections of a process, in the session with the most."""
         counts = Counter(w.session for w in self.wires if who in (w.source, w.target))
         return max(counts.values(), default=0)
 
     def visitor(self, who: str, *to: str) -> WiringEntry:
-        """Return the endpoints of a process outside the cell that talks to processes of it."""
+        """Return the endpoints of an outside process that connects to processes of the cell."""
         hosts = [self.entry(one) for one in to]
         for host in hosts:
             if "control" not in host.listen:
@@ -169,10 +150,10 @@ class Wiring:
 
 
 def roles(problem: Problem) -> tuple[Role, ...]:
-    """Every process of a cell, in the order in which ports are given out.
+    """Return every process of a cell, in the order of the ports.
 
-    Later ones connect to earlier ones: first those that hardly ever start anew, then workers along
-    the flows, last the controller, which may come and go.
+    Later processes connect to earlier processes. Processes that rarely restart are first, then the
+    workers along the flows, and last the controller, which may start and stop at any time.
     """
     pipeline = problem.pipeline
     order = pipeline.topological()
@@ -201,25 +182,16 @@ def roles(problem: Problem) -> tuple[Role, ...]:
 
 
 def wire(problem: Problem, *, protocol: str = "tcp") -> Wiring:
-    """Work out the ports and connections of a cell.
+    """Compute the ports and connections of a cell.
 
-    Parameters
-    ----------
-    problem : Problem
-        With every node among `live.hosts`.
-    protocol : str
-        Zenoh's name of what carries the sessions.
-
-    Raises
-    ------
-    LiveError
-        With everything that is missing or clashes.
+    `protocol` is Zenoh's name of the protocol of all sessions. Raises a LiveError that lists all
+    missing hosts, missing ports and conflicts.
     """
     everybody = roles(problem)
     _require_hosts(problem, everybody)
     hosts = problem.live.hosts
     rank = {role.who: i for i, role in enumerate(everybody)}
-    # Place of everybody on its node, from 0.
+    # Place of each process on its node, from 0.
     counts, places = Counter[str](), dict[str, int]()
     for role in everybody:
         places[role.who] = counts[role.node]
@@ -234,7 +206,7 @@ def wire(problem: Problem, *, protocol: str = "tcp") -> Wiring:
     listen: dict[str, dict[Session, Locator]] = {who: {} for who in rank}
     connect: dict[str, dict[Session, list[Locator]]] = {who: {} for who in rank}
     wires = []
-    # Where what listens is seen from a node that does not reach it where it does.
+    # Pairs of the endpoint seen from another node, and the endpoint on which the process listens.
     elsewhere: list[tuple[Locator, Locator]] = []
     for session, pair in _wires(problem, everybody):
         target, source = sorted(pair, key=rank.__getitem__)
@@ -247,7 +219,7 @@ def wire(problem: Problem, *, protocol: str = "tcp") -> Wiring:
         listen[target][session] = end
         connect[source].setdefault(session, []).append(seen)
     for role in everybody:
-        if role.kind == "controller":  # somebody may want to ask it something
+        if role.kind == "controller":  # for requests of operators
             listen[role.who]["control"] = locator(role.who, "control")
     entries = {
         role.who: WiringEntry(
@@ -262,23 +234,20 @@ def wire(problem: Problem, *, protocol: str = "tcp") -> Wiring:
 
 
 def lane_of(declared_bytes: int) -> Lane:
-    """Lane of what a cell file declares that many bytes for: a flow, or a task's state."""
+    """Return the lane of a flow, or of a task's state, by its declared size."""
     return "images" if declared_bytes >= IMAGE_BYTES else "control"
 
 
 def longest_bytes(declared_bytes: int) -> int:
-    """Longest payload that is sent, and taken, where a cell file declares that many bytes.
+    """Return the longest payload that processes send and accept, by its declared size.
 
-    Parameters
-    ----------
-    declared_bytes : int
-        Declared size of a flow, or of a task's state; 0 for a command, which declares none.
+    `declared_bytes` is the size of a flow or of a task's state; 0 for a command.
     """
     return max(SPARE * declared_bytes, MAX_CONTROL_BYTES)
 
 
 def longest_message_bytes(problem: Problem, session: Session) -> int:
-    """Longest message that anybody in a cell sends in a session: headers and key are in it."""
+    """Return the longest message of a cell in a session, with its header and key."""
     pipeline = problem.pipeline
     declared = [flow.payload_bytes for flow in pipeline.flows]
     declared += [task.state_bytes for task in pipeline.tasks.values()]
@@ -288,18 +257,11 @@ def longest_message_bytes(problem: Problem, session: Session) -> int:
 
 
 def session_of(entry: WiringEntry, lane: Lane, key: str) -> Session:
-    """Session that a process sends a message in.
+    """Return the session in which a process sends a message.
 
-    Parameters
-    ----------
-    key : str
-        ``dwell/CELL/in/TASK/NODE/...`` or ``dwell/CELL/state/TASK/NODE/...`` where the lane
-        is `images`: what stays on the node goes through `local`.
-
-    Returns
-    -------
-    str
-        `control` where the process has no other: it is slower than the lane should be, not lost.
+    On the lane `images` keys are ``dwell/CELL/in/TASK/NODE/...`` or
+    ``dwell/CELL/state/TASK/NODE/...``; a message to the process's own node uses `local`. If the
+    process has no such session, the result is `control`: the message is slower, but not lost.
     """
     if lane == "images":
         chunks = key.split("/")
@@ -311,7 +273,7 @@ def session_of(entry: WiringEntry, lane: Lane, key: str) -> Session:
 
 
 def _shadows(problem: Problem) -> frozenset[tuple[str, str]]:
-    """Where shadow jobs may run: tasks on nodes, sinks left out, as a shadow stops before them."""
+    """Return tasks and nodes of shadow jobs, without sinks: shadows end before them."""
     if not problem.controller.shadow_workers:
         return frozenset()
     pipeline = problem.pipeline
@@ -324,10 +286,10 @@ def _shadows(problem: Problem) -> frozenset[tuple[str, str]]:
 
 
 def _wires(problem: Problem, everybody: Sequence[Role]) -> list[tuple[Session, frozenset[str]]]:
-    """Every pair that has to hear each other, by session; each once, in a fixed order."""
+    """Return every pair of processes that must connect, by session, once and in a fixed order."""
     pairs: dict[tuple[Session, frozenset[str]], None] = {}
     for one, other in combinations(everybody, 2):
-        # Small things to say to each other, stages' messages aside.
+        # Connections for small messages, except for messages between stages.
         if _calls(problem, one, other) or _calls(problem, other, one):
             pairs["control", frozenset((one.who, other.who))] = None
     for flow in problem.pipeline.flows:
@@ -350,18 +312,18 @@ def _workers(everybody: Iterable[Role], task: str) -> list[Role]:
 
 
 def _calls(problem: Problem, one: Role, other: Role) -> bool:
-    """Whether the first is of a kind that has to reach the second."""
+    """Whether the first process must reach the second, by their kinds."""
     same_node = one.node == other.node
     match one.kind:
-        case "stamper":  # it stamps, and hears from everybody whether they are there
+        case "stamper":  # sends stamps, and receives all beats
             return True
-        case "agent":  # supervises its own node, and is the passage of all others
+        case "agent":  # supervises its own node; the relay's agent forwards for all others
             return other.kind == "agent" or same_node or one.node == problem.relay_node
-        case "sink":  # takes the commands of its task's workers
+        case "sink":  # receives the commands of its task's workers
             return other.kind == "controller" or (other.works and other.task == one.task)
-        case "standby":  # works only while that one is silent
+        case "standby":  # works only while its worker is silent
             return other.kind == "worker" and same_node and other.task == one.task
-        case "controller":  # of completions, loads, shadows that stopped, states that moved
+        case "controller":  # receives completions, loads, ended shadows, restored states
             if not other.works:
                 return other.kind == "agent"
             task = problem.pipeline.tasks[other.task]
@@ -371,7 +333,7 @@ def _calls(problem: Problem, one: Role, other: Role) -> bool:
 
 
 def _require_hosts(problem: Problem, everybody: Sequence[Role]) -> None:
-    """Raise a LiveError unless every node has a host, and ports enough."""
+    """Raise a LiveError unless every node has a host and enough ports."""
     faults = []
     for node in problem.fabric.nodes:
         host = problem.live.hosts.get(node)
@@ -394,7 +356,7 @@ def _require_hosts(problem: Problem, everybody: Sequence[Role]) -> None:
 def _require_apart(
     entries: Mapping[str, WiringEntry], elsewhere: Iterable[tuple[Locator, Locator]]
 ) -> None:
-    """Raise a LiveError where one port of one address would stand for two things."""
+    """Raise a LiveError if two endpoints have the same address and port."""
     taken: dict[Locator, str] = {}
     faults = []
 
