@@ -1,12 +1,15 @@
-"""The tables of dynamic-scenarios.md: `python docs/dynamic_tables.py`, half a minute.
+"""Write reproduction/evidence/dynamic-scenarios.md: `python docs/dynamic_tables.py`, half a minute.
 
-Static placements over 20 seeds: J and V_D of the windows that lie in one phase as a whole, with the
-95 % interval of J over seeds; bold where the lowest differs from the next, seed by seed.
+Static placements over 20 seeds: J and V_D of the windows inside one phase, with the 95 % interval
+of J over seeds. The lowest J is bold if it differs from the next, seed by seed.
 """
 
 from __future__ import annotations
 
+import platform
+import subprocess
 from collections.abc import Iterator, Mapping
+from datetime import date
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
@@ -18,7 +21,9 @@ from dwell.model import NodeDisturbance, Problem
 from dwell.study import load_study, mean_interval
 from dwell.study.drawn_disturbances import drawn_disturbances
 
-STUDY = Path(__file__).parents[1] / "examples" / "studies" / "dynamic.yaml"
+ROOT = Path(__file__).parents[1]
+STUDY = ROOT / "examples" / "studies" / "dynamic.yaml"
+PAGE = ROOT / "reproduction" / "evidence" / "dynamic-scenarios.md"
 CANDIDATES = ("LOC", "SO", "HYB")
 SEEDS = range(1, 21)
 
@@ -104,38 +109,77 @@ def faults(
         yield frozenset(on)
 
 
-def main() -> None:
-    """Print the tables."""
+HEAD = """# Static placements in the dynamic scenarios
+
+`python docs/dynamic_tables.py` wrote this page on {day} ({machine}, commit
+{commit}). J and V_D of each placement if it never moves, 20 seeds of 300 windows, the warm-up left
+out; ± is the 95 % interval over seeds. The lowest J is bold if its interval to the next, seed by
+seed, leaves out 0. [Dynamic scenarios](../../docs/dynamic-scenarios.md) describes the phases and
+faults.
+"""
+
+
+def phases(scenario: str, runs: Mapping[int, dict[str, Windows]]) -> Iterator[str]:
+    """Yield a row for each phase, over the windows inside it."""
+    yield "| s | LOC | SO | HYB |"
+    yield "|---|---|---|---|"
+    for begin, end in PHASES[scenario]:
+        within = {
+            seed: (one["LOC"].begin_s >= begin) & (one["LOC"].end_s <= end)
+            for seed, one in runs.items()
+        }
+        yield f"| {begin} to {end} | {row([means(runs[seed], within[seed]) for seed in SEEDS])} |"
+
+
+def combinations(
+    problem: Problem, scenario: str, runs: Mapping[int, dict[str, Windows]]
+) -> Iterator[str]:
+    """Yield a row for each of the 14 most frequent sets of faults that last a window."""
+    yield "| fault throughout the window | of the windows | LOC | SO | HYB |"
+    yield "|---|---|---|---|---|"
+    on = {seed: list(faults(problem, scenario, seed, runs[seed]["LOC"])) for seed in SEEDS}
+    kinds = [kind for known in on.values() for kind in known]
+    for kind in sorted(set(kinds), key=kinds.count, reverse=True)[:14]:
+        chosen = {seed: np.array([one == kind for one in on[seed]]) for seed in SEEDS}
+        some = [means(runs[seed], chosen[seed]) for seed in SEEDS if chosen[seed].any()]
+        share = 100 * kinds.count(kind) / len(kinds)
+        yield f"| {', '.join(sorted(kind)) or 'nothing'} | {share:.0f} % | {row(some)} |"
+
+
+def tables() -> Iterator[str]:
+    """Yield the lines of all tables."""
     problem = load_study(STUDY).points[0].problem
     gains = []
     for scenario in ("step", "drift", "bursts", "flapping", "mixture"):
         runs = {seed: played(problem, scenario, seed) for seed in SEEDS}
-        print(f"\n{scenario}")
-        for begin, end in PHASES.get(scenario, ()):
-            within = {
-                seed: (one["LOC"].begin_s >= begin) & (one["LOC"].end_s <= end)
-                for seed, one in runs.items()
-            }
-            print(
-                f"| {begin} to {end} | {row([means(runs[seed], within[seed]) for seed in SEEDS])} |"
-            )
-        if scenario not in PHASES:
-            on = {seed: list(faults(problem, scenario, seed, runs[seed]["LOC"])) for seed in SEEDS}
-            kinds = [kind for known in on.values() for kind in known]
-            for kind in sorted(set(kinds), key=kinds.count, reverse=True)[:14]:
-                chosen = {seed: np.array([one == kind for one in on[seed]]) for seed in SEEDS}
-                some = [means(runs[seed], chosen[seed]) for seed in SEEDS if chosen[seed].any()]
-                share = 100 * kinds.count(kind) / len(kinds)
-                print(f"| {', '.join(sorted(kind)) or 'nothing'} | {share:.0f} % | {row(some)} |")
         everything = [means(one, np.ones(len(one["LOC"].cost), bool)) for one in runs.values()]
-        print(f"| all | {row(everything)} |")
+        yield f"\n## `{scenario}`\n"
+        if scenario in PHASES:
+            yield from phases(scenario, runs)
+            yield f"| all | {row(everything)} |"
+        else:
+            yield from combinations(problem, scenario, runs)
+            yield f"| all | | {row(everything)} |"
         table = np.stack([[one[name].cost for name in CANDIDATES] for one in runs.values()])
         lowest = table.argmin(axis=1)
         average = table.mean(axis=(0, 2))
         shares = ", ".join(f"{100 * (lowest == i).mean():.0f}" for i in range(3))
         best = f"{average.min():.2f} ({CANDIDATES[average.argmin()]})"
         gains.append(f"| `{scenario}` | {best} | {table.min(axis=1).mean():.2f} | {shares} % |")
-    print("\n" + "\n".join(gains))
+    yield "\n## Lowest J of each window\n"
+    yield "| scenario | best static placement | lowest in each window | windows won: LOC, SO, HYB |"
+    yield "|---|---|---|---|"
+    yield from gains
+
+
+def main() -> None:
+    """Write the page."""
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"],
+        cwd=ROOT, capture_output=True, text=True, check=True,
+    ).stdout.strip()  # fmt: skip
+    head = HEAD.format(day=date.today().isoformat(), machine=platform.machine(), commit=commit)
+    PAGE.write_text(head + "\n".join(tables()) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

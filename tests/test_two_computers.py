@@ -122,9 +122,6 @@ def computers(tmp_path: Path) -> Iterator[dict[str, Computer]]:
                 "HOME": str(home),
                 "PATH": os.pathsep.join((str(tools), str(Path(sys.executable).parent), os.defpath)),
                 "PYTHONPATH": str(ROOT / "src"),
-                # What is there is enough.
-                "PIP_NO_INDEX": "1",
-                "PIP_DISABLE_PIP_VERSION_CHECK": "1",
             }
             made[name] = Computer(enter, home, environment)
         yield made
@@ -141,8 +138,8 @@ def steps() -> Iterator[tuple[tuple[str, ...], str]]:
             yield places[place], line
 
 
-def test_the_quickstart_has_thirteen_commands() -> None:
-    assert len(list(steps())) == 13
+def test_the_quickstart_has_twelve_commands() -> None:
+    assert len(list(steps())) == 12
 
 
 def assert_whole(line: str, computer: Computer) -> None:
