@@ -271,7 +271,7 @@ def capacity_of(
     limit : float
         Largest V_D of the worst cell.
     policy : str, optional
-        Policy or candidate of every cell (default: the fleet's). A candidate needs no estimator.
+        Policy or candidate of every cell (default: the fleet's). A candidate has no estimator.
     phases : {"sync", "even", "random"}, optional
         Phases of the cells (default: the fleet's).
     on_excess : bool

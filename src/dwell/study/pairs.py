@@ -109,8 +109,8 @@ class SameRun:
     n : int
         Number of pairs.
     word : str
-        The verdict: `dwell.study.SAME_RUN`, or `dwell.study.SAME_CYCLES` if only latencies are
-        compared.
+        The verdict: `dwell.study.SAME_RUN`, or `dwell.study.SAME_CYCLES` if only the latencies are
+        equal.
     """
 
     n: int
