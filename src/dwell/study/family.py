@@ -113,7 +113,7 @@ class Family:
         """Whether the first is lower or higher, with 95 % confidence for all verdicts together.
 
         "No difference shown" does not prove that the two are equal: the interval shows which
-        differences are possible. With too few seeds for any verdict it is that of `cannot_tell`.
+        differences are possible. If the seeds are too few, the text of `cannot_tell` replaces it.
         """
         words: dict[int, Comparative] = {-1: "lower", 1: "higher", 0: "no difference shown"}
         adjusted, tested = self.adjusted, self.tested
