@@ -1,9 +1,9 @@
 """Differences between pairs: two policies, or two settings, on the same realisations.
 
 Both numbers of a pair come from runs of the same seed; their difference cancels the randomness that
-the runs share. The unit is the pair. A comparison has three results: the difference in its own unit
-with an interval; the difference relative to the spread over seeds (effect sizes); and the
-probability that chance alone gives such a difference (the p value of a sign-flip test).
+the runs share. The unit is the pair. A comparison gives the difference in its own unit with an
+interval, and the difference relative to the spread over seeds (effect sizes). The p value of a
+sign-flip test is the probability of such a difference, or a larger one, by chance.
 
 `paired_difference` compares means. `paired_median` is for numbers that may be infinite, such as a
 percentile of latencies with lost cycles. The metric decides which of the two is right, never the
