@@ -1,9 +1,10 @@
-"""Capacity: how many robots the shared nodes of a fleet carry under a placement or a policy.
+"""Capacity: the number of robots that a fleet's shared nodes carry under a placement or a policy.
 
-A size is the number of cells of the first entry; the other entries stay. Each size is played under
-several seeds, and the cell with the largest V_D of each seed counts. With random phases the unit is
-the draw of phases: a run keeps its phases from begin to end. Where no cell moves, every size is
-played until the limit is passed for certain; the sizes of a policy are found by bisection.
+A size is the number of cells of the first entry; the other entries do not change. Each size is
+simulated with several seeds; for each seed the cell with the largest V_D counts. Random phases are
+sampled once per run, so a run is then one independent sample. If no cell moves, the sizes are
+simulated in ascending order until one is certainly over the limit. If a policy moves cells,
+bisection selects the sizes.
 """
 
 from __future__ import annotations
@@ -28,30 +29,30 @@ from dwell.study.played_sizes import KeptSizes, PlayedSize, Sizes, study_of
 from dwell.study.twins import with_twins
 from dwell.study.workers import available_processes, spread
 
-#: Cycles that count of the slowest cell in a run, and seeds, where phases are not drawn.
+#: Default number of counted cycles of the slowest cell per run, and default seeds.
 CYCLES = 2_000
 SEEDS = tuple(range(1, 11))
-#: Draws of phases, and cycles that count in each where no cell moves. Phases spread more than
-#: cycles do, so that many short runs say more than few long ones.
+#: Default seeds with random phases, and counted cycles per run if no cell moves. V_D varies more
+#: with the phases than with the cycles, so many short runs are better than few long runs.
 DRAWS = tuple(range(1, 101))
 CYCLES_OF_A_DRAW = 200
 MOST = 128
-#: Counted cycles of a cell in one run above which there is a warning.
+#: Counted cycles of a cell in one run above which `long_runs` warns.
 MANY_CYCLES = 2_000_000
-#: Share of cycles that one cell alone may miss where an excess over it is of any use.
+#: V_D of one cell alone from which a limit on the excess over it is useless.
 USELESS = 0.5
 ROUNDING = 1e-12
-#: Standard errors on either side of a 95 % interval.
+#: Half-width of a 95 % interval in standard errors.
 NORMAL = 1.96
-#: Sizes that are played together where no cell moves: their cells are drawn once.
+#: Sizes simulated together if no cell moves: their cells are sampled once.
 TOGETHER = 8
-#: Seeds that say where cycles wait.
+#: Number of seeds for the waiting times of missed cycles.
 WAITING_SEEDS = 3
 
 
 @dataclass(frozen=True, slots=True)
 class CapacityPoint:
-    """A size of a fleet.
+    """Results for a size of a fleet.
 
     Parameters
     ----------
@@ -60,11 +61,11 @@ class CapacityPoint:
     violation_rate : Interval
         V_D of the worst cell, over seeds.
     excess : Interval
-        The same less that of one cell alone, seed by seed.
+        V_D of the worst cell minus V_D of one cell alone, paired by seed.
     phases_error, cycles_error : float
-        Half-widths of the 95 % interval by the draws of phases alone, and by the cycles alone.
+        Half-widths of the 95 % interval from the sampled phases alone, and from the cycles alone.
     utilisation : mapping of str to float
-        Of the shared resources.
+        Mean utilisation of each shared resource.
     """
 
     robots: int
@@ -90,7 +91,7 @@ class CapacityPoint:
 
 @dataclass(frozen=True, slots=True)
 class Limiting:
-    """What limits a fleet: where the cycles that missed have waited most.
+    """Resource or link that limits a fleet: missed cycles waited longest for it.
 
     Parameters
     ----------
@@ -98,7 +99,7 @@ class Limiting:
     name : str
         ``E``, ``E.gpu``, ``R1->E``.
     share : float
-        Of all that they waited.
+        Share of the total waiting time of the missed cycles.
     """
 
     kind: str
@@ -108,33 +109,33 @@ class Limiting:
 
 @dataclass(frozen=True, slots=True)
 class Capacity:
-    """How many robots there may be.
+    """Capacity of a fleet: the number of robots that it can have within a limit on V_D.
 
     Parameters
     ----------
     robots : int
-        The largest size such that no played size up to it is over the limit.
+        The largest simulated size such that no simulated size up to it is over the limit.
     robots_at_limit : int
-        The same by V_D itself, whatever one cell alone misses.
+        0 if one cell alone is over the limit, else `robots`.
     at_least : bool
-        Whether larger ones were not asked for.
+        Whether `robots` is the largest size simulated: the capacity may be larger.
     interval : tuple of int
-        The same by the upper and the lower ends of the intervals.
+        Lower and upper number of robots, from the ends of the intervals of V_D or its excess.
     limit : float
     limit_on : {"violation_rate", "excess"}
-        What the limit is on: V_D, or V_D beyond that of one cell, where one alone is over it.
+        Whether the limit applies to V_D or to its excess over the V_D of one cell alone.
     phases : str or tuple of float
-        What was assumed of when cells begin.
+        Assumed phases of the cells.
     policy : str
-        What was played, where all cells have the same.
+        Policies or candidates of the entries, joined by commas.
     searched : {"every size", "bisection"}
-        Which sizes were played.
+        How the sizes were selected.
     curve : tuple of CapacityPoint
-        Of every size that was played.
+        All simulated sizes, the smallest first.
     limits : Limiting, optional
-        Of the size after, or of the largest that was asked for; None where nothing waited.
+        Limit of the next size, or of the largest simulated; None if no missed cycle waited.
     reason : str
-        Why there is none, or nothing.
+        Why the capacity is 0 if one cell alone misses too many deadlines; else empty.
     """
 
     robots: int
@@ -157,11 +158,11 @@ class Capacity:
 
     @property
     def bound(self) -> float:
-        """V_D that is not to be passed."""
+        """Largest V_D within the limit."""
         return self.limit + (self.alone if self.limit_on == "excess" else 0.0)
 
     def point(self, robots: int) -> CapacityPoint:
-        """Return the largest played size up to a number of robots, or the smallest."""
+        """Return the largest simulated size up to a number of robots, else the smallest."""
         return next((one for one in reversed(self.curve) if one.robots <= robots), self.curve[0])
 
     def as_json(self) -> dict[str, Any]:
@@ -185,7 +186,7 @@ PLAIN = (
 
 @dataclass(frozen=True, slots=True)
 class FleetPlayer:
-    """Plays a fleet in some sizes, in whichever process.
+    """Task for worker processes: simulates sizes of a fleet.
 
     Parameters
     ----------
@@ -193,7 +194,7 @@ class FleetPlayer:
     duration_ns : int
         Length of a run.
     servers : mapping of str to int
-        How many twins each shared node has (see `dwell.study.twins`).
+        Number of twins of each shared node (see `dwell.study.twins`).
     """
 
     fleet: Fleet
@@ -201,14 +202,14 @@ class FleetPlayer:
     servers: Mapping[str, int] = field(default_factory=dict)
 
     def of(self, robots: int) -> Fleet:
-        """Return the fleet with so many cells of the first entry."""
+        """Return the fleet with a number of cells of the first entry."""
         fleet = self.fleet.with_count(robots)
         for node, count in self.servers.items():
             fleet = with_twins(fleet, node, count)
         return fleet
 
     def __call__(self, unit: Sizes) -> list[PlayedSize]:
-        """Play every size."""
+        """Simulate every size of a unit."""
         fleets = [self.of(size) for size in range(unit.first, unit.last + 1)]
         if self.fleet.is_static:
             static = StaticFleet(seed=unit.seed, duration_ns=self.duration_ns)
@@ -234,7 +235,7 @@ class FleetPlayer:
         return PlayedSize.of(missed, used)
 
     def limiting(self, robots: int, seeds: Sequence[int]) -> Limiting | None:
-        """Return what the cycles that missed have waited for most; None where for nothing."""
+        """Return the resource or link with the most waiting of missed cycles; None without any."""
         waited = Waiting()
         fleet, duration_ns = self.of(robots), self.duration_ns
         for seed in seeds[:WAITING_SEEDS]:
@@ -263,40 +264,39 @@ def capacity_of(
     kept: KeptSizes | None = None,
     progress: Progress | None = None,
 ) -> Capacity:
-    """Find how many cells of the first entry a fleet may have.
+    """Find the largest number of cells of the first entry within a limit on V_D.
 
     Parameters
     ----------
     limit : float
-        Largest V_D that the worst cell may have.
+        Largest V_D of the worst cell.
     policy : str, optional
-        Policy or candidate of every cell; what the file says where None. A candidate is played
-        without any estimator.
+        Policy or candidate of every cell (default: the fleet's). A candidate has no estimator.
     phases : {"sync", "even", "random"}, optional
-        What the file says where None.
+        Phases of the cells (default: the fleet's).
     on_excess : bool
-        Whether the limit is on the excess over one cell, also where one alone is not over it.
+        Whether the limit applies to the excess over one cell alone even if that cell is within it.
     most : int
-        Sizes beyond are not played.
+        Largest size to try.
     seeds : sequence of int, optional
-        `SEEDS` where None. With random phases: `DRAWS` where no cell moves; for a policy the first
-        ten of these, and further ones at sizes whose interval holds the limit.
+        Default: `SEEDS`. With random phases the default is `DRAWS` if no cell moves; with a policy
+        it is the first ten of these, and more at sizes whose interval includes the limit.
     cycles : int, optional
-        Cycles of the slowest cell that count in a run, at least. `CYCLES` where None; with random
-        phases and no cell that moves `CYCLES_OF_A_DRAW`, after a warm-up of one window.
+        Least number of counted cycles of the slowest cell per run. Default: `CYCLES`; with random
+        phases and no moves `CYCLES_OF_A_DRAW`, after a warm-up of one window.
     twins : mapping of str to int, optional
-        How many more servers there are like a shared node; cells take them in turn.
+        Number of additional servers like a shared node; cells use them in turn.
     processes : int, optional
-        One a CPU where None.
+        Default: one per CPU.
     kept : KeptSizes, optional
-        Sizes that an interrupted study has played; those that are played now are added.
+        Results of an interrupted study; new results are added.
     progress : callable, optional
-        Called with the number of sizes that are done, and `most`.
+        Called with the number of finished sizes, and `most`.
 
     Raises
     ------
     ProblemError
-        If something named is unknown, the phases are a list, or no cell can use a shared node.
+        If a name is unknown, the phases are a list, or no cell can use a shared node.
     """
     fleet = fleet.changed(policy=policy, phases=phases)
     _require_capacity(fleet)
@@ -306,7 +306,7 @@ def capacity_of(
     fleet, duration_ns = _length(fleet, cycles)
     player = FleetPlayer(fleet, duration_ns, twins or {})
     known = tuple(seeds or (DRAWS if draws else SEEDS))
-    # A run has one draw of phases, and windows that differ.
+    # With random phases a run is one independent sample, otherwise each of its windows is.
     kinds = 1 if draws else max(duration_ns - fleet.warmup_ns, 1) // fleet.duration_ns(1)
     sizes = _Sizes(limit, kinds, on_excess=on_excess)
     workers = available_processes() if processes is None else processes
@@ -321,15 +321,15 @@ def capacity_of(
 
 
 class _Sizes:
-    """What has been played of each size.
+    """Results of the simulated sizes, by size and seed.
 
     Parameters
     ----------
     limit : float
     kinds : int
-        Independent parts of a run: windows, or one where its phases are a draw.
+        Independent parts of a run: its windows, or 1 if its phases are random.
     on_excess : bool
-        Whether the limit is on the excess in any case.
+        Whether the limit applies to the excess even if one cell alone is within it.
     """
 
     def __init__(self, limit: float, kinds: int, *, on_excess: bool) -> None:
@@ -338,16 +338,16 @@ class _Sizes:
         self._points: dict[tuple[int, int], CapacityPoint] = {}
 
     def take(self, unit: Sizes, played: Sequence[PlayedSize]) -> None:
-        """Keep what a unit has come to."""
+        """Store the results of a unit."""
         for size, one in enumerate(played, unit.first):
             self.played.setdefault(size, {})[unit.seed] = one
 
     def seeds(self, size: int) -> int:
-        """Return under how many seeds a size has been played."""
+        """Return the number of seeds with which a size has been simulated."""
         return len(self.played.get(size, {}))
 
     def point(self, size: int) -> CapacityPoint:
-        """Return what is known of a size."""
+        """Return the results for a size, over the seeds so far."""
         key = size, self.seeds(size)
         if key not in self._points:
             self._points[key] = self._point(size)
@@ -383,12 +383,12 @@ class _Sizes:
 
     @property
     def useless(self) -> bool:
-        """Whether one cell alone misses so much that no excess is of any use."""
+        """Whether one cell alone misses so much that a limit on the excess is useless."""
         return self.alone > self.limit + ROUNDING and self.alone >= USELESS
 
     @property
     def on_excess(self) -> bool:
-        """Whether the limit is on the excess over one cell."""
+        """Whether the limit applies to the excess over one cell alone."""
         return (self.asked or self.alone > self.limit + ROUNDING) and not self.useless
 
     def is_over(self, size: int, end: Callable[[Interval], float]) -> bool:
@@ -397,11 +397,11 @@ class _Sizes:
             return False
         point = self.point(size)
         rate = point.excess if self.on_excess else point.violation_rate
-        # One seed gives no interval.
+        # A single seed has no interval.
         return (end(rate) if rate.known else rate.value) > self.limit + ROUNDING
 
     def capacity(self, fleet: Fleet, searched: Literal["every size", "bisection"]) -> Capacity:
-        """Return what it comes to."""
+        """Return the capacity from the results so far, without `limits`."""
         names = dict.fromkeys(fleet.policy_of(entry) for entry in fleet.entries)
         robots, largest = self._largest(_value), max(self.played)
         alone = f"one cell alone misses {self.alone:.0%} of its deadlines"
@@ -420,7 +420,7 @@ class _Sizes:
         )
 
     def _largest(self, end: Callable[[Interval], float]) -> int:
-        """Return the largest played size such that none up to it is over the limit."""
+        """Return the largest simulated size before any that is over the limit, else 0."""
         found = 0
         for size in sorted(self.played):
             if self.is_over(size, end):
@@ -429,7 +429,7 @@ class _Sizes:
         return found
 
     def _below(self, end: Callable[[Interval], float]) -> int:
-        """Return the size before the first played one that is over the limit."""
+        """Return the first simulated size over the limit, minus 1; else the largest simulated."""
         over = (size - 1 for size in sorted(self.played) if self.is_over(size, end))
         return next(over, max(self.played))
 
@@ -447,13 +447,7 @@ def _high(rate: Interval) -> float:
 
 
 class _Search:
-    """Plays the sizes that decide.
-
-    Parameters
-    ----------
-    most : int
-        Largest size.
-    """
+    """Search for the capacity: selects the sizes to simulate, up to `most`."""
 
     def __init__(
         self,
@@ -468,7 +462,7 @@ class _Search:
         self.processes, self.kept, self.progress = processes, kept, progress
 
     def every_size(self, seeds: Sequence[int]) -> None:
-        """Play sizes from the smallest on until one is over the limit for certain."""
+        """Simulate sizes in ascending order until one is certainly over the limit."""
         sizes, done = self.sizes, 0
 
         def take(unit: Sizes, played: list[PlayedSize]) -> bool:
@@ -495,9 +489,9 @@ class _Search:
             del sizes.played[size]
 
     def by_bisection(self, few: Sequence[int], all_of: Sequence[int]) -> None:
-        """Play the sizes between which the limit is passed, each under few seeds first.
+        """Bisect to the largest size within the limit, each size with few seeds first.
 
-        A size whose interval holds the limit is played under more, until it does not.
+        The number of seeds doubles while the interval of a size includes the limit.
         """
         low, high, size = 0, self.most + 1, 1
         while low + 1 < high:
@@ -531,7 +525,7 @@ class _Search:
     def _spread(
         self, units: Sequence[Sizes], take: Callable[[Sizes, list[PlayedSize]], bool | None]
     ) -> None:
-        """Take what is known of some units, and play the others."""
+        """Take the saved results of units, then simulate the other units."""
         kept, player = self.kept, self.player
         if kept is None:
             spread(player, units, processes=self.processes, take=take)
@@ -553,13 +547,13 @@ class _Search:
 
 
 def _with_short_warmup(fleet: Fleet) -> Fleet:
-    """Return a fleet with one window of warm-up: enough where no cell moves."""
+    """Return a fleet with one window of warm-up, which is enough if no cell moves."""
     entries = (replace(one, cell=replace(one.cell, warmup_windows=1)) for one in fleet.entries)
     return replace(fleet, entries=tuple(entries))
 
 
 def _length(fleet: Fleet, cycles: int | None) -> tuple[Fleet, int]:
-    """Return a fleet as it is played, and how long: each cell counts so many cycles, in windows."""
+    """Return the fleet to simulate and the length of a run: `cycles` of each cell, in windows."""
     if cycles is None and fleet.phases == "random" and fleet.is_static:
         fleet, cycles = _with_short_warmup(fleet), CYCLES_OF_A_DRAW
     needed = CYCLES if cycles is None else cycles
@@ -569,9 +563,9 @@ def _length(fleet: Fleet, cycles: int | None) -> tuple[Fleet, int]:
 
 
 def long_runs(fleet: Fleet, cycles: int | None = None) -> Iterator[Fault]:
-    """Yield a warning for each cell of which a run counts more than `MANY_CYCLES` cycles.
+    """Yield a warning for each cell with more than `MANY_CYCLES` counted cycles per run.
 
-    All cells are played as long as the slowest one needs (see `capacity_of`).
+    The slowest cell sets the length of the run for all cells (see `capacity_of`).
     """
     played, duration_ns = _length(fleet, cycles)
     counted_ns = duration_ns - played.warmup_ns
@@ -588,7 +582,7 @@ def long_runs(fleet: Fleet, cycles: int | None = None) -> Iterator[Fault]:
 
 
 def _require_capacity(fleet: Fleet) -> None:
-    """Refuse a fleet of which there may be any number of cells, or whose phases are of one size."""
+    """Refuse a fleet without a bound on its cells, and phases listed for one size."""
     faults = []
     if not isinstance(fleet.phases, str):
         faults.append(Fault("phases", f"a list is of one size; give one of {', '.join(PHASES)}"))

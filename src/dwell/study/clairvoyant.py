@@ -1,21 +1,20 @@
 """The cheapest sequence of placements when all costs are known: dynamic programming over windows.
 
-What is minimised is J summed over windows, each with the switching term of the move that led to
-it::
+The objective is the sum of J over windows, each with the switching term of the move before it::
 
     sum over k of  costs[k, m_k] + switching[m_{k-1}, m_k]
 
-over every sequence m that Algorithm 1 could produce, whatever it were shown. Window 0 runs under
-the initial placement, because placements are decided one window late. n_d, the number of windows
-since the last migration, begins at 0 and blocks while n_d < N_min: the first migration takes
-effect in window N_min + 1 at the earliest, and two of them are at least N_min + 1 windows apart.
-There is neither Delta_min nor a cap: J alone decides.
+The minimum is over every sequence m that Algorithm 1 could produce for any input. Window 0 has the
+initial placement, because placements are decided one window late. n_d, the number of windows since
+the last migration, begins at 0, and a migration needs n_d >= N_min. The first migration therefore
+takes effect in window N_min + 1 or later, and migrations are at least N_min + 1 windows apart. J
+alone decides, without Delta_min and caps.
 
-How it is computed
-    Let G_k(m) be the least that windows k to K - 1 can cost when m is the placement before them
-    and the dwell is over, and f(k) the first window that a migration into window k leaves free to
-    migrate again: k + N_min + 1. Staying costs window k under m; a migration to x also settles
-    the windows up to f(k)::
+Method
+    Let G_k(m) be the least cost of windows k to K - 1 if m is the placement before them and the
+    dwell is over. Let f(k) be the first window that can migrate again after a migration into window
+    k: k + N_min + 1. Staying costs window k under m; a migration to x also determines the windows
+    up to f(k)::
 
         G_k(m) = min( costs[k, m] + G_{k+1}(m),
                       min over x of switching[m, x] + sum of costs[k:f(k), x] + G_{f(k)}(x) )
@@ -25,8 +24,8 @@ How it is computed
         H_k(m) = min( H_{k+1}(m), min over x of D_k(m, x) + H_{f(k)}(x) )
         D_k(m, x) = switching[m, x] + P_k(m) - P_k(x)
 
-    D takes a few array operations for all windows together. What remains for each of them, last to
-    first, are three NumPy calls: O(K M^2) operations, however long the dwell is.
+    D takes a few array operations for all windows together. Each window, last to first, then needs
+    three NumPy calls: O(K M^2) operations for any dwell.
 """
 
 from __future__ import annotations
@@ -42,20 +41,20 @@ from dwell.errors import MetricError, PolicyError
 from dwell.model.bounds import MIN_DWELL
 from dwell.model.number_arrays import Floats, Ints, Mask
 
-#: Totals that differ by no more than this share of the largest are a tie: sums carry rounding.
+#: Totals that differ by at most this share of the largest are a tie, because of rounding.
 TIE_TOLERANCE = 1e-12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sequence:
-    """A placement for every window, and what all of them cost.
+    """A placement for every window, and the total cost.
 
     Parameters
     ----------
     choice : int64 array, shape (K,)
-        Candidate of each window, by its index.
+        Index of the candidate of each window.
     total : float
-        J summed over the windows, switching terms included.
+        Sum of J over the windows, including switching terms.
     """
 
     choice: Ints
@@ -71,9 +70,9 @@ def clairvoyant(
     counts: ArrayLike | None = None,
     decides: ArrayLike | None = None,
 ) -> Sequence:
-    """Find the sequence with the least total.
+    """Find the sequence with the lowest total.
 
-    A tie goes to the placement that is there, then to the order of the candidates.
+    In a tie the current placement wins, then the first candidate in order.
 
     Parameters
     ----------
@@ -87,20 +86,15 @@ def clairvoyant(
     min_dwell : int
         N_min, windows.
     counts : array of float, shape (K,), optional
-        How many times J of each window enters the total, with its switching term; once where
-        None.
+        Weight of each window's J, with its switching term, in the total. Default: 1.
     decides : array of bool, shape (K,), optional
-        Whether a decision follows the close of each window; where none does, the placement stays
-        and n_d does not grow. All do where None.
-
-    Returns
-    -------
-    Sequence
+        Whether a decision follows the end of each window. Without a decision the placement stays
+        and n_d does not grow. Default: all True.
 
     Raises
     ------
     MetricError
-        If an array has the wrong shape, or holds what is not finite, or a negative price or count.
+        If an array has the wrong shape, a value is not finite, or a price or count is negative.
     PolicyError
         If `initial` is no candidate, or `min_dwell` is out of its range.
     """
@@ -114,7 +108,7 @@ def clairvoyant(
     decided = _one_a_window("decides", decides, windows).astype(bool)
     free_at = _free_at(decided, min_dwell)
     relative = costs * count[:, None]
-    # What every candidate costs alike decides nothing; without it sums round off less.
+    # A cost common to all candidates decides nothing; without it the sums are more accurate.
     relative -= relative.min(axis=1, keepdims=True)
     before = np.zeros((windows + 1, candidates))
     np.cumsum(relative, axis=0, out=before[1:])
@@ -127,17 +121,9 @@ def clairvoyant(
 
 
 def priced(choice: Ints, costs: Floats, switching: Floats) -> Floats:
-    """J of every window of a sequence, with the switching term of the move that led to it.
+    """J of every window of a sequence, shape (K,), with the switching term of the move before it.
 
-    Parameters
-    ----------
-    choice : int64 array, shape (K,)
-    costs : float64 array, shape (K, M)
-    switching : float64 array, shape (M, M)
-
-    Returns
-    -------
-    float64 array, shape (K,)
+    Shapes: `choice` (K,), `costs` (K, M), `switching` (M, M).
     """
     values: Floats = costs[np.arange(len(choice)), choice]
     values[1:] += switching[choice[:-1], choice[1:]]
@@ -145,7 +131,7 @@ def priced(choice: Ints, costs: Floats, switching: Floats) -> Floats:
 
 
 def _checked(costs: ArrayLike, switching: ArrayLike) -> tuple[Floats, Floats]:
-    """Return both arrays, or say what is wrong with them."""
+    """Return both arrays as float64; refuse wrong shapes and values."""
     costs = np.asarray(costs, np.float64)
     switching = np.asarray(switching, np.float64)
     if costs.ndim != 2 or 0 in costs.shape:
@@ -168,7 +154,7 @@ def _checked(costs: ArrayLike, switching: ArrayLike) -> tuple[Floats, Floats]:
 
 
 def _one_a_window(what: str, values: ArrayLike | None, windows: int) -> Floats:
-    """Return one number for each window, 1 where nothing is given."""
+    """Return one number per window, 1 by default."""
     row = np.ones(windows) if values is None else np.asarray(values, np.float64)
     if row.shape != (windows,):
         raise MetricError(f"{what} has the shape {row.shape}; it must be ({windows},)")
@@ -178,17 +164,9 @@ def _one_a_window(what: str, values: ArrayLike | None, windows: int) -> Floats:
 
 
 def _free_at(decided: Mask, min_dwell: int) -> Ints:
-    """Return f: the first window that may have another placement again, after one entered anew.
+    """Return f, shape (K,): the first window that can migrate again after a migration into each.
 
-    Parameters
-    ----------
-    decided : bool array, shape (K,)
-        Whether a decision follows the close of each window.
-
-    Returns
-    -------
-    int64 array, shape (K,)
-        At most K. N_min decisions are blocked after each entry; the next one is free.
+    The dwell blocks N_min decisions after a migration. Values are at most K.
     """
     windows = len(decided)
     closes = np.flatnonzero(decided)
@@ -220,7 +198,7 @@ def _least(price: Floats, end: Floats, free_at: Ints) -> Floats:
     rows = list(least)
     totals, moved = np.empty((candidates, candidates)), np.empty(candidates)
     add, smallest, smaller = np.add, np.minimum.reduce, np.minimum
-    # A loop over every window: what it needs is looked up outside.
+    # Names and arrays are looked up outside of the loop for speed.
     for k, at, there in zip(
         range(windows - 1, 0, -1), free_at[:0:-1].tolist(), price[:0:-1], strict=True
     ):
@@ -231,12 +209,7 @@ def _least(price: Floats, end: Floats, free_at: Ints) -> Floats:
 
 
 def _follow(least: Floats, price: Floats, free_at: Ints, initial: int, tie: float) -> Ints:
-    """Go through the windows from the initial placement, and move where that gains something.
-
-    Returns
-    -------
-    int64 array, shape (K,)
-    """
+    """Return the choice of every window, shape (K,): move whenever a move lowers the total."""
     windows, candidates, _ = price.shape
     choice = np.empty(windows, np.int64)
     gains = least[2:] - least[1:-1] > tie

@@ -1,8 +1,8 @@
-"""The same task on many units, spread over the workers of a Dask cluster.
+"""Parallel execution of one task on many units, by the workers of a Dask cluster.
 
-As `dwell.study.workers.spread` does over local processes. The workers need this package in the
-same version, and none of this machine's files: results come back as they are ready, and whoever
-asked for them writes them.
+`dwell.study.workers.spread` does the same with local processes. The workers need this package in
+the same version, but no files of this machine: results return as they are ready, and this process
+writes them.
 """
 
 from __future__ import annotations
@@ -82,13 +82,13 @@ def spread_on_dask(
                 "time"
             ) from None
         finally:
-            # The scheduler forgets what waits: nobody else asks for it.
+            # The scheduler drops the waiting units, because no other client needs them.
             client.close(timeout=ANSWER_S)
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep a client from logging the tracebacks of what ends here in one error."""
+    """Silence a client's log of tracebacks; the caller raises a single error."""
     logger = logging.getLogger("distributed.client")
     level = logger.level
     logger.setLevel(logging.CRITICAL)
@@ -131,7 +131,7 @@ def _ask(dask: Any, address: str) -> None:
         async with dask.rpc(address) as scheduler:
             return await scheduler.identity()
 
-    # In a thread, since a notebook has a loop of its own in this one.
+    # In a separate thread, because a notebook runs its own event loop in this thread.
     with ThreadPoolExecutor(1) as thread:
         try:
             found = thread.submit(asyncio.run, asyncio.wait_for(identity(), ANSWER_S)).result()

@@ -1,7 +1,7 @@
-"""Compare policies: every scenario, policy and seed, and intervals over the seeds.
+"""Comparison of policies: simulates every scenario, policy and seed; intervals over the seeds.
 
-Realisations are drawn once for each scenario and seed, and every policy plays the same one. What
-one policy gains over another is therefore a difference of pairs, free of what luck gave to both.
+The realisation of a scenario and seed is sampled once, and all policies run on it. The gain of one
+policy over another is therefore a paired difference, which cancels the randomness common to both.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Comparison(StudyRuns):
     Parameters
     ----------
     examples : mapping of (scenario, policy) to Example
-        The runs of the first seed; empty where they were not kept.
+        The runs of the first seed.
     """
 
     examples: Mapping[tuple[str, str], Example]
@@ -46,32 +46,32 @@ def compare(
     processes: int | None = None,
     progress: Progress | None = None,
 ) -> Comparison:
-    """Run every scenario, policy and seed.
+    """Simulate every scenario with every policy and seed.
 
     Parameters
     ----------
     scenarios : sequence of str, optional
-        All of the problem's where None.
+        Default: all scenarios of the problem.
     policies : sequence of str, Contender or policy, or mapping of str to policy or str
-        Names (`dtp`, a candidate's, ...), policies with an estimator of their own, or objects of
-        your own. In a sequence an object has its class's name in the tables, in a mapping its key.
-        With several processes an object must pickle, and its class must be in a module.
+        Names (`dtp`, a candidate, ...), contenders, or your own policy objects. Tables name an
+        object by its class if `policies` is a sequence, by its key if it is a mapping. With several
+        processes an object must pickle, and its class must be in a module.
     seeds : sequence of int
-        All different; the result is the same for the same seeds, whatever `processes` is.
+        All different. The result depends on the seeds, not on `processes`.
     windows : int
         Length of every run; more than the problem's warm-up.
     processes : int, optional
-        Over which the runs are spread; one a CPU where None (see `dwell.study.workers`).
+        Number of worker processes. Default: one per CPU (see `dwell.study.workers`).
     progress : callable, optional
-        Called with the number of runs done and of all runs, after every few.
+        Called with the number of finished runs and the number of all runs.
 
     Raises
     ------
     ProblemError, PolicyError, TraceError
-        If something named is unknown, or a trace is too short.
+        If a name is unknown, or a trace is too short.
     SimulationError
-        If a number is out of its range, two objects have one class's name, an object cannot be
-        sent to worker processes, or a worker process ended early.
+        If a number is out of its range, two policies have the same name, an object cannot be sent
+        to worker processes, or a worker process ended early.
     """
     if isinstance(policies, Mapping):
         contenders = [_contender(problem, policy, name) for name, policy in policies.items()]
@@ -93,7 +93,7 @@ def compare(
 def compare_study(
     study: Study, *, processes: int | None = None, progress: Progress | None = None
 ) -> Comparison:
-    """Run a study without parameters in memory, as `compare` does.
+    """Simulate a study without parameters in memory, as `compare` does.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Disturbances of a run by node, link and time: episodes as they were drawn."""
+"""Disturbances of a run by node, link and time, including the sampled episodes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dwell.sim import drawn_scenario
 
 
 def disturbances_of(run: Run) -> Scenario:
-    """Return the disturbances of a run, each with its time: as played, else as drawn.
+    """Return the disturbances of a run with their times: the recorded ones, else sampled again.
 
     Raises
     ------
@@ -41,16 +41,16 @@ def drawn_disturbances(
     shared: Sequence[str] = (),
     disturbances: Scenario = (),
 ) -> Scenario:
-    """Return a scenario's disturbances as they are drawn; without episodes that cannot be.
+    """Return a scenario's disturbances with sampled episodes; without episodes of missing traces.
 
     Parameters
     ----------
     seed, windows : int
-        The run's; episodes are drawn as far as it reaches.
+        Seed and length of the run; episodes are sampled up to its end.
     streams : str
-        What the names of its streams begin with: those of a cell of a fleet.
+        Prefix of the names of random streams, for a cell of a fleet.
     shared, disturbances
-        Nodes that the cells of a fleet share, and what happens to them (see `dwell.draw`).
+        Shared nodes of a fleet, and their disturbances (see `dwell.draw`).
     """
     try:
         return drawn_scenario(
@@ -63,6 +63,6 @@ def drawn_disturbances(
             disturbances=disturbances,
         )
     except TraceError:
-        # Their times are recorded ones, which a run does not have.
+        # The episodes have recorded times, and a run does not include their traces.
         items = (*problem.scenario(scenario), *disturbances)
         return tuple(dict.fromkeys(item for item in items if item.episodes is None))

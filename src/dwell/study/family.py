@@ -1,9 +1,9 @@
-"""Families of comparisons: what may be said of many at once.
+"""Families of comparisons, with p values adjusted for their number.
 
-Twenty comparisons at 5 % find one difference on average where there is none. All comparisons that
-answer one question on one metric are therefore a family, and its p values are adjusted together:
-with a probability of 95 % not one of its verdicts is luck. Neither metrics nor questions share a
-family: the 5 % hold for each, and a report says how many there are.
+Twenty comparisons at 5 % give one false difference on average. All comparisons that answer one
+question on one metric are therefore a family, and its p values are adjusted together: with a
+probability of 95 % none of its verdicts is due to chance. Each metric and each question has its own
+family and its own 5 %; a report states the number of families.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from dwell.study.summary import LATENCIES, PLAYED
 if TYPE_CHECKING:
     import polars as pl
 
-#: Begin of a verdict that is none, and what stands for it in the rows of a page.
+#: First words of a verdict with too few seeds, and its mark in the rows of a page.
 CANNOT_TELL, UNTOLD = "cannot tell", "–"
-#: Verdicts of a pair that is the same run, and of one with the same latencies only.
+#: Verdicts on identical runs, and on runs with identical latencies only.
 SAME_RUN, SAME_CYCLES = "same run", "same cycles"
-#: The columns of runs that are equal then.
+#: Columns of digests that are equal for each of these verdicts.
 EQUAL = {SAME_RUN: PLAYED, SAME_CYCLES: LATENCIES}
 
-#: Columns of runs and what they have to be, for one run a seed to be left.
+#: Values by column that select one run per seed.
 Labels: TypeAlias = Mapping[str, object]
-#: Two groups of runs, one run a seed each.
+#: Two groups of runs, each with one run per seed.
 Contrast: TypeAlias = "tuple[Labels, Labels]"
 
 #: ``lower``, ``higher``, ``no difference shown``, `SAME_RUN`, `SAME_CYCLES`, or `cannot_tell`.
@@ -59,10 +59,10 @@ class Family:
     question : str
         The question in words, for instance ``is DTP cheaper than each static placement?``
     metric : str
-        Column that is compared.
+        Name of the compared column.
     comparisons : mapping of str to PairedDifference, PairedMedian or SameRun
-        By a name, for instance ``baseline: dtp, LOC``. The first of a pair is what a verdict is
-        about. What is the same run is not tested, and does not count among the comparisons.
+        By a name, for instance ``baseline: dtp, LOC``. A verdict is about the first of a pair.
+        A `SameRun` is not tested and does not count as a comparison.
     """
 
     question: str
@@ -75,22 +75,22 @@ class Family:
     ) -> Family:
         """Compare a metric between pairs of groups of runs, seed by seed.
 
-        Metrics that may be infinite are compared by medians, the others by means; pairs that
-        played every cycle alike under every seed are the same run.
+        Metrics that may be infinite are compared by medians, other metrics by means. A pair whose
+        cycles are identical for every seed becomes a `SameRun`.
 
         Parameters
         ----------
         runs : DataFrame
-            One row a run, with a column ``seed``; see `dwell.study.StudyResult`.
+            One row per run, with a column ``seed``; see `dwell.study.StudyResult`.
         pairs : mapping of str to (labels, labels)
-            By a name; what columns are in the runs of each group. Both leave one run a seed.
+            By a name: the values by column that select each group, one run per seed.
 
         Raises
         ------
         SimulationError
-            If labels leave no run, or several a seed.
+            If labels select no run, or several runs per seed.
         MetricError
-            If there is no such column; with the nearest name.
+            If the column is unknown; the message suggests the nearest name.
         """
         return cls(
             question, metric, {name: _contrast(runs, metric, pair) for name, pair in pairs.items()}
@@ -98,22 +98,22 @@ class Family:
 
     @property
     def tested(self) -> dict[str, PairedDifference | PairedMedian]:
-        """The comparisons that have a p value: all but the same run."""
+        """The comparisons with a p value: all except each `SameRun`."""
         known = self.comparisons.items()
         return {name: item for name, item in known if not isinstance(item, SameRun)}
 
     @property
     def adjusted(self) -> dict[str, float]:
-        """Holm's p value of each comparison that is tested."""
+        """The p value of each tested comparison, adjusted by Holm's procedure."""
         tested = self.tested
         return dict(zip(tested, holm([item.p for item in tested.values()]), strict=True))
 
     @property
     def verdicts(self) -> dict[str, Comparative]:
-        """Where the first is lower or higher, with 95 % confidence in all of them together.
+        """Whether the first is lower or higher, with 95 % confidence for all verdicts together.
 
-        "No difference shown" is no proof that there is none: intervals say what is left open. Where
-        nothing can be shown, whatever the numbers are, `cannot_tell` says so.
+        "No difference shown" does not prove that the two are equal: the interval shows which
+        differences are possible. If the seeds are too few, the text of `cannot_tell` replaces it.
         """
         words: dict[int, Comparative] = {-1: "lower", 1: "higher", 0: "no difference shown"}
         adjusted, tested = self.adjusted, self.tested
@@ -137,16 +137,16 @@ class Family:
         return self.verdicts[name]
 
     def table(self) -> pl.DataFrame:
-        """Return one row a comparison, in their order.
+        """Return a table with one row per comparison, in order.
 
         Returns
         -------
         DataFrame
             ``question``, ``metric``, ``comparison``; ``centre`` (mean or median), ``difference``,
             ``low``, ``high``; ``d_z`` (null for medians), ``superiority``; ``n`` (pairs), ``p``,
-            ``p_holm``, ``p_least`` (the smallest that ``p_holm`` can be with so many pairs and
-            comparisons) and ``verdict``. What is NaN is null; of the same run, all but the
-            difference and the superiority.
+            ``p_holm``, ``p_least`` (the smallest possible ``p_holm`` for the numbers of pairs and
+            comparisons) and ``verdict``. NaN becomes null. A `SameRun` has null in the interval,
+            ``d_z`` and the p values.
         """
         import polars as pl
 
@@ -174,21 +174,21 @@ class Family:
 
 
 def seed_values(runs: pl.DataFrame, column: str, labels: Labels) -> Floats:
-    """Return one number a seed, in the order of the seeds.
+    """Return one number per seed, in the order of the seeds.
 
     Parameters
     ----------
     runs : DataFrame
-        One row a run.
+        One row per run.
     labels : mapping of str to object
-        Leave one run a seed.
+        Values by column that select one run per seed.
 
     Raises
     ------
     SimulationError
-        If they leave none, or several a seed.
+        If the labels select no run, or several runs per seed.
     MetricError
-        If there is no such column; with the nearest name.
+        If the column is unknown; the message suggests the nearest name.
     """
     group = _group(runs, labels)
     if group.is_empty() or group["seed"].n_unique() != group.height:
@@ -207,18 +207,17 @@ def _group(runs: pl.DataFrame, labels: Labels) -> pl.DataFrame:
 
 
 def played_alike(runs: pl.DataFrame, pair: Contrast) -> str:
-    """Return how two groups of runs, one run a seed each, played every cycle alike.
+    """Return whether two groups of runs are identical, by the digests of their cycles.
 
     Parameters
     ----------
     runs : DataFrame
-        One row per run. A table that was made of runs, and has no digests of their cycles, says
-        nothing.
+        One row per run. Without columns of digests the groups count as different.
 
     Returns
     -------
     str
-        `SAME_RUN`, `SAME_CYCLES`, or nothing if they differ.
+        `SAME_RUN`, `SAME_CYCLES`, or an empty text if the groups differ.
     """
     for word, column in EQUAL.items():
         if column in runs.columns:
@@ -229,7 +228,7 @@ def played_alike(runs: pl.DataFrame, pair: Contrast) -> str:
 
 
 def _contrast(runs: pl.DataFrame, metric: str, pair: Contrast) -> Difference:
-    """Compare the first of a pair to the second; by medians where a column may be infinite."""
+    """Compare the first of a pair with the second, by medians if the column may be infinite."""
     first, second = (seed_values(runs, metric, labels) for labels in pair)
     word = played_alike(runs, pair)
     if word and np.array_equal(first, second):
@@ -241,7 +240,7 @@ def _contrast(runs: pl.DataFrame, metric: str, pair: Contrast) -> Difference:
 
 
 def cannot_tell(seeds: int, comparisons: int = 1) -> str:
-    """Return ``cannot tell with 3 seeds`` where so many can show nothing; an empty text elsewhere.
+    """Return ``cannot tell with 3 seeds`` if these are too few for any verdict, else an empty text.
 
     Parameters
     ----------
@@ -256,24 +255,24 @@ def cannot_tell(seeds: int, comparisons: int = 1) -> str:
 
 
 def untold(words: Iterable[str]) -> dict[str, int]:
-    """Return how often each word stands there that says that nothing can be told.
+    """Count each verdict that begins with `CANNOT_TELL`.
 
-    A page says each of them once, and `UNTOLD` in its rows.
+    A page prints each of these verdicts once, and `UNTOLD` in its rows.
     """
     return dict(Counter(word for word in words if word.startswith(CANNOT_TELL)))
 
 
 def _least_adjusted(pairs: int, comparisons: int) -> float:
-    """Return the smallest p value of any of so many comparisons, adjusted."""
+    """Return the smallest possible adjusted p value in a family of comparisons."""
     return min(1.0, comparisons * least_p(pairs))
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
     """Adjust p values by Holm's step-down procedure.
 
-    The i-th smallest of m, from 0, is multiplied by m - i, and none becomes smaller than the one
-    before it. The probability that any of those at or below α is wrong is at most α, however they
-    depend on each other (Holm 1979, DOI 10.2307/4615733).
+    The i-th smallest of m values (i from 0) is multiplied by m - i, and raised to the value before
+    it if that is larger. The probability that any rejection at level α is wrong is at most α, for
+    any dependence between the tests (Holm 1979, DOI 10.2307/4615733).
 
     Parameters
     ----------
@@ -283,12 +282,12 @@ def holm(p_values: Sequence[float]) -> list[float]:
     Returns
     -------
     list of float
-        In the order given, at most 1.
+        In the order of `p_values`, at most 1.
 
     Raises
     ------
     SimulationError
-        If one is not in [0, 1].
+        If a value is not in [0, 1].
     """
     values = np.asarray(p_values, np.float64)
     wrong = values[~((values >= 0) & (values <= 1))]

@@ -1,8 +1,8 @@
-"""Plan: good placements of a fleet, by the table of loads first, then as played.
+"""Plan: good placements of a fleet, found with the table of loads and improved by simulation.
 
-The search begins at the placements with the least Φ of the table: a knapsack over one shared
-resource, a mixed-integer program over several. Moves of one cell and of two go on from there as
-long as one makes the played Φ better. Small fleets begin again from places nearby.
+The search begins at the placements with the lowest Φ of the table: a knapsack for one shared
+resource, a mixed-integer program for several. A local search then moves one or two cells at a time,
+as long as the simulated Φ improves. Small fleets repeat it from placements nearby.
 """
 
 from __future__ import annotations
@@ -27,28 +27,28 @@ from dwell.model.qos import QoS
 from dwell.record import FleetRun
 from dwell.sim.fleet import phased, priced_cells, tabled_cells
 
-#: Levels of the load of each of several shared resources.
+#: Number of load levels per resource if several resources are shared.
 LEVELS_OF_SEVERAL = 40
-#: Cells that the search may play in all, which bounds its time for large fleets.
+#: Largest number of cells that the search simulates; limits its time for large fleets.
 CELLS_PLAYED = 20_000
-#: Fleets whose search took fewer plays begin again, with as many cells elsewhere.
+#: Searches with fewer simulations start again, with a number of cells at random candidates.
 ENOUGH_PLAYS, ELSEWHERE = 200, 4
-#: Cycles that a plan is played for, of all cells together, and most of a cell.
+#: Simulated cycles of the final plan: total over all cells, and most per cell.
 CYCLES, MOST = 1_000_000, 15_000
 
 
 @dataclass(frozen=True, slots=True)
 class FleetPlan:
-    """Placements of a fleet with the best played price that was found.
+    """Placements of a fleet with the best simulated price of the search.
 
     Parameters
     ----------
     placements : mapping of str to str
         Candidate of each cell.
     table_phi : float
-        Φ a cell, as the table has it.
+        Φ per cell, from the table of loads.
     played : FleetPrice
-        What the fleet comes to there.
+        Simulated price of the fleet with these placements.
     """
 
     placements: Mapping[str, str]
@@ -60,24 +60,21 @@ class FleetPlan:
 
     @property
     def phi(self) -> float:
-        """Φ a cell, as played."""
+        """Simulated Φ per cell."""
         return self.played.phi / len(self.placements)
 
     @property
     def cells(self) -> dict[str, QoS]:
-        """What each cell comes to."""
+        """Simulated metrics by cell."""
         priced = map(self.played.qos, range(len(self.placements)))
         return {name: qos for name, qos in zip(self.placements, priced, strict=True) if qos}
 
     def above(self, limit: float) -> list[str]:
-        """Return the cells that miss a larger share of their deadlines than a limit."""
+        """Return the cells with V_D above a limit."""
         return [name for name, qos in self.cells.items() if qos.violation_rate > limit]
 
     def regret(self, run: FleetRun) -> float:
-        """How far Φ of a run, by what its windows show, is above that of the plan: a share of it.
-
-        Windows of the warm-up do not count.
-        """
+        """Relative excess of a run's Φ, from its windows after the warm-up, over the plan's Φ."""
         return phi_of(run) / self.phi - 1.0
 
     def as_json(self) -> dict[str, object]:
@@ -98,7 +95,7 @@ class FleetPlan:
 
 
 def phi_of(run: FleetRun) -> float:
-    """Φ a cell of a run, by the means of what its windows showed after the warm-up."""
+    """Φ per cell of a run, from the mean metrics of its windows after the warm-up."""
     own, shared = 0.0, 0.0
     problems = run.fleet.problems
     for name, one in run.cells.items():
@@ -116,14 +113,9 @@ def phi_of(run: FleetRun) -> float:
 
 
 def plan_fleet(fleet: Fleet, *, seed: int = 1, progress: Progress | None = None) -> FleetPlan:
-    """Find good placements of a fleet while its scenarios go on, by its objective.
+    """Find good placements of a fleet in its scenarios, by its objective.
 
-    Parameters
-    ----------
-    seed : int
-        Of the phases, where these are random.
-    progress : callable, optional
-        Told how many of how many levels of the table have been played.
+    `seed` samples random phases. `progress` receives the finished and total levels of the table.
     """
     cells = [
         replace(one, scenario=cell.entry.scenario)
@@ -162,7 +154,7 @@ def _as_played(
     alone: Sequence[Mapping[str, float]],
     starts: Sequence[tuple[str, ...]],
 ) -> tuple[str, ...]:
-    """Return the best placements of those that were played, from the better start on."""
+    """Search from the best start, and return the best simulated placements."""
     played: dict[tuple[str, ...], FleetPrice] = {}
     most = max(CELLS_PLAYED // len(alone), 1)
 
@@ -192,12 +184,9 @@ def _as_played(
 
 
 def best_placements(loads: Loads, alone: Sequence[Mapping[str, float]]) -> list[str]:
-    """Return the placements of which the table's Φ is least.
+    """Return the placements with the lowest Φ of the table.
 
-    Parameters
-    ----------
-    alone : sequence of mapping of str to float
-        J of every candidate of each cell where no other is there.
+    `alone` is J of every candidate of each cell without other cells.
     """
     if len(loads.resources) > 1:
         return _by_program(loads, alone)
@@ -207,8 +196,8 @@ def best_placements(loads: Loads, alone: Sequence[Mapping[str, float]]) -> list[
 def _by_program(loads: Loads, alone: Sequence[Mapping[str, float]]) -> list[str]:
     """Return the best placements over several resources; every load is rounded up to a level.
 
-    Of every cell one candidate is taken, of every resource one level. What candidates of one kind
-    wait at a level is paid for as often as they are taken while it is.
+    The program selects one candidate per cell and one level per resource. Each selected candidate
+    of a group pays the group's waiting cost at the selected level.
     """
     from scipy.optimize import Bounds, LinearConstraint, milp
 

@@ -1,4 +1,4 @@
-"""Summary of a fleet's run: its numbers, and the row of a study that it is."""
+"""Summary of a fleet's run: its numbers, and its row in the table of a study."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from dwell.study.judged_cost import judged_cost
 from dwell.study.summary import Summary, summarise
 from dwell.study.verdict import verdict_of
 
-#: Columns that are the sum over cells.
+#: Columns with sums over cells.
 TOTALS = ("migrations", "guard_moves")
 
 
 def summarise_fleet(run: FleetRun, judged: Fleet, labels: Mapping[str, str | int]) -> Summary:
-    """Sum up a fleet's run as the cell that misses most, with the cost of all.
+    """Return the summary of a fleet's run: its worst cell, and the mean cost of all cells.
 
     Parameters
     ----------
     judged : Fleet
-        By whose cells' objectives costs are judged.
+        Fleet whose objectives judge the costs.
     labels : mapping
         Leading columns of the row: scenario, policy, seed.
 
     Returns
     -------
     Summary
-        That of the cell with the largest V_D, the first of equal ones, but for these columns:
-        ``cost``, the mean over cells; ``migrations`` and ``guard_moves``, those of all cells;
-        ``cells``; ``worst_cell``, its name; ``mean_violation_rate``, of all cells.
+        Summary of the first cell with the largest V_D, with these columns for all cells: means
+        ``cost`` and ``mean_violation_rate``; sums ``migrations`` and ``guard_moves``; ``cells``;
+        ``worst_cell``, the name of that cell; digests of the runs.
 
     Raises
     ------
@@ -65,15 +65,15 @@ def _digest(digests: Iterable[object]) -> str:
 
 
 def fleet_numbers(run: FleetRun) -> dict[str, Any]:
-    """Return what a fleet comes to: its cells, the worst first, its shared nodes and its moves.
+    """Return the numbers of a fleet's run: its cells, shared nodes and moves.
 
     Returns
     -------
     dict
-        ``cells``: of each the means over its windows after the warm-up, the word of its verdict
-        (see `dwell.study.verdict`), and its moves; ``cost``,
-        the mean over cells; ``load`` by shared resource; ``moves``, ``guard_moves``; ``refused`` by
-        who refused; ``rounds`` (each with Φ before and after it, and who moved).
+        ``cells``: means over the windows after the warm-up and number of moves per cell, with the
+        word of its verdict (`dwell.study.verdict`), the worst cell first; ``cost``, the mean over cells; ``load`` by shared resource; ``moves``,
+        ``guard_moves``; ``refused``, the number of refusals by the first word of the reason;
+        ``rounds``, each with Φ before and after it and the cells that moved.
     """
     import polars as pl
 
@@ -115,7 +115,7 @@ def fleet_numbers(run: FleetRun) -> dict[str, Any]:
 
 
 def refusals(run: FleetRun) -> Counter[tuple[str, str]]:
-    """Return how many moves were refused, by the candidate and the reason without its amount."""
+    """Return the number of refused moves, by candidate and reason without its amount."""
     if "refused" not in run.decisions.columns:
         return Counter()
     return Counter(_refusal(text) for text in run.decisions["refused"].drop_nulls())
@@ -129,7 +129,7 @@ def _refusal(text: str) -> tuple[str, str]:
 
 
 def _known(mean: object) -> float:
-    """Return a mean; NaN where the controller saw no window."""
+    """Return a mean; NaN if the controller saw no window."""
     return mean if isinstance(mean, float) else math.nan
 
 
@@ -138,7 +138,7 @@ def _word(run: FleetRun, cell: str, rate: float) -> str:
 
 
 def _rounds(run: FleetRun) -> list[dict[str, Any]]:
-    """Return Φ before and after every round in which the ledger was asked, and who moved."""
+    """Return Φ before and after every round with a request to the ledger, and the moved cells."""
     import polars as pl
 
     asked = run.decisions.filter(pl.col("phi_before").is_not_null())

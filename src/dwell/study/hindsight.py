@@ -1,16 +1,16 @@
-"""Hindsight: an estimator that is told what every candidate would have shown, one window late.
+"""Hindsight: an estimator with the exact metrics of every candidate, one window late.
 
-At the close of a window it knows the latencies that the very cycles of that window have in the runs
-of every candidate alone on the same realisation, and makes of them what the controller would have
-seen. Whatever a rule loses with it is the rule's doing, and that of a decision that comes a window
-late; whatever it loses beyond that with a real estimator is the estimate's.
+At the end of a window it looks up the latencies of the same cycles in the static runs of all
+candidates on the same realisation, and computes the metrics that the controller would have seen.
+The loss of a rule with this estimator is due to the rule and to decisions one window late. Any
+further loss with a real estimator is due to the estimate.
 
-It is not the best of all estimators for a rule that looks at one window: it brings the luck of
-that window along, which an estimate over several windows does not. So a real one may do better.
+A real estimator may do better for a rule that uses one window: hindsight includes the random
+fluctuation of that window; an estimate over several windows averages it.
 
-The metrics are exact, except utilisation where windows do not begin with those of the static runs
-(after a migration whose order took time, or came after the next release): then it is that of the
-windows that overlap, by how much they do.
+The metrics are exact, except utilisation if windows do not begin with the windows of the static
+runs (after a migration whose order took time, or arrived after the next release). Utilisation is
+then the mean over the overlapping windows, weighted by their overlap.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class _Alone:
-    """Windows of a candidate played alone.
+    """Windows of a candidate's static run.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class _Alone:
     open_ns : int64 array, shape (windows + 1,)
         Begin of every window, and the end of the last.
     busy_ns : dict of str to float64 array, shape (windows + 1,)
-        Time for which each resource was busy until then, as if all of it were one core.
+        Cumulative busy time of each resource at these instants, as for a single core.
     """
 
     release_ns: Ints
@@ -56,7 +56,7 @@ class _Alone:
     busy_ns: dict[str, Floats]
 
     def utilisation(self, first: int, open_ns: int, close_ns: int) -> dict[str, float]:
-        """Utilisation of each resource in the window of a first cycle, between two instants."""
+        """Utilisation of each resource in the window that begins with cycle `first`."""
         window = int(np.searchsorted(self.first, first))
         if window < len(self.first) and self.first[window] == first:
             return {node: float(used[window]) for node, used in self.used.items()}
@@ -68,13 +68,13 @@ class _Alone:
 
 
 class Hindsight:
-    """Estimates every candidate by what it showed alone in the same cycles.
+    """Estimates every candidate by its metrics in the same cycles of its static run.
 
     Parameters
     ----------
     statics : mapping of str to Run, optional
-        Every candidate's run that never moves, of the realisation to be played. Where None it is
-        to be given them before it is asked (see `of`): a study does so for every realisation.
+        Static run of every candidate, on the realisation to simulate. Without them, `of` must set
+        them before the simulation; a study does so for every realisation.
     """
 
     def __init__(self, statics: Mapping[str, Run] | None = None) -> None:
@@ -85,16 +85,16 @@ class Hindsight:
         return "Hindsight()"
 
     def of(self, statics: Mapping[str, Run]) -> Hindsight:
-        """Return the same for a realisation of which every candidate's run is known."""
+        """Return the estimator for the realisation of some static runs."""
         return Hindsight(statics)
 
     def start(self, problem: Problem) -> None:
-        """Take the deadline and the censoring of the problem that will be played.
+        """Take the deadline and the censoring of the problem to simulate.
 
         Raises
         ------
         SimulationError
-            If it has not been told what every candidate of the problem showed.
+            If the static run of a candidate is missing.
         """
         missing = [name for name in problem.candidates if name not in self._alone]
         if missing:
@@ -107,7 +107,7 @@ class Hindsight:
         self._candidates = tuple(problem.candidates)
 
     def learn(self, evidence: Evidence) -> None:
-        """Look up the last W cycles."""
+        """Look up the last W cycles in the static runs."""
         last_ns, close_ns = int(evidence.release_ns[-1]), evidence.close_ns
         self._seen = {
             name: self._metrics(self._alone[name], last_ns, close_ns) for name in self._candidates
@@ -116,7 +116,7 @@ class Hindsight:
     def estimate(
         self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
     ) -> dict[str, QoS]:
-        """Return what every candidate alone showed in the window (see `Estimator`)."""
+        """Return the metrics of every candidate's static run in the window (see `Estimator`)."""
         return dict(self._seen)
 
     def _metrics(self, alone: _Alone, last_ns: int, close_ns: int) -> QoS:
@@ -131,11 +131,11 @@ class Hindsight:
 
 
 def _alone(run: Run) -> _Alone:
-    """Take what is needed of a static run."""
+    """Return the arrays of a static run."""
     windows, cycles = run.arrays("windows"), run.arrays("cycles")
     release_ns, first = cycles["release_ns"], windows["first_cycle"]
-    # The release that closes the last window is in no table: a window is taken to be as long as
-    # the one before it.
+    # The tables do not include the release that ends the last window. Its length is assumed to be
+    # the same as the length of the previous window.
     opened = release_ns[first]
     last = 2 * opened[-1] - opened[-2] if len(opened) > 1 else release_ns[-1]
     open_ns = np.append(opened, last)

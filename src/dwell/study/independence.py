@@ -1,4 +1,4 @@
-"""Which part of a study's runs is independent: the windows of a run, or the whole run alone."""
+"""Independent unit of a study's runs: the window or the run."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from dwell.study.over_seeds import RUN, WINDOW
 
 
 def unit_of(cells: Iterable[tuple[Problem, str]], windows: int) -> str:
-    """Return `WINDOW` if each run can show whatever any run shows, else `RUN`.
+    """Return `WINDOW` if every event can occur in every run, else `RUN`.
 
-    A run cannot if it replays a recorded trace, whose bad stretch is in few runs, or if it is
-    shorter than an on/off process is off and on, or than the correlation time of an AR(1) process.
+    `RUN` applies to recorded traces, because few runs include a trace's bad stretch. It also
+    applies to runs shorter than the mean time between begins of an on/off process or of episodes,
+    or shorter than the correlation time of an AR(1) process.
 
     Parameters
     ----------

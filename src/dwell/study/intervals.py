@@ -4,15 +4,15 @@ The unit is the seed: one run gives one number, and runs of different seeds are 
 kinds of number need three kinds of interval:
 
 * a mean: the studentised bootstrap (see `studentised_limits`);
-* a mean of shares: what the runs showed, by the same, and what they did not show, by the number of
-  their windows (see `share_interval`); without that number, by what every distribution on [0, 1]
-  allows (see `rule_of_three`);
-* a median, where infinity can occur: order statistics, by the binomial distribution. It assumes
-  nothing about the shape, and it never interpolates.
+* a mean of shares: the studentised bootstrap, widened for events that no run showed. The number of
+  windows limits these events (see `share_interval`); if it is unknown, the interval is valid for
+  every distribution on [0, 1];
+* a median of values that may be infinite: order statistics, by the binomial distribution. The
+  interval assumes nothing about the shape, and never interpolates.
 
-Rates of misses are skewed and seeds are few: Student's t is then wrong on the side that matters,
-its upper limits are too low (docs/decisions/0005-statistics.md has the numbers). It is left where
-the bootstrap has nothing to say: below `FEWEST` values, and where almost all are the same.
+Rates of misses are skewed and seeds are few. Student's t then gives upper limits that are too low
+(docs/decisions/0005-statistics.md has the numbers). It replaces the bootstrap only when the
+bootstrap gives no limit: below `FEWEST` values, or when almost all values are equal.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ Verdict: TypeAlias = Literal["under", "over", "not shown"]
 
 CONFIDENCE = 0.95
 
-#: Values below which there is no bootstrap: 3 have 27 resamples, and 1 in 9 is without spread.
+#: Fewest values for the bootstrap: 3 values have 27 resamples, of which 1 in 9 has no spread.
 FEWEST = 4
-#: How many times as far from a mean as Student's t its limits lie at most. Few values of which most
-#: nearly agree have resamples of hardly any spread, and limits a hundred times as far.
+#: Largest distance of a limit from the mean, in half-widths of Student's interval. Resamples of
+#: few, nearly equal values have hardly any spread: their limits can be 100 half-widths away.
 FARTHEST = 3.0
-#: So many that the quantiles of 2.5 % and of 5 % are order statistics of the resamples.
+#: With 4,999 resamples the quantiles of 2.5 % and of 5 % are order statistics.
 RESAMPLES = 4999
-#: Of every resampling, so that the same runs always have the same interval.
+#: A fixed seed: the same runs always have the same interval.
 RESAMPLING_SEED = 1
 
 
 class Interval(NamedTuple):
-    """A number over seeds and the interval around it; NaN at the ends where there is none."""
+    """A number over seeds and the ends of its interval, NaN if unknown."""
 
     value: float
     low: float
@@ -54,11 +54,11 @@ class Interval(NamedTuple):
 
     @property
     def known(self) -> bool:
-        """Whether there is an interval at all (one seed gives none)."""
+        """Whether the ends are known (a single seed has no interval)."""
         return not math.isnan(self.low)
 
     def columns(self, name: str) -> dict[str, float]:
-        """Return it as columns of a table: ``name``, ``name_low`` and ``name_high``."""
+        """Return the interval as columns of a table: ``name``, ``name_low`` and ``name_high``."""
         ends = (f"{name}{end}" for end in ENDS)
         return dict(zip(ends, (self.value, self.low, self.high), strict=True))
 
@@ -69,14 +69,14 @@ def mean_interval(values: Values, *, seed: int = RESAMPLING_SEED) -> Interval:
     Parameters
     ----------
     values : sequence of float
-        One a seed, finite, at least one.
+        One per seed, at least one.
 
     Returns
     -------
     Interval
-        An end for which the bootstrap has no limit is that of Student's t (see
-        `studentised_limits`), and none lies farther than `FARTHEST` times that. No width where all
-        values are the same, NaN at the ends for a single one and where one is not finite.
+        Student's t replaces an end for which the bootstrap has no limit (see `studentised_limits`).
+        No end is farther from the mean than `FARTHEST` times Student's half-width. The width is 0
+        if all values are equal. The ends are NaN for a single value, or if a value is not finite.
     """
     sample = np.asarray(values, np.float64)
     mean = float(sample.mean())
@@ -93,22 +93,23 @@ def mean_interval(values: Values, *, seed: int = RESAMPLING_SEED) -> Interval:
 def share_interval(values: Values, *, windows: int | None = None) -> Interval:
     """Mean of shares with its two-sided interval, inside [0, 1].
 
-    Runs spread, and that is in the studentised bootstrap. What no run showed is not, and is limited
-    by the windows: a kind of window that comes with probability p is in none of N with (1 - p)^N,
-    which is the tail at p = 1 - tail^(1/N), about 3/N; at worst all of its cycles miss. So the
-    upper limit is no less than (1 - p) · mean + p, the lower one no more than (1 - p) · mean. The
-    assumption is that a kind of window that may come at all comes in windows of any run
-    independently; of a kind that fills one run in ten and no window of the others N says nothing.
+    The studentised bootstrap covers the spread between runs. It does not cover events that no run
+    showed; the number of windows limits these. A kind of window with probability p is absent from
+    N windows with probability (1 - p)^N, which equals the tail at p = 1 - tail^(1/N), about 3/N. At
+    worst all cycles of such a window miss. The upper limit is therefore at least (1 - p) · mean + p
+    and the lower limit at most (1 - p) · mean. The argument assumes that every kind of window
+    occurs in the windows of any run independently. It does not cover a kind of window that fills
+    one run in ten and never occurs in the other runs.
 
     Parameters
     ----------
     values : sequence of float
-        One a seed, in [0, 1], at least one.
+        One per seed, in [0, 1], at least one.
     windows : int, optional
-        N, windows behind the values, all runs together. Where None, the limits are those that every
-        distribution on [0, 1] allows: with confidence 1 - tail a further run lies above the largest
-        of n with a probability of at most p = 1 - tail^(1/n) (Wilks 1941, DOI
-        10.1214/aoms/1177731788), and then it shows at most 1; below the smallest likewise.
+        N, windows behind the values, over all runs. If None, the limits are valid for every
+        distribution on [0, 1]: with confidence 1 - tail, a further run exceeds the largest of n
+        values with probability at most p = 1 - tail^(1/n) (Wilks 1941, DOI
+        10.1214/aoms/1177731788), and its value is then at most 1; the lower limit is symmetric.
 
     Returns
     -------
@@ -125,27 +126,28 @@ def share_interval(values: Values, *, windows: int | None = None) -> Interval:
 def share_difference_interval(
     first: Values, second: Values, *, windows: int | None = None, seed: int = RESAMPLING_SEED
 ) -> Interval:
-    """Mean of the first shares less the second, over pairs, with its two-sided interval.
+    """Mean difference of paired shares, first minus second, with its two-sided interval.
 
-    It is inside [-1, 1], and no narrower than what its parts leave open. Where one of them showed
-    the same in (nearly) all runs, the bootstrap has no limit for it on a side: what n runs did not
-    show of it is not in the differences either, whatever the other part adds to their spread.
+    The interval is inside [-1, 1] and includes the uncertainty of either sample. If a sample has
+    the same value in (nearly) all runs, the bootstrap gives no limit for it on one side. Events
+    that the n runs did not show are absent from the differences, too, however much the other sample
+    adds to their spread.
 
     Parameters
     ----------
     first, second : sequence of float
-        One a seed, in the same order, in [0, 1], at least one.
+        One per seed, in the same order, in [0, 1], at least one.
     windows : int, optional
-        Windows behind each of them (see `share_interval`).
+        Windows behind each sample (see `share_interval`).
 
     Returns
     -------
     Interval
-        By the studentised bootstrap of the differences, each end farther away by what is open of
-        the parts there (the distance from a part's mean to its limit of `share_interval`, on a side
-        on which the bootstrap has none); or what every distribution on [-1, 1] allows, whichever is
-        narrower. Where all differences are the same: they, and what no window showed. NaN at the
-        ends for a single pair.
+        Limits from the studentised bootstrap of the differences. If the bootstrap has no limit for
+        a sample on a side, the distance from that sample's mean to its limit of `share_interval` is
+        added. The limits valid for every distribution on [-1, 1] replace wider ones. If all
+        differences are equal, the interval is their value, widened for events that no window
+        showed. The ends are NaN for a single pair.
     """
     one, other = np.asarray(first, np.float64), np.asarray(second, np.float64)
     differences = one - other
@@ -171,25 +173,25 @@ def share_difference_interval(
 
 
 def share_limits(values: Values, *, windows: int | None = None) -> tuple[float, float]:
-    """One-sided limits of a mean of shares: it is above the first, it is below the second.
+    """One-sided limits of a mean of shares, lower and upper.
 
-    Each is right with the confidence of `CONFIDENCE` on its own. The lower one is that of
-    `share_interval`, one-sided. The upper one never rises where a value falls, or where a run of 0
-    is added, as a limit by the spread of the values does: it is that of `_limit_by_weights`, and no
-    less than what no window showed (see `share_interval`).
+    Each limit has the confidence `CONFIDENCE` on its own. The lower limit is the one-sided version
+    of `share_interval`'s. The upper limit is from `_limit_by_weights`, raised for events that no
+    window showed (see `share_interval`). It never rises when a value falls or a run of 0 is added;
+    a limit computed from the spread of the values can.
 
     Parameters
     ----------
     values : sequence of float
-        One a seed, in [0, 1], at least one.
+        One per seed, in [0, 1], at least one.
     windows : int, optional
-        Windows behind the values, all runs together. Where None, what every distribution on [0, 1]
-        allows: nothing but the number of runs is known.
+        Windows behind the values, over all runs. If None, the limits are valid for every
+        distribution on [0, 1].
 
     Returns
     -------
     at_least, at_most : float
-        0 and 1 for a single value, which limits nothing.
+        0 and 1 for a single value.
     """
     sample, tail = np.asarray(values, np.float64), 1 - CONFIDENCE
     if len(sample) == 1:
@@ -203,35 +205,35 @@ def share_limits(values: Values, *, windows: int | None = None) -> tuple[float, 
 
 
 def under(values: Values, limit: float = 0.05, *, windows: int | None = None) -> Verdict:
-    """Whether a mean of shares is shown to be under a limit, by its one-sided limits.
+    """Verdict on a mean of shares and a limit, by the one-sided limits of the mean.
 
-    The unit is the seed, and within it the window, not the cycle. Misses come in bursts, from a
-    disturbance or a bad hour of a trace: 10,000 cycles of one run may hold one independent event.
-    Fewer misses in any run, or one more run without any, never take the word "under" away.
+    The unit is the seed, and within a seed the window, because misses occur in bursts: a
+    disturbance or a bad hour of a trace may be the only independent event in 10,000 cycles. Fewer
+    misses in a run, or one more run without misses, never revoke the verdict "under".
 
     Parameters
     ----------
     values : sequence of float
-        One a seed (of a trace: one a run), in [0, 1], at least one.
+        One per seed (for a trace, one per run), in [0, 1], at least one.
     windows : int, optional
-        Windows behind the values, all runs together. Without it 59 runs that all show 0 are the
-        fewest that are "under" 5 %.
+        Windows behind the values, over all runs. Without this number, the verdict "under" 5 % needs
+        at least 59 runs, all with the value 0.
 
     Returns
     -------
     {"under", "over", "not shown"}
-        Under: the upper limit of `share_limits` is below `limit`. Over: the lower one is above it.
+        Under: the upper limit of `share_limits` is below `limit`. Over: the lower limit exceeds it.
     """
     at_least, at_most = share_limits(values, windows=windows)
     return "under" if at_most < limit else "over" if at_least > limit else "not shown"
 
 
 def rule_of_three(runs: int) -> float:
-    """Upper limit of a mean of shares that was 0 in every one of n independent runs.
+    """Upper limit of a mean of shares that was 0 in each of n independent runs.
 
-    If a run shows anything at all with probability p, then n runs show nothing with probability
-    (1 - p)^n; at p = 1 - 0.05^(1/n), about 3/n, that is 5 %. The share in a run is at most 1, so
-    its mean is at most p. Without a further assumption no smaller limit is sound.
+    If a run has a positive share with probability p, n runs all have 0 with probability (1 - p)^n.
+    This probability is 5 % at p = 1 - 0.05^(1/n), about 3/n. The share in a run is at most 1, so
+    its mean is at most p. A smaller limit needs a further assumption.
 
     Parameters
     ----------
@@ -247,19 +249,19 @@ def median_interval(values: Values) -> Interval:
     Parameters
     ----------
     values : sequence of float
-        One a seed, at least one, none NaN.
+        One per seed, at least one, none NaN.
 
     Returns
     -------
     Interval
-        The ceil(n/2)-th smallest; the ends are the r-th smallest and r-th largest for the largest
-        r whose coverage reaches `CONFIDENCE`. NaN at the ends below 6 values, where none does.
+        The value is the ceil(n/2)-th smallest. The ends are the r-th smallest and r-th largest, for
+        the largest r whose coverage reaches `CONFIDENCE`; NaN below 6 values.
     """
     sample = np.sort(np.asarray(values, np.float64))
     count = len(sample)
     median = float(sample[(count + 1) // 2 - 1])
-    # The largest r such that fewer than r of n values fall below the median with a probability of
-    # at most half of what is left over.
+    # The largest r such that fewer than r of n values are below the median with a probability of at
+    # most (1 - CONFIDENCE) / 2.
     rank = bisect_left(halves(count), (1 - CONFIDENCE) / 2)
     if rank < 1:
         return Interval(median, math.nan, math.nan)
@@ -271,28 +273,28 @@ def studentised_limits(
 ) -> tuple[float, float]:
     """Limits of a mean by the studentised bootstrap (bootstrap-t).
 
-    The distribution of t = (mean - μ) / (s / √n) is taken from resamples, t* = (mean* - mean) /
-    (s* / √n), in place of Student's. Its coverage is wrong by O(1/n) on either side, that of
-    Student's t and of the percentile bootstrap by O(1/√n) where the values are skewed (Hall 1988,
-    DOI 10.1214/aos/1176350933).
+    The distribution of t = (mean - μ) / (s / √n) is estimated from resamples, t* = (mean* - mean) /
+    (s* / √n). The error of its one-sided coverage is O(1/n); for skewed values the error of
+    Student's t and of the percentile bootstrap is O(1/√n) (Hall 1988, DOI
+    10.1214/aos/1176350933).
 
-    A resample of one value only has no spread: its t* is infinite, unless that value is the mean.
-    Where more of them than `tail` lie on one side there is no limit on the other: too few
-    different values were seen to tell how far the rare ones go. (Leaving such resamples out would
-    take exactly the uncertain ones for certain.)
+    If all values of a resample are equal, its t* is infinite, unless they equal the mean. If more
+    than the share `tail` of the resamples has an infinite t* on one side, the limit on the other
+    side is infinite: too few different values were seen to limit the rare ones. (Omitting such
+    resamples would omit exactly the uncertain cases.)
 
     Parameters
     ----------
     values : sequence of float
-        One a seed, finite, at least one.
+        One per seed, finite, at least one.
     tail : float
         Probability with which each limit may be wrong: 0.025 or 0.05.
 
     Returns
     -------
     low, high : float
-        Infinite where there is none, as below `FEWEST` values; both the mean where all values are
-        the same.
+        Infinite if unknown, for example below `FEWEST` values. Both equal the mean if all values
+        are equal.
     """
     sample = np.asarray(values, np.float64)
     count, mean = len(sample), float(sample.mean())
@@ -305,13 +307,13 @@ def studentised_limits(
     return mean - above * error, mean - below * error
 
 
-# A report asks for the same interval in a table, a figure and a sentence.
+# Cached: a report uses the same interval in a table, a figure and a sentence.
 @lru_cache(maxsize=4096)
 def _studentised(values: tuple[float, ...], tail: float, seed: int) -> tuple[float, float]:
     """Quantiles `tail` and 1 - `tail` of t*, over resamples of the values."""
     sample = np.array(values)
     centred = sample - sample.mean()
-    # What rounding leaves: of a value that is the mean, and of the spread of equal values.
+    # Rounding errors are below this: a value equal to the mean counts as 0, equal values as equal.
     least = 1e-9 * centred.std()
     centred[np.abs(centred) < least] = 0.0
     root = math.sqrt(len(values))
@@ -319,7 +321,7 @@ def _studentised(values: tuple[float, ...], tail: float, seed: int) -> tuple[flo
     rng = np.random.default_rng(seed)
     resamples = centred[rng.integers(len(values), size=(RESAMPLES, len(values)))]
     error = resamples.std(axis=1, ddof=1) / root
-    # Arctangents of t*: in the same order, and finite where t* is not.
+    # Arctangents of t*: they have the same order and are always finite.
     angles = np.sort(np.arctan2(resamples.mean(axis=1), np.where(error > least, error, 0.0)))
     rank = round((RESAMPLES + 1) * tail)
     return _tangent(float(angles[rank - 1])), _tangent(float(angles[-rank]))
@@ -345,14 +347,14 @@ def _share_limits(sample: Floats, tail: float, windows: int | None) -> tuple[flo
 
 @lru_cache(maxsize=4096)
 def _limit_by_weights(values: tuple[float, ...], tail: float) -> float:
-    """Upper limit of a mean of shares that does not rise where one of them falls.
+    """Upper limit of a mean of shares that never rises when a share falls.
 
-    Means over the values and one more, each with random weights (of a flat Dirichlet distribution:
-    the Bayesian bootstrap, Rubin 1981, DOI 10.1214/aos/1176345338): the limit is what 1 - `tail` of
-    them do not exceed. The one more is the end of the range that n values show, (1 + 1/n) times the
-    largest. Were it the end of all that may come, this would be Gaffke's limit, which no
-    distribution is known to break. Any draw gives the k-th largest value the same weight before it
-    is divided by their sum, so that no draw rises where a value falls, or where a 0 is added.
+    The limit is the quantile 1 - `tail` of weighted means of the values and an endpoint, with
+    random weights from a flat Dirichlet distribution (the Bayesian bootstrap, Rubin 1981, DOI
+    10.1214/aos/1176345338). The endpoint is (1 + 1/n) times the largest of the n values, at most 1.
+    With 1 as the endpoint this would be Gaffke's limit; no distribution is known to violate it.
+    Each sample of weights gives the k-th largest value the same weight before normalisation, so no
+    mean rises when a value falls or a 0 is added.
     """
     count = len(values)
     descending = np.sort(np.array(values))[::-1]
@@ -365,7 +367,7 @@ def _limit_by_weights(values: tuple[float, ...], tail: float) -> float:
 
 
 def _by_student(sample: Floats, tail: float, low: float, high: float) -> tuple[float, float]:
-    """Limits of a mean with Student's in place of those that the bootstrap has not."""
+    """Limits of a mean, infinite ones replaced by Student's."""
     if not (math.isinf(low) or math.isinf(high)):
         return low, high
     mean, half = float(sample.mean()), _half_width(sample, tail)
@@ -373,7 +375,7 @@ def _by_student(sample: Floats, tail: float, low: float, high: float) -> tuple[f
 
 
 def _open_sides(sample: Floats, windows: int | None) -> tuple[float, float]:
-    """How far below and above its mean shares may lie where the bootstrap has no limit; else 0."""
+    """Distances from a mean to its share limits, on sides without a bootstrap limit; else 0."""
     mean, low, high = share_interval(sample, windows=windows)
     if _same(sample):
         return mean - low, high - mean
@@ -385,7 +387,7 @@ def _open_sides(sample: Floats, windows: int | None) -> tuple[float, float]:
 
 
 def _unseen(runs: int, tail: float) -> float:
-    """Largest probability of what n runs did not show, with confidence 1 - `tail`."""
+    """Largest probability of an event absent from n runs, with confidence 1 - `tail`."""
     return float(1.0 - tail ** (1.0 / runs))
 
 
@@ -397,7 +399,7 @@ def _half_width(sample: Floats, tail: float) -> float:
 
 @lru_cache(maxsize=4096)
 def student_quantile(free: int, tail: float) -> float:
-    """Student's t that is exceeded with probability `tail`, by whole degrees of freedom.
+    """Student's t that is exceeded with probability `tail`, for integer degrees of freedom.
 
     With t = √free tan θ, the probability of |T| < t is a finite sum in sin θ and cos θ (Abramowitz
     and Stegun, Handbook of Mathematical Functions, 26.7.3 and 26.7.4).
@@ -418,11 +420,11 @@ def student_quantile(free: int, tail: float) -> float:
 
 @lru_cache(maxsize=4096)
 def halves(count: int) -> tuple[float, ...]:
-    """Probabilities that at most 0, 1, 2, ... of so many tosses of a coin are heads."""
+    """Probabilities that at most 0, 1, 2, ... of `count` coin tosses are heads."""
     ways = accumulate(range(count), lambda of, k: of * (count - k) // (k + 1), initial=1)
     return tuple(below / 2**count for below in accumulate(ways))
 
 
 def _same(sample: Floats) -> bool:
-    """Whether all values are the same: no spread, whatever the rounding of their mean says."""
+    """Whether all values are equal; their computed spread may differ from 0 by rounding."""
     return bool((sample == sample[0]).all())

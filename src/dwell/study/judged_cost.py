@@ -1,4 +1,4 @@
-"""Judged cost: what a run came to by the J of a problem that may not be its own."""
+"""Judged cost: J of a run by the objective of a problem, which may differ from the run's own."""
 
 from __future__ import annotations
 
@@ -17,17 +17,9 @@ if TYPE_CHECKING:
 
 
 def judged_cost(run: Run, problem: Problem) -> float:
-    """Mean J after the warm-up by a problem's objective.
+    """Mean J after the warm-up by a problem's objective; NaN if the controller saw no window.
 
-    Parameters
-    ----------
-    run : Run
-        A run of this problem, or of one with another controller and objective.
-
-    Returns
-    -------
-    float
-        Without unit; NaN where the controller saw no window.
+    The problem of the run may have another controller and objective.
     """
     windows = run.arrays("windows")
     counted = ~windows["warmup"] & ~np.isnan(windows["cost"])
@@ -36,17 +28,9 @@ def judged_cost(run: Run, problem: Problem) -> float:
 
 
 def judged_costs(run: Run, problem: Problem) -> Floats:
-    """J of every window by a problem's objective, with the switching terms of moves in it.
+    """J of every window, shape (windows,), by a problem's objective; NaN for unseen windows.
 
-    Parameters
-    ----------
-    run, problem
-        See `judged_cost`.
-
-    Returns
-    -------
-    float64 array, shape (windows,)
-        NaN where the controller did not see the window.
+    J includes the switching terms of the moves in a window.
     """
     windows = run.arrays("windows")
     if problem.decide_cycles < problem.window_cycles:
@@ -60,7 +44,7 @@ def judged_costs(run: Run, problem: Problem) -> Floats:
 
 
 def _moves(placed: Names, problem: Problem) -> Floats:
-    """S of each placement after the one before it; 0 of the first."""
+    """S between each placement and the previous placement; 0 for the first."""
     known = [problem.candidates[name] for name in placed.known]
     moved = np.array([[hamming(now, then) for now in known] for then in known])
     places = placed.places

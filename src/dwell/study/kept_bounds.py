@@ -1,4 +1,4 @@
-"""Bounds: whether a number keeps within them, as its whole interval says."""
+"""Bounds on numbers over seeds, checked against their intervals."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import math
 
 from dwell.study.intervals import Interval
 
-#: Share of missed deadlines that a cell should stay under (the paper's 5 %).
+#: Aim for a cell: a share of missed deadlines under 5 % (from the paper).
 AIM = 0.05
-#: The least number above 0: at least this is "above 0".
+#: The smallest number above 0, as a bound for "above 0".
 ABOVE_ZERO = math.ulp(0.0)
 
 
@@ -22,13 +22,13 @@ def keeps(
     known : Interval
         The number with its interval.
     at_least, at_most : float
-        In the number's unit; a number that is equal to one of them keeps it.
+        Bounds in the number's unit; a number equal to a bound is within it.
 
     Returns
     -------
     bool or None
-        True where the whole interval lies within, False where the whole of it lies beyond one of
-        them, None where it allows for either, or is not known.
+        True if the complete interval is within the bounds, False if it is entirely beyond one
+        bound, None if it includes a bound or is unknown.
     """
     if known.low >= at_least and known.high <= at_most:
         return True

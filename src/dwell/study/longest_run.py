@@ -9,12 +9,12 @@ from dwell.model import Problem
 
 
 def longest_run(problem: Problem, windows: int) -> int:
-    """Return `windows`, or how many the problem's traces last for where those are fewer.
+    """Return `windows`, or the number of windows in the problem's traces if that is smaller.
 
     Raises
     ------
     TraceError
-        If they do not last for a single window after the warm-up.
+        If the traces are too short for a window after the warm-up.
     """
     from dwell.sim import draw
 
@@ -23,7 +23,7 @@ def longest_run(problem: Problem, windows: int) -> int:
             for scenario in problem.scenarios:
                 draw(problem, scenario=scenario, seed=0, windows=length)
         except TraceError:
-            # Not even the shortest run is possible.
+            # The shortest run is too long for the traces.
             if length == lengths[0]:
                 raise
             return True

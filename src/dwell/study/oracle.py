@@ -1,7 +1,7 @@
-"""What every candidate costs to a planner that knows all disturbances and no other random numbers.
+"""Expected cost of every candidate for a planner that knows all disturbances in advance.
 
-The planner knows when each disturbance is on, drawn episodes included. It does not know the bursts
-of nodes and links, execution times, delays and losses.
+The planner knows when each disturbance is on, including sampled episodes. It does not know the
+bursts of nodes and links, execution times, delays and losses.
 
 The disturbances that are on in a cycle are its *set*. The kernel prices every candidate under each
 set, as if the set were always on (`dwell.estimators.prices`), from `PRICED_CYCLES` cycles. J of a

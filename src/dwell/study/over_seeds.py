@@ -24,39 +24,39 @@ if TYPE_CHECKING:
     from dwell.study.summary import Row
 
 
-#: Column of runs that names what is independent in them, `WINDOW` or `RUN`.
+#: Column of runs with their independent unit, `WINDOW` or `RUN`.
 UNIT = "unit"
 WINDOW, RUN = "window", "run"
 
-#: Means of what cannot be below 0, as utilisations cannot.
+#: Columns without negative values; utilisations have none either.
 NOT_NEGATIVE = frozenset({"cost", "j_still", "l95_ms", "migrations", "moved", "returns"})
 
 
 def over_seeds(
     runs: pl.DataFrame, keys: Sequence[str], columns: Sequence[str] | None = None
 ) -> pl.DataFrame:
-    """Return one row a group of runs: columns over seeds with their intervals.
+    """Return one row per group of runs: columns over seeds with their intervals.
 
     Parameters
     ----------
     runs : DataFrame
-        One row a run, with a column ``seed``.
+        One row per run, with a column ``seed``.
     keys : sequence of str
-        Columns that runs of one group share; groups come in the order of their first runs.
+        Columns whose values define a group. Groups have the order of their first runs.
     columns : sequence of str, optional
-        All others that hold numbers where None.
+        Default: all other columns of numbers.
 
     Returns
     -------
     DataFrame
         The keys, ``seeds``, and for each column x: ``x``, ``x_low`` and ``x_high`` (see
-        `interval_of`; null ends where one seed gives none); with the violation rate, also its
-        one-sided limits ``violation_rate_at_least`` and ``violation_rate_at_most``.
+        `interval_of`; the ends are null for a single seed). The violation rate also has its
+        one-sided limits, ``violation_rate_at_least`` and ``violation_rate_at_most``.
 
     Raises
     ------
     MetricError
-        If a column is none of `runs`, or holds text.
+        If a column is not in `runs`, or holds text.
     """
     import polars as pl
 
@@ -79,13 +79,13 @@ def over_seeds(
 
 
 def windows_behind(*groups: pl.DataFrame) -> int | None:
-    """Windows behind the runs of each of some groups: the fewest; None if they tell nothing.
+    """Number of independent windows in the group with the fewest; None if unknown.
 
     Parameters
     ----------
     *groups : DataFrame
-        One row a run each; their column ``windows`` counts those after the warm-up. None if a
-        table has no such column, or if the `UNIT` of a run is `RUN` (see `unit_of`).
+        One row per run; the column ``windows`` counts the windows after the warm-up. The number is
+        unknown without this column, or if the `UNIT` of a run is `RUN` (see `unit_of`).
     """
     for runs in groups:
         if "windows" not in runs.columns or RUN in runs.get_column(UNIT, default=()):
@@ -94,7 +94,7 @@ def windows_behind(*groups: pl.DataFrame) -> int | None:
 
 
 def has_median(column: str) -> bool:
-    """Whether a column of runs may be infinite, so that its median stands for it."""
+    """Whether tables show the median of a column because its values may be infinite."""
     return column in ("p95_ms", "p50_ms", "spread_ms") or column.startswith("tracking_")
 
 
@@ -104,12 +104,12 @@ def is_share(column: str) -> bool:
 
 
 def interval_of(column: str, windows: int | None = None) -> Callable[[Floats], Interval]:
-    """Which interval a column of runs takes: of a median where it may be infinite, or a mean.
+    """Return the function for the interval of a column: of a median if values may be infinite.
 
     Parameters
     ----------
     windows : int, optional
-        Behind the runs (see `windows_behind`); shares have wide intervals where None.
+        Windows behind the runs (see `windows_behind`); without them shares have wide intervals.
     """
     if has_median(column):
         return median_interval
@@ -119,12 +119,12 @@ def interval_of(column: str, windows: int | None = None) -> Callable[[Floats], I
 
 
 def is_plain(column: str) -> bool:
-    """Whether a column's name gives no other interval than that of a mean."""
+    """Whether a column has the interval of a plain mean."""
     return interval_of(column) is mean_interval
 
 
 def difference_of(column: str, windows: int | None = None) -> Callable[[Floats, Floats], Interval]:
-    """Which interval the mean difference of a column of runs takes, between pairs of runs."""
+    """Return the function for the interval of a column's mean difference over pairs of runs."""
     if is_share(column):
         return partial(share_difference_interval, windows=windows)
     return lambda first, second: mean_interval(first - second)
@@ -136,23 +136,19 @@ def _not_negative(values: Floats) -> Interval:
 
 
 def metric_values(runs: pl.DataFrame, metric: str) -> Floats:
-    """Return a column of runs, one number a run.
+    """Return a column of runs as numbers, shape (runs,).
 
     Parameters
     ----------
     runs : DataFrame
-        One row a run.
+        One row per run.
     metric : str
-        Name of a column that holds no text.
-
-    Returns
-    -------
-    ndarray, shape (runs,)
+        Name of a column of numbers.
 
     Raises
     ------
     MetricError
-        If there is no such column; with the nearest name.
+        If no column of numbers has this name; the message suggests the nearest name.
     """
     import polars as pl
 

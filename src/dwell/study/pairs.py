@@ -1,14 +1,14 @@
 """Differences between pairs: two policies, or two settings, on the same realisations.
 
-Both numbers of a pair come from runs of the same seed, so that their difference is free of what
-luck gave to both. The unit is the pair. Of every difference there are three things to say: how
-large it is in its own unit, with an interval; how large it is beside what differs from seed to seed
-(effect sizes); and whether luck alone could have made it (the p value of a sign-flip test).
+Both numbers of a pair come from runs of the same seed; their difference cancels the randomness that
+the runs share. The unit is the pair. A comparison gives the difference in its own unit with an
+interval, and the difference relative to the spread over seeds (effect sizes). The p value of a
+sign-flip test is the probability of such a difference, or a larger one, by chance.
 
-`paired_difference` is about the mean. `paired_median` is for numbers that may be infinite, such as
-a percentile of latencies where cycles are lost; which of the two is right depends on the metric,
-never on the values that came out. Where both of every pair are the same run there is nothing to
-compare: their difference is 0 by what was played, and not by luck (`SameRun`).
+`paired_difference` compares means. `paired_median` is for numbers that may be infinite, such as a
+percentile of latencies with lost cycles. The metric decides which of the two is right, never the
+values. If the two runs of every pair are identical, the result is `SameRun`: the difference is 0 by
+construction and needs no test.
 """
 
 from __future__ import annotations
@@ -29,29 +29,30 @@ from dwell.study.intervals import (
     share_difference_interval,
 )
 
-#: Differences below this part of the values are what rounding left of equal ones.
+#: Relative differences up to this size are rounding errors and count as 0.
 ROUNDING = 1e-12
-#: Up to so many pairs all 2^n flips are counted; beyond, `FLIPS` of them are drawn.
+#: Largest number of pairs for which all 2^n flips are counted; above it, `FLIPS` are sampled.
 EXACT_PAIRS = 30
 FLIPS = 19_999
 
 
 @dataclass(frozen=True, slots=True)
 class PairedDifference:
-    """The mean of the first less the second, over pairs.
+    """Mean difference over pairs, first minus second.
 
     Parameters
     ----------
     mean, low, high : float
-        With the ends of its 95 % interval; NaN for a single pair.
+        Mean and the ends of its 95 % interval; the ends are NaN for a single pair.
     d_z : float
-        Mean over standard deviation of the differences, with the correction of Hedges for few
-        pairs. It grows with what the pairs have in common and is no measure of importance. Infinite
-        where all differences are the same and not 0, NaN below three pairs.
+        Mean divided by the standard deviation of the differences, with Hedges' correction for few
+        pairs. It grows with the correlation within pairs and is no measure of importance. Infinite
+        if all differences are equal and not 0; NaN below three pairs.
     superiority : float
-        Share of pairs in which the first is lower, ties counting half. For costs, lower is better.
+        Share of pairs in which the first is lower; ties count half. For costs, lower is better.
     p : float
-        Two-sided, of the sign-flip test; for this comparison alone (see `dwell.study.family`).
+        Two-sided p value of the sign-flip test, not adjusted for other comparisons (see
+        `dwell.study.family`).
     n : int
         Number of pairs.
     """
@@ -66,22 +67,22 @@ class PairedDifference:
 
     @property
     def direction(self) -> int:
-        """-1 where the first is lower, 1 where it is higher, 0 where they are equal."""
+        """-1 if the first is lower on average, 1 if it is higher, 0 if they are equal."""
         return _sign(self.mean)
 
 
 @dataclass(frozen=True, slots=True)
 class PairedMedian:
-    """The median of the first less the second, over pairs that may be infinite.
+    """Median difference over pairs, first minus second; values may be infinite.
 
     Parameters
     ----------
     median, low, high : float
-        With its 95 % interval between order statistics; NaN at the ends below six pairs.
+        Median and its 95 % interval between order statistics; the ends are NaN below six pairs.
     superiority : float
-        Share of pairs in which the first is lower, ties counting half.
+        Share of pairs in which the first is lower; ties count half.
     p : float
-        Two-sided, of the sign test.
+        Two-sided p value of the sign test.
     n : int
         Number of pairs.
     """
@@ -95,20 +96,21 @@ class PairedMedian:
 
     @property
     def direction(self) -> int:
-        """-1 where the first is lower in most pairs, 1 where it is higher, 0 where in neither."""
+        """-1 if the first is lower in more pairs, 1 if it is higher in more pairs, else 0."""
         return _sign(0.5 - self.superiority)
 
 
 @dataclass(frozen=True, slots=True)
 class SameRun:
-    """Two that played every cycle alike under every seed: one run, and no comparison.
+    """Result for two groups whose runs are identical for every seed.
 
     Parameters
     ----------
     n : int
         Number of pairs.
     word : str
-        The verdict: whether only the latencies are equal, or the loads, too.
+        The verdict: `dwell.study.SAME_RUN`, or `dwell.study.SAME_CYCLES` if only the latencies are
+        equal.
     """
 
     n: int
@@ -128,19 +130,18 @@ def paired_difference(
     Parameters
     ----------
     first, second : sequence of float
-        One a seed, in the same order, finite.
+        One per seed, in the same order, finite.
     shares : bool
-        Whether they are shares, in [0, 1].
+        Whether the values are shares, in [0, 1].
     windows : int, optional
-        Windows behind each of the samples, where they are shares (see `share_interval`).
+        Windows behind each sample of shares (see `share_interval`).
     seed : int
-        Seed of resamples and of drawn flips: the same samples always give the same numbers.
+        Seed of the resamples and of the sampled flips.
 
     Returns
     -------
     PairedDifference
-        The interval is `mean_interval`'s, by the studentised bootstrap, of shares
-        `share_difference_interval`'s.
+        With the interval of `share_difference_interval` for shares, else of `mean_interval`.
 
     Raises
     ------
@@ -178,7 +179,7 @@ def paired_median(first: Values, second: Values) -> PairedMedian:
     Parameters
     ----------
     first, second : sequence of float
-        One a seed, in the same order; two infinities of a pair are a tie.
+        One per seed, in the same order; a pair of two infinities is a tie.
 
     Raises
     ------
@@ -199,28 +200,28 @@ def paired_median(first: Values, second: Values) -> PairedMedian:
 
 
 def least_p(pairs: int) -> float:
-    """Smallest p value that so many pairs can have, by the sign-flip test and the sign test."""
+    """Smallest p value of the sign-flip test and of the sign test with a number of pairs."""
     return min(1.0, 2.0 / 2.0**pairs)
 
 
 def sign_flip_p(differences: Values, *, seed: int = RESAMPLING_SEED) -> float:
     """Two-sided p value of the sign-flip test of a mean of 0.
 
-    If neither of a pair is better, each difference could as well have had the other sign: the p
-    value is the share of all 2^n assignments of signs whose sum is at least as far from 0. Zeros
-    change no sum. The least p value is 2 / 2^n: five pairs cannot show anything at 5 %.
+    If the two groups do not differ, both signs of a difference are equally likely. The p value is
+    the share of all 2^n assignments of signs whose sum is at least as far from 0. Zeros do not
+    change a sum. The smallest p value is 2 / 2^n: five pairs cannot show a difference at 5 %.
 
     Parameters
     ----------
     differences : sequence of float
-        One a pair, finite.
+        One per pair, finite.
     seed : int
-        Seed of the flips that are drawn above `EXACT_PAIRS` pairs. Then p is (hits + 1) /
+        Seed of the flips that are sampled above `EXACT_PAIRS` pairs. Then p is (hits + 1) /
         (`FLIPS` + 1), which is never too small (Phipson & Smyth 2010, DOI 10.2202/1544-6115.1585).
     """
     sample = np.asarray(differences, np.float64)
     sizes = np.abs(sample[sample != 0])
-    # Sums that are equal on paper may differ by rounding.
+    # Sums that are equal in exact arithmetic may differ by rounding.
     reach = abs(float(sample.sum())) - ROUNDING * float(sizes.sum())
     if reach <= 0:
         return 1.0
@@ -228,7 +229,7 @@ def sign_flip_p(differences: Values, *, seed: int = RESAMPLING_SEED) -> float:
         flips = np.random.default_rng(seed).integers(0, 2, size=(FLIPS, len(sizes)))
         sums = (2.0 * flips - 1.0) @ sizes
         return float(((np.abs(sums) >= reach).sum() + 1) / (FLIPS + 1))
-    # Every sum is one of the first half's plus one of the second's: 2 · 2^(n/2) numbers, not 2^n.
+    # Each sum adds a sum of the first half and a sum of the second: 2 · 2^(n/2) numbers, not 2^n.
     half = len(sizes) // 2
     left, right = _signed_sums(sizes[:half]), np.sort(_signed_sums(sizes[half:]))
     hits = len(left) * len(right) - int(np.searchsorted(right, reach - left).sum())
@@ -244,7 +245,7 @@ def _signed_sums(sizes: Floats) -> Floats:
 
 
 def _pairs(first: Values, second: Values) -> tuple[Floats, Floats]:
-    """Check what any comparison of pairs needs."""
+    """Return both samples as arrays; refuse different lengths, empty samples and NaN."""
     one, other = np.asarray(first, np.float64), np.asarray(second, np.float64)
     if one.shape != other.shape or one.ndim != 1 or not one.size:
         raise SimulationError(
@@ -259,7 +260,7 @@ def _pairs(first: Values, second: Values) -> tuple[Floats, Floats]:
 
 
 def _differences(one: Floats, other: Floats) -> Floats:
-    """First less second; exactly 0, and exactly the same, where they are so but for rounding."""
+    """Return first minus second; differences within rounding are exactly 0 or exactly equal."""
     differences = np.zeros(len(one))
     # Two infinities are equal, and their difference stays 0.
     np.subtract(one, other, out=differences, where=one != other)
@@ -273,7 +274,7 @@ def _differences(one: Floats, other: Floats) -> Floats:
 
 
 def _standardised(differences: Floats) -> float:
-    """d_z, without its bias at n - 1 degrees of freedom.
+    """Return d_z, corrected for its bias at n - 1 degrees of freedom.
 
     Hedges 1981, DOI 10.3102/10769986006002107.
     """

@@ -1,8 +1,8 @@
 """Parts of a study: the runs of one player in a batch of items, each part a Parquet file.
 
-A part's name has a digest of all that its runs depend on, and the places of its items. A process
-writes a part under another name, brings it to the disk, and renames it, so each part is complete.
-After a stop, the items without a part are played.
+A part's name includes a digest of all inputs of its runs, and the range of its items. A process
+writes a part under a temporary name, syncs it to disk, and renames it, so each part is complete.
+After an interruption, the items without a part are simulated.
 """
 
 from __future__ import annotations
@@ -57,9 +57,9 @@ class Parts:
     folder : Path
         Folder of the study, or of a shard.
     digests : mapping of str to str
-        A digest of all that a player's runs depend on, by the player.
+        Digest of all inputs of a player's runs, by player.
     span : range
-        The items that belong into the folder.
+        Indices of the items of the folder.
     """
 
     def __init__(self, folder: Path, study: Study, digests: Mapping[str, str], span: range) -> None:
@@ -142,7 +142,7 @@ def batches_of(study: Study, left: Mapping[int, tuple[str, ...]], processes: int
 def play_and_write(
     player: Player, folder: Path, digests: Mapping[str, str], batch: Batch
 ) -> PlayedBatch:
-    """Play a batch and write its parts; its summaries stay there.
+    """Simulate a batch in a worker, write its parts, and return the result without summaries.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Played sizes of a fleet, and the file that keeps them until a study of capacity is done."""
+"""Simulated sizes of a fleet, and the file that keeps them until a capacity study ends."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from dwell.sim.versions import versions
 
 
 class Sizes(NamedTuple):
-    """Sizes that are played together, under one seed."""
+    """Range of sizes to simulate together with one seed; both ends included."""
 
     first: int
     last: int
@@ -26,15 +26,16 @@ class Sizes(NamedTuple):
 
 
 class PlayedSize(NamedTuple):
-    """One size under one seed.
+    """Result of one size with one seed.
 
     Parameters
     ----------
     rate : float
-        V_D of the cell that misses most. Which cell that is, one half of the cycles says, and the
-        other half how much it misses: the largest of several noisy rates would be too high.
+        V_D of the worst cell. Each half of the cycles selects the worst cell, and the other half
+        gives its V_D; `rate` is the mean of both. The largest of several noisy rates would be
+        biased upwards.
     half : float
-        Half the difference between both halves: how far `rate` may be off by its cycles.
+        Half the difference between both values: the error of `rate` from its cycles.
     used : mapping of str to float
         Utilisation of the shared resources.
     """
@@ -45,7 +46,7 @@ class PlayedSize(NamedTuple):
 
     @classmethod
     def of(cls, missed: Iterable[NDArray[np.bool_]], used: Mapping[str, float]) -> PlayedSize:
-        """Sum up whether each counted cycle of each cell missed."""
+        """Return the result for the missed counted cycles of each cell."""
         halves = np.array([[part.mean() for part in np.array_split(one, 2)] for one in missed])
         first, last = halves.argmax(axis=0)
         late, early = float(halves[first, 1]), float(halves[last, 0])
@@ -53,17 +54,17 @@ class PlayedSize(NamedTuple):
 
 
 class KeptSizes:
-    """Played sizes in a file, one line of JSON per call of a player.
+    """Results of simulated sizes in a file, one line of JSON per call of a player.
 
     Parameters
     ----------
     file : Path
-        A line that a crash has cut does not count.
+        A line that a crash has truncated is ignored.
 
     Attributes
     ----------
     count : int
-        How many results the file has.
+        Number of results in the file.
     """
 
     def __init__(self, file: Path) -> None:
@@ -81,11 +82,11 @@ class KeptSizes:
         return f"<KeptSizes: {self.count} in {self.file}>"
 
     def known(self, study: str, sizes: Sizes) -> list[PlayedSize] | None:
-        """Return what some sizes came to in a study; None where they have not been played."""
+        """Return the results of sizes in a study; None if they are not in the file."""
         return self._known.get((study, sizes))
 
     def keep(self, study: str, sizes: Sizes, played: Sequence[PlayedSize]) -> None:
-        """Add what some sizes have come to."""
+        """Append the results of sizes to the file."""
         self.count += len(played)
         row = {"study": study, "sizes": sizes, "played": played}
         self.file.parent.mkdir(parents=True, exist_ok=True)
@@ -93,13 +94,13 @@ class KeptSizes:
             file.write(f"\n{json.dumps(row)}")
 
     def remove(self) -> None:
-        """Remove the file, and its folder if that is empty then."""
+        """Remove the file, and its folder if empty."""
         self.file.unlink(missing_ok=True)
         with suppress(OSError):
             self.file.parent.rmdir()
 
 
 def study_of(fleet: Fleet, duration_ns: int, twins: Mapping[str, int]) -> str:
-    """Return a digest of all that the results of a size depend on, except the seed."""
+    """Return a digest of all inputs that determine the results of a size, except the seed."""
     source = [fleet_document(fleet), duration_ns, dict(twins), versions()]
     return hashlib.sha256(json.dumps(source, sort_keys=True).encode()).hexdigest()

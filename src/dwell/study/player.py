@@ -1,7 +1,7 @@
-"""Player: plays a batch of a study's items, wherever it is sent to.
+"""Player: simulates a batch of a study's items, in any process.
 
-A contender may weigh in its own way: its controller then minimises one J, and is judged by
-another. What a window showed is the same for both.
+A contender may have its own objective: its controller minimises that J, and the J of the point
+judges its runs. Both use the same measurements of a window.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from dwell.record import Run
     from dwell.sim import Realisation
 
-#: How long a batch is played, seconds: this much work of a process is lost at most, and an item.
+#: Target time of a batch, seconds: a process loses at most this work and one item.
 BATCH_S = 1.0
 #: Columns by which tables compare runs with the references.
 COMPARED = frozenset(
@@ -53,7 +53,7 @@ COMPARED = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """One run kept whole, for pictures: its windows and decisions."""
+    """Windows and decisions of one run, for figures."""
 
     windows: pl.DataFrame
     decisions: pl.DataFrame
@@ -65,14 +65,14 @@ class Example:
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Items that follow each other in a study, and who plays them.
+    """Consecutive items of a study, and the players to simulate.
 
     Parameters
     ----------
     first : int
-        Place of the first item in the study, from 0.
+        Index of the first item in the study.
     players : tuple of str
-        Some of `Study.players`.
+        A subset of `Study.players`.
     """
 
     first: int
@@ -81,11 +81,11 @@ class Batch:
 
     @property
     def end(self) -> int:
-        """Place after the last item."""
+        """Index after the last item."""
         return self.first + len(self.items)
 
     def split(self, count: int) -> tuple[Batch, Batch | None]:
-        """Return the first items, and the others if there are any."""
+        """Return the first items, and the rest; None for an empty rest."""
         begun, left = self.items[:count], self.items[count:]
         rest = replace(self, first=self.first + count, items=left) if left else None
         return replace(self, items=begun), rest
@@ -93,18 +93,18 @@ class Batch:
 
 @dataclass(frozen=True, slots=True)
 class PlayedBatch:
-    """Result of a batch, as far as it was played.
+    """Results of the simulated items of a batch.
 
     Parameters
     ----------
     batch : Batch
-        The items that were played.
+        The simulated items.
     rest : Batch, optional
-        The items that were not.
+        The other items.
     summaries : mapping of str to list of (int, Summary)
-        The summaries of a player's runs, with the index of their points.
+        Index of the point and summary of each run, by player.
     examples : mapping of (Item, int, str) to Example
-        The runs that are kept whole, by item, point and policy.
+        Runs of the kept seeds, by item, point and policy.
     """
 
     batch: Batch
@@ -115,16 +115,16 @@ class PlayedBatch:
 
 @dataclass(frozen=True, slots=True)
 class Player:
-    """Draws the realisations of items and lets contenders play them.
+    """Samples the realisations of items and simulates contenders on them.
 
     Parameters
     ----------
     software : mapping of str to str
-        That of the process that asks; a process with other software refuses to play.
+        Software of the main process; a worker with other software refuses a batch.
     kept : tuple of int
-        Seeds whose runs are kept whole.
+        Seeds whose runs are kept as examples.
     prices : dict
-        What candidates come to, as the process that asks has played them (see `rehearse`).
+        Prices of candidates that the main process has simulated (see `rehearse`).
     """
 
     study: Study
@@ -133,13 +133,13 @@ class Player:
     prices: dict[Question, Mapping[str, Price]] = field(
         default_factory=dict, repr=False, compare=False
     )
-    # Problems as contenders see them, by point and contender: a study asks for each many times.
+    # Cache of problems with the settings of contenders, by point and contender.
     _seen: dict[tuple[int, str], Problem] = field(default_factory=dict, repr=False, compare=False)
 
     def __call__(self, batch: Batch) -> PlayedBatch:
-        """Play a batch for about `BATCH_S`, at least one item.
+        """Simulate a batch for about `BATCH_S`, at least one item.
 
-        Every item is drawn once for all its players.
+        Each item is sampled once for all its players.
 
         Raises
         ------
@@ -170,15 +170,15 @@ class Player:
         return PlayedBatch(*batch.split(done), summaries, examples)
 
     def rehearse(self) -> None:
-        """Play one window of everything at the first point of each estimator.
+        """Simulate one window of each scenario and contender, at the first point per estimator.
 
-        Wrong names are found before the work begins.
+        This finds wrong names before the work begins.
         """
         from dwell.sim import draw
         from dwell.sim.fleet import simulate_fleet
 
         points, contenders = self.study.points, self.study.contenders
-        # The last assignment of a key stays, so the first point of each estimator.
+        # In reverse order, so the first point of each estimator replaces the later points.
         firsts = {points[i].problem.controller.estimator: i for i in reversed(range(len(points)))}
         for index, scenario in product(firsts.values(), self.study.scenarios):
             first, problem = points[index], points[index].problem
@@ -198,7 +198,7 @@ class Player:
     def _play(
         self, item: Item, players: Sequence[str]
     ) -> Iterator[tuple[str, int, Run | None, Summary]]:
-        """Yield the player, the point and the run of all that some players do in an item."""
+        """Yield player, point, run and summary of every run of some players on an item."""
         from dwell.sim import draw
 
         contenders = [one for one in self.study.contenders if one.name in players]
@@ -218,7 +218,7 @@ class Player:
                 alone = play_alone(problem, realisation)
             for contender in contenders:
                 seen = self._problem(contender, point)
-                # Candidates alone are played with the estimator `profile`, without shadow jobs.
+                # The static references have the estimator `profile`, without shadow jobs.
                 own = seen.controller.estimator
                 is_static = contender.is_candidate(seen) and own in (None, "profile")
                 if known is not None and is_static:
@@ -245,7 +245,7 @@ class Player:
     def _play_fleets(
         self, item: Item, contenders: Sequence[Contender]
     ) -> Iterator[tuple[str, int, None, Summary]]:
-        """Yield the summary of the fleet's run at every point under every contender."""
+        """Yield the summary of the fleet's run at every point with every contender."""
         from dwell.sim.fleet import simulate_fleet
         from dwell.study.fleet_summary import summarise_fleet
 
@@ -263,7 +263,7 @@ class Player:
                 yield contender.name, point, None, self._completed(summary, worst, unit, labels)
 
     def _summary(self, run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Summary:
-        """Sum up a run of a cell."""
+        """Return the summary of a cell's run."""
         unit = unit_of([(problem, str(labels["scenario"]))], self.study.windows)
         summary = self._completed(summarise(run, problem, labels), run, unit, labels)
         if self.study.references:
@@ -274,7 +274,7 @@ class Player:
     def _completed(
         self, summary: Summary, run: Run, unit: str, labels: Mapping[str, str | int]
     ) -> Summary:
-        """Add the independent unit of a run, and the metrics of the study's own."""
+        """Add the independent unit of a run, and the study's own metrics."""
         summary = replace(summary, row={**summary.row, UNIT: unit})
         taken = [name for name in self.study.metrics if name in summary.row or name in COMPARED]
         if taken:
@@ -293,7 +293,7 @@ class Player:
         realisation: Realisation,
         alone: Mapping[str, Run] | None,
     ) -> Run:
-        """Let a contender play; `alone` are the candidates' own runs, for who knows them."""
+        """Simulate a contender; `alone` are the candidates' static runs, for `Hindsight`."""
         from dwell.sim import simulate_realisation
 
         estimator = contender.estimator
@@ -307,7 +307,7 @@ class Player:
         )
 
     def _problem(self, contender: Contender, point: int) -> Problem:
-        """Return the problem of a point as a contender sees it."""
+        """Return the problem of a point with a contender's settings, cached."""
         key = (point, contender.name)
         if key not in self._seen:
             self._seen[key] = contender.problem(self.study.points[point].problem)

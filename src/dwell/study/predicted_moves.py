@@ -1,7 +1,7 @@
-"""Predicted moves: what was estimated of a placement when it was chosen, and what it then showed.
+"""Predicted moves: the estimate for a placement at the decision, and the measurements after it.
 
-The estimate is that of the window at whose close the move was decided, and what is seen are later
-windows: a disturbance that begins or ends in between is a difference, too.
+The estimate is from the window at whose end the move was decided; the measurements are from later
+windows. A disturbance that begins or ends in between also causes a difference.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from dwell.record import Run
 
 QUANTITIES = ("l95_ms", "l95_error_ms", "violation_rate", "violation_error")
-#: Columns of what the table says of a move, by their types.
+#: Polars types of the table's columns, by name.
 COLUMNS = {
     "window": "Int64",
     "from": "String",
@@ -30,26 +30,25 @@ COLUMNS = {
 
 
 def predicted_moves(run: Run, excluded: Collection[int] = ()) -> pl.DataFrame:
-    """Set the estimate of every placement that a run moved to beside what it showed there.
+    """Return a table of the moves of a run, with predicted and seen metrics of the new placement.
 
-    Moves that the guard made, which nobody estimated, have no row; nor have those that were decided
-    in the warm-up.
+    The table omits moves of the guard, which have no estimate, and moves decided in the warm-up.
 
     Parameters
     ----------
     excluded : collection of int
-        Numbers of windows that are left out, with what was decided on them.
+        Numbers of windows to omit, together with the moves decided at their ends.
 
     Returns
     -------
     DataFrame
-        One row a move: the ``window`` at whose close it was decided, ``from`` and ``to``; the
-        estimate ``predicted_l95_ms`` and ``predicted_violation_rate`` with their standard errors
-        (``predicted_l95_error_ms``, ``predicted_violation_error``; null where the run has none);
-        and ``seen_...``, the means over ``windows``, as the controller saw them at their closes,
-        with standard errors (null of fewer than two). These are the windows until the next move,
-        without the first one, in which the old placement's cycles may still be on their way, where
-        there are others.
+        One row per move: the ``window`` at whose end it was decided, ``from`` and ``to``; the
+        estimates ``predicted_l95_ms`` and ``predicted_violation_rate`` with their standard errors
+        (``predicted_l95_error_ms``, ``predicted_violation_error``; null if the run has none); and
+        the means ``seen_...`` of the metrics that the controller saw in the next ``windows``
+        windows, with standard errors (null for fewer than two windows). The means cover the windows
+        until the next move. They omit the first window if there are others, because cycles of the
+        old placement may still be in flight in it.
     """
     import polars as pl
 
@@ -89,6 +88,6 @@ def _rows(run: Run, excluded: Collection[int]) -> Iterator[tuple[object, ...]]:
 
 
 def _mean_and_error(values: pl.Series) -> tuple[object, float | None]:
-    """Return the mean and its standard error; None where they are not known."""
+    """Return the mean and its standard error; None if unknown."""
     spread = values.std()
     return values.mean(), None if spread is None else float(str(spread)) / math.sqrt(len(values))

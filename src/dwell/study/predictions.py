@@ -1,9 +1,8 @@
 """Predictions of the paper for its cell (its table of scenarios), and whether runs agree.
 
-The predictions are qualitative: words. To hold them against runs, each is read as a condition on
-numbers, which is stated beside it, and the answer is one of three: it agrees, it differs, or the
-runs leave it open. A condition holds, or fails, only where the whole 95 % interval over seeds says
-so.
+The predictions are qualitative. Each is read as a condition on numbers, shown with it. The answer
+for the runs is "agrees", "differs" or "open". A condition holds or fails only if the complete 95 %
+interval over seeds does; otherwise it is open.
 """
 
 from __future__ import annotations
@@ -31,16 +30,16 @@ DTP = "dtp"
 
 
 class PaperClaim(NamedTuple):
-    """A few words of the paper on a static placement, and the condition they are read as.
+    """A statement of the paper about a static placement, and its reading as a condition.
 
     Parameters
     ----------
     words : str
-        The paper's.
+        The paper's words.
     reading : str
         The condition, in words.
     holds : callable
-        The condition on runs in a scenario: True, False, or None where the runs do not tell.
+        The condition on runs in a scenario: True, False, or None if open.
     """
 
     words: str
@@ -54,15 +53,15 @@ class Prediction(NamedTuple):
     Parameters
     ----------
     scenario : str
-        Its name in a cell file.
+        Name of the scenario in a cell file.
     claims : mapping of str to tuple of PaperClaim
-        By the static placement that they are about.
+        Statements by static placement.
     dtp : str
         The paper's words on the placement that dominates under DTP.
     dominant : tuple of str
-        The placements meant by that.
+        The predicted dominant placements.
     share : float
-        Share of the windows that these words ask for.
+        Least share of the windows that counts as dominant.
     """
 
     scenario: str
@@ -87,7 +86,7 @@ def _over_aim(policy: str) -> PaperClaim:
 
 
 def _stands(policy: str, word: str, comparison: StudyRuns, scenario: str) -> bool | None:
-    """Whether V_D stands under or over the aim; None where that is not shown."""
+    """Whether the verdict on V_D and the aim is `word`; None if it is "not shown"."""
     rates = _values(comparison, scenario, policy, "violation_rate")
     if rates is None:
         return None
@@ -98,7 +97,7 @@ def _stands(policy: str, word: str, comparison: StudyRuns, scenario: str) -> boo
 def _more(
     words: str, reading: str, policy: str, column: str, other: str, *, than_in: str | None = None
 ) -> PaperClaim:
-    """A policy shows more in a column than another policy, which may be in another scenario."""
+    """Claim that a policy has more in a column than another, possibly in another scenario."""
 
     def holds(comparison: StudyRuns, scenario: str) -> bool | None:
         elsewhere = than_in or scenario
@@ -117,19 +116,19 @@ def _more(
 
 
 def _saturated(words: str, reading: str, policy: str, column: str) -> PaperClaim:
-    """A tier is at its utilisation cap, or above."""
+    """Claim that a tier is at its utilisation cap, or above."""
 
     def holds(comparison: StudyRuns, scenario: str) -> bool | None:
         values = _values(comparison, scenario, policy, column)
         cap = min(comparison.problem.objective.caps.utilisation, 1.0)
-        # Just under the cap, so that a node at exactly 1 all the time counts.
+        # The tolerance includes a node that is always at exactly 1.
         return None if values is None else keeps(mean_interval(values), at_least=cap - 1e-9)
 
     return PaperClaim(words, reading, holds)
 
 
 def _typically_in_time(words: str, policy: str) -> PaperClaim:
-    """The median latency is within the deadline."""
+    """Claim that the median latency is within the deadline."""
 
     def holds(comparison: StudyRuns, scenario: str) -> bool | None:
         values = _values(comparison, scenario, policy, "p50_ms")
@@ -141,7 +140,7 @@ def _typically_in_time(words: str, policy: str) -> PaperClaim:
 
 
 def _values(comparison: StudyRuns, scenario: str, policy: str, column: str) -> Floats | None:
-    """One number a seed; None where there are no such runs."""
+    """Return one number per seed; None if the runs lack the policy or the scenario."""
     if policy not in comparison.policies or scenario not in comparison.scenarios:
         return None
     return comparison.values(scenario, policy, column)
@@ -211,17 +210,17 @@ PAPER: tuple[Prediction, ...] = (
 
 
 class Judgement(NamedTuple):
-    """Behaviour of DTP in a scenario, beside the paper's prediction.
+    """Behaviour of DTP in a scenario, compared with the paper's prediction.
 
     Parameters
     ----------
     answer : {"agrees", "differs", "open"}
-        Whether the whole interval of the share lies at or above what the words ask for, or below;
-        open where it allows for either.
+        Agrees if the complete interval of `share` is at or above the prediction's share, differs if
+        it is below, else open.
     leader : str
         Placement with the largest mean share of the windows.
     share : Interval
-        Share of the predicted placements together.
+        Sum of the shares of the predicted placements.
     """
 
     answer: Answer
@@ -230,7 +229,7 @@ class Judgement(NamedTuple):
 
 
 def applies(comparison: StudyRuns) -> bool:
-    """Whether the paper's predictions are about this cell at all: its candidates, its words."""
+    """Whether the cell has the paper's candidates, and the study one of its scenarios."""
     names = {prediction.scenario for prediction in PAPER}
     return comparison.problem.candidates.keys() == CANDIDATES and bool(
         names & set(comparison.scenarios)
@@ -238,14 +237,14 @@ def applies(comparison: StudyRuns) -> bool:
 
 
 def judge_placement(comparison: StudyRuns, prediction: Prediction, policy: str = DTP) -> Judgement:
-    """Hold the predicted dominant placement against the shares of windows.
+    """Compare the predicted dominant placements with a policy's shares of windows.
 
     Parameters
     ----------
     comparison : StudyRuns
-        With the prediction's scenario and `policy`, of a cell to which the paper applies.
+        Runs of the paper's cell, with the prediction's scenario and `policy`.
     policy : str
-        The one that is called DTP.
+        Name of the policy that counts as DTP.
     """
     shares = {
         name: comparison.values(prediction.scenario, policy, f"share_{name}")
@@ -261,7 +260,7 @@ def judge_placement(comparison: StudyRuns, prediction: Prediction, policy: str =
 
 
 def judge_claim(comparison: StudyRuns, scenario: str, claim: PaperClaim) -> Answer:
-    """Hold the words on a static placement against its runs."""
+    """Compare a statement about a static placement with its runs."""
     return _answer(claim.holds(comparison, scenario))
 
 
@@ -270,23 +269,24 @@ def _answer(holds: bool | None) -> Answer:
 
 
 def paper_predictions(comparison: StudyRuns, policies: Sequence[str] = (DTP,)) -> pl.DataFrame:
-    """Hold every prediction of the paper's table against runs of its cell.
+    """Compare every prediction of the paper's table with runs of its cell.
 
     Parameters
     ----------
     comparison : StudyRuns
-        Runs at a single point of the candidates LOC, SO and HYB, in some of the paper's
+        Runs without parameters, with the candidates LOC, SO and HYB and some of the paper's
         scenarios.
     policies : sequence of str
-        Policies that the predictions about DTP are held against.
+        Policies to compare with the predictions about DTP.
 
     Returns
     -------
     DataFrame
-        One row a prediction: ``scenario``; ``policy``, or the placement that it is about; the
-        paper's ``words`` and their ``reading``; ``answer`` (agrees, differs, open); of a policy
-        also ``leader``, the placement with most windows, and the ``share`` of the predicted one in
-        them with ``share_low`` and ``share_high``. No rows for another cell.
+        One row per prediction: ``scenario``; ``policy``, the policy or static placement; the
+        paper's ``words`` and their ``reading``; ``answer`` (agrees, differs, open). A row about DTP
+        also has ``leader``, the placement with the largest share of windows, and the ``share`` of
+        the predicted placements with ``share_low`` and ``share_high``. The table has no rows for
+        another cell.
     """
     import polars as pl
 

@@ -1,8 +1,8 @@
 """Quality of the actuation: misses in a row, the age of its information, tracking errors.
 
-A cycle *actuates* at its completion, late or not; a lost one never does. What it knows dates from
-its release. A cycle that completes after a newer one is discarded at the actuator, so that its
-information never gets older by an actuation.
+A cycle *actuates* when it completes, late or not; a lost cycle never does. Its information dates
+from its release. The actuator discards a cycle that completes after a newer cycle, so an actuation
+never makes the information older.
 
 References
 ----------
@@ -24,19 +24,19 @@ from dwell.model import Servo
 from dwell.model.instants import NEVER_NS
 from dwell.model.number_arrays import Ints
 
-#: Percentile of the age that is given.
+#: Percentile of the age in `Age.p95_ms`.
 PERCENT = 95
 
 
 class EffectiveCommands(NamedTuple):
-    """Commands that took effect, in that order, which is also that of their cycles.
+    """Commands that took effect, in order; their cycles have the same order.
 
     Parameters
     ----------
     start_ns : int
-        First release of the run. Before the first actuation, information dates from then.
+        First release of the run. Information dates from it until the first actuation.
     release_ns, at_ns : int64 array, shape (n,)
-        Release of each command's cycle, and the instant at which it took effect.
+        Release of each command's cycle, and the instant at which the command took effect.
     """
 
     start_ns: int
@@ -50,9 +50,9 @@ class Age(NamedTuple):
     Parameters
     ----------
     mean_ms, p95_ms, peak_ms : float
-        Mean over time, what it does not exceed for 95 % of the time, and its largest value.
+        Mean over time, 95th percentile over time, and largest value.
     mean_peak_ms : float
-        Mean of the ages that actuations ended.
+        Mean of the ages just before actuations.
     """
 
     mean_ms: float
@@ -62,7 +62,7 @@ class Age(NamedTuple):
 
 
 class TrackingError(NamedTuple):
-    """Error of the reference loop over a stretch of time; infinite where the loop is unstable.
+    """Error of the reference loop over a stretch of time; infinite if the loop is unstable.
 
     Parameters
     ----------
@@ -80,22 +80,17 @@ class TrackingError(NamedTuple):
 
     @property
     def mean_mm(self) -> float:
-        """Mean absolute error: the IAE of a second."""
+        """Mean absolute error: the IAE per second."""
         return self.iae_mm_s / self.seconds
 
 
 def actuations(release_ns: Ints, latency_ns: Ints) -> EffectiveCommands:
-    """Find the commands that take effect: those that no newer one precedes.
+    """Return the commands that take effect: no newer command completes before or with them.
 
     Parameters
     ----------
     release_ns, latency_ns : int64 array, shape (n,)
-        Every cycle from the first; at least one. `NEVER_NS` is one that never finished.
-
-    Returns
-    -------
-    EffectiveCommands
-        The newest alone where several complete at one instant.
+        All cycles from the first, at least one. `NEVER_NS` marks a cycle that never finished.
     """
     start_ns = int(release_ns[0])
     done = latency_ns < NEVER_NS
@@ -110,18 +105,15 @@ def actuations(release_ns: Ints, latency_ns: Ints) -> EffectiveCommands:
 
 
 def age_of_information(actuated: EffectiveCommands, begin_ns: int, end_ns: int) -> Age:
-    """Age at the actuator: t less the release of the newest command in effect at t.
+    """Age at the actuator: t minus the release of the newest command in effect at t.
+
+    The age is a sawtooth that rises by 1 ms per ms and falls at actuations. Its percentile over
+    time is exact to the nanosecond.
 
     Parameters
     ----------
     begin_ns, end_ns : int
-        The stretch of time; the begin not before the first release, the end after the begin.
-
-    Returns
-    -------
-    Age
-        The age is a sawtooth that rises by 1 ms a ms and falls at actuations; the percentile is
-        that of its distribution over time, to the nanosecond.
+        The stretch of time; it begins at or after the first release.
     """
     first = int(np.searchsorted(actuated.at_ns, begin_ns, side="right"))
     last = int(np.searchsorted(actuated.at_ns, end_ns, side="left"))
@@ -188,8 +180,8 @@ def misses_in(missed: NDArray[np.bool_], stretches: Iterable[int]) -> Iterator[N
     Yields
     ------
     int32 array, shape (n - K + 1,)
-        The largest is the m for which the cycles meet "at most m misses in any K". Where there
-        are fewer than K cycles, one number: all their misses.
+        The largest is the smallest m for which the cycles meet "at most m misses in any K". With
+        fewer than K cycles the array has one element, the number of all misses.
     """
     total = np.zeros(len(missed) + 1, np.int32)
     np.cumsum(missed, dtype=np.int32, out=total[1:])
@@ -203,14 +195,14 @@ def track(servo: Servo, actuated: EffectiveCommands, begin_ns: int, end_ns: int)
     Parameters
     ----------
     actuated : EffectiveCommands
-        A command is made of what is seen at its cycle's release, and held until the next.
+        Each command uses the state at its cycle's release, and stays in effect until the next.
     begin_ns, end_ns : int
         The stretch of time whose error counts; the loop runs from the first release.
 
     Returns
     -------
     TrackingError
-        See `dwell.kernels.servo_loop` for what is computed and how exactly.
+        See `dwell.kernels.servo_loop` for the equations and their accuracy.
     """
     from dwell.kernels import servo_loop as kernel
 

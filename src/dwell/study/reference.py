@@ -7,16 +7,15 @@ The clairvoyant plans with the J of every window of every candidate that was sim
 this realisation: it knows all random numbers. The oracle plans with expected costs: it knows when
 each disturbance is on, and no other random numbers (`dwell.study.oracle`).
 
-Neither is a bound. J of a window depends on the windows before it: queued work is carried over to
-another candidate, and a node that is left alone recovers, so taking turns may beat two overloaded
-nodes. Regret is measured against the cheapest of the candidates alone and the clairvoyant's
-sequences, and may be negative.
+Neither is a bound. J of a window depends on the windows before it: queued work moves to another
+candidate, and an idle node recovers, so alternating between two overloaded nodes may be better than
+either. Regret is relative to the cheapest of the static runs and the clairvoyant's sequences, and
+may be negative.
 
-Orders of both come in time, and a moved task is ready when it is due: the sequences move at the
-planned boundaries, without ``order_delay_ms``, ``order_lead_cycles`` or a cold start. (Late orders
-shift all later windows, and after some tens of migrations the plan is about other cycles.) With
-``close_grace_ms``, or if releases jitter, a window closes after the first release beyond it, and a
-migration is late by that time.
+Both move exactly at the planned boundaries, without ``order_delay_ms``, ``order_lead_cycles`` or a
+cold start. (Late orders would shift all later windows; after some tens of migrations the plan would
+apply to other cycles.) With ``close_grace_ms`` or release jitter, a window ends after the first
+release beyond it, and a migration is late by that time.
 """
 
 from __future__ import annotations
@@ -222,24 +221,15 @@ def planned(
 
 
 def regret(run_cost: float, reference_cost: float) -> float:
-    """How much more a run costs than the reference, as a share of what that costs.
+    """Relative excess of a run's `mean_cost` over `References.cost` of the same realisation.
 
-    Parameters
-    ----------
-    run_cost, reference_cost : float
-        `mean_cost` of a run, and `References.cost` of the same realisation.
-
-    Returns
-    -------
-    float
-        0.1 is a tenth more. Negative where the run costs less than the reference, which is no
-        bound.
+    The regret is negative if the run costs less than the reference, which is no bound.
     """
     return run_cost / reference_cost - 1.0
 
 
 def few_misses(run: Run, problem: Problem, limit: float = 0.05) -> Mask:
-    """Whether a run misses no more than a limit, in every window.
+    """For every window, whether the run's share of misses is at most a limit.
 
     Parameters
     ----------
@@ -260,17 +250,10 @@ def few_misses(run: Run, problem: Problem, limit: float = 0.05) -> Mask:
 
 
 def share_kept(mine: Mask, asked: Mask) -> float:
-    """Share of the windows in which the reference misses few cycles and a run does too.
+    """Share of the reference's windows with few misses that also have few misses in a run.
 
-    Parameters
-    ----------
-    mine, asked : bool array
-        `few_misses` of the run, and of the cheapest reference of the same realisation.
-
-    Returns
-    -------
-    float
-        1 where the reference misses more in all of them.
+    `mine` and `asked` are `few_misses` of the run and of the cheapest reference. The share is 1 if
+    the reference has no such window.
     """
     count = min(len(mine), len(asked))
     asked = asked[:count]
@@ -278,12 +261,12 @@ def share_kept(mine: Mask, asked: Mask) -> float:
 
 
 def mean_cost(run: Run) -> float:
-    """Mean J over the windows after the warm-up, those that the controller did not see left out.
+    """Mean J over the windows after the warm-up that the controller saw.
 
     Raises
     ------
     SimulationError
-        If there is none.
+        If the run has no such window.
     """
     windows = run.arrays("windows")
     warmup = windows["warmup"]
@@ -297,19 +280,11 @@ def mean_cost(run: Run) -> float:
 
 
 def window_costs(run: Run, problem: Problem, realisation: Realisation) -> Floats:
-    """J of every window of a run that never moves, also of those the controller did not see.
+    """J of every window of a static run, shape (windows,), including unseen windows.
 
-    Such a window has the J that the controller would have seen, had its node been up. Statistics
-    leave it out; a sequence that were planned without it would spend an outage anywhere.
-
-    Parameters
-    ----------
-    problem, realisation
-        What it is a run of.
-
-    Returns
-    -------
-    float64 array, shape (windows,)
+    For a window during an outage of the controller's node, this is the J that the controller would
+    have seen. Statistics omit these windows, but a plan needs their costs to choose a placement for
+    the outage.
     """
     windows = run.arrays("windows")
     costs: Floats = windows["cost"].copy()

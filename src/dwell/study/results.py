@@ -1,4 +1,4 @@
-"""Results: the runs of a study in numbers, one row a run, and the statistics over their seeds."""
+"""Results of a study: a table with one row per run, and statistics over the seeds."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     import polars as pl
 
 
-#: Begin of the columns that hold the values of parameters.
+#: Prefix of the columns with values of parameters.
 PARAMETER = "parameter."
 
 
@@ -40,33 +40,31 @@ class StudyRuns(Displayed):
     Parameters
     ----------
     problem : Problem
-        The first point's.
+        Problem of the first point.
     scenarios, policies : tuple of str
-        In the order of tables and figures; a policy that has a candidate's name never moves.
+        In the order of tables and figures. A policy with the name of a candidate never moves.
     windows : int
-        Length of every run, the warm-up included.
+        Length of every run, including the warm-up.
     runs : DataFrame
-        One row a point, scenario, policy and seed: the values of the point's parameters in columns
-        that begin with `PARAMETER`, ``scenario``, ``policy``, ``seed``, and what
-        `dwell.study.summary` makes of the run. ``cost`` is J by the objective of the point,
-        whatever the settings of the contender. With references, also ``reference_cost``,
-        ``best_static``, ``regret``, ``oracle_regret``, and ``share_kept`` (see
-        `dwell.study.reference`).
+        One row per point, scenario, policy and seed: the point's parameters in columns that begin
+        with `PARAMETER`, ``scenario``, ``policy``, ``seed``, and the numbers of
+        `dwell.study.summary`. ``cost`` is J by the objective of the point, for all contenders. With
+        references, also ``reference_cost``, ``best_static``, ``regret``, ``oracle_regret``, and
+        ``share_kept`` (see `dwell.study.reference`).
     costs : DataFrame
-        One row a run and candidate: mean J ``estimated`` while it was not active (against the
-        incumbent, switching term included), mean J ``measured`` while it was, both by the
-        contender's own objective, and ``shadow_fraction``, the share of cycles that each
-        alternative got as shadows while it was.
+        One row per run and candidate: mean J ``estimated`` while the candidate was not active
+        (against the incumbent, including the switching term), mean J ``measured`` while it was
+        active, both by the contender's own objective, and ``shadow_fraction``, the share of cycles
+        that each alternative received as shadows while the candidate was active.
     latencies : DataFrame
         Distribution of final latencies over all seeds: ``share`` of the cycles that finished
-        within ``latency_ms``, by point, scenario and policy. It stays below 1 where cycles were
-        lost.
+        within ``latency_ms``, by point, scenario and policy. Lost cycles keep it below 1.
     versions : mapping of str to str
         Versions of the software that made the runs, by package.
     labels : mapping of str to str
         Names of parameters in figures and tables, by their paths.
     metrics : tuple of str
-        Columns of `runs` that are metrics of the study's own.
+        Columns of `runs` with the study's own metrics.
     """
 
     name: str
@@ -92,14 +90,14 @@ class StudyRuns(Displayed):
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Columns that hold the values of parameters."""
+        """Columns of `runs` with values of parameters."""
         return tuple(name for name in self.runs.columns if name.startswith(PARAMETER))
 
     @property
     def axes(self) -> tuple[tuple[str, ...], ...]:
-        """Columns of parameters whose values go together; the first has a value for each.
+        """Parameter columns by axis: the first column of an axis determines the other columns.
 
-        What has one value throughout goes with the first of the others.
+        A constant parameter belongs to the first axis.
         """
         values = self.runs.select(self.parameters).unique()
         varying = [name for name in self.parameters if values[name].n_unique() > 1]
@@ -114,22 +112,22 @@ class StudyRuns(Displayed):
         return tuple((first, *others) for first, others in axes.items())
 
     def shown_parameter(self, column: str) -> str:
-        """Return what a parameter's column is called in figures and tables."""
+        """Return the name of a parameter's column in figures and tables."""
         path = column.removeprefix(PARAMETER)
         return self.labels.get(path, path)
 
     @property
     def statics(self) -> tuple[str, ...]:
-        """Policies that are a candidate's placement and never move."""
+        """Policies that stay at a candidate's placement."""
         return tuple(name for name in self.policies if name in self.problem.candidates)
 
     def values(self, scenario: str, policy: str, column: str) -> Floats:
-        """Return one number a seed, in the order of the seeds.
+        """Return one number per seed, in the order of the seeds.
 
         Raises
         ------
         SimulationError, PolicyError, MetricError
-            If there is no such scenario, policy or column of `runs`, or there are several points.
+            If the scenario, policy or column of `runs` is unknown, or the study has parameters.
         """
         if self.parameters:
             raise SimulationError(
@@ -144,22 +142,22 @@ class StudyRuns(Displayed):
         return metric_values(self.runs.filter(scenario=scenario, policy=policy), column)
 
     def interval(self, scenario: str, policy: str, column: str) -> Interval:
-        """Return a column over seeds: its mean, or its median where it may be infinite."""
+        """Return the mean of a column over seeds, or its median if values may be infinite."""
         windows = self.windows_behind(scenario, policy)
         return interval_of(column, windows)(self.values(scenario, policy, column))
 
     def windows_behind(self, scenario: str, *policies: str) -> int | None:
-        """Return the windows behind the runs of a policy; of several, the fewest."""
+        """Return the number of windows of the policy with the fewest; None if unknown."""
         return windows_behind(
             *(self.runs.filter(scenario=scenario, policy=policy) for policy in policies)
         )
 
     def difference(self, scenario: str, policies: tuple[str, str], column: str) -> Interval:
-        """Return the mean over seeds of what the first policy shows less what the second does.
+        """Return the mean difference between two policies over seeds, first minus second.
 
-        Its interval is that of pairs of runs, and for shares (the violation rate, say) no narrower
-        than what either policy's own leaves open (see `share_difference_interval`). Policies that
-        played every cycle alike are the same run: 0, without an interval.
+        The interval is for pairs of runs. For shares, such as the violation rate, it includes the
+        uncertainty of either policy (see `share_difference_interval`). For policies with identical
+        cycles the difference is 0, without an interval.
         """
         first, second = (self.values(scenario, policy, column) for policy in policies)
         one, other = ({"scenario": scenario, "policy": policy} for policy in policies)
@@ -169,18 +167,18 @@ class StudyRuns(Displayed):
         return difference_of(column, windows)(first, second)
 
     def table(self, columns: Sequence[str] | None = None) -> pl.DataFrame:
-        """Return one row a point, scenario and policy: columns over seeds with their intervals.
+        """Return one row per point, scenario and policy: columns over seeds with their intervals.
 
         Parameters
         ----------
         columns : sequence of str, optional
-            Columns of `runs`; all that hold numbers where None.
+            Columns of `runs`. Default: all columns of numbers.
 
         Returns
         -------
         DataFrame
-            For each column x: ``x``, ``x_low`` and ``x_high`` (see `interval`; null ends where one
-            seed gives none), and for the violation rate also its one-sided limits
+            For each column x: ``x``, ``x_low`` and ``x_high`` (see `interval`; the ends are null
+            for a single seed). The violation rate also has its one-sided limits,
             ``violation_rate_at_least`` and ``violation_rate_at_most``.
         """
         return over_seeds(self.runs, (*self.parameters, "scenario", "policy"), columns)

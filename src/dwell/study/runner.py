@@ -1,7 +1,7 @@
-"""Run a study: batches over processes or a cluster, parts as they are ready, tables at the end.
+"""Run a study: simulate batches in processes or on a cluster, save parts, write tables at the end.
 
-A run depends only on the study, its scenario, its seed and its contender. So the tables have the
-same bytes, however the batches are played: by which process, in which order, in how many attempts.
+A run depends only on the study, its scenario, its seed and its contender. The tables therefore have
+the same bytes for every number of processes, order of batches and number of attempts.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from dwell.study.workers import available_processes, require_importable, spread
 if TYPE_CHECKING:
     import polars as pl
 
-#: Processes of a cluster, for the size of batches: it may have more or fewer.
+#: Assumed number of processes of a cluster, for the size of batches.
 DASK_WORKERS = 64
 
 
@@ -48,7 +48,7 @@ class StudyResult(StudyRuns):
     Parameters
     ----------
     folder : Path or None
-        Where the tables are.
+        Folder of the tables; None if they are only in memory.
     """
 
     study: Study
@@ -63,30 +63,31 @@ def run_study(
     dask: str | None = None,
     progress: Progress | None = None,
 ) -> StudyResult:
-    """Simulate a study, or what is left to do of it.
+    """Simulate a study, or the missing runs of a study in a folder.
 
     Parameters
     ----------
     folder : Path, optional
-        For the parts and the tables (``runs.parquet``, ``costs.parquet``, ``latencies.parquet``);
-        a study that was stopped there continues. If None, the tables stay in memory.
+        Folder for the parts and the tables (``runs.parquet``, ``costs.parquet``,
+        ``latencies.parquet``). An interrupted study in it continues. If None, the tables stay in
+        memory.
     processes : int, optional
-        Over which the batches are spread; one per CPU where None (see `dwell.study.workers`).
+        Number of worker processes. Default: one per CPU (see `dwell.study.workers`).
     dask : str, optional
-        Address of a Dask scheduler, whose workers play the batches instead.
+        Address of a Dask scheduler; its workers replace the processes.
     progress : callable, optional
-        Called with the number of runs done and of all runs after each batch; in a folder also
-        once before.
+        Called with the number of finished runs and the number of all runs after each batch; with
+        a folder also once at the start.
 
     Raises
     ------
     ProblemError, PolicyError, TraceError
-        If something named is unknown, or a trace is too short.
+        If a name is unknown, or a trace is too short.
     RunError
-        If the folder holds something else than this study, or another process works on it.
+        If the folder contains another study, or another process works on it.
     SimulationError
-        If the folder cannot be written, a worker ended early, or the cluster is out of reach. The
-        runs that are finished stay.
+        If the folder cannot be written, a worker ended early, or the cluster cannot be reached.
+        Finished runs in the folder are kept.
     """
     if folder is None:
         tables, _ = play_in_memory(Player(study), processes=processes, dask=dask, progress=progress)
@@ -100,7 +101,7 @@ def run_study(
 
 
 def results_of(study: Study, tables: Tables) -> dict[str, Any]:
-    """Return what all results of a study have: its plan, tables, and versions of the software."""
+    """Return the fields common to all results: plan, tables, and versions of the software."""
     names = ("name", "scenarios", "policies", "seeds", "windows", "labels")
     plan = {name: getattr(study, name) for name in names}
     more = {"metrics": tuple(study.metrics), "versions": versions()}
@@ -114,15 +115,7 @@ def play_in_memory(
     dask: str | None = None,
     progress: Progress | None = None,
 ) -> tuple[Tables, dict[tuple[Item, int, str], Example]]:
-    """Simulate a study and write nothing.
-
-    Returns
-    -------
-    tables : dict of str to DataFrame
-        See `StudyRuns`.
-    examples : dict of (Item, point, policy) to Example
-        The runs of the seeds that the player keeps.
-    """
+    """Simulate a study in memory; return its tables and the example runs that the player keeps."""
     study, done = player.study, 0
     frames: list[pl.DataFrame] = []
     examples: dict[tuple[Item, int, str], Example] = {}
@@ -144,7 +137,7 @@ def play_in_memory(
 
 
 def require_sendable(study: Study, processes: int | None, dask: str | None) -> None:
-    """Refuse objects that worker processes cannot import, if there will be some.
+    """Refuse objects that local worker processes cannot import.
 
     Raises
     ------
@@ -163,19 +156,19 @@ def open_parts(
     *,
     player: Player | None = None,
 ) -> Iterator[Parts]:
-    """Open the folder of a study, or of a shard, for this process alone.
+    """Open the folder of a study or shard, with a lock against other processes.
 
     Parameters
     ----------
     player : Player, optional
-        If runs are missing, it rehearses before the folder is made.
+        If runs are missing, it rehearses before the folder is created.
 
     Raises
     ------
     RunError
-        If the folder holds something else than this study, or another process works on it.
+        If the folder contains another study, or another process works on it.
     SimulationError
-        If it cannot be made or written, or a metric cannot be imported.
+        If the folder cannot be created or written, or a metric cannot be imported.
     """
     description, sources = describe(study), own_sources(study)
     digests = part_digests(description, sources)
@@ -194,7 +187,7 @@ def open_parts(
         try:
             yield parts
         except SimulationError as error:
-            # This process may not know yet what the others have written.
+            # Worker processes may have written parts since the last look.
             parts.look()
             if not parts.done:
                 raise
@@ -212,7 +205,7 @@ def play_parts(
     dask: str | None = None,
     progress: Progress | None = None,
 ) -> None:
-    """Play what a folder misses; see `run_study`."""
+    """Simulate the missing runs of a folder; see `run_study`."""
     folder, workers = parts.folder, _workers(processes, dask)
     missing = parts.missing(workers)
 
@@ -230,20 +223,20 @@ def play_parts(
         return
     for name in TABLES:
         (folder / f"{name}.parquet").unlink(missing_ok=True)
-    # Workers of a cluster have no file system in common.
+    # Workers of a cluster may not share a file system: this process writes their parts.
     writer = partial(play_and_write, player, folder, parts.digests)
     task = writer if dask is None else player
     try:
         _spread(task, missing, workers, dask, take)
     except KeyboardInterrupt:
-        # Workers have finished the batches that they had begun.
+        # The workers have finished their current batches.
         look()
         raise
     parts.clear()
 
 
 def write_tables(parts: Parts) -> Tables:
-    """Write the tables of a study whose parts are all there.
+    """Write the tables of a study from its complete set of parts.
 
     Raises
     ------
@@ -252,7 +245,7 @@ def write_tables(parts: Parts) -> Tables:
     SimulationError
         If a table cannot be written.
     """
-    # From the files in any case: a study that was stopped makes its tables of the same.
+    # Always from the files: an interrupted study gives the same tables.
     remedy = "; remove it and run the study again"
     tables = tables_of(parts.study, (read_table(file, remedy)() for file in parts.files))
     for name, table in tables.items():
@@ -261,7 +254,7 @@ def write_tables(parts: Parts) -> Tables:
 
 
 def _workers(processes: int | None, dask: str | None) -> int:
-    """Return how many processes share the work; of a cluster, a guess."""
+    """Return the number of processes that share the work; for a cluster, a guess."""
     if dask is not None:
         return DASK_WORKERS
     return available_processes() if processes is None else processes
@@ -274,7 +267,7 @@ def _spread(
     dask: str | None,
     take: Callable[[Batch, PlayedBatch], None],
 ) -> None:
-    """Play batches, and hand over each result as soon as it is ready."""
+    """Simulate batches, and call `take` with each result as soon as it is ready."""
     rest = operator.attrgetter("rest")
     if dask is None:
         spread(task, batches, processes=processes, take=take, rest=rest)

@@ -1,6 +1,6 @@
-"""Shards: stretches of a study's items, played apart, on several computers say, and merged.
+"""Shards: parts of a study, simulated separately (for example on several computers) and merged.
 
-A shard has a folder of its own in the folder of its study, ``shards/2-of-4``.
+A shard has its own folder in the folder of its study, such as ``shards/2-of-4``.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ def run_shard(
     dask: str | None = None,
     progress: Progress | None = None,
 ) -> int:
-    """Simulate a shard of a study, or what is left to do of it, and return its number of runs.
+    """Simulate the missing runs of a shard, and return the shard's number of runs.
 
     Parameters
     ----------
     folder : Path
-        Folder of the study; the shard has a folder in it.
+        Folder of the study; it will contain the shard's folder.
     processes, dask, progress
         See `dwell.study.run_study`, also for the exceptions.
     """
@@ -52,7 +52,7 @@ def run_shard(
 
 
 def merge_shards(study: Study, folder: Path) -> StudyResult:
-    """Put the shards of a study together, in its own folder.
+    """Merge the shards of a study in its folder, and write its tables.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def merge_shards(study: Study, folder: Path) -> StudyResult:
     Raises
     ------
     RunError
-        If a shard is missing, there twice, not finished, or one of another study or version.
+        If a shard is missing, duplicate or unfinished, or belongs to another study or version.
     SimulationError
         If the folder cannot be written.
     """
@@ -93,13 +93,7 @@ def merge_shards(study: Study, folder: Path) -> StudyResult:
 
 
 def _complete(study: Study, folder: Path) -> dict[Shard, Path]:
-    """Return the folders of the shards that hold all items, each once.
-
-    Raises
-    ------
-    RunError
-        If an item is in two of them, or in none.
-    """
+    """Return the folders of the shards; refuse duplicate and missing items with a RunError."""
     items, of, found = len(study.items()), 1, {}
     places: dict[int, Path] = {}
     for file in sorted((folder / SHARDS).glob(f"*/{STUDY.file}")):

@@ -48,13 +48,10 @@ def versions() -> dict[str, str]:
 
 @cache
 def software() -> Mapping[str, str]:
-    """Return what has to be the same for the same numbers, to the last bit.
+    """Return the versions and digests that must be equal for bit-identical numbers.
 
-    Returns
-    -------
-    mapping of str to str
-        The versions, of the kernel only the digest of its sources, since every compiler makes the
-        same of them; ``sources``, the digest of this package's own.
+    The kernel has only the digest of its sources, because every compiler gives the same numbers;
+    ``sources`` is the digest of this package's Python sources.
     """
     from dwell.sim.versions import kernel_digest
 
@@ -63,7 +60,7 @@ def software() -> Mapping[str, str]:
 
 
 def describe(study: Study) -> dict[str, Any]:
-    """Return all that the tables of a study depend on but a user's own code, ready for JSON.
+    """Return all inputs of a study's tables except the user's own code, ready for JSON.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Study: scenarios × policies × parameters × seeds, of which every combination is simulated."""
+"""Study: simulates every combination of scenarios, policies, parameters and seeds."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from dwell.estimators import Estimator
     from dwell.policies import MinimalPolicy
 
-#: Runs of an item at most, where they can be parted: enough that the time for drawing what they
-#: share does not count, and few enough that little is lost with an item.
+#: Largest number of runs of an item with several points. Enough runs make the time for sampling
+#: their realisation negligible; with few runs, an interruption loses little work.
 ITEM_RUNS = 64
 
 TAKEN = "the tables have such a column already; choose another name"
@@ -33,20 +33,20 @@ TAKEN = "the tables have such a column already; choose another name"
 
 @dataclass(frozen=True, slots=True)
 class Contender:
-    """A policy of a study, with what it believes.
+    """A policy of a study, with its estimator and settings.
 
     Parameters
     ----------
     name : str
-        In tables; a candidate's name is kept for the placement that never moves.
+        Name in tables. A candidate's name is reserved for its static placement.
     policy : policy or str
-        An object with ``decide``, a policy's name, or a candidate's.
+        An object with ``decide``, or the name of a policy or candidate.
     estimator : Estimator or str, optional
-        The cell's where None.
+        Default: the cell's estimator.
     settings : mapping of str to object
-        Values of the cell below ``controller`` and ``objective``, by their paths. They change what
-        the controller does and how it weighs, and nothing that happens to it; its runs are judged
-        by the objective of the point, like everybody's.
+        Values below ``controller`` and ``objective`` of the cell, by their paths. They change the
+        controller and its objective, but not the conditions of its runs. The objective of the point
+        judges the runs of all contenders.
     """
 
     name: str
@@ -58,7 +58,7 @@ class Contender:
         object.__setattr__(self, "settings", FrozenDict(self.settings))
 
     def problem(self, problem: Problem) -> Problem:
-        """Return the problem as this contender sees it.
+        """Return the problem with this contender's settings and estimator.
 
         Raises
         ------
@@ -71,7 +71,7 @@ class Contender:
         return with_settings(problem, settings) if settings else problem
 
     def fleet(self, fleet: Fleet, scenario: str) -> Fleet:
-        """Return the fleet as this contender plays it, the first entry in a scenario.
+        """Return the fleet with this contender's settings, and a scenario for the first entry.
 
         Raises
         ------
@@ -89,7 +89,7 @@ class Contender:
         return replace(fleet, entries=entries).changed(**given)
 
     def is_candidate(self, problem: Problem) -> bool:
-        """Whether it is a bare candidate's placement, which never moves."""
+        """Whether the contender is a candidate's static placement, without other settings."""
         plain = self.estimator is None and not self.settings
         return plain and isinstance(self.policy, str) and self.policy in problem.candidates
 
@@ -101,11 +101,11 @@ class Point:
     Parameters
     ----------
     values : mapping of str to float, int or str
-        By the parameter's path in the cell.
+        Values by the parameter's path in the cell.
     problem : Problem
-        With these values put in; of a fleet the first cell.
+        Problem with these values; for a fleet, of its first cell.
     fleet : Fleet, optional
-        With these values put in, where it is a point of a fleet's study.
+        Fleet with these values, in a study of a fleet.
     """
 
     values: Mapping[str, Value]
@@ -113,7 +113,7 @@ class Point:
     fleet: Fleet | None = None
 
     def __post_init__(self) -> None:
-        # Numbers of arrays are no numbers to JSON.
+        # JSON cannot store NumPy scalars.
         values = {
             name: value.item() if isinstance(value, np.generic) else value
             for name, value in self.values.items()
@@ -125,7 +125,7 @@ class Point:
 
     @property
     def window_cycles(self) -> int:
-        """Cycles of a window, of all cells."""
+        """Cycles per window, summed over the cells."""
         if self.fleet is None:
             return self.problem.window_cycles
         return sum(cell.problem.window_cycles for cell in self.fleet.cells)
@@ -133,12 +133,12 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One realisation, which every contender plays.
+    """One realisation, common to all contenders.
 
     Parameters
     ----------
     points : tuple of int
-        Points whose realisations are the same: they differ in nothing that is drawn.
+        Indices of points with the same realisation.
     """
 
     points: tuple[int, ...]
@@ -153,25 +153,25 @@ class Study:
     Parameters
     ----------
     points : tuple of Point
-        All with the same parameters, candidates and nodes, and different values.
+        Points with the same parameters, candidates and nodes, and different values.
     windows : int
-        Length of every run, the warm-up included.
+        Length of every run, including the warm-up.
     references : bool
-        Whether the references play as well.
+        Whether the references are simulated, too.
     labels : mapping of str to str
-        Names of parameters in figures and tables, by their paths; a path where there is none.
+        Names of parameters in figures and tables, by their paths. Default: the path.
     metrics : mapping of str to str
-        Functions of a Run that return a number, as ``package.module:function``, by the names of
-        their columns.
+        Functions from a Run to a number, as ``package.module:function``, by the names of their
+        columns.
     folder : str, optional
-        Where modules of metrics are looked for first.
+        First folder of the search path for modules of metrics.
 
     Raises
     ------
     SimulationError
-        If no study can be made of it.
+        If a value is invalid or a name is ambiguous.
     ProblemError
-        If a scenario is unknown, or 64 bits do not hold the runs (see `Problem.cycles_of`).
+        If a scenario is unknown, or a run is too long for 64 bits (see `Problem.cycles_of`).
     """
 
     name: str
@@ -242,13 +242,13 @@ class Study:
 
     @property
     def policies(self) -> tuple[str, ...]:
-        """Names in the tables, the references' last."""
+        """Names of the contenders, then of the references, as in the tables."""
         names = tuple(contender.name for contender in self.contenders)
         return (*names, *REFERENCES) if self.references else names
 
     @property
     def players(self) -> tuple[str, ...]:
-        """Names of all that have parts of their own: the contenders, and the references."""
+        """Names with separate parts: each contender, and one name for all references."""
         names = tuple(contender.name for contender in self.contenders)
         return (*names, CLAIRVOYANT) if self.references else names
 
@@ -259,21 +259,21 @@ class Study:
 
     @property
     def runs(self) -> int:
-        """Number of runs, those of the references left out."""
+        """Number of runs without the references."""
         pairs = len(self.scenarios) * len(self.seeds)
         return pairs * len(self.points) * len(self.contenders)
 
     @property
     def cycles(self) -> int:
-        """Number of cycles of all these runs."""
+        """Number of cycles of all runs without the references."""
         pairs = len(self.scenarios) * len(self.seeds) * len(self.contenders)
         return pairs * self.windows * sum(point.window_cycles for point in self.points)
 
     def items(self) -> tuple[Item, ...]:
-        """Return the items in the order in which they are done: all scenarios of a seed, then on.
+        """Return the items in the order of execution: by seed, then by scenario.
 
-        Points that differ in the controller and the objective alone are played in one item, as
-        many as make `ITEM_RUNS`.
+        Points that differ only in the controller and the objective share an item, up to `ITEM_RUNS`
+        runs.
         """
         drawn_alike: dict[Drawn | int, list[int]] = {}
         for index, point in enumerate(self.points):
@@ -294,7 +294,7 @@ class Study:
 
 
 def _require_each_once(what: str, given: Sequence[object], remedy: str = "name each once") -> None:
-    """Refuse nothing at all, and anything twice."""
+    """Refuse an empty sequence, and duplicates."""
     if not given:
         raise SimulationError(f"{what} is empty; name at least one")
     seen = set()
@@ -311,7 +311,7 @@ def load_study(path: str | PathLike[str]) -> Study:
     Raises
     ------
     ProblemError
-        With every fault found in it, each with its line and field path.
+        With all faults of the file, each with its line and field path.
     """
     declared = read_study(path, references=REFERENCES)._asdict()
     points = tuple(Point(*one) for one in declared.pop("points"))

@@ -18,7 +18,7 @@ from dwell.study.results import StudyRuns
 #: Folders of shards, by their names.
 SHARDS = "shards"
 STUDY = FolderMark("study", "study.json", 2, (PARTS, SHARDS))
-#: Of a finished study, each a Parquet file.
+#: Tables of a finished study, each a Parquet file.
 TABLES = ("runs", "costs", "latencies")
 
 
@@ -35,7 +35,7 @@ class Shard(NamedTuple):
         Raises
         ------
         ProblemError
-            If it is none.
+            If the text is not i/n with i from 1 to n.
         """
         found = re.fullmatch(r"([1-9]\d{0,5})/([1-9]\d{0,5})", text)
         if found is None or int(found[1]) > int(found[2]):
@@ -62,12 +62,12 @@ def is_study(folder: Path) -> bool:
 
 
 def open_study(folder: str | Path) -> StudyRuns:
-    """Read the folder of a study that is finished.
+    """Read the folder of a finished study.
 
     Raises
     ------
     RunError
-        If it is none, its runs are not finished, or a file of it cannot be read.
+        If the folder contains no study, the study is unfinished, or a file cannot be read.
     """
     from dwell.study.results import StudyRuns
 

@@ -1,20 +1,20 @@
-"""Summary of a run: the row of numbers that statistics over seeds are made of.
+"""Summary of a run: one row of numbers for statistics over seeds.
 
-Only what follows the warm-up counts: the windows not flagged as such, the decisions at their
-closes, and every cycle from the first of those windows to the end of the last. (After a migration
-the next window begins where the order takes effect, so that some cycles lie between two windows;
-they are cycles like any other. What is left after the last complete window is not played.)
+The warm-up does not count. The summary covers the other windows, the decisions at their ends, and
+every cycle from the first of these windows to the end of the last. (After a migration the next
+window begins when the order takes effect. Cycles between two windows count, too. A run has no
+cycles after the last complete window.)
 
-L95 is given twice, because the two answer different questions:
+The summary has two forms of L95, for two questions:
 
-* ``l95_ms``: mean over windows of the L95 that the controller saw, which J prices. An unfinished
-  cycle counts with its age, so that it is always finite.
-* ``p95_ms``: the 95th percentile of the final latencies of all cycles together, an order
-  statistic. A lost cycle counts as infinite, and so does this where more than 5 % are lost.
+* ``l95_ms``: mean over windows of the L95 that the controller saw and that J prices. It is always
+  finite, because an unfinished cycle counts with its age.
+* ``p95_ms``: the 95th percentile of the final latencies of all cycles, an order statistic. A lost
+  cycle counts as infinite, so the percentile is infinite if more than 5 % are lost.
 
-Misses in any K consecutive cycles are counted for K = 20 and K = 100: 20 is the least K of which
-5 %, the aim, is a whole number of misses, and 100 is about as long as a window. Unlike windows,
-these stretches begin at every cycle.
+Misses in any K consecutive cycles are counted for K = 20 and K = 100. K = 20 is the smallest K for
+which 5 % (the aim) is an integer number of misses; K = 100 is about the length of a window. Unlike
+windows, these stretches begin at every cycle.
 """
 
 from __future__ import annotations
@@ -45,24 +45,24 @@ if TYPE_CHECKING:
 
 Row: TypeAlias = dict[str, float | int | str]
 
-#: Points of the latency distributions: so many to a deadline, up to four deadlines.
+#: Points per deadline in the latency distributions, and their range in deadlines.
 GRID_PER_DEADLINE = 80
 DEADLINES = 4
 
 #: Parts of a latency.
 PARTS = ("compute", "queue", "network")
 
-#: Column of what tells runs apart that differ in anything but their names.
+#: Column with the digest of placements, latencies and utilisation (see `_played`).
 PLAYED = "played"
-#: Column of the latencies alone, which shadow jobs may leave as they are.
+#: Column with the digest of the latencies alone; shadow jobs may leave it unchanged.
 LATENCIES = "latencies"
 
-#: K, the lengths of stretches of cycles, with m, the misses that are 5 % of one.
+#: K, the length of a stretch of cycles, and m, 5 % of it.
 STRETCHES = {20: 1, 100: 5}
 
 
 class Counted(NamedTuple):
-    """The part of a run for statistics: no warm-up, no incomplete window."""
+    """The part of a run for statistics: complete windows after the warm-up."""
 
     windows: pl.DataFrame
     decisions: pl.DataFrame
@@ -76,14 +76,14 @@ class Summary:
     Parameters
     ----------
     row : dict
-        One value a column of ``Comparison.runs``.
+        One value per column of ``Comparison.runs``.
     costs : list of dict
-        One a candidate: mean estimated J while it was not active, mean measured J while it was,
-        and the share of cycles that each alternative got as shadows while it was.
+        One row per candidate: mean estimated J while the candidate was not active, mean measured J
+        while it was active, and the share of cycles that each alternative received as shadows then.
     within : int64 array
-        Cycles that finished within each point of the latency grid.
+        Number of cycles that finished within each point of the latency grid.
     compared : mapping
-        What tables need of it to compare runs with the references (see `dwell.study.player`).
+        Values for the comparison of runs with the references (see `dwell.study.player`).
     """
 
     row: Row
@@ -93,25 +93,25 @@ class Summary:
 
 
 def latency_grid_ms(deadline_ms: float) -> Floats:
-    """Points at which distributions of latency are kept, ascending; D is one of them."""
+    """Grid points of the latency distributions, ms, ascending; includes the deadline."""
     points = np.arange(1, DEADLINES * GRID_PER_DEADLINE + 1, dtype=np.float64)
     return points / GRID_PER_DEADLINE * deadline_ms
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Latencies:
-    """Final latencies of cycles, each at its place on the latency grid.
+    """Final latencies of cycles, each with its place on the latency grid.
 
-    An order statistic is sought among the cycles of one place, so that nothing is sorted.
+    An order statistic needs no sort: it is selected among the cycles of one place.
 
     Parameters
     ----------
     latency_ns : int64 array, shape (n,)
-        `NEVER_NS` where the cycle never finished.
+        `NEVER_NS` if the cycle never finished.
     place : integer array, shape (n,)
-        The first point of the grid that it is within; the number of points where it is in none.
+        Index of the first grid point at or above the latency; the number of points if above all.
     within : int64 array
-        Cycles that finished within each point of the grid.
+        Number of cycles that finished within each point of the grid.
     """
 
     latency_ns: Ints
@@ -120,21 +120,21 @@ class Latencies:
 
     @classmethod
     def of(cls, latency_ns: Ints, deadline_ms: float) -> Latencies:
-        """Place latencies on the grid, whose points are rounded to ns as the deadline is."""
+        """Place latencies on the grid; its points are rounded to ns like the deadline."""
         ends_ns = np.rint(latency_grid_ms(deadline_ms) * 1e6).astype(np.int64)
         points, step_ns = len(ends_ns), deadline_ms * 1e6 / GRID_PER_DEADLINE
         place: NDArray[np.integer]
         if step_ns < 1.0:  # several points are one
             place = np.searchsorted(ends_ns, latency_ns)
         else:
-            # So many points are below, give or take the one whose rounding decides.
+            # The number of points below a latency, corrected by 1 for the rounding of points.
             below = np.minimum(latency_ns / step_ns, points).astype(np.int16)
             place = below + (latency_ns > np.append(-1, ends_ns)[below]) - 1
         within = np.bincount(place, minlength=points + 1)[:points].cumsum()
         return cls(latency_ns, place, within)
 
     def percentile_ms(self, percent: int) -> float:
-        """Return the ceil(percent n / 100)-th smallest; infinite of one that never finished."""
+        """Return the ceil(percent n / 100)-th smallest; infinite if that cycle never finished."""
         rank = rank_of(percent, len(self.latency_ns))
         at = int(np.searchsorted(self.within, rank))
         rank -= int(self.within[at - 1]) if at else 0
@@ -143,7 +143,7 @@ class Latencies:
 
 
 def count_in(run: Run, window_cycles: int) -> Counted:
-    """Leave out the warm-up, and the cycles after the last complete window.
+    """Return a run without its warm-up and the cycles after the last complete window.
 
     Raises
     ------
@@ -170,12 +170,12 @@ def _counting(run: Run, window_cycles: int) -> tuple[Mask, Mask, slice]:
 
 
 def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Summary:
-    """Sum up a run.
+    """Return the summary of a run.
 
     Parameters
     ----------
     problem : Problem
-        The one it was made with.
+        Problem of the run.
     labels : mapping
         Leading columns of the row: scenario, policy, seed.
 
@@ -227,7 +227,7 @@ def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Su
 
 
 def answer_of(run: Run, problem: Problem) -> dict[str, float]:
-    """Return `violation_rate`, `l95_ms` and `cost` of a run's summary, without its other numbers.
+    """Return only `violation_rate`, `l95_ms` and `cost` of a run's summary.
 
     Raises
     ------
@@ -244,16 +244,16 @@ def answer_of(run: Run, problem: Problem) -> dict[str, float]:
 
 
 def _unfinished(outcomes: Names) -> dict[str, int]:
-    """Count the cycles that were lost, and those that were under way at the end."""
+    """Count the lost cycles, and the cycles in flight at the end."""
     done, in_flight = (int(outcomes.equal(name).sum()) for name in ("done", "in_flight"))
     return {"lost": len(outcomes.places) - done - in_flight, "in_flight": in_flight}
 
 
 def _played(latency_ns: Ints, placed: Names, used: Mapping[str, Floats], problem: Problem) -> str:
-    """Digest of what was played: of runs on one realisation, equal ones are the same run.
+    """Digest of a run; runs on one realisation are identical if their digests are equal.
 
-    It is that of every cycle's placement and latency, and of the resources' utilisation, to which
-    shadow jobs add where they delay nobody.
+    It covers the placement and latency of every cycle, and the utilisation of resources, which
+    shadow jobs change even if they delay no cycle.
     """
     digest = hashlib.blake2b(latency_ns.data, digest_size=8)
     for name in problem.candidates:
@@ -271,7 +271,7 @@ def longest_streak(missed: Mask) -> int:
 
 
 def _misses(missed: Mask) -> dict[str, float]:
-    """Misses in stretches of K cycles: the most, and the share of stretches with more than 5 %."""
+    """Largest number of misses in K cycles, and share of stretches with more than 5 % misses."""
     row: dict[str, float] = {}
     every = misses_in(missed, STRETCHES)
     for (stretch, aim), counts in zip(STRETCHES.items(), every, strict=True):
@@ -283,7 +283,8 @@ def _misses(missed: Mask) -> dict[str, float]:
 def _actuator(cycles: TableArrays, counted: slice, problem: Problem) -> dict[str, float]:
     """Age at the actuator and tracking error, until a period after the last counted release.
 
-    What took effect before the first of them may still last, so that every cycle played is needed.
+    An earlier command may still be in effect at the first counted release, so the cycles of the
+    warm-up are needed, too.
     """
     release_ns = cycles["release_ns"][: counted.stop]
     actuated = actuations(release_ns, cycles["latency_ns"][: counted.stop])
@@ -298,14 +299,15 @@ def _actuator(cycles: TableArrays, counted: slice, problem: Problem) -> dict[str
 
 
 def mean_of(values: NDArray[Any]) -> float:
-    """Return the mean of what is there; NaN where nothing is.
+    """Return the mean of the present values; NaN without any.
 
-    Floats are added in Polars' order, so that the mean is that of the same column of a table, to
-    the last bit: rows of 128 in pairs, after those that fill none; in a row, 16 sums side by side.
+    Floats are added in Polars' order, to match the mean of a table's column to the last bit: the
+    first len % 128 values one after another; each further row of 128 values in 16 parallel sums;
+    the sums of rows in pairs.
 
     Parameters
     ----------
-    values : float64 array, NaN where there is none; or int64 array, `NEVER_NS` where there is none
+    values : float64 array, NaN if missing; or int64 array, `NEVER_NS` if missing
     """
     if values.dtype == np.int64:
         there = values if values.max(initial=0) < NEVER_NS else values[values < NEVER_NS]
@@ -320,13 +322,13 @@ def mean_of(values: NDArray[Any]) -> float:
     for width in (8, 4):
         sums = sums[:, :width] + sums[:, width:]
     rows = (sums[:, 0] + sums[:, 2]) + (sums[:, 1] + sums[:, 3])
-    # One after another: from Python 3.12 on, `sum` rounds floats otherwise.
+    # One after another, without `sum`: it rounds floats differently from Python 3.12 on.
     ahead = float(np.add.accumulate(terms[:begin])[-1]) if begin else 0.0
     return (_sum_of_pairs(rows.tolist()) + ahead) / count
 
 
 def _sum_of_pairs(values: Sequence[float]) -> float:
-    """Add the sums of both halves."""
+    """Return the sum of values, added recursively as the sums of both halves."""
     if len(values) < 2:
         return values[0] if values else 0.0
     half = len(values) // 2
@@ -334,20 +336,20 @@ def _sum_of_pairs(values: Sequence[float]) -> float:
 
 
 def share_of(those: Mask) -> float:
-    """Return the share of rows of which something is true; at least one."""
+    """Return the share of true values in a mask with at least one row."""
     return float(np.count_nonzero(those) / len(those))
 
 
 def latency_ms(cycles: pl.DataFrame) -> Floats:
-    """Final latencies, infinite where the cycle never finished."""
+    """Final latencies, infinite for cycles that never finished."""
     final_ms: Floats = (cycles["latency_ns"].cast(float) / 1e6).fill_null(np.inf).to_numpy()
     return final_ms
 
 
 def _percentiles(latencies: Latencies) -> dict[str, float]:
-    """Percentiles of all cycles together, and how far the 95th is from the median."""
+    """Percentiles over all cycles, and the distance of the 95th from the median."""
     p50, p95 = (latencies.percentile_ms(percent) for percent in (50, 95))
-    # Infinity less infinity is no number: where half of the cycles are lost, the tail has no end.
+    # Infinity minus infinity is NaN: the spread is infinite if half of the cycles are lost.
     return {"p95_ms": p95, "p50_ms": p50, "spread_ms": p95 - p50 if p50 < np.inf else np.inf}
 
 
@@ -357,7 +359,7 @@ def used_in(windows: TableArrays, problem: Problem) -> dict[str, Floats]:
 
 
 def _utilisation(used: Mapping[str, Floats], problem: Problem) -> dict[str, float]:
-    """Mean over windows of the busiest of a tier, and of every resource."""
+    """Mean utilisation over windows: the busiest resource of each tier, and every resource."""
     robot, edge, _ = busiest(used, problem)
     return {
         "u_robot": mean_of(robot),
@@ -367,7 +369,7 @@ def _utilisation(used: Mapping[str, Floats], problem: Problem) -> dict[str, floa
 
 
 def _migrations(decisions: TableArrays, decided: Mask) -> dict[str, int]:
-    """Count migrations, those that undo the one before, and the guard's moves, which are apart."""
+    """Count the policy's migrations, its returns to the previous placement, and guard moves."""
     migrated = decided & decisions["migrated"]
     guarded = by_guard(decisions)
     ends = (decisions.names(end)[migrated & ~guarded] for end in ("incumbent", "placement"))

@@ -10,10 +10,10 @@ from dwell.model.fleet import Fleet, FleetEntry
 
 
 def with_twins(fleet: Fleet, node: str, count: int) -> Fleet:
-    """Return a fleet with more servers like a shared node; its cells take them in turn.
+    """Return a fleet with more servers like a shared node; its cells use them in turn.
 
-    Every cell keeps its candidates, with its own server in place of the node. A twin has the links
-    of the node.
+    In the candidates of each cell, the cell's server replaces the node. A twin has the node's
+    links.
     """
     entries: list[FleetEntry] = []
     for entry in fleet.entries:

@@ -21,11 +21,11 @@ from dwell.model import (
 from dwell.model.fleet import Fleet
 from dwell.study.capacity import Capacity, capacity_of
 
-#: How much later a deadline may be, ms, and how much faster a resource.
+#: Extension of deadlines, ms, and speed-up of a resource.
 LATER_MS, FASTER = 10.0, 1.25
-#: How many of a thing a site is thought to buy at most.
+#: Largest number of repetitions of a change.
 MOST_OFTEN = 4
-#: Names of what a process has in its own unit.
+#: Parameters of a process with the unit of its values.
 SCALED = ("value", "mean", "std", "low", "high", "min")
 Scalable: TypeAlias = Constant | Uniform | Normal | LogNormal | Gamma | Exponential | AR1
 
@@ -39,11 +39,11 @@ class SiteChange:
     text : str
         ``a core more on E``.
     make : callable
-        Returns a fleet with the change made a number of times.
+        Returns the fleet after a number of repetitions of the change.
     repeats : bool
-        Whether it can be made more than once.
+        Whether the change can be repeated.
     twins_of : str
-        Shared node of which there is one more with each change; empty for none.
+        Shared node that each change duplicates; empty for none.
     """
 
     text: str
@@ -52,20 +52,14 @@ class SiteChange:
     twins_of: str = ""
 
     def capacity(self, count: int = 1, **settings: Any) -> Capacity:
-        """Return how many robots there may be when it is made (see `capacity_of`)."""
+        """Return the capacity of the fleet after the change (see `capacity_of`)."""
         twins = {self.twins_of: count} if self.twins_of else None
         return capacity_of(self.make(count), twins=twins, **settings)
 
 
 @dataclass(frozen=True, slots=True)
 class WhatIf:
-    """A change of a fleet, and how many robots there may be then.
-
-    Parameters
-    ----------
-    change : str
-    capacity : Capacity
-    """
+    """A change of a fleet, and the capacity after it."""
 
     change: str
     capacity: Capacity
@@ -78,7 +72,7 @@ class WhatIf:
 
 
 def changes_of(fleet: Fleet) -> Iterator[SiteChange]:
-    """Yield what a site can change, the cheapest first."""
+    """Yield the possible changes of a fleet's site, the cheapest first."""
     if fleet.phases != "even":
         yield SiteChange("phases evenly spread", lambda _: fleet.changed(phases="even"))
     cells = [entry.cell for entry in fleet.entries]
@@ -112,9 +106,9 @@ def changes_of(fleet: Fleet) -> Iterator[SiteChange]:
 
 
 def served_by(fleet: Fleet, robots: int, **settings: Any) -> tuple[str, int] | None:
-    """Return the first change that serves a number of robots, and how often it is made.
+    """Return the first change that serves a number of robots, and its number of repetitions.
 
-    None where none does within `MOST_OFTEN` times.
+    The result is None if no change serves them within `MOST_OFTEN` repetitions.
     """
     for change in changes_of(fleet):
         for count in range(1, (MOST_OFTEN if change.repeats else 1) + 1):
@@ -141,7 +135,7 @@ def _later(cell: Problem) -> Problem:
 
 
 def _uses(cells: list[Problem], resource: str) -> bool:
-    """Whether jobs run on a resource, all of whose times can be scaled."""
+    """Whether jobs run on a resource, and all their times can be scaled."""
     times = [
         of.exec_ms
         for cell in cells
@@ -163,7 +157,7 @@ def _fast(cell: Problem, resource: str) -> Problem:
 
 
 def _scaled(process: Scalable, factor: float) -> Scalable:
-    """Return a process all of whose values are so many times as large."""
+    """Return a process with all values multiplied by a factor."""
     values: dict[str, Any] = {
         name: value * factor for name, value in asdict(process).items() if name in SCALED
     }

@@ -1,10 +1,9 @@
-"""The same task on many units, spread over processes.
+"""Parallel execution of one task on many units, in worker processes.
 
-Every result is handed over with its unit, in whatever order they are ready: whoever takes them
-puts them in order, so that nothing depends on how many processes there are or which one was
-faster. Processes are spawned, never forked (a fork of a process with threads may lock up), and
-share nothing but the task, which is sent to each of them once. They end with the process that
-began them, even where that is killed.
+Results arrive in any order, each with its unit. The caller sorts them, so its result does not
+depend on the number or the speed of processes. Processes are spawned, because a fork of a process
+with threads may deadlock. Each process receives the task once and shares no other state. Workers
+end with their parent process, even if the parent is killed.
 """
 
 from __future__ import annotations
@@ -48,22 +47,22 @@ def spread(
     take: Callable[[Unit, Result], bool | None],
     rest: Callable[[Result], Unit | None] = lambda _: None,
 ) -> None:
-    """Do a task on every unit, or until there is enough.
+    """Run a task on every unit, until `take` returns True.
 
     Parameters
     ----------
     task : callable
-        It, the units and the results must pickle.
+        The task, the units and the results must pickle.
     units : sequence
-        They hash, and each is there once.
+        Hashable and unique.
     processes : int
-        How many to use; 1 stays in this one. A script that asks for more has to begin its work
-        under ``if __name__ == "__main__":``, as every process imports it again.
+        Number of worker processes; 1 runs the task in this process. With more, a script must begin
+        its work under ``if __name__ == "__main__":``, because every process imports the script.
     take : callable
-        Called in this process with each unit and its result, as soon as that is ready. Where it
-        returns True, the units that are left are not done.
+        Called in this process with each unit and its result, as soon as the result is ready. If it
+        returns True, the remaining units are dropped.
     rest : callable
-        Returns the part of a unit that its result leaves open, which is then a further unit.
+        Returns the unfinished part of a unit from its result; the part becomes a further unit.
 
     Raises
     ------
@@ -100,7 +99,7 @@ def spread(
         submit(units)
         while waiting:
             future = ready.get()
-            # A future keeps its result, and `waiting` would keep the future.
+            # Removed from `waiting` to free the result, which the future references.
             unit, result = waiting.pop(future), cast("Result", future.result())
             if take(unit, result):
                 break
@@ -112,17 +111,17 @@ def spread(
             'without `if __name__ == "__main__":`; ask for 1 process to work without them'
         ) from None
     finally:
-        # On an interrupt or an error: drop what waits, let what runs end, leave no process behind.
+        # On an interrupt or an error: cancel waiting units, finish running ones, end the workers.
         pool.shutdown(wait=True, cancel_futures=True)
 
 
 def require_importable(objects: Mapping[str, object]) -> None:
-    """Refuse objects that worker processes cannot get.
+    """Refuse objects that cannot be sent to worker processes.
 
     Parameters
     ----------
     objects : mapping of str to object
-        By their names for messages.
+        Objects by their names in messages.
 
     Raises
     ------
@@ -152,7 +151,7 @@ class _Sender(pickle.Pickler):
 
 
 class _Worker:
-    """Settings that a worker process was started with; their types end at the pickle."""
+    """Task of a worker process; pickling loses its static type."""
 
     task: Callable[..., object]
 
@@ -164,7 +163,7 @@ def _begin(task: Callable[..., object]) -> None:
 
 
 def _end_with_parent() -> None:
-    """End this process when the one that began it has ended without saying so."""
+    """End this process when its parent has ended."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -172,23 +171,23 @@ def _end_with_parent() -> None:
 
 
 def _work(unit: object) -> object:
-    """Do the task on a unit, in a worker process."""
+    """Run the task on a unit, in a worker process."""
     try:
         return _Worker.task(unit)
     except Exception as error:
         try:
             pickle.loads(pickle.dumps(error))  # noqa: S301 - made here
         except Exception:
-            # The process that waits could not read it.
+            # The parent process could not unpickle the error.
             raise PolicyError(user_note(error) or describe_raised(error)) from None
         raise
 
 
 @contextmanager
 def _as_for_workers() -> Iterator[None]:
-    """Let processes that begin here ignore Ctrl-C, which this process handles, and use one thread.
+    """Start processes in this context with one thread, and without Ctrl-C: the parent handles it.
 
-    NumPy reads its variable when it is imported, before a worker runs any line of ours.
+    The variables must be set before the start, because NumPy reads them when it is imported.
     """
     before = {name: os.environ[name] for name in SINGLE_THREADED if name in os.environ}
     os.environ.update(SINGLE_THREADED)
