@@ -28,8 +28,8 @@ RESEND_S = 0.2
 class OperatorClient:
     """Connection to a cell's controller from outside of the cell; a context manager.
 
-    Raises a LiveError if the cell needs keys and has none, and a TrustError if the keys are not an
-    operator's or observer's.
+    Raises a LiveError if the cell needs keys and has none, and a TrustError if the keys are a
+    node's.
     """
 
     def __init__(self, problem: Problem, environment: Mapping[str, str] | None = None) -> None:

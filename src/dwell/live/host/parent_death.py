@@ -36,7 +36,7 @@ SWEEP_S = 60.0
 
 
 def end_with_owner(stopped: threading.Event, owner: int | None) -> None:
-    """Set an event when the owner (a process id) has ended; do nothing without an owner.
+    """Set an event when the owner (a process id, if any) has ended.
 
     If this process hangs and ignores the event, it is ended after `PATIENCE_S`.
     """
@@ -60,7 +60,7 @@ def _wait(owner: int, stopped: threading.Event) -> None:
 
 
 def start_sweeper() -> subprocess.Popen[bytes]:
-    """Start the process that removes the shared memory of the processes that end with this one."""
+    """Start the process that removes the shared memory of all processes with this owner."""
     return subprocess.Popen(  # noqa: S603 - our own command
         [sys.executable, "-P", "-m", "dwell.live.host.parent_death", str(os.getpid())],
         stdin=subprocess.DEVNULL,
