@@ -439,10 +439,10 @@ def _say_left(
 
 
 def down(problem: Problem, folder: Path) -> list[str]:
-    """End a cell's processes on this computer, with those of dead agents; return their names.
+    """End a cell's processes on this computer, even of dead agents; return their names.
 
     The controller is the first, because its run would otherwise end with an outage. Raises a
-    LiveError if a process had to be killed.
+    LiveError if a process did not end by itself, and was killed.
     """
     background = Background(problem, folder)
     running = background.running()

@@ -75,8 +75,8 @@ def measure(
     path = out or FOLDER / f"{file_name(node)}.parquet"
     sources = _sources(task)
     factories = _factories(inputs or (), sources)
-    # First the cores, then everything else: numerical packages start as many threads as they see
-    # cores when they are imported. What the tasks print must not get into the results.
+    # Set the cores first: at their import, numerical packages start one thread per available core.
+    # Keep the output of the tasks out of the results.
     with pinned(choose_cores(core)), redirect_stdout(sys.stderr):
         from dwell.calibration.measure import Settings
         from dwell.calibration.profile_file import require_free, task_name, write_profile

@@ -9,7 +9,7 @@ from pathlib import Path
 from dwell.errors import LiveError
 from dwell.live.roles.control_group import cgroup_mounts
 
-#: Controllers of v1 that are required, and those that are used if they are mounted.
+#: Required controllers of v1, and all controllers that are used if mounted.
 NEEDED = ("cpu", "cpuacct")
 USED = (*NEEDED, "cpuset", "freezer")
 
