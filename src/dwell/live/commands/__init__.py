@@ -1,1 +1,1 @@
-"""The commands of live cells: each is declared in a light module, which imports what it needs."""
+"""Commands of live cells; light modules declare them, and import the rest when they run."""

@@ -1,8 +1,7 @@
 """`dwell live up`, `down` and `log`: a cell's agents and controller in the background.
 
-Each is a process in a session of its own, so that it outlives the terminal, with two files in the
-cell's folder below the state folder: ``agent@R1.pid`` says which process it is, ``agent@R1.log``
-has what it prints.
+Each process has its own session, so it outlives the terminal. It has two files in the cell's folder
+in the state folder: ``agent@R1.pid`` with its process id, and ``agent@R1.log`` with its output.
 """
 
 from __future__ import annotations
@@ -40,37 +39,31 @@ from dwell.live.wire.local_addresses import is_here, listening_ports, taken_port
 from dwell.live.wire.wiring import Role, Wiring, roles, wire
 from dwell.model import Problem
 
-#: How long a process has to listen, and to end after it was told to: an actuator is told to stop
-#: for two seconds, and a controller completes its run's folder.
+#: Longest times until a process listens, and until it ends after SIGTERM: an actuator may take two
+#: seconds to stop, and a controller completes its run's folder.
 START_S, END_S = 30.0, 30.0
 LOOK_S = 0.1
-#: How long a step of a take-over may last: the processes of a node restart one after another.
+#: Longest time for a step of `--again`, as the processes of a node restart one by one.
 TAKEN_S = 120.0
-#: How long the processes of a cell take to end in order, about.
+#: Typical time for a clean end of a cell's processes.
 STOPPED_S = 2.0
-#: How much of the log of a process that does not start is shown.
+#: Number of log lines in the message about a process that does not start.
 LAST_LINES = 5
 
 
 @dataclass(frozen=True, slots=True)
 class Background:
-    """A cell's part on this computer.
-
-    Parameters
-    ----------
-    folder : Path
-        The cell's, with a folder for each node.
-    """
+    """Part of a cell on this computer; `folder` has one folder per node."""
 
     problem: Problem
     folder: Path
 
     def running(self) -> dict[str, psutil.Process]:
-        """Return the agents and the controller that run, by name."""
+        """Return the running agents and controller by name."""
         return _survivors(self.folder.glob("*.pid"))
 
     def leftovers(self, wiring: Wiring) -> dict[str, psutil.Process]:
-        """Return the processes of agents that have died, by name."""
+        """Return the running processes of dead agents by name."""
         listening = listening_ports()
         marks: list[Path] = []
         for node in self.folder.iterdir() if self.folder.is_dir() else ():
@@ -93,12 +86,9 @@ def _named(processes: Mapping[str, psutil.Process]) -> str:
 
 
 def nodes_here(problem: Problem, named: Sequence[str]) -> list[str]:
-    """Return the nodes that this computer is: those named, or those whose address is its own.
+    """Return the nodes to run here: the named nodes, or else the nodes with a local address.
 
-    Raises
-    ------
-    ProblemError
-        If there is no such node, or none is this computer.
+    Raises a ProblemError if a node is unknown, or no node belongs to this computer.
     """
     for node in named:
         problem.require_node(node)
@@ -125,23 +115,11 @@ def up(
     environment: Mapping[str, str],
     policy: str | None = None,
 ) -> list[str]:
-    """Start the agents of some nodes, and the controller where it is on one of them.
+    """Start the agents of some nodes, and the controller if it belongs to them; return the names.
 
-    Nothing is left of what was started where something cannot be.
-
-    Returns
-    -------
-    list of str
-        Names of what runs now.
-
-    Raises
-    ------
-    ProblemError
-        If the cell cannot run.
-    LiveError
-        If some of it runs already, ports are taken, or something does not start.
-    TrustError
-        If the keys are not those of the nodes.
+    If a process does not start, ends the others and removes their files. Raises a ProblemError if
+    the cell cannot run; a LiveError if a process runs already, a port is taken, or a process does
+    not start; and a TrustError if the keys belong to other nodes.
     """
     wiring, background = wire(problem), Background(problem, folder)
     here = [
@@ -154,7 +132,7 @@ def up(
     _require_ports(problem, wiring, nodes)
     commands = {role.who: _command(role, file, folder, out, policy) for role in here}
     with _Start(folder, out, environment) as start:
-        # Somebody else may have been faster.
+        # Check again under the lock: another `dwell live up` may have been faster.
         _require_down(background, wiring, file)
         for who, command in commands.items():
             start.run(who, command)
@@ -171,7 +149,7 @@ def _command(role: Role, file: Path, folder: Path, out: Path, policy: str | None
 
 
 def _require_down(background: Background, wiring: Wiring, file: Path) -> None:
-    """Refuse what runs already, or is left of it."""
+    """Raise a LiveError if an agent, the controller or a process of a dead agent runs."""
     name, remedy = background.problem.name, f"dwell live down {shlex.quote(str(file))}"
     if running := background.running():
         raise LiveError(f"{name} is up already: {_named(running)}; this ends it: {remedy}")
@@ -183,7 +161,7 @@ def _require_down(background: Background, wiring: Wiring, file: Path) -> None:
 
 
 def _require_ports(problem: Problem, wiring: Wiring, nodes: Sequence[str]) -> None:
-    """Refuse what cannot listen where the cell file says."""
+    """Raise a LiveError if an address of the nodes is not local, or a port is taken."""
     hosts = problem.live.hosts
     away = [
         f"live.hosts.{node}: {why_not_listen(hosts[node].address, 0)}"
@@ -204,13 +182,13 @@ def _require_ports(problem: Problem, wiring: Wiring, nodes: Sequence[str]) -> No
 
 
 class _Start:
-    """Processes that are started together: all of them, or none is left."""
+    """Start of several processes, which is undone after an error."""
 
     def __init__(self, folder: Path, out: Path, environment: Mapping[str, str]) -> None:
         self.folder, self._out, self._environment = folder, out, environment
         self._was = {path: path.exists() for path in (*folder.parents, folder, out)}
         self._started: dict[str, subprocess.Popen[bytes]] = {}
-        #: How long each log was before; None where there was none.
+        #: Size of each log before the start; None for a new log.
         self._logs: dict[str, int | None] = {}
         self._lock = -1
 
@@ -231,7 +209,7 @@ class _Start:
             os.close(self._lock)
 
     def run(self, who: str, command: Sequence[str]) -> None:
-        """Start a process, in a session of its own."""
+        """Start a process in a new session."""
         path = self.folder / f"{who}.log"
         length = path.stat().st_size if path.exists() else None
         if length is not None and length > LOG_BYTES:
@@ -251,13 +229,7 @@ class _Start:
         write_mark(self.folder / f"{who}.pid", ProcessGroup.of(process.pid))
 
     def wait(self, ports: Mapping[str, int]) -> None:
-        """Return when all listen.
-
-        Raises
-        ------
-        LiveError
-            If one of them has ended, or does not listen.
-        """
+        """Wait until all processes listen; raises a LiveError if one ends, or after `START_S`."""
         until_s = time.monotonic() + START_S
         while True:
             for who, process in self._started.items():
@@ -273,14 +245,14 @@ class _Start:
             time.sleep(LOOK_S)
 
     def _last(self, who: str) -> str:
-        """Return the last lines that a process has printed since it was started."""
+        """Return the last lines that a process has printed since its start."""
         data = (self.folder / f"{who}.log").read_bytes()[self._logs[who] or 0 :]
         lines = data.decode(errors="replace").strip().splitlines()[-LAST_LINES:]
         told = "\n".join(map(printable, lines)).removeprefix("error: ")
         return told or "it has printed nothing"
 
     def _undo(self) -> None:
-        """End what was started, and remove what was made."""
+        """End the started processes, and remove the new files and folders."""
         for process in self._started.values():
             process.terminate()
         for process in self._started.values():
@@ -290,7 +262,7 @@ class _Start:
                 process.kill()
                 process.wait()
         for who in self._started:
-            # An agent that had to be killed has left its processes.
+            # The processes of a killed agent still run.
             _end(_survivors((self.folder / who.partition("@")[2]).glob("*.pid")))
             (self.folder / f"{who}.pid").unlink(missing_ok=True)
         for who, length in self._logs.items():
@@ -315,26 +287,12 @@ def again(
     *,
     yes: bool = False,
 ) -> list[str]:
-    """Have what runs here take over an edited cell file, edited modules, or another Dwell.
+    """Apply an edited cell file, edited modules, or another version of Dwell to a running cell.
 
-    Parameters
-    ----------
-    yes : bool
-        Whether all may end where the wiring is another.
-
-    Returns
-    -------
-    list of str
-        Nodes that were ended, and have to be started.
-
-    Raises
-    ------
-    ProblemError
-        If the cell cannot run.
-    LiveError
-        If it does not run here, or is not taken over, or has another wiring and may not end.
-    TrustError
-        If the keys are not those of an operator, and nodes have other code.
+    If the wiring has changed and `yes` is set, ends all processes and returns the nodes that the
+    caller has to start again. Raises a ProblemError if the new cell cannot run; a LiveError if the
+    cell is not running here, an agent does not apply the files, or the wiring has changed without
+    `yes`; and a TrustError if new code needs an operator's keys.
     """
     kept, new = cell_here(file, root), KeptCell.of(file)
     problem = new.problem()
@@ -362,7 +320,7 @@ def again(
         return nodes
     fixed = {role.node for role in roles(problem) if role.kind in ("stamper", "sink")}
     if found == "code":
-        # The robot stops as short as it can: nodes that can be empty are the first.
+        # Nodes without stamper and sinks are first, to keep the stop of the robot short.
         agents.sort(key=lambda who: who.partition("@")[2] in fixed)
         with OperatorClient(problem, environment) as visitor:
             for who in agents:
@@ -384,10 +342,10 @@ def again(
 
 
 def _pause_s(problem: Problem, root: Path, running: Mapping[str, psutil.Process]) -> float:
-    """Return how long it will take to end all and start it: as long as the last start took."""
+    """Return the expected time for a restart of the cell, from the duration of its last start."""
     began_s = min(process.create_time() for process in running.values())
     there = _survivors((root / problem.name).glob("*/*.pid")).values()
-    # Some may have been restarted since.
+    # Use the median, as some processes may have been restarted since.
     started_s = statistics.median([began_s, *(process.create_time() for process in there)])
     longest_ms = max(task.start_ms for task in problem.pipeline.tasks.values())
     return STOPPED_S + started_s - began_s + longest_ms / 1e3
@@ -396,7 +354,7 @@ def _pause_s(problem: Problem, root: Path, running: Mapping[str, psutil.Process]
 def _hand_over(
     here: Background, who: str, process: psutil.Process, new: KeptCell, port: int | None = None
 ) -> None:
-    """Have an agent or a controller keep new bytes; with a port, it begins again and listens."""
+    """Make an agent or a controller copy the new files; with a port, await its restart."""
     place, before = here.folder / who.removeprefix("agent@"), process.cmdline()
 
     def done() -> bool:
@@ -410,7 +368,7 @@ def _hand_over(
 
 @contextmanager
 def _moved_off(visitor: OperatorClient, node: str) -> Iterator[None]:
-    """Have as few stages as possible on a node meanwhile; then what operators wanted before."""
+    """Pin the candidate with the fewest stages on a node; restore the previous pin at the end."""
     status = visitor.ask("status")
     clear = {
         name: [*placement.values()].count(node)
@@ -433,14 +391,14 @@ def _moved_off(visitor: OperatorClient, node: str) -> Iterator[None]:
 def _await_restarts(
     visitor: OperatorClient, here: Background, node: str, before: Mapping[str, psutil.Process]
 ) -> None:
-    """Return when the processes of a node are others than before, and ready."""
+    """Wait until all processes of a node have been restarted and are ready."""
 
     def ready() -> bool:
         running = _survivors((here.folder / node).glob("*.pid"))
         if any(running.get(who) in (None, process) for who, process in before.items()):
             return False
         known, now_s = visitor.ask("status")["processes"], time.time()
-        # The beat that says so may be of the process before.
+        # Ignore beats of the previous process, which are older than the new process.
         return all(
             known[who]["ready"] and known[who]["age_ms"] / 1e3 < now_s - process.create_time()
             for who, process in running.items()
@@ -464,7 +422,7 @@ def _say_left(
     running: Collection[str],
     say: Callable[[str], None],
 ) -> None:
-    """Say on which other computers a change has to be taken over, too."""
+    """Print the nodes on other computers that also have to apply the change."""
     whom = {f"controller@{problem.controller_node}": problem.controller_node}
     if found in ("code", "wiring"):
         whom |= {f"agent@{node}": node for node in problem.fabric.nodes}
@@ -481,19 +439,10 @@ def _say_left(
 
 
 def down(problem: Problem, folder: Path) -> list[str]:
-    """End a cell's agents and controller on this computer, and what dead agents have left.
+    """End a cell's processes on this computer, even of dead agents; return their names.
 
-    The controller goes first, so that its run does not end with an outage.
-
-    Returns
-    -------
-    list of str
-        Names of what was ended.
-
-    Raises
-    ------
-    LiveError
-        If something had to be killed.
+    The controller is the first, because its run would otherwise end with an outage. Raises a
+    LiveError if a process did not end by itself, and was killed.
     """
     background = Background(problem, folder)
     running = background.running()
@@ -514,7 +463,7 @@ def down(problem: Problem, folder: Path) -> list[str]:
 
 
 def _end(processes: Mapping[str, psutil.Process]) -> list[str]:
-    """Tell processes to end; returns the names of those that had to be killed."""
+    """Send SIGTERM to processes, and SIGKILL after `END_S`; return the names of the killed."""
     for process in processes.values():
         for number in (signal.SIGTERM, signal.SIGCONT):
             with suppress(psutil.NoSuchProcess):
@@ -536,13 +485,7 @@ def logs_of(root: Path, cell: str) -> dict[str, Path]:
 
 
 def log_of(root: Path, who: str, cell: str) -> Path:
-    """Return the log of a process of a cell.
-
-    Raises
-    ------
-    ProblemError
-        If it does not exist.
-    """
+    """Return the log of a process of a cell; raises a ProblemError if it does not exist."""
     known = logs_of(root, cell)
     if who not in known:
         listed = f"processes with a log: {', '.join(known)}" if known else f"no log in {root}"
@@ -551,7 +494,7 @@ def log_of(root: Path, who: str, cell: str) -> Path:
 
 
 def print_log(path: Path, *, follow: bool) -> None:
-    """Print a log; `follow` goes on with what is added, until interrupted."""
+    """Print a log; with `follow`, also print new lines until interrupted."""
     decoder = codecs.getincrementaldecoder("utf-8")("replace")
     with path.open("rb") as file:
         while True:
@@ -560,6 +503,6 @@ def print_log(path: Path, *, follow: bool) -> None:
             if not follow:
                 return
             time.sleep(LOOK_S)
-            # Its agent has begun it anew.
+            # The log was shortened: read it from the beginning.
             if path.stat().st_size < file.tell():
                 file.seek(0)

@@ -1,4 +1,4 @@
-"""`dwell check --node`: whether a node has what it needs to run its part of a live cell."""
+"""`dwell check --node`: checks whether a node can run its part of a live cell."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from dwell.model.bounds import counted
 
 @dataclass(slots=True)
 class StateTimes:
-    """How long the stages of a node take to write their states and to read them."""
+    """Times in which the stages of a node write and read their states."""
 
-    #: By task: ``snapshot_ms``, ``restore_ms`` and ``bytes``.
+    #: ``snapshot_ms``, ``restore_ms`` and ``bytes`` by task.
     tasks: dict[str, dict[str, float]] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
 
     def measure(self, problem: Problem, name: str, stage: CellStage) -> None:
-        """Call both methods of a stage that was made and not started."""
+        """Time `snapshot` and `restore` of a stage that has not been started."""
         began_s = time.perf_counter()
         try:
             data = bytes(stage.snapshot())
@@ -68,15 +68,9 @@ def check_node(
     insecure: bool = False,
     as_json: bool,
 ) -> bool:
-    """Import and make every stage and actuator of a node, and print what is missing.
-
-    Returns
-    -------
-    bool
-        Whether nothing is.
-    """
+    """Import and make all stages and actuators of a node; print the faults, return if none."""
     problem.require_node(node)
-    # As the worker's process does: the user's stages lie beside their cell file.
+    # Import the user's stages from the folder of the cell file, like a worker's process.
     sys.path.insert(0, str(cell.resolve().parent))
     wiring, faults = _wiring(problem)
     security, unsafe = _security(problem, node, environment(keys, insecure=insecure))
@@ -115,7 +109,7 @@ def _packages() -> Iterator[Fault]:
 def _security(
     problem: Problem, node: str, given: Mapping[str, str]
 ) -> tuple[Security | None, list[Fault]]:
-    """Return what protects the node's processes, or why they must not start."""
+    """Return the protection of the node's processes, or the faults that forbid their start."""
     try:
         return Security.of(problem, Role(f"agent@{node}", node, "agent"), given), []
     except TrustError as error:
@@ -125,7 +119,7 @@ def _security(
 
 
 def _wiring(problem: Problem) -> tuple[Wiring | None, list[Fault]]:
-    """Return who listens where, or what is wrong with the hosts."""
+    """Return the wiring, or the faults of the hosts."""
     try:
         return wire(problem), []
     except LiveError as error:
@@ -136,7 +130,7 @@ def _wiring(problem: Problem) -> tuple[Wiring | None, list[Fault]]:
 
 
 def _stages(problem: Problem, node: str, states: StateTimes) -> Iterator[Fault]:
-    """Yield what keeps a stage of the node from running, and time those that have a state."""
+    """Yield the faults of the node's stages, and time the stages with a state."""
     pipeline = problem.pipeline
     first = next(name for name in pipeline.tasks if not pipeline.inputs(name))
     for name, task in pipeline.tasks.items():
@@ -169,7 +163,7 @@ def _inputs(problem: Problem, name: str, stage: CellStage, where: str) -> Iterat
 
 
 def _state(name: str, run: str, stage: CellStage, state_bytes: int) -> Iterator[Fault]:
-    """Yield where the cell file and the stage disagree on whether there is a state to move."""
+    """Yield a fault if only one of cell file and stage has a state to move."""
     where = f"tasks.{name}.state_bytes"
     if state_bytes and not stage.stateful:
         yield Fault(where, f"{state_bytes}, but {run} has no methods snapshot() and restore()")
@@ -193,7 +187,7 @@ def _actuators(problem: Problem, node: str) -> Iterator[Fault]:
 
 
 def _summary(problem: Problem, wiring: Wiring, node: str) -> str:
-    """Return the node's processes, their ports, and who connects to them."""
+    """Return a table of the node's processes, their ports and their peers."""
     host = problem.live.hosts[node]
     here = [role.who for role in wiring.on(node)]
     last = host.port + PORTS_PER_ROLE * len(here) - 1
@@ -216,7 +210,7 @@ def _summary(problem: Problem, wiring: Wiring, node: str) -> str:
 
 
 def _others(wiring: Wiring, role: Role, node_of: dict[str, str], *, incoming: bool) -> str:
-    """Return the other nodes that a process is reached from, or connects to."""
+    """Return the other nodes that connect to a process, or to which it connects."""
     nodes = {
         node_of[link.source if incoming else link.target]
         for link in wiring.wires

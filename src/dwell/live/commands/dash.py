@@ -21,10 +21,10 @@ from dwell.live.commands.log_format import LogFormat, Logs, begin_log
 if TYPE_CHECKING:
     from dwell.dash.server import Dash
 
-#: Where a page is served where nobody says.
+#: Default port of the page.
 PORT = 8780
 CELL = Path("cell.yaml")
-#: At least 128 bits in base64; no sign that a header, a cookie or an address would change.
+#: At least 128 bits in base64, with characters that need no escapes in headers, cookies and URLs.
 TOKEN = re.compile(r"[A-Za-z0-9_-]{22,200}")
 
 
@@ -98,7 +98,7 @@ def dash(
 
 
 def _kept(file: Path) -> str:
-    """Return the token in a file; a new one is made, and kept there, where there is none."""
+    """Return the token in a file; if the file is missing, write a new token to it."""
     from dwell.dash.gate import new_token
     from dwell.files import write_whole
 

@@ -1,4 +1,4 @@
-"""The part of `dwell doctor` about live cells: CPUs, clocks, ports, certificates."""
+"""Checks of `dwell doctor` for live cells: CPUs, clocks, ports, certificates."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from dwell.live.local.cgroups import find_cgroups
 from dwell.live.wire.local_addresses import is_here, taken_ports
 from dwell.model import Host, Problem
 
-#: How many ports are looked at where no cell says which.
+#: Number of ports to check without a cell file.
 DEFAULT_PORTS = 50
-#: Clocks that take long to be read.
+#: Clock sources whose reading is slow.
 SLOW_CLOCKS = ("acpi_pm", "hpet", "jiffies", "refined-jiffies")
 
 
 def checks(problem: Problem | None, keys: Path | None) -> Iterator[Part]:
-    """Yield CPUs, clocks, ports and certificates."""
+    """Yield the findings about CPUs, clocks, ports and certificates."""
     yield Part("CPU", list(_cpu(MachineCounters(os.sched_getaffinity(0)))))
     yield Part("clocks", [_synchronised(), _clock_source()])
     yield Part("ports", [_ports(problem)])
@@ -34,7 +34,7 @@ def checks(problem: Problem | None, keys: Path | None) -> Iterator[Part]:
 
 
 def _cpu(counters: MachineCounters) -> Iterator[Finding]:
-    """Yield what this process may use, and what disturbs it."""
+    """Yield the findings about the CPUs of this process, and their disturbances."""
     seen, usable = counters.conditions(), len(os.sched_getaffinity(0))
     yield Finding("CPUs", True, f"{usable} of {seen.cpus} for this process; {processor()}")
     quota = _quota()
@@ -55,7 +55,7 @@ def _cpu(counters: MachineCounters) -> Iterator[Finding]:
 
 
 def _quota() -> float | None:
-    """Return the CPUs that the quotas of this process's group and those around it leave it."""
+    """Return the smallest quota of this process's control group and its parents, in CPUs."""
     try:
         groups = find_cgroups()
         lines = Path("/proc/self/cgroup").read_text(encoding="utf-8").splitlines()
@@ -73,7 +73,7 @@ def _quota() -> float | None:
 
 
 def _limit(folder: Path) -> float | None:
-    """Return the quota of one group, CPUs."""
+    """Return the quota of a group in CPUs, if any."""
     with suppress(OSError, ValueError):
         quota, period = (folder / "cpu.max").read_text().split()
         return None if quota == "max" else int(quota) / int(period)
@@ -84,7 +84,7 @@ def _limit(folder: Path) -> float | None:
 
 
 class _Timex(ctypes.Structure):
-    """The head of what adjtimex(2) fills in."""
+    """First fields of the structure of adjtimex(2)."""
 
     _fields_ = (
         ("modes", ctypes.c_uint),
@@ -98,7 +98,7 @@ class _Timex(ctypes.Structure):
 
 
 def _synchronised() -> Finding:
-    """Ask the kernel whether something keeps its clock right; nothing is set."""
+    """Read from the kernel whether its clock is synchronised, without a change to the clock."""
     name, unsynchronised = "synchronised", 0x40
     state = _Timex()
     try:
@@ -127,7 +127,7 @@ def _clock_source() -> Finding:
 
 
 def _ports(problem: Problem | None) -> Finding:
-    """Look at the ports of the nodes that are this computer, or at the first that cells take."""
+    """Check the ports of the cell's nodes on this computer, or the default ports of cells."""
     try:
         wanted = _ports_here(problem)
     except LiveError as error:
@@ -160,7 +160,7 @@ def _ports_here(problem: Problem | None) -> set[int]:
 
 
 def _certificates(keys: Path | None, problem: Problem | None) -> Iterator[Finding]:
-    """Look at a keyring, or at all in a folder."""
+    """Check a keyring, or all keyrings in a folder."""
     name = "keyring"
     if keys is None:
         yield Finding(name, True, "none is named, by --keys or DWELL_KEYS")

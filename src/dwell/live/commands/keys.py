@@ -1,4 +1,4 @@
-"""`dwell keys`: who may take part in a live cell."""
+"""`dwell keys`: certificates of the members of a live cell."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def init(
 
 
 def _addresses(problem: Problem, node: str) -> list[str]:
-    """Return where a node is reached, from anywhere."""
+    """Return all addresses of a node, as other nodes see them."""
     from dwell.model import Host
 
     host = problem.live.hosts.get(node) or Host()

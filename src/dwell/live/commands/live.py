@@ -37,9 +37,9 @@ from dwell.live.host.state_folder import state_root
 if TYPE_CHECKING:
     from dwell.live.host.operator_client import OperatorClient
 
-#: Time between two looks of ``status --watch``.
+#: Period of ``status --watch``.
 WATCH_S = 1.0
-#: How long a move that was asked for is waited for.
+#: Longest wait for the end of a requested move.
 MOVES_S = 3.0
 
 Cpus = Annotated[
@@ -169,7 +169,7 @@ def controller(
 
 @contextmanager
 def _bad_parameters() -> Iterator[None]:
-    """Have an option that is wrong told with the command's usage."""
+    """Report an invalid option together with the command's usage."""
     from dwell.live.host.node_command import OptionError
 
     try:
@@ -260,7 +260,7 @@ def status(
 
 
 def _watch(visitor: OperatorClient, *, stages: bool, as_json: bool) -> NoReturn:
-    """Show how a cell is every second, until interrupted."""
+    """Print the status of a cell every second until interrupted."""
     screen = sys.stdout.isatty() and not as_json
     while True:
         until_s = time.monotonic() + WATCH_S
@@ -275,7 +275,7 @@ def _watch(visitor: OperatorClient, *, stages: bool, as_json: bool) -> NoReturn:
 
 
 def _drawn(lines: list[str]) -> str:
-    """Return lines as they replace what a terminal shows, as many as it has room for."""
+    """Return text that replaces the content of a terminal by as many lines as fit."""
     width, height = shutil.get_terminal_size()
     more = len(lines) - (height - 1)
     if more > 0:
@@ -534,7 +534,7 @@ def _ask(
     problem = cell_here(cell, state_root()).problem()
     with OperatorClient(problem, environment(keys, insecure=insecure)) as visitor:
         answer = visitor.ask(what, about)
-        # The answer comes before the move that was asked for.
+        # The controller answers before the end of the requested move.
         until_s = time.monotonic() + MOVES_S
         while answer.get("moving_to") and time.monotonic() < until_s:
             time.sleep(0.1)
@@ -547,13 +547,7 @@ def _ask(
 
 
 def status_lines(status: dict[str, Any], *, stages: bool = False) -> list[str]:
-    """Return a status as lines of text: first what is wrong, and who is not well.
-
-    Parameters
-    ----------
-    stages : bool
-        Whether times of stages and counts of flows follow.
-    """
+    """Return a status as lines of text, troubles first, and with `stages` also stages and flows."""
     headline = status["headline"]
     lines = [f"{status['cell']} is {status['health']}: {headline}"] if headline else []
     if status["health"] == "absent":
@@ -603,7 +597,7 @@ def status_lines(status: dict[str, Any], *, stages: bool = False) -> list[str]:
 
 
 def _stage_lines(status: dict[str, Any]) -> list[str]:
-    """Return tables of stages and flows; without a complete window, that there is none yet."""
+    """Return tables of stages and flows, or a note before the first complete window."""
     if not status.get("stages"):
         return ["stages and flows: no window has been counted yet"]
     columns: tuple[str, ...] = ("jobs", "replaced", "dropped")

@@ -1,4 +1,4 @@
-"""`dwell live run`: a cell on this machine, its scenario, and what came of it."""
+"""`dwell live run`: runs a cell on this machine under a scenario, and reports the results."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ from dwell.report.phases import PhaseRow, phase_rows, phase_table
 from dwell.report.run_header import RunHeader
 from dwell.report.table import table_text
 
-#: A folder with this file is a live run's, and may be replaced by the next.
+#: File that marks the folder of a live run, which the next run may replace.
 MARK = ".dwell-live-run"
-#: What the cell did before everybody was there belongs to the run, up to so many seconds of it.
+#: Longest time before all processes are ready that belongs to the run.
 MOST_BEFORE_S = 4.0
-#: Of a cell that nothing is played on, and of what a scenario has after its last change.
+#: Length of a run without disturbances, and time after the last change of a scenario.
 USUAL_S, AFTER_S = 60.0, 16.0
 
 
@@ -63,14 +63,10 @@ def run_live(
     out: Path | None,
     as_json: bool,
 ) -> None:
-    """Run the cell, save the run, write its report, print what happened (see `dwell live run`).
+    """Run the cell, save the run, write its report, print a summary (see `dwell live run`).
 
-    Interrupted, it ends everything and reports on what there is.
-
-    Raises
-    ------
-    DwellError
-        If the cell has tasks without a stage, does not come up, or the folder holds something else.
+    An interrupt ends the cell and reports the run so far. Raises a DwellError if a task has no
+    stage, a process does not start, or the folder has other content.
     """
     problem = dwell.load(file)
     if policy is not None or estimator is not None:
@@ -119,12 +115,9 @@ def run_live(
 
 
 def _announce_left_out() -> tuple[bool, bool]:
-    """Say what a run will be without, as the packages are not here that make it.
+    """Print which results will be missing because of missing packages.
 
-    Returns
-    -------
-    tuple of bool
-        Whether there will be a report, and whether there will be tables.
+    Returns whether the run will have a report, and whether it will have tables.
     """
     lacking = not_installed("sim", "report")
     if not lacking:
@@ -141,27 +134,27 @@ def _announce_left_out() -> tuple[bool, bool]:
 
 @dataclass(slots=True)
 class _ObservedRun(Played):
-    """A played run, and its observer: neither is known to its controller."""
+    """Record of the applied changes and the observer, which the controller does not know."""
 
     observer: CellObserver | None = None
 
     def on(self) -> list[Disturbed]:
-        """Return what is on now, as it is shown."""
+        """Return the active disturbances for the printed lines."""
         return disturbed(self.active(), self.problem.fabric)
 
     def observed(self, span: tuple[int, int] | None) -> dict[str, Any]:
-        """Return what the cell's observer has to say of a run with this first and last release."""
+        """Return the observer's notes about a run with this first and last release."""
         if self.observer is None or span is None:
             return {}
         return dict(self.observer.told(span[0]))
 
     def look(self) -> Mapping[str, float]:
-        """Return what the cell's observer sees now."""
+        """Return the present values of the cell's observer."""
         return {} if self.observer is None else self.observer.look(time.monotonic_ns())
 
 
 def _cpus(problem: Problem) -> dict[str, int]:
-    """Give the robots one CPU, and the edge another where there is one."""
+    """Return the CPU of each node: the first for robots, the last for other nodes."""
     there = sorted(os.sched_getaffinity(0))
     if len(there) < 2:
         typer.echo("note: there is one CPU only; robots and edge share it", err=True)
@@ -172,7 +165,7 @@ def _cpus(problem: Problem) -> dict[str, int]:
 
 
 def _watch_from_start(cell: Loopback, seconds: float, played: _ObservedRun) -> None:
-    """Start the cell, and play the scenario."""
+    """Start the cell, load its observer, and apply the scenario."""
     with working("starting the cell"):
         cell.start()
     earliest_ns = time.monotonic_ns() - round(MOST_BEFORE_S * 1e9)
@@ -189,7 +182,7 @@ def _watch_from_start(cell: Loopback, seconds: float, played: _ObservedRun) -> N
 
 
 def _watch(cell: Loopback, seconds: float, played: _ObservedRun) -> None:
-    """Play the changes at their times, and show how the cell is."""
+    """Apply the changes at their times, and print the state of the cell."""
     status: Mapping[str, Any] = {}
     answered_s, lines = 0.0, Lines()
 
@@ -199,21 +192,21 @@ def _watch(cell: Loopback, seconds: float, played: _ObservedRun) -> None:
             status = cell.sample(LOOK_S)
             answered_s = (time.monotonic_ns() - cell.begun_ns) / 1e9
         except LiveError:
-            pass  # the next line says that the controller is silent
+            pass  # the next line shows that the controller is silent
         lines.show(CellState(at_s, status, answered_s, played.look(), played.on()))
 
     play_on(cell, played, seconds, show)
 
 
 class _Table(Protocol):
-    """Columns of a run's table, whoever keeps them."""
+    """Columns of a run's table, in Polars or in plain lists."""
 
     def __getitem__(self, column: str, /) -> Sequence[Any] | Any: ...
 
 
 @dataclass(frozen=True, slots=True)
 class _Outcome:
-    """What a run was, as far as it is told; what needs tables is empty where there are none."""
+    """Printed results of a run; without tables, `phases` and `report` are empty."""
 
     meta: Mapping[str, Any]
     cycles: int
@@ -227,7 +220,7 @@ class _Outcome:
 
     @classmethod
     def of(cls, meta: Mapping[str, Any], cycles: _Table, decisions: _Table) -> _Outcome:
-        """Count what was missed, lost and moved."""
+        """Count missed deadlines, lost cycles and moves."""
         missed, moved = list(cycles["missed"]), moves_in(decisions)
         guard_moves = sum(move.by_guard for move in moved)
         return cls(
@@ -241,11 +234,11 @@ class _Outcome:
 
 
 def _told(run: Run, out: Path, *, reported: bool) -> _Outcome:
-    """Tell a run by its tables, and write its report."""
+    """Return the results of a run from its tables, and write its report."""
     outcome = _Outcome.of(run.meta, run.cycles, run.decisions)
     phases = phase_rows(run, RunHeader.of(run))
     page = out / "report.html"
-    # A run that ended within its warm-up has nothing to report on.
+    # A run that ended during its warm-up gets no report.
     if run.windows.filter(~run.windows["warmup"]).is_empty():
         return replace(outcome, phases=phases, instead="no report: it ended within its warm-up")
     if not reported:
@@ -255,7 +248,7 @@ def _told(run: Run, out: Path, *, reported: bool) -> _Outcome:
 
 
 def _counted(played: _ObservedRun, folder: Path) -> _Outcome:
-    """Tell a run that stays a journal, and note in it what was played."""
+    """Return the results of a run from its journal, and record the scenario in it."""
     meta, tables = read_plain_journal(folder)
     releases, span = tables["cycles"]["release_ns"], None
     if releases and "origin_ns" in meta:

@@ -1,4 +1,4 @@
-"""Lines about a live cell while it runs."""
+"""Printed lines about the state of a running live cell."""
 
 from __future__ import annotations
 
@@ -11,24 +11,16 @@ import typer
 
 from dwell.model.disturbed import Disturbed
 
-#: Age from which an answer of the controller counts as silence.
+#: Age of the controller's last answer above which the controller is silent.
 SILENT_S = 1.5
 
 
 @dataclass(frozen=True, slots=True)
 class CellState:
-    """State of a cell at an instant.
+    """State of a cell at `at_s`, the time since its begin.
 
-    Parameters
-    ----------
-    at_s : float
-        Time since the cell began.
-    status : mapping
-        The controller's last answer; empty before the first.
-    answered_s : float
-        Time of that answer.
-    observed : mapping of str to float
-        Values of the cell's observer, by names with units; ``error_mm`` is shown.
+    `status` is the controller's last answer, at `answered_s` (empty before the first). `observed`
+    has the values of the cell's observer by names with units; the lines show ``error_mm``.
     """
 
     at_s: float
@@ -39,35 +31,35 @@ class CellState:
 
     @property
     def error_mm(self) -> float:
-        """Tracking error of the last second; NaN where unknown."""
+        """Tracking error from the observer; NaN if unknown."""
         return self.observed.get("error_mm", math.nan)
 
     @property
     def window(self) -> Mapping[str, Any]:
-        """The last closed window."""
+        """Metrics of the last complete window."""
         window: Mapping[str, Any] = self.status.get("window") or {}
         return window
 
     @property
     def disturbances(self) -> str:
-        """The disturbances that are on, in words."""
+        """Text about the active disturbances."""
         return "; ".join(f"{item.kind} ({item.what})" for item in self.active)
 
     @property
     def silent_s(self) -> float:
-        """How long the controller has not answered; 0 where that is not long."""
+        """Time since the controller's last answer; 0 up to `SILENT_S`."""
         silent_s = self.at_s - self.answered_s
         return silent_s if silent_s > SILENT_S else 0.0
 
 
 @dataclass(slots=True)
 class Lines:
-    """A line whenever something has changed, for logs."""
+    """Prints a line at each change of a cell's state."""
 
     last: tuple[object, ...] = ()
 
     def show(self, state: CellState) -> None:
-        """Print a line if there is news."""
+        """Print a line if the state has changed."""
         status, window = state.status, state.window
         silent = state.silent_s > 0
         headline = "" if silent else status.get("headline") or ""

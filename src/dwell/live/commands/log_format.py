@@ -22,7 +22,7 @@ Logs = Annotated[
 
 
 def begin_log(log_format: LogFormat, who: str) -> None:
-    """Have a process print its log in a form."""
+    """Set the form of this process's log."""
     if log_format is LogFormat.JSON:
         from dwell.live.log import log_as_json
 

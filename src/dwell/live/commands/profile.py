@@ -1,4 +1,4 @@
-"""`dwell profile`: samples of what tasks and links take here, for cells to replay."""
+"""`dwell profile`: measures samples of tasks and links, which cells replay."""
 
 from __future__ import annotations
 
@@ -75,8 +75,8 @@ def measure(
     path = out or FOLDER / f"{file_name(node)}.parquet"
     sources = _sources(task)
     factories = _factories(inputs or (), sources)
-    # First the cores, then everything else: numerical packages start as many threads as they see
-    # cores when they are imported. What the tasks print must not get into the results.
+    # Set the cores first: at their import, numerical packages start one thread per available core.
+    # Keep the output of the tasks out of the results.
     with pinned(choose_cores(core)), redirect_stdout(sys.stderr):
         from dwell.calibration.measure import Settings
         from dwell.calibration.profile_file import require_free, task_name, write_profile
@@ -161,7 +161,7 @@ def link(
 
 
 def _refuse_options(context: typer.Context, command: str) -> None:
-    """Refuse options of measuring before a subcommand, where they would have no effect."""
+    """Raise a ProfileError for options before a subcommand, which would have no effect."""
     for parameter in context.command.params:
         source = context.get_parameter_source(parameter.name or "")
         if source is not None and source.name == "COMMANDLINE":
@@ -198,7 +198,7 @@ def _measured(
 
 
 def _factories(declared: Sequence[str], tasks: Collection[str]) -> dict[str, str]:
-    """Return what makes each task's inputs, by the name of the task."""
+    """Return the names of the functions that make inputs, by task."""
     named: dict[str, str] = {}
     for text in declared:
         task, equals, name = text.rpartition("=")
@@ -212,7 +212,7 @@ def _factories(declared: Sequence[str], tasks: Collection[str]) -> dict[str, str
 
 
 def _sources(declared: Sequence[str]) -> dict[str, str]:
-    """Return what each task is, by name."""
+    """Return the names of the tasks' functions, by task."""
     sources: dict[str, str] = {}
     for text in declared:
         task, equals, name = text.partition("=")
@@ -225,7 +225,7 @@ def _sources(declared: Sequence[str]) -> dict[str, str]:
 
 
 def _say(what: str) -> None:
-    # A line and no spinner: its thread would take part in what is measured.
+    # Print a line: the thread of a spinner would disturb the measurement.
     if sys.stderr.isatty():
         typer.echo(what, err=True)
 

@@ -14,8 +14,8 @@ from dwell.cli.output import write_file
 from dwell.live.log import say
 from dwell.model import Problem
 
-#: Files and connections that a process of a cell may have open: what only connects, and says
-#: nothing, must not keep it from its work.
+#: Most open files and connections of a process; large, as silent connections must not stop its
+#: work.
 MOST_FILES = 65_536
 
 UNIT = """\
@@ -39,7 +39,7 @@ RestartSec=1
 [Install]
 WantedBy=multi-user.target
 """
-#: Settings of each service beside those that both have.
+#: Additional settings of each service.
 AGENT = f"""\
 # An agent that hangs is replaced; its processes go on.
 WatchdogSec=30
@@ -64,11 +64,11 @@ WatchdogSec=60
 TimeoutStopSec=60
 LimitNOFILE={MOST_FILES}
 """
-#: Where systemd puts the folder that StateDirectory= names.
+#: Variable with the path of the folder that StateDirectory= names.
 STATE = "${STATE_DIRECTORY}"
-#: Signs that end a word, or mean something in one.
+#: Characters that end a word, or have a special meaning in it.
 SPECIAL = frozenset(" \t\"'\\;")
-#: Signs that the name of a unit has as they are.
+#: Characters that need no escape in the name of a unit.
 PLAIN_SIGN = re.compile("[A-Za-z0-9:_.]")
 
 
@@ -82,21 +82,9 @@ def unit_texts(
     insecure: bool = False,
     program: Sequence[str] = (sys.executable, "-m", "dwell"),
 ) -> dict[str, str]:
-    """Return the units of a node by the names of their files.
+    """Return the units of a node by file name; raises a ProblemError if the node is unknown.
 
-    Parameters
-    ----------
-    cell : Path
-        The cell file, as the services shall read it.
-    user : str
-        Name of the user that the services run as.
-    program : sequence of str
-        Command that is `dwell`.
-
-    Raises
-    ------
-    ProblemError
-        If the cell has no such node.
+    The services run as `user`, read the file `cell`, and run `dwell` with the command `program`.
     """
     problem.require_node(node)
     variables = {} if keys is None else {"DWELL_KEYS": str(keys)}
@@ -130,7 +118,7 @@ def unit_texts(
 
 
 def escaped_name(name: str) -> str:
-    """Return a name as part of the name of a unit, as systemd-escape(1) writes it."""
+    """Return a name with the escapes of systemd-escape(1), for the name of a unit."""
     return "".join(
         sign if PLAIN_SIGN.fullmatch(sign) and (sign, i) != (".", 0) else _hexadecimal(sign)
         for i, sign in enumerate(name)
@@ -142,12 +130,12 @@ def _hexadecimal(sign: str) -> str:
 
 
 def _escaped(text: str) -> str:
-    """Return a text in which systemd expands no specifier."""
+    """Return a text with escaped specifiers of systemd."""
     return text.replace("%", "%%")
 
 
 def _quoted(word: str, *, command: bool = False) -> str:
-    """Return a word as a unit has it: one word, whatever signs it has (systemd.syntax(7))."""
+    """Return a word with the quotes and escapes of a unit (systemd.syntax(7))."""
     text = _escaped(word)
     if command:
         text = text.replace("$", "$$").replace(f"${STATE}", STATE)
@@ -167,12 +155,9 @@ def write_units(
     keys: Path | None,
     insecure: bool,
 ) -> list[Path]:
-    """Write the units of a node, and have systemd look at them where there is one.
+    """Write the units of a node, and verify them with systemd if it is installed.
 
-    Raises
-    ------
-    ProblemError
-        If the cell has no such node.
+    Raises a ProblemError if the node is unknown.
     """
     texts = unit_texts(
         problem,
@@ -192,7 +177,7 @@ def write_units(
 
 
 def verify(files: Sequence[Path]) -> list[str]:
-    """Return what systemd has to say against units; nothing where it is not installed."""
+    """Return systemd's complaints about units; empty if systemd is not installed."""
     program = shutil.which("systemd-analyze")
     if program is None:
         return []

@@ -1,1 +1,1 @@
-"""The processes of a node: an agent starts them, watches them and gives them time and transport."""
+"""Processes of a node: the agent, which starts and supervises the others, and their hosting."""

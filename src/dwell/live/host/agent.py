@@ -1,6 +1,7 @@
-"""Agent: one a node. It keeps the cell's processes there running, and carries none of its data.
+"""Agent: the process on each node that keeps the cell's other processes there running.
 
-It also reports the load of the node's CPU, and on one node it is the detour for small messages.
+It reports the load of the node's CPU. The agent of the relay node also relays small messages. No
+data of stages passes through an agent.
 """
 
 from __future__ import annotations
@@ -25,18 +26,18 @@ from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import roles
 from dwell.model.instants import NEVER_NS
 
-#: Time between two looks at the processes: while all run, and while one has to be started.
+#: Period of the checks of the processes: while all run, and while a process waits for its start.
 LOOK_NS, LOOK_SOON_NS = 200_000_000, 20_000_000
-#: Time between two reports of the CPU.
+#: Period of the reports of the CPU's load.
 LOAD_NS = 250_000_000
-#: Time between two looks at the memory of the processes, and at how long their logs are.
+#: Period of the checks of the processes' memory and of the size of their logs.
 HOUSEKEEPING_NS = 1_000_000_000
-#: Age from which what a gauge showed counts no more.
+#: Age from which a gauge's value is invalid.
 GAUGE_S = 2.0
 
 
 def busy_ns_of(cpus: Iterable[int]) -> int:
-    """Core-nanoseconds that CPUs have been busy since the machine was started, by its 10 ms."""
+    """Core-nanoseconds that CPUs have been busy since the boot, in steps of 10 ms."""
     times = psutil.cpu_times(percpu=True)
     busy_s = 0.0
     for cpu in cpus:
@@ -46,13 +47,7 @@ def busy_ns_of(cpus: Iterable[int]) -> int:
 
 
 class Gauge:
-    """Asks a user's function for a utilisation, in a thread of its own: it may fail, or hang.
-
-    Parameters
-    ----------
-    read : callable
-        Returns a share from 0 to 1.
-    """
+    """Reads a utilisation (0 to 1) from a user's function in a thread, as it may fail or block."""
 
     def __init__(self, read: Callable[[], float], every_s: float = LOAD_NS / 1e9) -> None:
         self._read, self._every_s = read, every_s
@@ -74,11 +69,11 @@ class Gauge:
             time.sleep(self._every_s)
 
     def value(self) -> float:
-        """Return the last value; -1 where there is none that counts."""
+        """Return the last value; -1 if the function failed or has not returned for `GAUGE_S`."""
         return self._value if self._silent_s() < GAUGE_S else -1.0
 
     def trouble(self) -> str:
-        """Return what keeps it from telling, or nothing."""
+        """Return why no value is available; empty if one is."""
         silent_s = self._silent_s()
         if silent_s < GAUGE_S:
             return self._trouble
@@ -89,17 +84,7 @@ class Gauge:
 
 
 class Agent:
-    """See the module.
-
-    Parameters
-    ----------
-    busy_ns : callable
-        Returns the core-nanoseconds that the node has been busy so far.
-    stages : callable, optional
-        Returns the counts of the node's workers.
-    changed : callable
-        Returns which files have changed since the node began; empty for none.
-    """
+    """Logic of the agent's role; `changed` returns a sentence about changed files, or none."""
 
     def __init__(
         self,
@@ -115,16 +100,16 @@ class Agent:
         self._stages: tuple[StageCounts, ...] = ()
         self._busy_ns, self._accelerator = busy_ns, accelerator
         self.cpu_clock: Callable[[], int] = time.process_time_ns
-        # No guard waits for it: it carries nothing that a cycle needs.
+        # It may beat slowly: no cycle depends on it, so no guard waits for its beats.
         hears = [place.stamper]
         if place.seals is not None:
-            # They say which roster they use.
+            # Beats of agents contain the number of their roster.
             hears += [
                 (role.node, role.who) for role in roles(place.problem) if role.kind == "agent"
             ]
         self.pulse = Pulse(place, self._state, hears=hears, every=AGENT_BEAT)
         self._relays = place.node == place.problem.relay_node
-        # What is done again and again, every so often; and when each is due.
+        # Periodic tasks with their periods; `_due_ns` has the time of the next call.
         self._chores: dict[Callable[[int], None], int] = {
             lambda _: supervisor.tend(): HOUSEKEEPING_NS,
             self._count: REPORT_NS,
@@ -144,13 +129,13 @@ class Agent:
         self._spent: dict[str, int] = {"own": 0, "shadow": 0}
 
     def subscriptions(self) -> Iterable[str]:
-        """Key expressions that it wants to hear."""
+        """Yield the key expressions to subscribe to."""
         yield from self.pulse.subscriptions()
         if self._relays:
             yield self.place.keys.relay(f"{self.place.keys.root}/**")
 
     def receive(self, sample: Arrival, now_ns: int) -> int | None:
-        """Take a message in; carry it on where this is the detour."""
+        """Read a beat, or queue a message to relay; return when to relay it, if at all."""
         if self.pulse.hears(sample):
             self.pulse.receive(sample, now_ns)
             return None
@@ -171,7 +156,7 @@ class Agent:
         return not self.supervisor.stuck(), "; ".join(note for note in notes if note)
 
     def wake(self, now_ns: int) -> int:
-        """Look after the processes, report the load, beat; returns what is due next."""
+        """Check the processes, report the load, relay, beat; return the time of the next call."""
         if self._setback.back_ns(now_ns):
             self._due_ns = dict.fromkeys(self._chores, now_ns)
             self._looked_ns = -NEVER_NS
@@ -200,7 +185,7 @@ class Agent:
         return self._looked_ns + (LOOK_SOON_NS if self.supervisor.pending else LOOK_NS)
 
     def _try(self, chore: Callable[[int], None], now_ns: int) -> None:
-        """Do a chore, or leave it for the next time where strangers hold all descriptors."""
+        """Run a task; skip it if other programs hold all file descriptors."""
         try:
             chore(now_ns)
         except OSError as error:
@@ -210,7 +195,7 @@ class Agent:
             self.place.complain(LiveError(f"{who}: no file can be opened ({error.strerror})"))
 
     def _tell(self, now_ns: int) -> None:
-        """Tell the controller what came over the detour; of beats the last, and less often."""
+        """Send relayed messages to the controller; beats less often, and only the newest."""
         messages = self._gathered.taken()
         if now_ns >= self._beats_ns:
             messages += self._beats.taken()
@@ -222,14 +207,14 @@ class Agent:
         self.place.transport.put(key, encode(Carried(tuple(messages))))
 
     def _count(self, _: int) -> None:
-        """Read what the next report of the load says of stages."""
+        """Read the stage counts for the next report of the load."""
         self._stages = tuple(self._read_stages())
 
     def _report(self, now_ns: int) -> None:
         place = self.place
         processes = {who: round(s * 1e9) for who, s in self.supervisor.cpu_seconds().items()}
         for who, cpu_ns in processes.items():
-            # One that was started again counts from 0 again.
+            # The CPU time of a restarted process starts at 0.
             before = self._read.get(who, 0)
             grown = cpu_ns - before if cpu_ns >= before else cpu_ns
             self._spent["shadow" if who.endswith(".shadow") else "own"] += grown

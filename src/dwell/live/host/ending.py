@@ -1,4 +1,4 @@
-"""Signals that tell a process to end in good order, and those that end it at once."""
+"""Handlers of the signals that end a process: cleanly at the first, at once at the second."""
 
 from __future__ import annotations
 
@@ -18,18 +18,11 @@ def end_when_told(
     at_once: Callable[[], None],
     again: Callable[[], object] | None = None,
 ) -> None:
-    """Have SIGTERM, SIGINT and SIGHUP set an event.
+    """Set an event at SIGTERM, SIGINT or SIGHUP; call `at_once` at a later SIGTERM or SIGINT.
 
-    The end of a terminal brings several SIGHUP, and none to a process that was started to outlive
-    it (`nohup`).
-
-    Parameters
-    ----------
-    at_once : callable
-        Called when SIGTERM or SIGINT comes after another of these signals.
-    again : callable, optional
-        Called in a thread at SIGHUP instead, if the process leads a session: a service, or what
-        `dwell live up` has started, has no terminal.
+    A closing terminal sends several SIGHUP, so a repeated SIGHUP has no effect. A process that
+    ignores SIGHUP (`nohup`) keeps ignoring it. A process that leads a session has no terminal (a
+    service, or started by `dwell live up`): SIGHUP then calls `again` in a thread, if given.
     """
     told = False
     ending = [signal.SIGTERM, signal.SIGINT]
@@ -44,7 +37,7 @@ def end_when_told(
         if told and number != signal.SIGHUP:
             at_once()
         if not told:
-            # In this thread the signal may have come inside `stopped.wait`, whose lock is held.
+            # The signal may interrupt `stopped.wait`, which holds the lock in this thread.
             threading.Thread(target=stopped.set, name="ending", daemon=True).start()
         told = True
 
@@ -53,10 +46,10 @@ def end_when_told(
 
 
 def _restore_in_children(handle: Handler, usual: Mapping[int, Handler]) -> None:
-    """Restore the usual handlers in children that this process forks.
+    """Restore the previous handlers in children that this process forks.
 
-    A child of a stage has to end when it is terminated, also right after its start: the signals
-    are blocked until the child has its handlers.
+    SIGTERM must end a child of a stage, even right after the fork. So the signals are blocked
+    during the fork, until the child has its handlers.
     """
     masks = threading.local()
 

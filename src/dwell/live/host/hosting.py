@@ -1,4 +1,4 @@
-"""Hosting: a role gets a thread, a clock and a transport, and becomes a process."""
+"""Hosting: runs a role in a process, with a thread, a clock and a transport."""
 
 from __future__ import annotations
 
@@ -19,73 +19,53 @@ from dwell.model import Problem
 
 Clock = Callable[[], int]
 
-#: No role is left alone for longer, so that its thread notices that it shall stop.
+#: Longest sleep of a role's thread, which then checks whether it has to stop.
 LONGEST_SLEEP_S = 0.2
 
 
 def clock_of(problem: Problem) -> Clock:
-    """Return what all processes of a live cell read the time from.
+    """Return the clock of all processes of a live cell.
 
-    Where clocks are kept synchronous by others, that is the time of day; elsewhere a clock that
-    nobody sets.
+    This is the time of day if the cell file states that the system synchronises it (`clock:
+    system`), else the monotonic clock.
     """
     return time.time_ns if problem.live.clock == "system" else time.monotonic_ns
 
 
 class Platform:
-    """Clock and transport of the processes of a node; a testbed's has faults around both.
+    """Clock and transport of the processes of a node; a testbed adds faults to both."""
 
-    Attributes
-    ----------
-    program : sequence of str
-        Module, and its first arguments, that runs one process of a cell.
-    """
-
+    #: Module that runs one process of a cell, and its first arguments.
     program: Sequence[str] = ("dwell.live.host.role_command",)
 
     def clock(self, problem: Problem, node: str) -> Clock:
-        """Return what the processes of a node read the time from."""
+        """Return the clock of the processes of a node."""
         return clock_of(problem)
 
     def transport(self, security: Security, who: str, node: str) -> Transport:
-        """Open the sessions of a process on a node.
-
-        Raises
-        ------
-        LiveError
-            If there is no such process, or a port is taken.
-        """
+        """Open the sessions of a process; raises a LiveError if a port is taken."""
         return security.transport(who)
 
 
-#: As everybody's is, but for a testbed's.
+#: Platform of all cells, except for those in a testbed.
 PLAIN = Platform()
 
 
 def keep_collections_short() -> None:
-    """Spare the garbage collector what there is now: modules, settings, sessions.
+    """Exclude all present objects (modules, settings, sessions) from garbage collection.
 
-    It stops all threads while it looks at everything, for 15 ms after the imports alone.
+    A full collection stops all threads: for 15 ms with the imported modules alone.
     """
     gc.collect()
     gc.freeze()
 
 
 class Hosted:
-    """A role on a transport: called by one thread at a time, and woken when something is due.
+    """A role with its transport: calls the role from one thread at a time, and when it is due.
 
-    Parameters
-    ----------
-    clock : callable
-        The node's clock, nanoseconds.
-    heard : callable, optional
-        Called, outside the role, after every message; `news` is released where it says so.
-    stopped : Event, optional
-        Ends `run` within a fifth of a second.
-    hurry : Event, optional
-        Set when something is due sooner than was said; roles that take turns share one.
-    complain : callable, optional
-        Told of a message at which the role has failed; it goes on with the next one.
+    `heard` is called after each message, without the lock; if it returns true, `news` is released.
+    `hurry` is set when a message makes the role due sooner; roles of one thread share it. If the
+    role fails at a message, `complain` reports the error, and the role gets the next message.
     """
 
     def __init__(
@@ -109,13 +89,13 @@ class Hosted:
         self.hear_through(transport)
 
     def hear_through(self, transport: Transport) -> None:
-        """Have the role get what a transport brings."""
+        """Subscribe the role to its messages on a transport."""
         for key in self.role.subscriptions():
             transport.subscribe(key, self._receive)
 
     def _receive(self, sample: Arrival) -> None:
         with self.lock:
-            # Also where it has waited for the last that was done: nothing follows that.
+            # The role may have stopped while this thread waited for the lock.
             if self.stopped.is_set():
                 return
             wanted_ns = self._taken(sample)
@@ -128,7 +108,7 @@ class Hosted:
             self.news.release()
 
     def _taken(self, sample: Arrival) -> int | None:
-        """Have the role take a message."""
+        """Pass a message to the role; return when it is due, or None."""
         try:
             return self.role.receive(sample, self.clock())
         except KeyboardInterrupt:
@@ -142,22 +122,22 @@ class Hosted:
             end_process(f"a message under {sample.key}", error)
 
     def rest_ns(self) -> int:
-        """Time until the role is due; negative where it is late."""
+        """Return the time until the role is due; negative if it is late."""
         now_ns = self.clock()
         if self._setback.back_ns(now_ns):
-            # And what is due with it: nobody knows for how long.
+            # The clock was set back, so the due time may be far in the future.
             self._due_ns = now_ns
         return self._due_ns - now_ns
 
     def wake(self) -> None:
-        """Have the role do what is due."""
+        """Wake the role, and note when it is due next."""
         with self.lock:
             now_ns = self.clock()
             latest_ns = now_ns + round(LONGEST_SLEEP_S * 1e9)
             self._due_ns = min(self.role.wake(now_ns), latest_ns)
 
     def wake_now(self) -> None:
-        """Have `run` wake the role at once; any thread may call it."""
+        """Make the role due now, from any thread."""
         with self.lock:
             self._due_ns = min(self._due_ns, self.clock())
         self.hurry.set()
@@ -167,20 +147,16 @@ class Hosted:
         take_turns([self])
 
     def stop(self) -> None:
-        """Have `run` return."""
+        """End `run`."""
         self.stopped.set()
         self.hurry.set()
 
 
 def take_turns(all_hosted: Sequence[Hosted], each_turn: Iterable[Callable[[], None]] = ()) -> None:
-    """Wake roles in this thread, always the one that is due first, until they are told to stop.
+    """Wake roles in this thread, earliest due time first, until `stopped` is set.
 
-    Parameters
-    ----------
-    all_hosted : sequence of Hosted
-        With the same `stopped` and the same `hurry`.
-    each_turn : iterable of callable, optional
-        Called before each role that is woken, and several times a second.
+    All roles share one `stopped` and one `hurry`. The functions `each_turn` are called before each
+    role, and at least five times per second.
     """
     stopped, hurry = all_hosted[0].stopped, all_hosted[0].hurry
     try:
@@ -208,16 +184,10 @@ def work(
     begin: Callable[[], None] = lambda: None,
     ready: Callable[[], None] = lambda: None,
 ) -> None:
-    """Run a worker's jobs in this thread until it is told to stop.
+    """Run a worker's jobs in this thread until `stopped` is set.
 
-    Parameters
-    ----------
-    note : callable, optional
-        Told what job begins, and None when it is over.
-    begin : callable, optional
-        Called before the stage is started, when the thread of the beats runs.
-    ready : callable, optional
-        Called when the stage has started.
+    `note` gets each job when it starts, and None when it ends. `begin` is called before the stage
+    starts, while the worker already beats; `ready` is called after the stage has started.
     """
     complain = worker.place.complain
     hosted = Hosted(worker, transport, clock, heard=lambda: worker.has_work, complain=complain)
@@ -244,7 +214,7 @@ def work(
 def _drain(
     worker: Worker, hosted: Hosted, note: Callable[[Job | None], None], clock: Clock
 ) -> None:
-    """Do all that there is to do."""
+    """Run all chores and jobs that are due; chores first."""
     while True:
         with hosted.lock:
             chore = worker.next_chore(clock())
@@ -268,7 +238,7 @@ def _drain(
 
 
 def _frames(worker: Worker, hosted: Hosted, stopped: threading.Event) -> None:
-    """Ask the stamper for a cycle whenever the source has a frame."""
+    """Request a cycle from the stamper for each frame of the source."""
     while not stopped.is_set():
         try:
             worker.stage.wait()

@@ -1,7 +1,7 @@
-"""Kept cell: the bytes of a cell file, and of the modules next to it, that a node began with.
+"""Kept cell: copy of a cell file and of the modules next to it, made at the start of a node.
 
-Every process of the node reads these bytes, whenever it starts: an edited file changes nothing
-until `dwell live up --again` takes it over, or the node has ended in order.
+All processes of the node read the copy. An edited file has an effect after `dwell live up --again`,
+or after the node has ended cleanly.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from dwell.model import FrozenDict, Problem
 from dwell.model.document import digests
 from dwell.version import __version__
 
-#: Nothing but the text, keys of the controller's alone, a node's code, or all processes.
+#: Part of a cell that a change affects: comments only, the controller, stage code, all processes.
 Change: TypeAlias = Literal["text", "decision", "code", "wiring"]
-#: In a state folder: where the bytes are, and the file that says what they are.
+#: Folder of the copy in a state folder, and its description.
 FOLDER, INDEX = "cell", "cell.json"
 #: Time between two comparisons with the files.
 COMPARE_S = 2.0
@@ -44,14 +44,14 @@ NAMED = re.compile(rb"(\w+)(?:\.\w+)*:\w")
 
 
 def installed_version() -> str:
-    """Return the version of Dwell that a process gets which starts now."""
+    """Return the installed version of Dwell, which may be newer than this process."""
     text = files("dwell").joinpath("version.py").read_text(encoding="utf-8")
     found = re.search(r'__version__ = "(.+)"', text)
     return found[1] if found else __version__
 
 
 class _Index(msgspec.Struct, frozen=True):
-    """What is kept: cell file, since when (Unix time), Dwell, and the boot in which it ended."""
+    """Description of a copy: cell file, Unix time, Dwell's version, boot id of a clean end."""
 
     file: str
     since_s: float
@@ -61,20 +61,10 @@ class _Index(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class KeptCell:
-    """See the module.
+    """Bytes of a cell's files: `contents`, by path relative to the folder of the cell file.
 
-    Parameters
-    ----------
-    file : Path
-        The cell file, which may have changed since.
-    contents : mapping of str to bytes
-        By name, relative to the folder of the cell file.
-    since_s : float
-        When they were read, Unix time.
-    folder : Path, optional
-        State folder that they are kept in; None where they are the present ones.
-    version : str
-        Version of Dwell that is installed with them.
+    `since_s` is the Unix time at which they were read, `version` the version of Dwell at that time.
+    `folder` is the state folder with the copy; None if the bytes come from the files themselves.
     """
 
     file: Path
@@ -88,12 +78,9 @@ class KeptCell:
 
     @classmethod
     def of(cls, file: Path, folders: Iterable[Path] = ()) -> KeptCell:
-        """Return what a node that has not ended in order began with, else the present bytes.
+        """Return the copy in the first state folder with a valid copy, else read the files.
 
-        Parameters
-        ----------
-        folders : iterable of Path
-            State folders to look into.
+        A copy is invalid if its node has ended cleanly in this boot.
         """
         file = file.resolve()
         for folder in folders:
@@ -107,13 +94,7 @@ class KeptCell:
         return cls(file, _contents(file), time.time())
 
     def write(self, folder: Path) -> None:
-        """Keep the bytes in a state folder.
-
-        Raises
-        ------
-        OSError, LiveError
-            If that fails; then nothing is kept.
-        """
+        """Write the copy; after an OSError or LiveError the state folder has no valid copy."""
         make_folder(folder)
         (folder / INDEX).unlink(missing_ok=True)
         kept = folder / FOLDER
@@ -125,9 +106,9 @@ class KeptCell:
         self._write_index(folder)
 
     def end(self, folder: Path) -> None:
-        """Note that the node has ended in order: a start in the same boot reads the files again.
+        """Record a clean end of the node: a start in the same boot reads the files again.
 
-        A computer that is shut down ends its nodes in order, too.
+        After a shutdown, which also ends nodes cleanly, the copy stays valid in the next boot.
         """
         with suppress(OSError):
             self._write_index(folder, ended=_this_boot())
@@ -137,17 +118,9 @@ class KeptCell:
         write_whole(folder / INDEX, msgspec.json.encode(index))
 
     def problem(self, *, traces: bool = False) -> Problem:
-        """Return the cell.
+        """Return the problem of the cell file; traces come from the original folder.
 
-        Parameters
-        ----------
-        traces : bool
-            Whether to read the traces, too, which are not kept.
-
-        Raises
-        ------
-        DwellError
-            If it is at fault.
+        Raises a DwellError if the cell file has an error.
         """
         file, home = self.file, self.file.parent
         if self.folder is not None:
@@ -156,21 +129,21 @@ class KeptCell:
         return replace(problem, folder=str(home))
 
     def install(self) -> None:
-        """Have this process import the kept modules, and others from next to the cell file."""
+        """Import the kept modules in this process; other modules come from the cell's folder."""
         sys.path.insert(0, str(self.file.parent))
         sys.meta_path.insert(0, _KeptModules(self))
 
     def paths(self) -> Iterator[Path]:
-        """Return the paths of the files whose bytes these are."""
+        """Return the paths of the original files."""
         return map(self.file.parent.joinpath, self.contents)
 
     def changed(self) -> list[str]:
-        """Return the names of the files that are other ones now."""
+        """Return the names of the files that have changed or vanished."""
         now = _contents(self.file)
         return [name for name, content in self.contents.items() if now.get(name) != content]
 
     def told(self, where: str) -> str:
-        """Return that files have changed; empty where none has."""
+        """Return a sentence that lists the changed files; empty if none has changed."""
         if not (changed := self.changed()):
             return ""
         began = time.localtime(self.since_s)
@@ -185,13 +158,7 @@ class KeptCell:
 
 
 def change(old: KeptCell, new: KeptCell) -> Change:
-    """Return the most that a change of a cell's files asks for.
-
-    Raises
-    ------
-    DwellError
-        If one of the cell files is at fault.
-    """
+    """Return the widest effect of the differences; raises a DwellError for an invalid cell file."""
     problems = old.problem(), new.problem()
     before, after = map(digests, problems)
     differ = {part for part in before if before[part] != after[part]}
@@ -206,33 +173,22 @@ def change(old: KeptCell, new: KeptCell) -> Change:
 
 
 def cell_here(file: Path, root: Path) -> KeptCell:
-    """Return what runs on this computer by a cell file, else the present bytes of the file.
+    """Return this computer's copy of a cell, else read the files.
 
-    Parameters
-    ----------
-    root : Path
-        With a folder per cell, and in it one per node.
+    `root` has one folder per cell, and in it one state folder per node.
     """
     return KeptCell.of(file, sorted(root.glob("*/*")))
 
 
 def forget(file: Path, root: Path) -> None:
-    """Have nodes and controllers on this computer read the files when they start next."""
+    """Invalidate a cell's copies on this computer: the next start of each node reads the files."""
     for folder in root.glob("*/*"):
         if KeptCell.of(file, [folder]).folder is not None:
             (folder / INDEX).unlink(missing_ok=True)
 
 
 class CellKeeper:
-    """Keeps a cell's bytes while a node runs, and looks whether the files have changed.
-
-    Parameters
-    ----------
-    folder : Path
-        State folder of the node, or of the controller.
-    where : str
-        Node, for messages.
-    """
+    """Copies a cell to a node's state folder, and compares the copy with the files regularly."""
 
     def __init__(
         self, kept: KeptCell, folder: Path, where: str, say: Callable[[str], None]
@@ -242,17 +198,17 @@ class CellKeeper:
         self._lock = threading.Lock()
         #: Restarts the processes of a node.
         self.renew: Callable[[], object] = str
-        #: Whether the agent has to replace itself, as another version of Dwell is installed.
+        #: Whether the agent has to replace itself, because Dwell's installed version has changed.
         self.replaced = False
         self._sentence = self._trouble = ""
         self._marks: tuple[object, ...] = ()
 
     def told(self) -> str:
-        """Return which files have changed, or are not kept; empty where all is well."""
+        """Return a sentence about a failed copy or changed files; empty without either."""
         return self._trouble or self._sentence
 
     def begin(self, stopped: threading.Event) -> None:
-        """Keep the bytes, and compare them with the files until the node is told to stop."""
+        """Write the copy, and compare it with the files in a thread until `stopped` is set."""
         self.look()
         start_thread("cell file", self._look_again, stopped)
 
@@ -261,17 +217,10 @@ class CellKeeper:
             self.look()
 
     def take_over(self, check: Callable[[KeptCell], object] = str) -> Change | None:
-        """Keep the present bytes from now on, unless their wiring is another.
+        """Replace the copy by the present files, and return the change.
 
-        Parameters
-        ----------
-        check : callable
-            Raises a DwellError if the new cell cannot run.
-
-        Returns
-        -------
-        str or None
-            None where the files stay as they were kept; the log says why.
+        If the wiring differs, or `check` raises a DwellError, keep the old copy, log the reason and
+        return None.
         """
         name, new = self.kept.file.name, KeptCell.of(self.kept.file)
         try:
@@ -297,7 +246,7 @@ class CellKeeper:
         self._marks = ()
 
     def look(self) -> None:
-        """Keep the bytes where they are not kept yet, or no more; see what has changed."""
+        """Write the copy if it is missing, and compare it with the files."""
         with self._lock:
             self._look()
 
@@ -308,9 +257,9 @@ class CellKeeper:
                 self._keep(self.kept)
         except (OSError, LiveError) as error:
             trouble = f"{self.kept.file.name} cannot be kept: {error}"
-        # What cannot be read now may be what it was.
+        # Keep the last sentence if a file cannot be read.
         with suppress(OSError):
-            # Read again at midnight, too: the sentence then has a date.
+            # Also write a new sentence at midnight, when it gets a date.
             marks = (time.localtime()[:3], *map(_mark, self.kept.paths()))
             if marks != self._marks:
                 sentence = self.kept.told(self._where)
@@ -321,7 +270,7 @@ class CellKeeper:
         self._trouble, self._sentence = trouble, sentence
 
     def end(self) -> None:
-        """Note that the node has ended in order."""
+        """Record a clean end of the node."""
         self.kept.end(self.folder)
 
 
@@ -334,7 +283,7 @@ class _KeptModules(importlib.abc.MetaPathFinder):
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> importlib.machinery.ModuleSpec | None:
-        """Return where a module is, if it is kept (see `importlib`)."""
+        """Return the spec of a kept module, else None (see `importlib`)."""
         place = Path(*fullname.split("."))
         if path is not None and str(self._home / place.parent) not in path:
             return None
@@ -353,22 +302,22 @@ class _KeptModules(importlib.abc.MetaPathFinder):
 
 
 class _KeptSource(importlib.abc.SourceLoader):
-    """A kept module: data files next to it are found by its ``__file__``, as ever."""
+    """Loader of a kept module, whose ``__file__`` is the original file, next to its data files."""
 
     def __init__(self, file: str, content: bytes) -> None:
         self._file, self._content = file, content
 
     def get_filename(self, fullname: str) -> str:
-        """Return the module's own file."""
+        """Return the path of the original file."""
         return self._file
 
     def get_data(self, path: str | bytes) -> bytes:
-        """Return the kept source, and other data from where they are."""
+        """Return the kept source of the module, or read another file from the disk."""
         return self._content if path == self._file else Path(str(path)).read_bytes()
 
 
 def _contents(file: Path) -> dict[str, bytes]:
-    """Return the bytes of a cell file and of the modules next to it that can be read.
+    """Return the bytes of a cell file and of the readable modules next to it.
 
     These are the modules in its folder, packages with an ``__init__.py``, and packages that the
     cell file names.
@@ -388,7 +337,7 @@ def _contents(file: Path) -> dict[str, bytes]:
 
 
 def _mark(path: Path) -> tuple[int, int, int] | None:
-    """Return values of a file that differ after each change of it; None where there is no file.
+    """Return values that differ after each change of a file; None if it is missing.
 
     Programs can set `st_mtime_ns` back, but not `st_ctime_ns`.
     """
@@ -400,5 +349,5 @@ def _mark(path: Path) -> tuple[int, int, int] | None:
 
 
 def _this_boot() -> str:
-    """Return the id of the kernel's boot; never empty, which stands for a node that runs."""
+    """Return the id of the kernel's boot; never empty, as an empty id means a running node."""
     return boot_id() or "unknown"

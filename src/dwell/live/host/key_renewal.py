@@ -1,8 +1,8 @@
-"""Key renewal: newer keys in a keyring are taken over while the cell runs.
+"""Key renewal: replaces the keys of a running cell by newer keys from a keyring.
 
-A roster is used at once, the certificate of this node only when all other agents use a roster that
-lists it: so hosts may get their files in any order. The processes of a node read a copy of its
-keyring in the state folder, which is valid at every moment.
+A new roster is used at once. A new certificate of this node waits until all other agents use a
+roster that lists it, so hosts may get their files in any order. The processes of a node read a copy
+of its keyring in the state folder, which is always valid.
 """
 
 from __future__ import annotations
@@ -24,27 +24,17 @@ from dwell.live.trust.signing import Seals
 from dwell.live.wire.transport import Transport
 from dwell.live.wire.wiring import roles
 
-#: Time between two looks; each node has its own part of it, so that not all restart together.
+#: Period of the checks for newer keys; each node has its own offset, so not all restart together.
 EVERY_S = 20.0
-#: Time before the end of a certificate from which its successor is used in any case.
+#: Remaining validity of a certificate below which its successor is used in any case.
 LAST = timedelta(hours=1)
 
 
 class KeyRenewal:
-    """Takes newer keys over: in the processes of a node in turn, then in this process.
+    """Applies newer keys: restarts a node's processes in turn, then reconnects this process.
 
-    Parameters
-    ----------
-    source : Path
-        The keyring into which newer keys are put.
-    hosted : Hosted
-        Role of this process, whose pulse hears the agents.
-    connect : callable
-        Opens the sessions of this process with some keys.
-    copy : Path, optional
-        The keyring that processes read; the source itself if left out.
-    supervisor : Supervisor, optional
-        Has the processes of the node.
+    Users put newer keys into `source`. Processes read the keyring `copy`, or else `source`.
+    `connect` opens the sessions of this process, and `pulse` receives the agents' beats.
     """
 
     def __init__(
@@ -70,11 +60,11 @@ class KeyRenewal:
         return int((time.time() - self._offset_s) // EVERY_S)
 
     def step(self) -> None:
-        """Look for newer keys when it is time, and use them."""
+        """Check for newer keys once per `EVERY_S`, and apply them."""
         place, supervisor = self._place, self._supervisor
         if self._new is None and self._count() != self._looked and place.seals is not None:
             self._looked = self._count()
-            # Files that are being copied are passed over.
+            # Incomplete files, which a user is still copying, wait for the next check.
             with suppress(TrustError, OSError):
                 self._new = self._news(place.seals.keyring)
             if self._new is not None and supervisor is not None:
@@ -87,7 +77,7 @@ class KeyRenewal:
         self._new = None
 
     def _news(self, own: Keyring) -> Keyring | None:
-        """Return the keys to use from now on, where they differ from the present keys."""
+        """Return newer keys that may be used now, else None."""
         new = Keyring.open(self._source, cell=own.roster.cell)
         changes = new.own != own.own
         whole = changes and self._may_use(new, own)
@@ -108,19 +98,16 @@ class KeyRenewal:
 
 
 def installed(source: Keyring, copy: Path, *, whole: bool = False) -> Keyring:
-    """Copy a keyring; its certificate and key only if asked, or if those of the copy do not hold.
+    """Copy a keyring's roster; also its certificate and key if `whole`, or if the copy is invalid.
 
-    Raises
-    ------
-    TrustError
-        If it cannot be written.
+    Raises a TrustError if the copy cannot be written.
     """
     make_private_folder(copy)
     write_private(copy / "roster.json", (source.folder / "roster.json").read_bytes())
     if not whole:
         with suppress(TrustError):
             return Keyring.open(copy, cell=source.roster.cell)
-    # The certificate is the last: it chooses the key.
+    # Write the certificate last: the name of the key file depends on it.
     write_private(copy / "ca.pem", (source.folder / "ca.pem").read_bytes())
     write_private(own_key_file(copy, source.own.key), source.key_file.read_bytes())
     write_private(copy / "cert.pem", (source.folder / "cert.pem").read_bytes())

@@ -1,9 +1,9 @@
-"""Launchers: how an agent starts its node's processes.
+"""Launcher of a node's processes: a fork server.
 
-Imports are nearly all that the start of a process costs: about a second of a core, which those that
-run have to do without. So an agent has one process, the *fork server*, that does them once, and is
-asked to fork for each process that is to start. It opens no session, and neither Zenoh nor a user's
-stages are imported there: both start threads, which a fork does not copy.
+Imports are most of the cost of starting a process: about one core-second, which running processes
+lack. So an agent has one process, the *fork server*, that imports the modules once and forks each
+new process. It opens no session, and imports neither Zenoh nor users' stages, as both start
+threads, which a fork does not copy.
 """
 
 from __future__ import annotations
@@ -28,26 +28,20 @@ import psutil
 #: Exit code of a process whose fork server has died before it.
 UNKNOWN_CODE = 1 << 16
 LONGEST_BYTES = 1 << 16
-#: How long a fork may take on a machine that is full.
+#: Longest time for a fork on a busy machine.
 PATIENCE_S = 10.0
-#: Time between two starts of a fork server.
+#: Shortest time between two starts of a fork server.
 AGAIN_S = 1.0
 
-#: A process that was started.
+#: A started process.
 Running: TypeAlias = "subprocess.Popen[bytes] | Survivor"
 
 
 class ForkServer:
-    """Has processes forked; a `command` is the words that `serve` returns in the new process.
+    """Client of a fork server, which ends with this process; the forked processes survive it.
 
-    The fork server ends with this process. Those that it has forked do not.
-
-    Parameters
-    ----------
-    program : sequence of str
-        Command of the fork server; it calls `serve` with its standard input.
-    environment : mapping of str to str, optional
-        Environment of the processes; this one's own if left out.
+    `program` is the command of the fork server, which calls `serve`. `environment` defaults to this
+    process's environment.
     """
 
     def __init__(
@@ -65,16 +59,13 @@ class ForkServer:
         self.watched: set[int] = set()
 
     def ready(self) -> bool:
-        """Return whether it has done its imports; starts it where it does not run.
-
-        `start` can be called once it has.
-        """
+        """Return whether the server has finished its imports; start it if it is not running."""
         if self._channel is None and time.monotonic() >= self._next_s:
             self._next_s = time.monotonic() + AGAIN_S
             channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             with theirs:
-                # Ctrl-C in a terminal is for the agent; a session of its own would make each
-                # process one of the groups that share the CPU, whatever runs in it.
+                # A separate process group: Ctrl-C in a terminal is for the agent. A separate
+                # session would also be a scheduling group with its own share of the CPU.
                 self._server = subprocess.Popen(  # noqa: S603 - our own interpreter and module
                     self._program, stdin=theirs.fileno(), env=self.environment, process_group=0
                 )
@@ -83,12 +74,9 @@ class ForkServer:
         return self._serves
 
     def start(self, command: Sequence[str], log: BinaryIO) -> Running:
-        """Have a process forked that prints into a log.
+        """Fork a process that prints to a log; `serve` returns `command` in it.
 
-        Raises
-        ------
-        OSError
-            If it cannot be started.
+        Raises an OSError if the process cannot be started.
         """
         deadline = time.monotonic() + PATIENCE_S
         if self._channel is not None:
@@ -106,12 +94,12 @@ class ForkServer:
         raise OSError(errno.ECHILD, "the fork server does not answer")
 
     def hear(self) -> None:
-        """Take in what the server has said since."""
+        """Read the server's pending messages."""
         while self._channel is not None and self._receive(0.0):
             pass
 
     def _receive(self, patience_s: float) -> dict[str, int]:
-        """Return the next message; an empty one if none comes, or the server has ended."""
+        """Return the next message; empty after the timeout, or if the server has ended."""
         if self._channel is None:
             return {}
         self._channel.settimeout(patience_s)
@@ -131,7 +119,7 @@ class ForkServer:
         return message
 
     def code(self, pid: int) -> int | None:
-        """Return the exit code of a process that was forked; None where it is not known (yet)."""
+        """Return the exit code of a forked process; None while it is unknown."""
         self.hear()
         return self._codes.pop(pid, None)
 
@@ -146,13 +134,13 @@ class ForkServer:
             self._server = None
 
     def stop(self) -> None:
-        """End the server; what it has forked goes on."""
+        """End the server for good; the forked processes continue."""
         self._end()
         self._next_s = float("inf")
 
 
 class Survivor:
-    """A process whose agent, or fork server, has died before it: its exit code is not known."""
+    """A process that has outlived its agent or fork server, so its exit code is unknown."""
 
     def __init__(self, pid: int) -> None:
         self.pid = pid
@@ -161,7 +149,7 @@ class Survivor:
             self._process = psutil.Process(pid)
 
     def poll(self) -> int | None:
-        """Return `UNKNOWN_CODE` when it has ended; None while it runs."""
+        """Return `UNKNOWN_CODE` after the process has ended; None while it runs."""
         process = self._process
         with suppress(psutil.NoSuchProcess):
             if process and process.is_running() and process.status() != psutil.STATUS_ZOMBIE:
@@ -169,14 +157,14 @@ class Survivor:
         return UNKNOWN_CODE
 
     def wait(self) -> int:
-        """Return its exit code when it has ended."""
+        """Wait until the process has ended, and return its exit code."""
         while (code := self.poll()) is None:
             time.sleep(0.005)
         return code
 
 
 class _Forked(Survivor):
-    """A process that a fork server has forked, and tells the end of while it lives."""
+    """A forked process, whose exit code the fork server reports while it lives itself."""
 
     def __init__(self, server: ForkServer, pid: int) -> None:
         super().__init__(pid)
@@ -184,7 +172,7 @@ class _Forked(Survivor):
         self._code: int | None = None
 
     def poll(self) -> int | None:
-        """Return its exit code, negative for a signal; None while it runs."""
+        """Return the exit code, negative for a signal; None while the process runs."""
         if self._code is None:
             self._code = self._server.code(self.pid)
         if self._code is None and self.pid not in self._server.watched:
@@ -193,25 +181,16 @@ class _Forked(Survivor):
 
 
 def serve(stdin: int = 0) -> list[str] | None:
-    """Fork whenever an agent asks for it.
+    """Fork at each request from `ForkServer`, whose socket is the descriptor `stdin`.
 
-    Parameters
-    ----------
-    stdin : int
-        Descriptor of the socket that `ForkServer` has given as standard input.
-
-    Returns
-    -------
-    list of str, optional
-        In a process that has been forked, the words that it was asked for with; its output goes to
-        the log, and nothing else is left of the server's. None in the server, when the agent has
-        gone.
+    Returns the command in a forked process, which prints to the log and has closed the server's
+    descriptors. Returns None in the server after the agent has ended.
     """
     channel = socket.socket(fileno=os.dup(stdin))
     empty = os.open(os.devnull, os.O_RDWR)
     os.dup2(empty, stdin)
     os.close(empty)
-    # No collection in a process that is forked looks at what there is now.
+    # Exclude the present objects from garbage collection in forked processes.
     gc.collect()
     gc.freeze()
     woken, wake = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
@@ -244,12 +223,9 @@ def _tell(channel: socket.socket, what: Mapping[str, int]) -> None:
 
 
 def _fork(channel: socket.socket) -> list[str] | None:
-    """Fork as a request says; returns its words in the new process.
+    """Read a request and fork; return the command in the new process, None in the server.
 
-    Raises
-    ------
-    EOFError
-        If the agent has gone.
+    Raises an EOFError if the agent has ended.
     """
     data, descriptors, _, _ = socket.recv_fds(channel, LONGEST_BYTES, 1)
     if not data:
@@ -257,7 +233,7 @@ def _fork(channel: socket.socket) -> list[str] | None:
     (log,) = descriptors
     try:
         with warnings.catch_warnings():
-            # Of threads: OpenBLAS ends its own before a fork, and nothing else has any.
+            # The warning is about threads. Only OpenBLAS has some, and ends them before a fork.
             warnings.simplefilter("ignore", DeprecationWarning)
             pid = os.fork()
     except OSError as error:
@@ -270,7 +246,7 @@ def _fork(channel: socket.socket) -> list[str] | None:
             os.setpgid(pid, pid)
         _tell(channel, {"forked": pid})
         return None
-    # Both do it: the server may be dead by now.
+    # Server and child both set the group, as the server may have died by now.
     os.setpgid(0, 0)
     for descriptor in (sys.stdout.fileno(), sys.stderr.fileno()):
         os.dup2(log, descriptor)

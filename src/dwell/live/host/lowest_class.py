@@ -1,4 +1,4 @@
-"""The lowest class of the system's scheduler: for what runs on what all others leave of a CPU."""
+"""Lowest scheduling class of the operating system, for threads that may only use idle CPU time."""
 
 from __future__ import annotations
 
@@ -7,17 +7,11 @@ from collections.abc import Callable
 
 
 def take_lowest_class(who: str, say: Callable[[str], None]) -> None:
-    """Give the calling thread, and those that it starts, what others leave of the CPUs.
+    """Set the lowest scheduling class for the calling thread and the threads that it starts.
 
-    Linux has SCHED_IDLE, whose threads weigh 3 beside 1024; elsewhere it is niceness 19. A thread
-    that has a real-time priority keeps it. A system without either is told of, once.
-
-    Parameters
-    ----------
-    who : str
-        Name of the process, for what is said.
-    say : callable
-        Where the sentence goes.
+    This is SCHED_IDLE on Linux (weight 3, compared with 1024 of a normal thread), elsewhere
+    niceness 19. A thread with a real-time priority keeps it. If the system refuses the class, `say`
+    gets a sentence that names the process `who`.
     """
     try:
         if hasattr(os, "SCHED_IDLE"):

@@ -1,4 +1,4 @@
-"""Memory that a process has been given by the kernel, and keeps."""
+"""Setting of `malloc`: a process keeps its freed memory."""
 
 from __future__ import annotations
 
@@ -6,24 +6,19 @@ import ctypes
 
 # malloc.h of the GNU C library.
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
-#: The most that it takes for the second: larger blocks come from the kernel, and go back to it.
+#: Largest valid M_MMAP_THRESHOLD in bytes; freed blocks above it return to the kernel.
 LARGE = 32 << 20
-#: Free memory at the end of a heap from which on the kernel gets it back.
+#: Free bytes at the end of a heap above which `malloc` returns memory to the kernel.
 SPARE = 1 << 30
 
 
 def keep_memory() -> bool:
-    """Have `malloc` keep the memory that it has been given, as real-time programs do.
+    """Make `malloc` keep freed memory, as real-time programs do; return whether it will.
 
-    Otherwise a stage that needs some arrays for each job may give them back each time, or may not:
-    that depends on what else its process has allocated. Where it does, every page of every array is
-    a fault: 7 to 11 % of the CPU time of a detector in pictures of 300 kB, in one process and not
-    in the next.
-
-    Returns
-    -------
-    bool
-        Whether it does; only the GNU C library is asked.
+    Otherwise a stage may return its arrays to the kernel after each job, depending on the other
+    allocations of its process. Each page of each array then costs a page fault: 7 to 11 % of the
+    CPU time of a detector with images of 300 kB, in one process and not in the next. Only the GNU C
+    library has this setting.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is None:

@@ -1,4 +1,4 @@
-"""Runs a node's agent, and the controller of some cells."""
+"""Main functions of the agent of a node and of the controller of cells."""
 
 from __future__ import annotations
 
@@ -41,18 +41,12 @@ from dwell.model import Problem, QoS
 if TYPE_CHECKING:
     from dwell.live.trust.keyring import Keyring
 
-#: Why a folder cannot be made that somebody has to put right; anything else is tried again.
+#: Errors of making a folder that the user has to fix; Dwell tries again after other errors.
 MISTAKEN = frozenset({errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP})
 
 
 class Continued(msgspec.Struct, frozen=True):
-    """The run of a cell that its controller has ended, and what operators wanted then.
-
-    Parameters
-    ----------
-    folder : str
-        The run's; empty where there is none.
-    """
+    """Folder of a run that the next controller continues (or empty), with its pins and drains."""
 
     folder: str = ""
     pinned: str = ""
@@ -76,36 +70,34 @@ def run_agent(
     platform: Platform = PLAIN,
     say: Callable[[str], None] = print,
 ) -> None:
-    """Keep a node's processes running until told to stop; then end them.
+    """Keep a node's processes running until `stopped` is set; then end them.
 
     Parameters
     ----------
     program : sequence of str
-        Command of the process that the others are forked from (`ForkServer`).
+        Command of the fork server (`ForkServer`).
     words : callable
-        Returns the words that start a process, by the process's name.
+        Returns the arguments of a process from its name.
     hurried : Event, optional
-        Has its processes end at once, and not in order, once it is told to stop.
+        If set, the processes end at once instead of cleanly.
     keeper : CellKeeper, optional
-        Keeps the cell file for the processes; without one they read the file itself.
+        Keeps the copy of the cell file for the processes, which otherwise read the file itself.
     renews : bool
-        Whether the processes that it takes over are to be restarted.
+        Whether to restart the running processes of a previous agent.
     accelerator : callable, optional
-        Returns the utilisation of the node's accelerators, a share from 0 to 1. It counts where the
-        cell says that the node has one kind of them.
+        Returns the utilisation of the node's accelerators, from 0 to 1. Used only if the cell file
+        gives the node exactly one kind of accelerator.
     environment : mapping of str to str, optional
-        Environment of the node's processes, with the variables of `dwell.live.host.security`; this
-        process's own if left out.
-    platform : Platform, optional
-        Clock and transport of the agent; without faults if left out.
+        Environment of the node's processes, with the variables of `dwell.live.host.security`
+        [default: this process's environment].
 
     Raises
     ------
     LiveError
-        If there is no such node, or its ports or its folder cannot be had, or it leaves this
-        computer without keys; or if an actuator could not be stopped at the end.
+        If the node is unknown, its ports are taken, its folder cannot be made, or the cell needs
+        keys and has none; or if an actuator could not be stopped at the end.
     TrustError
-        If the keys are not the node's.
+        If the keys belong to another node.
     """
     if node not in problem.fabric.nodes:
         known = ", ".join(problem.fabric.nodes)
@@ -116,7 +108,7 @@ def run_agent(
         say(unused)
     wiring = wire(problem)
     who = f"agent@{node}"
-    # Without the variables of systemd, which the processes must not have.
+    # `Service` removes the variables of systemd, which the processes must not inherit.
     environment = dict(os.environ if environment is None else environment)
     service = Service(who, environment)
     security = Security.of(problem, wiring.entry(who).role, environment)
@@ -130,7 +122,7 @@ def run_agent(
         security = replace(security, keyring=installed(source, folder / "keys"))
     transport = platform.transport(security, who, node)
     place = security.place(who, node, transport, Log(say))
-    # Only what runs is kept: a file that could not be started can be corrected.
+    # Copy the cell only now: if the start has failed, the user can correct the file.
     if keeper is not None:
         keeper.begin(stopped)
     launcher = ForkServer(program, environment)
@@ -170,12 +162,12 @@ def run_agent(
     finally:
         service.stopping()
         if keeper is not None and keeper.replaced:
-            launcher.stop()  # the agent that takes this one's place takes the processes over
+            launcher.stop()  # the processes continue: the next agent supervises them
             failed = {}
         else:
             failed = supervisor.stop(hurried=hurried)
         place.transport.close()
-        # Those that have been killed could not remove theirs.
+        # Killed processes leave their shared memory behind.
         remove_orphans()
     moving = [f"{who} {why}" for who, why in failed.items() if who.startswith("sink.")]
     if moving:
@@ -183,7 +175,7 @@ def run_agent(
 
 
 def _unused_hook(problem: Problem, node: str) -> str:
-    """Say why the utilisation that a hook returns counts for nothing; empty where it counts."""
+    """Return why the utilisation from `--accelerator` is unused; empty if it is used."""
     kinds = problem.fabric.nodes[node].accelerators
     if len(kinds) == 1:
         return ""
@@ -192,7 +184,7 @@ def _unused_hook(problem: Problem, node: str) -> str:
 
 
 def _busy_clock(problem: Problem, node: str, say: Callable[[str], None]) -> Callable[[], int]:
-    """Count the node's CPUs; of a node with a quota, what its own control group uses of them."""
+    """Return a counter of the node's busy core-ns: of its control group if the node has a quota."""
     if problem.fabric.nodes[node].quota is not None:
         if (group := own_group()) is not None:
             return group.used_ns
@@ -217,42 +209,34 @@ def run_controller(
     platform: Platform = PLAIN,
     say: Callable[[str], None] = print,
 ) -> dict[str, Continued]:
-    """Control cells until told to stop.
+    """Control cells until `stopped` is set; return their runs by cell name.
 
     Parameters
     ----------
     out : Path
-        Where the runs' folders go, one a cell and run.
+        Folder for the runs' folders.
     keepers : mapping of str to CellKeeper, optional
-        Keep the cell files, by the names of the cells.
+        Keepers of the cell files, by cell name.
     continues : mapping of str to Continued, optional
-        Last runs of a controller that took over edited files, by the names of the cells.
+        Runs to continue after edited cell files, by cell name.
     policy : str, optional
-        Instead of the cells' own.
+        Policy of all cells [default: the policy of each cell file].
     name : str, optional
-        Name of this controller, by which others that would take charge tell it apart.
+        Name that distinguishes this controller from rivals.
     jobs : bool
-        Whether the runs keep their jobs, and what each process took of the CPUs.
+        Whether to record the jobs and the CPU time of each process.
     environment : mapping of str to str, optional
-        With the variables of `dwell.live.host.security`; this process's own if left out.
-    platform : Platform, optional
-        Clock and transport of the controller; without faults if left out.
-
-    Returns
-    -------
-    dict of str to Continued
-        The runs, by the names of the cells.
+        Contains the variables of `dwell.live.host.security` [default: this process's environment].
 
     Raises
     ------
     LiveError
         If two cells have one name, ports are taken, the runs' folder cannot be made, or a cell
-        leaves this computer without keys.
+        needs keys and has none.
     TrustError
         If the keys are not the controller's.
     KernelError
-        If a cell's estimator needs the compiled kernel, which cannot be loaded, and its policy may
-        move it.
+        If the kernel cannot be loaded, but a cell's estimator needs it and its policy is not fixed.
     """
     names = [problem.name for problem in problems]
     if len(set(names)) < len(names):
@@ -260,11 +244,11 @@ def run_controller(
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        # A disk that is full may have room later.
+        # Continue after other errors: a full disk may have space later.
         if error.errno in MISTAKEN:
             raise LiveError(f"{out}: cannot be made ({error.strerror})") from None
     name = name or f"controller-{os.getpid()}"
-    # No message waits for long while a window closes.
+    # Switch threads often, so messages are read while the end of a window is processed.
     sys.setswitchinterval(0.0005)
     recorders: dict[str, tuple[RunRecorder, ControlledCell]] = {}
     environment = dict(os.environ if environment is None else environment)
@@ -322,7 +306,7 @@ def _close(place: RolePlace) -> None:
 def _connected(
     platform: Platform, security: Security, who: str, state: Path | None, keyring: Keyring
 ) -> Transport:
-    """Open the sessions of a process with newer keys, whose roster a state folder remembers."""
+    """Open the sessions of a process with newer keys; note their roster in the state folder."""
     renewed = replace(security, keyring=keyring)
     if state is not None:
         renewed.remember(state)
@@ -330,7 +314,7 @@ def _connected(
 
 
 def controller_of(problem: Problem, policy: str | None, say: Callable[[str], None]) -> Controller:
-    """Make a cell's controller; without the compiled kernel only one that prices nothing."""
+    """Make a cell's controller; without the compiled kernel, only a fixed placement is possible."""
     try:
         return Controller(problem, policy)
     except KernelError as error:
@@ -342,7 +326,7 @@ def controller_of(problem: Problem, policy: str | None, say: Callable[[str], Non
 
 
 class _AsSeen:
-    """An estimator that expects of every candidate what the window showed."""
+    """Estimator that predicts the observed window for every candidate."""
 
     def __init__(self, problem: Problem) -> None:
         self._names = tuple(problem.candidates)
@@ -350,7 +334,7 @@ class _AsSeen:
     def estimate(
         self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
     ) -> Mapping[str, QoS]:
-        """Expect the window of all (see `Estimator`)."""
+        """Return the observed window for every candidate (see `Estimator`)."""
         return dict.fromkeys(self._names, observed)
 
 

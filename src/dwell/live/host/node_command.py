@@ -1,4 +1,4 @@
-"""An agent, and a controller of some cells, from what a command line says of them."""
+"""Start of an agent or a controller from the options of a command line."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ T = TypeVar("T")
 
 
 class OptionError(ValueError):
-    """An option of a command is wrong; the text names it, and what was given."""
+    """An option of a command is invalid; the message names the option and its value."""
 
 
 def agent(
@@ -50,32 +50,30 @@ def agent(
     renews: bool = False,
     platform: Platform = PLAIN,
 ) -> None:
-    """Run a node of a live cell until told to end (see `run_agent`).
+    """Run a node of a live cell until a signal ends it (see `run_agent`).
 
     Parameters
     ----------
     state : Path, optional
-        Where processes keep their files; below `state_root` if not given.
+        State folder of the node [default: a folder in `state_root`].
     cpus : str, optional
-        CPUs to use, as ``0,2-3``; those of this process if not given.
+        CPUs to use, such as ``0,2-3`` [default: the CPUs of this process].
     cpus_of, realtime : sequence of str
-        CPUs, and real-time priorities, of some processes, as ``perception@*=2-3``; of those that
-        name one process the last counts.
+        CPUs and real-time priorities of processes, such as ``perception@*=2-3``; the last match
+        applies.
     accelerator : str, optional
         Function that returns the utilisation of the node's accelerator, as ``module:function``.
     keys : Path, optional
-        Keyring; that of the environment if not given.
+        Keyring [default: the keyring of the environment].
     owner : int, optional
-        Id of the process that this one ends with.
+        Id of the process with which this process ends.
     renews : bool
-        As in `run_agent`.
-    platform : Platform, optional
-        Clock and transport; without faults if not given.
+        See `run_agent`.
 
     Raises
     ------
     OptionError
-        If what an option says cannot be.
+        If an option is invalid.
     DwellError
         If the cell cannot be read, or the agent cannot run.
     """
@@ -133,24 +131,23 @@ def controller(
     continues: str = "{}",
     platform: Platform = PLAIN,
 ) -> None:
-    """Decide where the stages of live cells run until told to end (see `run_controller`).
+    """Control live cells until a signal ends this process (see `run_controller`).
 
     Parameters
     ----------
     out : Path
-        Where the runs' folders go.
+        Folder for the runs' folders.
     state : Path, optional
-        With a folder per cell, where the controller keeps what it began with; `state_root` if not
-        given.
+        Folder for the state folders, one per cell [default: `state_root`].
     cpus, keys, owner, platform : optional
-        As those of an `agent`.
+        See `agent`.
     continues : str
-        As in `run_controller`, in JSON.
+        JSON of the same argument of `run_controller`.
 
     Raises
     ------
     OptionError
-        If the CPUs cannot be had.
+        If a CPU is not available.
     DwellError
         If a cell cannot be read, or the controller cannot run.
     """
@@ -201,8 +198,8 @@ def controller(
 
 
 def _replace_process(*more: str) -> None:
-    """Begin again as the same process, which imports its modules again."""
-    # Until it listens to signals, a further one must not end it.
+    """Execute the same command again, with the same process id, to import the modules again."""
+    # A further SIGHUP must not end the process before it has its handlers.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     words = sys.orig_argv[1:]
     if more[0] in words:
@@ -213,7 +210,7 @@ def _replace_process(*more: str) -> None:
 def _by_process(
     option: str, given: Sequence[str], there: Sequence[str], read: Callable[[str], T]
 ) -> dict[str, T]:
-    """Read options of the form PROCESS=VALUE, where PROCESS may have a ``*``; the last counts."""
+    """Read options PROCESS=VALUE; PROCESS may contain ``*``, and the last match applies."""
     values: dict[str, T] = {}
     for text in given:
         pattern, equals, value = text.partition("=")
@@ -234,7 +231,7 @@ def _priority(text: str) -> int:
 def _cpus(
     text: str | None, option: str = "--cpus", among: set[int] | None = None
 ) -> set[int] | None:
-    """Read a list of CPUs, each of which has to be available."""
+    """Read a list of available CPUs."""
     if text is None:
         return None
     cpus: set[int] = set()
@@ -253,7 +250,7 @@ def _cpus(
 def _until_told(
     owner: int | None, at_once: Callable[[], None], again: Callable[[], object]
 ) -> threading.Event:
-    """Return an event that is set when this process is told to end, or its owner has ended."""
+    """Return an event that is set by a signal to end, or when the owner has ended."""
     stopped = threading.Event()
     end_with_owner(stopped, owner)
     end_when_told(stopped, at_once, again)

@@ -1,4 +1,4 @@
-"""Asks a cell's controller for its status, and tells it what an operator wants."""
+"""Operator's client of a cell's controller: reads the status, pins candidates, drains nodes."""
 
 from __future__ import annotations
 
@@ -26,19 +26,10 @@ RESEND_S = 0.2
 
 
 class OperatorClient:
-    """Client of a cell's controller, outside of the cell; a context manager.
+    """Connection to a cell's controller from outside of the cell; a context manager.
 
-    Parameters
-    ----------
-    environment : mapping of str to str, optional
-        With the variables of `dwell.live.host.security`; this process's own if left out.
-
-    Raises
-    ------
-    LiveError
-        If the cell leaves this computer, and there are no keys.
-    TrustError
-        If the keys are not those of somebody who visits.
+    Raises a LiveError if the cell needs keys and has none, and a TrustError if the keys are a
+    node's.
     """
 
     def __init__(self, problem: Problem, environment: Mapping[str, str] | None = None) -> None:
@@ -63,7 +54,7 @@ class OperatorClient:
         self._transport.close()
 
     def _heard(self, sample: Arrival) -> None:
-        # All others' answers are heard, too.
+        # Skip the answers to other visitors.
         if not sample.key.startswith(self._keys.answer(self.name)):
             return
         try:
@@ -74,21 +65,11 @@ class OperatorClient:
         self._answers.put(msgspec.structs.replace(answer, refused=refused, status=status))
 
     def ask(self, what: str, about: str = "", *, patience_s: float = 3.0) -> dict[str, Any]:
-        """Ask, and return how the cell is.
+        """Send a request, and return the status of the cell.
 
-        Parameters
-        ----------
-        what : str
-            ``status``, ``pin``, ``unpin``, ``drain`` or ``undrain``.
-        about : str
-            Candidate to pin, node to drain.
-
-        Raises
-        ------
-        LiveError
-            If it is refused, or nobody answers.
-        TrustError
-            If the keys are those of somebody who may only look.
+        `what` is ``status``, ``pin``, ``unpin``, ``drain`` or ``undrain``; `about` is the candidate
+        to pin or the node to drain. Raises a LiveError if the controller refuses the request or
+        does not answer, and a TrustError if an observer's keys do not permit it.
         """
         keyring = self._security.keyring
         if what != "status" and keyring is not None and keyring.own.role == "observer":
@@ -101,14 +82,10 @@ class OperatorClient:
         return answer.status
 
     def look(self, *, patience_s: float = 3.0) -> dict[str, Any]:
-        """Return how the cell is, and that nobody answers where that is so.
+        """Return the controller's status (`ControlledCell.status`) and ``answer_age_ms``.
 
-        Returns
-        -------
-        dict
-            The controller's status (`ControlledCell.status`) and ``answer_age_ms``. Without
-            an answer: ``cell``, ``health`` (``absent``), ``headline``, and the age of the last
-            answer to this visitor, None where there was none.
+        Without an answer, return ``cell``, ``health`` (``absent``), ``headline``, and the age of
+        the last answer (None before the first).
         """
         answer = self._answer("status", "", patience_s)
         if answer is not None:
@@ -119,15 +96,15 @@ class OperatorClient:
         return {**status, "answer_age_ms": round((time.monotonic() - self._answered_s) * 1e3, 1)}
 
     def _answer(self, what: str, about: str, patience_s: float) -> Answer | None:
-        """Ask until there is an answer, or patience ends."""
-        # Who only looks may do so with the keys of an observer.
+        """Repeat a request until the controller answers, or the time is over."""
+        # An observer's keys permit requests for the status.
         if what == "status":
             number, key = self.name, self._keys.look()
         else:
-            # Each wish has a number of its own: no late answer to another is taken for its own.
+            # A unique number distinguishes the answer from late answers to earlier requests.
             number, key = f"{self.name}-{next(self._wishes)}", self._keys.ask()
         ask = encode(Ask(number, what, about))
-        # One question is sent several times; what was answered to the one before is old.
+        # Discard answers to the repeated messages of earlier requests.
         while not self._answers.empty():
             self._answers.get()
         for _ in range(max(round(patience_s / RESEND_S), 1)):
@@ -139,7 +116,7 @@ class OperatorClient:
         return None
 
     def _answer_to(self, number: str) -> Answer | None:
-        """Wait a while for an answer with a number."""
+        """Wait up to `RESEND_S` for the answer with a number."""
         until_s = time.monotonic() + RESEND_S
         while (left_s := until_s - time.monotonic()) > 0:
             try:
@@ -160,7 +137,7 @@ class OperatorClient:
         )
 
     def _ended(self) -> str:
-        """Return that the controller's certificate has ended, by the roster; nothing otherwise."""
+        """Return a sentence if the controller's certificate in the roster has expired, else ''."""
         keyring = self._security.keyring
         known = [] if keyring is None else keyring.roster.of(CONTROLLER)[:1]
         ends = [one.ends for one in known if one.ends < datetime.now(UTC)]
@@ -168,7 +145,7 @@ class OperatorClient:
 
 
 def _shown(value: Any) -> Any:
-    """Return plain values with all their texts printable."""
+    """Return a JSON value with all strings made printable."""
     if isinstance(value, str):
         return printable(value)
     if isinstance(value, dict):

@@ -1,13 +1,14 @@
-"""Ends this process when its owner ends, however many processes stand between the two.
+"""End of a process with its owner, which may be a distant ancestor.
 
-The processes of a cell outlive their agent, so that it can be started again. Where a whole cell
-belongs to one process (a testbed, a test), all of them have its process id on their command lines
-(`OPTION`), and none of them is left when that process has ended, even if it was killed.
+The processes of a cell outlive their agent, so it can be restarted. If a complete cell belongs to
+one process (a testbed, a test), all its processes have the owner's process id on their command
+lines (`OPTION`). They end with the owner, even if it was killed.
 
-Nor is their shared memory. Zenoh removes a segment with the last process that lets go of it, but
-where two do so at the same instant each finds it held by the other, and it stays until a Zenoh
-starts again. So a separate process, ``python -m dwell.live.host.parent_death OWNER``, waits until
-all of them have ended, and removes the segments that no process holds.
+Their shared memory is removed, too. Zenoh removes a segment when the last process releases it. If
+two processes release it at the same instant, each finds it held by the other, and the segment stays
+until another process starts Zenoh. So a separate process, ``python -m
+dwell.live.host.parent_death OWNER``, waits until all of them have ended, and removes the segments
+that no process holds.
 """
 
 from __future__ import annotations
@@ -26,23 +27,18 @@ from pathlib import Path
 from dwell.live.failures import start_thread
 from dwell.live.transport.orphans import remove_orphans
 
-#: Option of agent, controller and processes: id of the process that they end with.
+#: Option of agents, controllers and processes: id of the owner.
 OPTION = "--owner"
-#: What does not end by itself within this time after its owner is ended.
+#: Time from the owner's end to the forced end of a process.
 PATIENCE_S = 8.0
-#: How long the sweeper waits for those that end with its owner.
+#: Longest time that the sweeper waits for the processes of its owner.
 SWEEP_S = 60.0
 
 
 def end_with_owner(stopped: threading.Event, owner: int | None) -> None:
-    """Set an event when the owner has ended; nothing happens where there is none.
+    """Set an event when the owner (a process id, if any) has ended.
 
-    A process that hangs, and does not look at the event, ends some seconds later.
-
-    Parameters
-    ----------
-    owner : int, optional
-        Its process id.
+    If this process hangs and ignores the event, it is ended after `PATIENCE_S`.
     """
     if owner is None:
         return
@@ -52,7 +48,7 @@ def end_with_owner(stopped: threading.Event, owner: int | None) -> None:
         stopped.set()
         return
     except OSError:
-        return  # a kernel without them
+        return  # a kernel without pidfd_open
     start_thread("parent-death", _wait, descriptor, stopped)
 
 
@@ -64,7 +60,7 @@ def _wait(owner: int, stopped: threading.Event) -> None:
 
 
 def start_sweeper() -> subprocess.Popen[bytes]:
-    """Start what removes the shared memory of all that end with this process, once they have."""
+    """Start the process that removes the shared memory of all processes with this owner."""
     return subprocess.Popen(  # noqa: S603 - our own command
         [sys.executable, "-P", "-m", "dwell.live.host.parent_death", str(os.getpid())],
         stdin=subprocess.DEVNULL,
@@ -75,15 +71,7 @@ def start_sweeper() -> subprocess.Popen[bytes]:
 
 
 def end_those_of(owner: str, cell: Path, patience_s: float) -> None:
-    """Kill those of a cell that end with an owner, and wait until they have ended.
-
-    Parameters
-    ----------
-    owner : str
-        What follows `OPTION` on their command lines.
-    cell : Path
-        Cell file there.
-    """
+    """Kill the processes with this owner and cell file on their command lines; await their end."""
     _await({OPTION: owner, "--cell": str(cell.resolve())}, patience_s, signal.SIGKILL)
 
 
@@ -93,31 +81,31 @@ def _sweep(owner: int) -> None:
     except ProcessLookupError:
         pass  # it has ended already
     except OSError:
-        return  # a kernel without them: nobody ends with an owner
+        return  # a kernel without pidfd_open: no process ends with an owner
     _await({OPTION: str(owner)}, SWEEP_S)
     remove_orphans()
 
 
 def _await(options: Mapping[str, str], patience_s: float, number: int = 0) -> None:
-    """Wait until those have ended that have such options; a signal goes to each, if not 0."""
+    """Wait for the end of all processes with some options; first send them a signal, if not 0."""
     deadline = time.monotonic() + patience_s
-    # Whoever is waited for may have started another one meanwhile.
+    # Search again: a process may have started another process before its end.
     while (left_s := deadline - time.monotonic()) > 0 and (left := _with_options(options)):
         for process in left:
             with suppress(OSError):
                 signal.pidfd_send_signal(process, number)
         for process in left:
-            # Readable when it has let go of all its files.
+            # The descriptor is readable after the process has released all its files.
             select.select([process], [], [], left_s)
             os.close(process)
 
 
 def _with_options(options: Mapping[str, str]) -> list[int]:
-    """Return a descriptor of every process whose command line has some options."""
+    """Return a descriptor of every process whose command line has all these options."""
     parts = [os.fsencode(f"\0{name}\0{value}\0") for name, value in options.items()]
     found = []
     for file in Path("/proc").glob("[0-9]*/cmdline"):
-        # Some have just ended, and some are other users'.
+        # Skip processes that have just ended, or belong to other users.
         with suppress(OSError):
             read = file.read_bytes()
             if all(part in read for part in parts):

@@ -1,4 +1,4 @@
-"""Process ends: wakes an agent at once when a process of its node has ended."""
+"""Process ends: wakes an agent as soon as a process of its node has ended."""
 
 from __future__ import annotations
 
@@ -10,13 +10,7 @@ from dwell.live.failures import start_thread
 
 
 class ProcessEnds:
-    """Waits in a thread for the descriptors of processes (see `os.pidfd_open`).
-
-    Attributes
-    ----------
-    wake : callable
-        Called in that thread after a process has ended.
-    """
+    """Waits in a thread for the end of processes (`os.pidfd_open`), and calls `wake` there."""
 
     def __init__(self) -> None:
         self.wake: Callable[[], object] = str
@@ -26,23 +20,24 @@ class ProcessEnds:
         start_thread("process ends", self._run)
 
     def watch(self, pid: int) -> None:
-        """Wait for the end of a process that runs."""
+        """Watch a running process."""
         self._ended.discard(pid)
         try:
             descriptor = os.pidfd_open(pid)
         except OSError:
-            # No such process, no free descriptor, or an old kernel: its supervisor has to look.
+            # The process has ended, descriptors are used up, or the kernel is old: the supervisor
+            # has to check the process itself.
             self._ended.add(pid)
             return
         self._pids[descriptor] = pid
         self._epoll.register(descriptor, select.EPOLLIN)
 
     def pending(self, pids: Iterable[int | None]) -> bool:
-        """Whether one of these processes has ended, or cannot be watched."""
+        """Return whether any of these processes has ended, or cannot be watched."""
         return not self._ended.isdisjoint(pids)
 
     def forget(self, pid: int) -> None:
-        """Drop an end that its supervisor has seen."""
+        """Remove a process whose end the supervisor has noticed."""
         self._ended.discard(pid)
 
     def _run(self) -> None:

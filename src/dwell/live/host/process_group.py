@@ -1,8 +1,7 @@
-"""Process groups: each process of a cell leads one, and what it leaves there is ended after it.
+"""Process groups: each process of a cell leads a group, whose other members are ended after it.
 
-A group is the process's as long as nobody else can have its number: the kernel gives the id of a
-process away again only when its group is empty, too. Helpers that have made a session, or a group,
-of their own are not found.
+The id of the group stays unique: the kernel reuses the id of a process only after its group is
+empty. Helper processes that have made their own session or group are not found.
 """
 
 from __future__ import annotations
@@ -15,22 +14,15 @@ from dataclasses import dataclass
 
 import psutil
 
-#: Two readings of one start differ by less, s.
+#: Largest difference between two readings of one start time, s.
 SAME_S = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class ProcessGroup:
-    """Group of a process that was started.
+    """Group of a started process, whose id is also the group's id.
 
-    Parameters
-    ----------
-    pid : int
-        Of the process that leads it, and of the group.
-    started : float
-        When that process was started, s since 1970.
-    session : int
-        Session of all of the group; -1 where nobody has noted it.
+    `started` is the start of the leader in s since 1970; `session` is -1 if unknown.
     """
 
     pid: int
@@ -39,14 +31,14 @@ class ProcessGroup:
 
     @classmethod
     def of(cls, pid: int) -> ProcessGroup | None:
-        """Return the group of a process that runs; None where it has ended."""
+        """Return the group of a process; None if the process has ended."""
         try:
             return cls(pid, psutil.Process(pid).create_time(), os.getsid(pid))
         except (psutil.Error, OSError):
             return None
 
     def leader(self) -> psutil.Process | None:
-        """Return the process that leads it, if it runs."""
+        """Return the process that leads the group; None if it has ended."""
         with suppress(psutil.Error):
             process = psutil.Process(self.pid)
             same = abs(process.create_time() - self.started) < SAME_S
@@ -55,10 +47,9 @@ class ProcessGroup:
         return None
 
     def kill(self) -> int:
-        """Kill the members, but for this process; returns how many there were.
+        """Send SIGKILL to all members except this process; return their number.
 
-        Call it again until there is none: they may have started others meanwhile, and take their
-        time.
+        Call it again until it returns 0: members may start others, and take time to end.
         """
         try:
             os.killpg(self.pid, 0)
@@ -79,7 +70,7 @@ class ProcessGroup:
                 process = psutil.Process(pid)
                 started = process.create_time()
                 if pid == self.pid and abs(started - self.started) >= SAME_S:
-                    return  # the id is somebody else's, and so is the group
+                    return  # another process has the id now, so the group is another, too
                 same = os.getsid(pid) == self.session and process.uids().real == os.getuid()
                 later = started > self.started - SAME_S
                 if same and later and process.status() != psutil.STATUS_ZOMBIE:
@@ -87,7 +78,7 @@ class ProcessGroup:
 
 
 def end_helpers() -> None:
-    """End what else is in the group that this process leads; nothing where it leads none."""
+    """Kill the other processes of the group that this process leads, if it leads a group."""
     own = ProcessGroup.of(os.getpid())
     if own is not None and os.getpgrp() == own.pid:
         own.kill()

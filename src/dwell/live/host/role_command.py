@@ -1,8 +1,8 @@
-"""A process of a cell, as agents start it.
+"""Command of a process of a cell; agents start it.
 
 ``python -m dwell.live.host.role_command --cell FILE --who NAME --state FOLDER``
 
-With ``--serve`` it is the one that an agent has them forked from, which has done their imports.
+With ``--serve`` it is the fork server: it imports the modules, and forks the other processes.
 """
 
 from __future__ import annotations
@@ -26,18 +26,11 @@ if TYPE_CHECKING:
 def server(
     cell: Path, program: Sequence[str], owner: int | None = None, state: Path | None = None
 ) -> list[str]:
-    """Return the command of the process that those of a cell are forked from.
+    """Return the command of the fork server of a cell.
 
-    Parameters
-    ----------
-    cell : Path
-        File that it reads once, so that the modules for reading are imported.
-    program : sequence of str
-        Module that runs this one or stands for it, with its first arguments (see `Platform`).
-    owner : int, optional
-        Id of the process that all of them end with.
-    state : Path, optional
-        Folder of the node's files.
+    The server reads `cell` once, to import the modules for reading. `program` is the module that
+    runs or replaces this module, with its first arguments (see `Platform`). All the processes end
+    with the process `owner`.
     """
     ends_with = [] if owner is None else ["--owner", str(owner)]
     kept = [] if state is None else ["--state", str(state)]
@@ -53,14 +46,7 @@ def words(
 ) -> list[str]:
     """Return the arguments of a process of a cell.
 
-    Parameters
-    ----------
-    state : Path
-        Folder of its node's files.
-    cpus : iterable of int, optional
-        CPUs that it may use; its agent's if not given.
-    priority : int, optional
-        Real-time priority, 1 to 99.
+    `cpus` default to the agent's CPUs; `priority` is a real-time priority from 1 to 99.
     """
     arguments = ["--who", who, "--cell", str(cell), "--state", str(state)]
     if cpus is not None:
@@ -71,15 +57,7 @@ def words(
 
 
 def main(arguments: Sequence[str] | None = None, platform: Platform | None = None) -> int:
-    """Run the process until it is told to end; returns the exit code.
-
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        Words after the module; those of this process if not given.
-    platform : Platform, optional
-        Clock and transport; without faults if not given.
-    """
+    """Run the process until a signal ends it; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cell", type=Path, required=True)
     parser.add_argument("--serve", action="store_true")
@@ -105,7 +83,7 @@ def main(arguments: Sequence[str] | None = None, platform: Platform | None = Non
 
 
 def _serve(cell: Path, state: Path, owner: int | None, platform: Platform | None) -> int:
-    """Import what every process needs, and fork; in a forked process, run it."""
+    """Import the modules of all processes and fork at each request; run each forked process."""
     from dwell.live.host import supervision  # noqa: F401
     from dwell.live.host.kept_cell import KeptCell
     from dwell.live.host.launcher import serve
@@ -114,7 +92,7 @@ def _serve(cell: Path, state: Path, owner: int | None, platform: Platform | None
     words = serve()
     if words is None:
         return 0
-    # Stages may look who they are.
+    # Stages may read their names there.
     sys.argv[1:] = words
     return main(words if owner is None else [*words, "--owner", str(owner)], platform)
 
@@ -134,12 +112,12 @@ def _run(options: argparse.Namespace, platform: Platform | None) -> int:
     from dwell.live.host.supervision import claim
     from dwell.live.log import escape_output
 
-    # What a user's code prints, and its exceptions, are shown on terminals.
+    # Terminals show the output and the exceptions of users' code.
     escape_output()
     keep_memory()
     end_with_owner(stopped, options.owner)
     claim(options.state, options.who)
-    # What the node's agent keeps; the files, where the process was started by hand.
+    # Read the agent's copy, or the files if a user started the process.
     kept = KeptCell.of(options.cell, [options.state])
     kept.install()
     problem = kept.problem()
@@ -151,15 +129,15 @@ def _run(options: argparse.Namespace, platform: Platform | None) -> int:
 
 
 def _name(who: str) -> None:
-    """Have `ps -o comm` and `top` show who it is: the command line is that of the fork server."""
+    """Set the name that `ps -o comm` and `top` show; the command line is the fork server's."""
     with suppress(OSError):
         Path("/proc/self/comm").write_text(who)
 
 
 def _schedule(who: str, cpus: str, priority: int) -> None:
-    """Take CPUs and a priority; threads that are started later inherit both.
+    """Set the CPUs and the priority of this process; later threads inherit both.
 
-    A process that may not goes on without: it says so, and the loop does not stop for it.
+    If the system refuses, the process prints an error and continues, as the loop must not stop.
     """
     try:
         if cpus:

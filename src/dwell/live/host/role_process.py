@@ -1,4 +1,4 @@
-"""The process of a stamper, worker or sink: what an agent starts."""
+"""Process of a stamper, worker or sink; an agent starts it."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from dwell.live.wire.wiring import Role as Named
 from dwell.live.wire.wiring import wire
 from dwell.model import Problem
 
-#: What an actuator is told at its process's orderly end, and for how long it is told again.
+#: Calls of an actuator at a clean end of its process, and the longest time for repeating them.
 ENDING: tuple[Rest, ...] = ("zero", "stop")
 ENDING_S = 2.0
 
@@ -57,23 +57,11 @@ def run_process(
     stopped: threading.Event,
     platform: Platform = PLAIN,
 ) -> bool:
-    """Run one process of a cell until it is told to end; returns whether it has ended in order.
+    """Run a process of `wiring.roles` until `stopped` is set; return whether it ended cleanly.
 
-    A sink tells its actuator to stop; where that raises to the last, the end is not in order.
-
-    Parameters
-    ----------
-    who : str
-        As in `wiring.roles`: a stamper, worker, shadow, standby or sink.
-    platform : Platform, optional
-        Its clock and transport; without faults if left out.
-
-    Raises
-    ------
-    LiveError
-        If there is no such process, or it cannot listen, or must not.
-    TrustError
-        If the keys that it has been given are not its.
+    A sink ends cleanly if it could stop its actuator. Raises a LiveError if the
+    process is unknown, its port is taken, or the cell needs keys and has none; and a TrustError if
+    the keys belong to another process.
     """
     entry = wire(problem).entry(who)
     node = entry.role.node
@@ -91,9 +79,9 @@ def _run(
     role: Named, place: RolePlace, folder: Path, stopped: threading.Event, clock: Clock
 ) -> bool:
     problem = place.problem
-    # A stage that computes must not keep a beat waiting for long.
+    # Switch threads often: a beat must not wait for a computing stage.
     sys.setswitchinterval(0.0005)
-    # What counts the CPU time of a node with a quota.
+    # The control group counts the CPU time of a node with a quota.
     group = own_group() if problem.fabric.nodes[role.node].quota is not None else None
     if role.kind not in ("stamper", "sink"):
         _work(role, place, folder, stopped, clock, group)
@@ -113,13 +101,13 @@ def _run(
         sink.group_clock = group.taken_ns
     start_thread("actuator", _watch, sink, clock, stopped)
     hosted = _host(sink, place, stopped, clock)
-    # A command that is being applied comes first; the role takes no other one.
+    # Wait for a command that is being applied; the role accepts no further commands.
     with hosted.lock:
         return bring_to_rest(sink)
 
 
 def _host(role: RoleLogic, place: RolePlace, stopped: threading.Event, clock: Clock) -> Hosted:
-    """Run a role in this thread until the process is told to end."""
+    """Run a role in this thread until `stopped` is set."""
     hosted = Hosted(role, place.transport, clock, stopped=stopped, complain=place.complain)
     keep_collections_short()
     hosted.run()
@@ -132,9 +120,9 @@ def _watch(sink: Sink, clock: Clock, stopped: threading.Event) -> None:
 
 
 def bring_to_rest(sink: Sink, patience_s: float = ENDING_S) -> bool:
-    """Have an actuator stop for good: `zero`, then `stop`; returns whether neither raised at last.
+    """Stop an actuator for good with `zero` and `stop`; return whether both succeeded.
 
-    What raises is called again every `max_age_ms` until patience ends.
+    A call that raises is repeated every `max_age_ms`, for up to `patience_s` in total.
     """
     until_s = time.monotonic() + patience_s
     rests = True
@@ -172,7 +160,7 @@ def _work(
             raise LiveError(f"tasks.{role.task}.run: missing; name its stage, as module:Name")
         stage = load_stage(name, f"tasks.{role.task}.run")
     except LiveError as error:
-        # It stays, and says in its beats what is wrong: a crash loop would say it less well.
+        # The process keeps running and reports the error in its beats, as restarts would hide it.
         print(error, file=sys.stderr, flush=True)
         broken = False, f"{role.who}: {error}"
         _host(_Broken(place, lambda: broken), place, stopped, clock)
@@ -195,7 +183,7 @@ def _work(
         if job is None:
             inflight.end()
         else:
-            # So that another process can try the job's inputs again.
+            # If this process dies, the next process tries the job's inputs again.
             inputs = [(header, bytes(payload)) for header, payload, _ in job.inputs.values()]
             inflight.begin(msgspec.msgpack.encode([job.shadow, inputs]))
 
@@ -214,14 +202,14 @@ def _print(line: str) -> None:
 
 
 class _Broken(Pulse):
-    """Stands for a worker whose stage cannot be had, and says so."""
+    """Replaces a worker whose stage cannot be loaded, and reports the error."""
 
     def receive(self, sample: Arrival, now_ns: int) -> None:
         super().receive(sample, now_ns)
 
 
 def _retry_suspect(worker: Worker, path: Path, clock: Clock) -> None:
-    """Try first what the process before died of, to see whether it was the message."""
+    """Run the job at which the previous process died first, to test whether its inputs kill."""
     try:
         shadow, inputs = msgspec.msgpack.decode(
             path.read_bytes(), type=tuple[bool, list[tuple[Header, bytes]]]

@@ -1,6 +1,6 @@
-"""Security of a process: its keys where the cell has some, and nothing but loopback where not.
+"""Security of a process: its keys, or only loopback addresses if the cell has no keys.
 
-Both settings come from the environment, so that an agent's processes have them of it.
+Two variables of the environment set this, so an agent's processes inherit it.
 """
 
 from __future__ import annotations
@@ -30,23 +30,19 @@ if TYPE_CHECKING:
 
 #: Variable of the environment: ``1`` allows addresses beyond this computer without keys.
 INSECURE = "DWELL_INSECURE"
-#: A certificate that ends soon is spoken of once a day.
+#: Period of warnings about keys in the log: one day.
 REMIND_S = 86_400.0
-#: People, and what watches, that a process is connected to besides the cell's processes.
+#: Largest number of operators and observers connected to a process.
 VISITORS_AT_ONCE = 8
-#: Of people, and of what runs where the controller does.
+#: Roles of keys that may visit; the controller's keys serve on its own node.
 VISITORS = ("operator", "observer", "controller")
 
 
 def environment(keys: Path | None, *, insecure: bool) -> dict[str, str]:
-    """Return this process's environment with what was said of its keys.
+    """Return this process's environment with the given settings of its security.
 
-    Parameters
-    ----------
-    keys : Path, optional
-        Keyring; what the environment says if not given.
-    insecure : bool
-        Whether addresses beyond this computer are allowed without keys.
+    `keys` is a keyring [default: the keyring of the environment]; `insecure` allows addresses
+    beyond this computer without keys.
     """
     named = {KEYS: str(keys.resolve())} if keys is not None else {}
     return {**os.environ, **named, **({INSECURE: "1"} if insecure else {})}
@@ -54,13 +50,7 @@ def environment(keys: Path | None, *, insecure: bool) -> dict[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class Security:
-    """Protection of a process of a cell.
-
-    Parameters
-    ----------
-    keyring : Keyring, optional
-        Its keys; without, whoever reaches its ports can say anything.
-    """
+    """Protection of a process of a cell; without a keyring, its ports accept any message."""
 
     problem: Problem
     keyring: Keyring | None = None
@@ -69,22 +59,10 @@ class Security:
     def of(
         cls, problem: Problem, role: Role, environment: Mapping[str, str] | None = None
     ) -> Security:
-        """Return the protection that the environment gives a process.
+        """Return the protection of a process or visitor, as the environment sets it.
 
-        Parameters
-        ----------
-        role : Role
-            A process of the cell, or a visitor.
-        environment : mapping of str to str, optional
-            This process's own if left out.
-
-        Raises
-        ------
-        TrustError
-            If the keys are not this cell's or not this process's, or are damaged, revoked or
-            expired.
-        LiveError
-            If there are none, and the cell leaves this computer.
+        Raises a TrustError if the keys belong to another cell or process, or are damaged, revoked
+        or expired; and a LiveError without keys if the cell has addresses beyond this computer.
         """
         given = os.environ if environment is None else environment
         folder = given.get(KEYS, "")
@@ -98,12 +76,10 @@ class Security:
         return cls(problem)
 
     def remember(self, folder: Path) -> None:
-        """Take note of the roster in a node's folder; it never goes back to an earlier one.
+        """Record the number of the roster in a node's folder.
 
-        Raises
-        ------
-        TrustError
-            If a later one was used there before: who has been revoked since would be back.
+        Raises a TrustError if the node has used a newer roster before: with the older roster,
+        certificates that were revoked since would be valid again.
         """
         if self.keyring is None:
             return
@@ -121,27 +97,21 @@ class Security:
             write_whole(kept, str(number))
 
     def transport(self, who: str) -> ZenohTransport:
-        """Open the sessions of a process of the cell.
-
-        Raises
-        ------
-        LiveError
-            If there is no such process, or a port is taken.
-        """
+        """Open the sessions of a process of the cell; raises a LiveError if a port is taken."""
         wiring = wire(self.problem, protocol=self._protocol)
-        # Those of before may be there still when everybody starts again.
+        # Twice the peers: old connections may still be open when all processes restart.
         most_peers = 2 * wiring.peers(who) + VISITORS_AT_ONCE
         return ZenohTransport(wiring.entry(who), self._settings(most_peers))
 
     def visit(self, who: str, *to: str) -> ZenohTransport:
-        """Open a session of somebody who is no part of the cell, to processes that are."""
+        """Open a session of a visitor, which is outside of the cell, to processes of the cell."""
         wiring = wire(self.problem, protocol=self._protocol)
         return ZenohTransport(wiring.visitor(who, *to), self._settings(VISITORS_AT_ONCE))
 
     def place(
         self, who: str, node: str, transport: Transport, say: Callable[[str], None]
     ) -> RolePlace:
-        """Return where a role runs that is just started."""
+        """Return the place of a role that starts now."""
         from dwell.live.roles.role import RolePlace
 
         seals = None
@@ -152,7 +122,7 @@ class Security:
         return RolePlace(self.problem, who, node, transport, time.time_ns(), say=say, seals=seals)
 
     def warnings(self) -> Iterator[str]:
-        """Yield warnings that belong into its log every day."""
+        """Yield the daily warnings: no keys, or a certificate that expires soon."""
         if self.keyring is None:
             addresses = sorted(set(_beyond(self.problem).values()))
             if addresses:
@@ -165,7 +135,7 @@ class Security:
             yield f"warning: {ends}"
 
     def remind(self, say: Callable[[str], None], stopped: threading.Event) -> None:
-        """Have the log say now what is wrong with the keys, and every day from now on."""
+        """Log the warnings now, and once per day until `stopped` is set."""
 
         def tell() -> None:
             for line in self.warnings():
@@ -193,14 +163,10 @@ class Security:
 
 
 def _keyring(folder: Path, problem: Problem, role: Role) -> Keyring:
-    """Open the keyring of a process.
+    """Open the keyring of a process; raises a TrustError if it is missing or invalid.
 
-    The folder is it, or has it by the name of its subject, of the cell, or of both.
-
-    Raises
-    ------
-    TrustError
-        If it is none.
+    The keyring is the folder itself, or a folder below it, named after the subject, the cell, or
+    both.
     """
     try:
         from dwell.live.trust.keyring import Keyring
@@ -216,7 +182,7 @@ def _keyring(folder: Path, problem: Problem, role: Role) -> Keyring:
 
 
 def _require_own(keyring: Keyring, role: Role) -> None:
-    """Raise a TrustError unless a keyring is the one that a process has to have."""
+    """Raise a TrustError if a keyring belongs to another process."""
     own = keyring.own
     where = f"{keyring.folder}: keys of {own.name}, a subject with the role {own.role}"
     if role.kind == "visitor":
@@ -230,11 +196,11 @@ def _require_own(keyring: Keyring, role: Role) -> None:
 
 
 def _tls(problem: Problem, keyring: Keyring) -> dict[str, object]:
-    """Zenoh's settings for mutual TLS and nothing else."""
+    """Return Zenoh's settings that permit only mutual TLS."""
     from dwell.live.trust.acl import access_control
     from dwell.live.trust.permissions import subjects
 
-    # Zenoh reads files at every connection, when newer ones may be there.
+    # Pass contents: Zenoh would read files at every connection, when they may have changed.
     authority, certificate, key = (
         base64.b64encode(path.read_bytes()).decode()
         for path in (keyring.folder / "ca.pem", keyring.folder / "cert.pem", keyring.key_file)
@@ -256,7 +222,7 @@ def _tls(problem: Problem, keyring: Keyring) -> dict[str, object]:
 
 
 def exposed(problem: Problem) -> Iterator[Fault]:
-    """Yield every address of a cell that takes it beyond this computer."""
+    """Yield a fault for each address of a cell beyond this computer."""
     for path, address in _beyond(problem).items():
         yield Fault(
             path,
@@ -267,7 +233,7 @@ def exposed(problem: Problem) -> Iterator[Fault]:
 
 
 def _beyond(problem: Problem) -> dict[str, str]:
-    """Return addresses that are not loopback, by where they stand in the cell file."""
+    """Return the addresses that are not loopback, by their path in the cell file."""
     addresses = {}
     for node, host in problem.live.hosts.items():
         addresses[f"live.hosts.{node}.address"] = host.address

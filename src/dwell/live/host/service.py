@@ -1,4 +1,4 @@
-"""Service: reports of an agent or a controller to systemd, and the length of its own log."""
+"""Service: reports of an agent or a controller to systemd, and a bound on its log's size."""
 
 from __future__ import annotations
 
@@ -11,22 +11,17 @@ from pathlib import Path
 
 from dwell.live.host.supervision import LOG_BYTES, shorten_log
 
-#: Variables that systemd sets for a service: first where it listens (sd_notify(3)).
+#: Variables that systemd sets for a service; the first is systemd's socket (sd_notify(3)).
 VARIABLES = "NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC"
-#: Time between two signs of life, and between two looks at the log.
+#: Period of the watchdog's messages and of the checks of the log.
 STEP_S = 1.0
 
 
 class Service:
-    """An agent or a controller, as the program that keeps it running sees it.
+    """Reports of an agent or a controller to systemd.
 
-    Parameters
-    ----------
-    who : str
-        Name of the process; `dwell live up` has its stderr in a file ``WHO.log``.
-    environment : mapping of str to str
-        The variables of systemd are removed from it: processes that get it do not report in the
-        name of this one.
+    Removes the variables of systemd from `environment`, so the processes that inherit it do not
+    report to systemd. `dwell live up` writes the stderr of the process to ``WHO.log``.
     """
 
     def __init__(
@@ -43,7 +38,7 @@ class Service:
         self._report("READY=1")
 
     def step(self) -> None:
-        """Report that the main loop turns, and keep the log short; does so once a second."""
+        """Report once per second that the main loop runs, and shorten the log if it is long."""
         now_s = time.monotonic()
         if now_s < self._next_s:
             return
@@ -55,7 +50,7 @@ class Service:
                 shorten_log(log, self._log_bytes)
 
     def stopping(self) -> None:
-        """Report that the process ends in order."""
+        """Report that the process begins a clean end."""
         self._report("STOPPING=1")
 
     def _report(self, state: str) -> None:

@@ -1,4 +1,4 @@
-"""Modules of a cell's stages: looked at before any process is started."""
+"""Check of the modules of a cell's stages, before the first process starts."""
 
 from __future__ import annotations
 
@@ -11,14 +11,10 @@ from dwell.model.user_classes import import_user_module
 
 
 def require_stages(problem: Problem, cell: Path, nodes: Collection[str]) -> None:
-    """Refuse a cell that lacks a stage for a task of some nodes, or whose stages are not here.
+    """Raise a DwellError if a task of these nodes has no stage, or its modules cannot be imported.
 
-    A node starts a worker that failed again and again, so such a cell would never come up.
-
-    Raises
-    ------
-    DwellError
-        With the task, and what is missing.
+    Otherwise the nodes would restart the failing workers forever, and the cell would never be
+    ready.
     """
     tasks = [
         task for task in problem.pipeline.tasks.values() if not task.on.keys().isdisjoint(nodes)

@@ -1,4 +1,4 @@
-"""Files in which a process of a live cell keeps its state across its own death."""
+"""State files of the processes of a live cell, which survive a crash of the process."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ _LENGTH = struct.Struct("<QI")
 _SLOT = struct.Struct("<QII")
 _BOOK_BYTES = 2_048
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
-#: Bits of a folder's mode by which its group, or everybody, may change what is in it.
+#: Bits of a folder's mode that permit writes by its group or by all users.
 OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
 def boot_id() -> str:
-    """Return the id of the kernel's present boot; nothing if the system has none."""
+    """Return the id of the kernel's present boot; empty if the system has none."""
     try:
         return BOOT_ID.read_text(encoding="ascii").strip()
     except OSError:
@@ -36,15 +36,13 @@ def boot_id() -> str:
 
 
 def make_folder(path: Path) -> Path:
-    """Make a folder for a node's files; nobody else may change what is in it.
+    """Make a folder for a node's files, which only this user may change.
 
-    Raises
-    ------
-    LiveError
-        If it cannot be made or written to, or belongs to another user, or others may write to it.
+    Raises a LiveError if the folder cannot be made or written to, belongs to another user, or other
+    users may write to it.
     """
     try:
-        # `parents=True` would leave those above open to the group where the umask is 002.
+        # With `parents=True` and umask 002, the group could write to the parents.
         for folder in reversed(path.parents):
             if not folder.exists():
                 folder.mkdir(exist_ok=True, mode=0o700)
@@ -68,26 +66,15 @@ def make_folder(path: Path) -> Path:
 
 
 def open_own(path: str | os.PathLike[str], flags: int) -> int:
-    """Open a file of a node's folder as `open` does, and no symbolic link to one elsewhere.
-
-    Raises
-    ------
-    OSError
-        If it is a link (ELOOP), or cannot be opened.
-    """
+    """Open a file of a node's folder (an opener for `open`); raises OSError (ELOOP) at a link."""
     return os.open(path, flags | os.O_NOFOLLOW, 0o666)
 
 
 def _mapped(path: Path, size: int) -> mmap.mmap:
-    """Map a file of a fixed length, which is made where it is missing or has another one.
+    """Map a file of a fixed size; make the file if it is missing or has another size.
 
-    Its place on the disk is taken at once: who writes to it later needs none that might not be
-    there, and would be killed for that.
-
-    Raises
-    ------
-    OSError
-        If the disk is full, or it is a symbolic link.
+    The blocks on the disk are allocated at once. Otherwise a later write to the map on a full disk
+    would kill the process. Raises an OSError if the disk is full, or the file is a symbolic link.
     """
     with open(path, "a+b", opener=open_own) as file:
         if file.seek(0, os.SEEK_END) != size:
@@ -97,13 +84,7 @@ def _mapped(path: Path, size: int) -> mmap.mmap:
 
 
 def _required(path: Path, size: int) -> mmap.mmap:
-    """Map a file that its process cannot do without.
-
-    Raises
-    ------
-    LiveError
-        If it is not there yet, and the disk is full; or it is a symbolic link.
-    """
+    """Map a file that its process needs; raises a LiveError if that fails."""
     try:
         return _mapped(path, size)
     except OSError as error:
@@ -113,7 +94,7 @@ def _required(path: Path, size: int) -> mmap.mmap:
 
 
 def kept_memory(path: Path, size: int) -> mmap.mmap | bytearray:
-    """Map a file for counts; memory of the process's own where the disk has no room."""
+    """Map a file for counts; return private memory if that fails, as on a full disk."""
     try:
         return _mapped(path, size)
     except OSError:
@@ -123,9 +104,8 @@ def kept_memory(path: Path, size: int) -> mmap.mmap | bytearray:
 class _Slots:
     """Two slots of mapped memory, written in turn.
 
-    Mapped memory outlives its process, and a full disk does not stop a write. A process that dies
-    during a write spoils only the slot that was not the last. A file that was removed is made again
-    by the next write.
+    Mapped memory outlives its process, and can be written when the disk is full. A process that
+    dies during a write damages only the older slot. The next write restores a removed file.
     """
 
     def __init__(self, path: Path, size: int) -> None:
@@ -141,9 +121,9 @@ class _Slots:
                 self._number, self.content = number, content
 
     def write(self, content: bytes) -> None:
-        """Write the slot that was not the last."""
+        """Overwrite the older slot."""
         if _identity(self._path) != self._file:
-            # Until it can be made again, the writes go to the file that was removed.
+            # If the removed file cannot be restored yet, write to the old map.
             with suppress(OSError):
                 self._map = _mapped(self._path, 2 * self._size)
                 self._file = _identity(self._path)
@@ -156,7 +136,7 @@ class _Slots:
 
 
 def _identity(path: Path) -> tuple[int, int]:
-    """Return device and number of a file; (-1, -1) if there is none."""
+    """Return device and inode of a file; (-1, -1) if it is missing."""
     try:
         status = os.lstat(path)
     except OSError:
@@ -165,20 +145,20 @@ def _identity(path: Path) -> tuple[int, int]:
 
 
 class BookFile:
-    """A stamper's `StamperState`."""
+    """State file of a stamper."""
 
     def __init__(self, path: Path) -> None:
         self._slots = _Slots(path, _BOOK_BYTES)
 
     def read(self) -> StamperState | None:
-        """Return what was written last; None where nothing was, or it cannot be read."""
+        """Return the last written state; None if the file is empty or invalid."""
         try:
             return msgspec.json.decode(self._slots.content, type=StamperState)
         except msgspec.MsgspecError:
             return None
 
     def write(self, entry: StamperState) -> None:
-        """Write it."""
+        """Save the state."""
         text = msgspec.json.encode(entry)
         if len(text) > _BOOK_BYTES:
             raise LiveError(f"the placement's name is too long: {entry.placement[:40]}...")
@@ -186,24 +166,24 @@ class BookFile:
 
 
 class HighestFile:
-    """The highest cycle actuated."""
+    """State file of a sink: the highest actuated cycle."""
 
     def __init__(self, path: Path) -> None:
         self._slots = _Slots(path, _CYCLE.size)
 
     def load(self) -> tuple[int, int]:
-        """Return its run and number; (-1, -1) where none is known."""
+        """Return run and number of the cycle; (-1, -1) if unknown."""
         content = self._slots.content
         run, cycle = _CYCLE.unpack(content) if content else (-1, -1)
         return run, cycle
 
     def store(self, run: int, cycle: int) -> None:
-        """Write them."""
+        """Save run and number of the cycle."""
         self._slots.write(_CYCLE.pack(run, cycle))
 
 
 class InFlight:
-    """Inputs of a worker's present job, in mapped memory: it died of them, if it dies."""
+    """Inputs of a worker's present job in mapped memory: the suspected cause if the worker dies."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -211,7 +191,7 @@ class InFlight:
         self._map: mmap.mmap | None = None
 
     def begin(self, content: bytes) -> None:
-        """Note the inputs of the job that begins."""
+        """Record the inputs of a job that begins."""
         needed = _LENGTH.size + len(content)
         if self._map is None or needed > self._size:
             self._grow(needed)
@@ -220,12 +200,12 @@ class InFlight:
             _LENGTH.pack_into(self._map, 0, len(content), 1)
 
     def end(self) -> None:
-        """Note that the job is over."""
+        """Record the end of the job."""
         if self._map is not None:
             _LENGTH.pack_into(self._map, 0, 0, 0)
 
     def _grow(self, needed: int) -> None:
-        """Make room; where the disk has none, nothing is noted, and the work goes on."""
+        """Enlarge the file; on a full disk, continue without records."""
         size = 1 << (needed - 1).bit_length()
         try:
             self._map, self._size = _mapped(self._path, size), size
@@ -234,7 +214,7 @@ class InFlight:
 
     @staticmethod
     def read(path: Path) -> bytes | None:
-        """Return the inputs of the job that a dead worker was at; None if it was at none."""
+        """Return the inputs of the job during which a worker died; None if it was idle."""
         try:
             data = path.read_bytes()
         except OSError:

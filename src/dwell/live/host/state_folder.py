@@ -1,4 +1,4 @@
-"""The state folder: what a computer keeps of its cells, a folder each, with one for each node."""
+"""State folder of a computer: one folder per cell, and in it one folder per node."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def state_root(given: Path | None = None) -> Path:
-    """Return the folder that has one for each cell; by default below ``~/.local/state``."""
+    """Return the folder with one folder per cell [default: ``~/.local/state/dwell``]."""
     if given is not None:
         return given.resolve()
     home = os.environ.get("XDG_STATE_HOME")
@@ -15,7 +15,7 @@ def state_root(given: Path | None = None) -> Path:
 
 
 def logs(root: Path) -> dict[str, dict[str, Path]]:
-    """Return the logs of processes below a state folder, by process and cell."""
+    """Return the logs of the processes in a state folder, by process and cell."""
     found: dict[str, dict[str, Path]] = {}
     for pattern in ("*/*.log", "*/*/*.log"):
         for path in sorted(root.glob(pattern)):

@@ -1,4 +1,4 @@
-"""Supervision: keeps the processes of a node running, and finds out why they die."""
+"""Supervision: keeps the processes of a node running, and finds the causes of their deaths."""
 
 from __future__ import annotations
 
@@ -26,39 +26,39 @@ from dwell.live.host.process_group import ProcessGroup
 from dwell.live.host.state_files import InFlight, make_folder, open_own
 from dwell.live.log import printable
 
-#: Waits between two starts of a process that keeps dying.
+#: Shortest and longest wait before a restart of a process that keeps dying.
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.05, 5.0
-#: Time in which processes end by themselves when told to: an actuator may take two seconds of it.
+#: Time for a clean end of processes; an actuator may take two seconds.
 STOP_S = 3.5
-#: Time after which the next process is restarted, whether the one before it is ready or not.
+#: Longest wait for a restarted process to be ready, before the next process is restarted.
 TURN_S = 30.0
-#: Time between two looks whether they have, or whether they shall end at once.
+#: Period of the checks of processes that are ending.
 LOOK_S = 0.1
-#: A process that lived so long has recovered.
+#: Lifetime after which a process has recovered.
 HEALTHY_S = 10.0
-#: Deaths of one message before it is put aside.
+#: Number of deaths at one message after which the message is quarantined.
 POISONOUS = 2
-#: A process has warmed up after this time; it is reported when it has gained this much since, and
-#: has more than twice what it had then.
+#: Warm-up time of a process. Its memory is reported if it has since grown by more than this number
+#: of bytes, and to more than twice its size after the warm-up.
 WARM_S, GROWTH_BYTES = 30.0, 128 << 20
-#: Memory above its largest so far from which on a process still grows.
+#: Least increase of the largest memory of a process that counts as growth.
 GROWS_BYTES = 1 << 20
-#: Time for which notes repeat that a process has died for want of memory, that a message has been
-#: put aside, or, since the last growth, that memory grows.
+#: Time for which notes repeat a death for lack of memory, a quarantined message, or a growth of
+#: memory.
 TOLD_S = 60.0
-#: An agent is not ready while a process of its node has died so often, one start after another.
+#: Number of consecutive deaths of a process from which its agent is not ready.
 MOST_TRIES = 10
-#: Of a process that an agent before has started, nobody knows what it died of.
+#: Cause of death of a process that a previous agent has started: unknown.
 ENDED = "has ended"
-#: Where the kernel counts the processes that it has killed because there was no memory left.
+#: File with the kernel's count of processes killed for lack of memory, and its key.
 EVENTS, OOM_KILL = Path("/proc/vmstat"), "oom_kill"
-#: A log that is longer becomes the older one, which is dropped.
+#: Largest size of a log; a longer log replaces the older log.
 LOG_BYTES = 8 << 20
 
 
 @dataclass(slots=True)
 class SupervisedProcess:
-    """A process that is kept running."""
+    """A supervised process, with its deaths and its memory."""
 
     who: str
     command: Sequence[str]
@@ -70,55 +70,48 @@ class SupervisedProcess:
     next_s: float = 0.0
     note: str = ""
     deaths: Counter[str] = field(default_factory=Counter)
-    #: What is told of it for a while though it may run again, and since when.
+    #: Note that is reported for `TOLD_S`, even if the process runs again, and its time.
     told: str = ""
     told_s: float = -math.inf
-    #: Where the output of its present life begins in its log.
+    #: Offset in the log at which the output of the present process begins.
     log_begins: int = 0
     group: ProcessGroup | None = None
-    #: Helpers that have outlived it and are not gone yet.
+    #: Number of helper processes that have outlived the process and still run.
     helpers: int = 0
     has_bytes: int = 0
     watched: psutil.Process | None = None
     warm_bytes: int | None = None
-    #: Its largest memory so far, the instant of that, and the note about its growth.
+    #: Largest memory so far, its time, and the note about its growth.
     peak_bytes: int = 0
     peak_s: float = -math.inf
     growth: str = ""
 
     @property
     def pid(self) -> int | None:
-        """Id of the running process; None where none runs."""
+        """Id of the running process; None if it has ended."""
         return self.process.pid if self.process is not None else None
 
     @property
     def ails(self) -> bool:
-        """Whether it has died more than once, and not lived long enough since."""
+        """Whether the process has died more than once, and has not recovered since."""
         lives_s = time.monotonic() - self.started_s if self.process is not None else 0.0
         return self.failures > 1 and lives_s < HEALTHY_S
 
     def file(self, kind: str) -> Path:
-        """Return a file of its: its output (`log`), inputs of its present job (`inflight`), ...
+        """Return a file of the process by its suffix.
 
-        ``pid`` tells the next agent of a process that outlives this one, what is in ``again`` is
-        worked on first by a worker that is started, and ``ready`` is there once it can work.
+        ``log`` has its output, ``inflight`` the inputs of its present job, ``pid`` its process
+        group for the next agent, and ``again`` the inputs of a job that the next worker runs first.
+        ``ready`` exists when the process can work.
         """
         return self.folder / f"{self.who}.{kind}"
 
 
 class Supervisor:
-    """Starts processes, starts them again when they die, and adopts those of an agent before.
+    """Starts processes, restarts them when they die, and adopts processes of a previous agent.
 
-    Parameters
-    ----------
-    folder : Path
-        The node's.
-    say : callable
-        Takes a line for the log of the agent.
-    warm_s, growth_bytes, log_bytes
-        From when on, and from what on, memory that grows is reported; length of a log.
-    launcher : ForkServer
-        Starts the processes.
+    `folder` is the node's state folder; `say` writes a line to the agent's log. See `WARM_S`,
+    `GROWTH_BYTES` and `LOG_BYTES` for the other parameters.
     """
 
     def __init__(
@@ -138,15 +131,15 @@ class Supervisor:
         self._say = say
         self._oom_kills = _oom_kills()
         self._launcher = launcher
-        # Processes that are to be restarted, the next one last; who is, since when, and after how
-        # many starts.
+        # Processes to restart (the next is the last of the list), and the process that is being
+        # restarted, with the time and its number of starts before.
         self._turns: list[SupervisedProcess] = []
         self._turn: tuple[SupervisedProcess, float, int] | None = None
-        # What has become of the folder, if it was removed, and when.
+        # Note about a removed state folder, and its time.
         self._lost, self._lost_s = "", -math.inf
 
     def keep(self, who: str, command: Sequence[str]) -> SupervisedProcess:
-        """Have a process run from now on."""
+        """Add a process to keep running."""
         child = SupervisedProcess(who, command, self.folder)
         child.group = marked_group(child.file("pid"))
         if not self._adopts(child):
@@ -155,7 +148,7 @@ class Supervisor:
         return child
 
     def _adopts(self, child: SupervisedProcess) -> bool:
-        """Take a process over that somebody before has started, if it runs."""
+        """Supervise a running process of a previous agent; return whether one exists."""
         if (process := survivor(child.file("pid"))) is None:
             return False
         child.process, child.group = Survivor(process.pid), marked_group(child.file("pid"))
@@ -165,7 +158,7 @@ class Supervisor:
         return True
 
     def _end_group(self, child: SupervisedProcess) -> bool:
-        """End what a process that has died has left of its group; whether nothing is left."""
+        """Kill the helpers of a dead process; return whether all have ended."""
         left = 0 if child.group is None else child.group.kill()
         if left > child.helpers:
             self._say(f"{child.who}: {left} of its helpers have outlived it, and are ended")
@@ -175,7 +168,7 @@ class Supervisor:
         return not left
 
     def step(self) -> None:
-        """Look after every process once."""
+        """Check each process once, and start the missing processes."""
         ready = self._launcher.ready()
         for child in self.children:
             if self._alive(child) or not self._end_group(child):
@@ -187,7 +180,7 @@ class Supervisor:
 
     @property
     def pending(self) -> bool:
-        """Whether a process has ended or has to be started: `step` is due soon."""
+        """Whether `step` is due soon, because a process has ended or waits for its start."""
         pids = [child.pid for child in self.children]
         return self.restarting or None in pids or self.ends.pending(pids)
 
@@ -197,9 +190,9 @@ class Supervisor:
         return self._turn is not None or bool(self._turns)
 
     def restart_in_turn(self) -> None:
-        """Have every process end and start again, each when the one before it is ready.
+        """Restart all processes one by one, each after the previous process is ready.
 
-        Those that were kept last are the first: workers before sinks, and the stamper at the end.
+        The order is the reverse of `children`: workers before sinks, and the stamper last.
         """
         self._turns = list(self.children)
 
@@ -251,9 +244,9 @@ class Supervisor:
             self._say(f"{child.who}: what it died of cannot be kept ({error.strerror})")
 
     def _starved(self, child: SupervisedProcess, reason: str, last: str) -> str:
-        """Return that a process died for want of memory, and how; empty where it did not.
+        """Return how a process died for lack of memory; empty for other causes.
 
-        The kernel counts the processes that it has killed for that, of the whole machine.
+        The kernel's count of processes killed for lack of memory includes the whole machine.
         """
         killed = self._oom_kills < (kills := _oom_kills())
         self._oom_kills = kills
@@ -265,7 +258,7 @@ class Supervisor:
         return ""
 
     def _hand_on_suspect(self, child: SupervisedProcess, reason: str) -> None:
-        """Give the message that a worker died of to the next one, but not twice."""
+        """Pass the inputs at which a worker died to the next worker, or quarantine them."""
         content = InFlight.read(child.file("inflight"))
         again = child.file("again")
         again.unlink(missing_ok=True)
@@ -286,7 +279,7 @@ class Supervisor:
         self._say(child.note)
 
     def _start(self, child: SupervisedProcess) -> None:
-        """Start a process; a disk that is full must not end the agent, and with it the node."""
+        """Start a process; a full disk must not end the agent, and so the node."""
         child.starts += 1
         child.started_s = time.monotonic()
         with suppress(OSError):
@@ -304,7 +297,7 @@ class Supervisor:
         self._write_mark(child)
 
     def _write_mark(self, child: SupervisedProcess) -> None:
-        """Write who runs; the mark of somebody before it must not stay."""
+        """Replace the ``pid`` file of the previous process."""
         try:
             child.file("pid").unlink(missing_ok=True)
             write_mark(child.file("pid"), child.group)
@@ -312,7 +305,7 @@ class Supervisor:
             self._say(f"{child.who}: its mark cannot be written ({error.strerror})")
 
     def tend(self) -> None:
-        """Look how much memory the processes have taken, and how much they have printed."""
+        """Check the memory and the logs of the processes, and restore missing files."""
         self._oom_kills = _oom_kills()
         if self.children and not self.folder.is_dir():
             self._make_folder()
@@ -320,11 +313,11 @@ class Supervisor:
             if shorten_log(child.file("log"), self._log_bytes):
                 child.log_begins = 0
             if child.process is not None and not child.file("pid").exists():
-                self._write_mark(child)  # there was no room for it
+                self._write_mark(child)  # the disk was full before, or the file was removed
             self._weigh(child)
 
     def _make_folder(self) -> None:
-        """Make the state folder again; a disk that is gone must not end the agent."""
+        """Make the removed state folder again; a missing disk must not end the agent."""
         lost = f"{self.folder}: was removed, and is made again"
         try:
             make_folder(self.folder)
@@ -335,14 +328,14 @@ class Supervisor:
         self._say(lost)
 
     def _weigh(self, child: SupervisedProcess) -> None:
-        """Report a process whose memory has doubled since it had warmed up, at every doubling."""
+        """Report each doubling of a process's memory since its warm-up."""
         if child.pid is None:
             return
         try:
             memory = psutil.Process(child.pid).memory_info()
         except psutil.Error:
             return
-        # Without what it shares with others: the payloads in shared memory.
+        # Subtract shared memory, which contains payloads.
         child.has_bytes = has_bytes = memory.rss - memory.shared
         now_s = time.monotonic()
         if has_bytes > child.peak_bytes + GROWS_BYTES:
@@ -361,7 +354,7 @@ class Supervisor:
             self._say(child.growth)
 
     def cpu_seconds(self) -> dict[str, float]:
-        """CPU time of every process that runs, since it was started."""
+        """Return the CPU time of each running process since its start."""
         seconds: dict[str, float] = {}
         for child in self.children:
             if child.pid is None:
@@ -376,11 +369,11 @@ class Supervisor:
         return seconds
 
     def stuck(self) -> bool:
-        """Return whether a process has died at so many starts that somebody has to look."""
+        """Return whether a process has died `MOST_TRIES` times, so the user has to act."""
         return any(child.failures >= MOST_TRIES and child.ails for child in self.children)
 
     def notes(self) -> str:
-        """Return the last troubles of processes that keep dying or growing, or died for memory."""
+        """Return notes about processes that keep dying, whose memory grows, or lacked memory."""
         since_s = time.monotonic() - TOLD_S
         ailing = [child for child in self.children if child.ails]
         ailing.sort(key=lambda child: -child.failures)
@@ -393,17 +386,9 @@ class Supervisor:
     def stop(
         self, patience_s: float = STOP_S, *, hurried: threading.Event | None = None
     ) -> dict[str, str]:
-        """End all processes; those that do not listen are killed.
+        """End all processes; return the causes of unclean ends by process.
 
-        Parameters
-        ----------
-        hurried : Event, optional
-            Has them killed at once.
-
-        Returns
-        -------
-        dict of str to str
-            How processes ended that did not end in order.
+        Processes that still run after `patience_s`, or when `hurried` is set, are killed.
         """
         running = [
             psutil.Process(c.pid) for c in self.children if c.pid and psutil.pid_exists(c.pid)
@@ -433,7 +418,7 @@ class Supervisor:
         return failed
 
     def _end_groups(self, patience_s: float) -> None:
-        """End what the processes have left; a helper that the kernel keeps is not waited for."""
+        """Kill the processes' helpers; give up after `patience_s`."""
         deadline = time.monotonic() + patience_s
         left = [child for child in self.children if not self._end_group(child)]
         while left and time.monotonic() < deadline:
@@ -452,37 +437,28 @@ def _signal(process: psutil.Process, number: int) -> None:
 
 
 def write_mark(mark: Path, group: ProcessGroup | None) -> None:
-    """Write who runs, for the next agent.
-
-    Raises
-    ------
-    OSError
-        If there is no room.
-    """
+    """Write the group of a running process for the next agent."""
     if group is not None:
-        # Nobody waits for a slow disk: after a loss of power no process runs.
+        # No sync to the disk: after a power failure, the process has ended anyway.
         write_whole(mark, json.dumps(asdict(group)), durable=False)
 
 
 def claim(folder: Path, who: str) -> None:
-    """Mark this process as the one of its name on its node: its agent may be dead by now.
+    """Write the ``pid`` file of this process, as its agent may have died since the fork.
 
-    Raises
-    ------
-    LiveError
-        If another one runs.
+    Raises a LiveError if another process of this name runs on the node.
     """
     mark = folder / f"{who}.pid"
     other = survivor(mark)
     if other is not None and other.pid != os.getpid():
         raise LiveError(f"{who}: runs already (process {other.pid})")
-    # Where there is no room, its agent will try again.
+    # If the disk is full, the agent tries again.
     with suppress(OSError):
         write_mark(mark, ProcessGroup.of(os.getpid()))
 
 
 def marked_group(mark: Path) -> ProcessGroup | None:
-    """Return the group of the process that a mark tells of, whether that runs or not."""
+    """Return the group in a ``pid`` file, whether its process runs or not."""
     try:
         content = json.loads(mark.read_text())
         pid, started = int(content["pid"]), float(content["started"])
@@ -492,7 +468,7 @@ def marked_group(mark: Path) -> ProcessGroup | None:
 
 
 def survivor(mark: Path) -> psutil.Process | None:
-    """Return the process that a mark tells of, if it is still that one."""
+    """Return the process in a ``pid`` file, if it still runs."""
     group = marked_group(mark)
     return None if group is None else group.leader()
 
@@ -509,7 +485,7 @@ def _reason(code: int) -> str:
 
 
 def _oom_kills() -> int:
-    """Return how many processes the kernel has killed for memory; 0 where it does not count."""
+    """Return the kernel's count of processes killed for lack of memory; 0 without a count."""
     try:
         counts = dict(line.split() for line in EVENTS.read_text().splitlines())
         return int(counts.get(OOM_KILL, 0))
@@ -518,7 +494,10 @@ def _oom_kills() -> int:
 
 
 def shorten_log(path: Path, longest: int) -> bool:
-    """Begin a log anew that is too long; its process goes on appending to the same file."""
+    """Move the content of a long log to ``.log.1``; its process keeps appending to the log.
+
+    Returns whether the log was too long and has been emptied.
+    """
     try:
         if path.stat().st_size <= longest:
             return False
@@ -531,7 +510,7 @@ def shorten_log(path: Path, longest: int) -> bool:
 
 
 def _last_line(path: Path, begins: int) -> str:
-    """Return the last line of a log behind a place."""
+    """Return the last line of a log after an offset."""
     try:
         with path.open("rb") as file:
             file.seek(max(file.seek(0, os.SEEK_END) - 2_000, begins))

@@ -1,1 +1,1 @@
-"""A live cell on this computer: its processes, emulated links, and disturbances."""
+"""Testbed: a live cell on this computer, with emulated links and disturbances."""

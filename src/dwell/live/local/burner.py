@@ -1,9 +1,9 @@
-"""Foreign work on a node's CPUs: busy threads at normal priority, as many as asked for.
+"""Foreign load on a node's CPUs: a number of busy threads at normal priority.
 
-Each is what the simulator calls a foreign thread (`stress_threads`): always runnable, pinned to the
-node's CPUs, no memory traffic to speak of. It is a process of its own, because threads of one
-Python process take turns instead of competing; the kernel knows no difference. All end with the
-process that starts them, and that one with the testbed's.
+Each is a foreign thread of the simulator (`stress_threads`): always runnable, pinned to the node's
+CPUs, almost without memory traffic. It is a separate process, because threads of one Python process
+take turns instead of competing; the kernel schedules both alike. All end with the burner's process,
+which ends with the testbed's.
 """
 
 from __future__ import annotations
@@ -19,26 +19,19 @@ from collections.abc import Callable, Collection, Sequence
 from dwell.errors import LiveError
 from dwell.live.local.child import Child, Parent
 
-#: One busy process; a loop without memory traffic, as the simulator has its foreign threads.
+#: Command of a busy process: a loop without memory traffic, like the simulator's foreign threads.
 STRESS_NG = ("stress-ng", "--quiet", "--cpu", "1", "--cpu-method", "loop", "--timeout", "0")
 MAX_THREADS = 1_000
-# Turns of an empty loop between two looks at whether the parent lives: below a millisecond.
+# Turns of an empty loop (below a millisecond) between two checks whether the parent lives.
 TURNS = 20_000
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 class Burner(Child):
-    """Foreign threads on some CPUs, as many as ordered; a context manager.
+    """Foreign threads on some CPUs, over which the kernel spreads them; a context manager.
 
-    Parameters
-    ----------
-    cpus : collection of int
-        Where the threads run; the kernel spreads them over these.
-    prefix : sequence of str
-        Words of a command that runs the words behind them, in the same process: as a group of
-        processes that the threads are to be in.
-    program : sequence of str
-        A command that keeps one CPU busy, in place of this module's own empty loop.
+    `prefix` is a command that executes the command after it in the same process, such as in a group
+    of processes. `program` is a command that keeps one CPU busy [default: an empty loop].
     """
 
     def __init__(
@@ -54,34 +47,26 @@ class Burner(Child):
             asked = f"CPU {', '.join(map(str, missing))}" if missing else "no CPU"
             known = ", ".join(map(str, sorted(allowed)))
             raise LiveError(f"a burner cannot run on {asked}; this process may use {known}")
-        #: Ids of the threads as of the last answer: each is a process.
+        #: Process ids of the threads at the last answer.
         self.pids: tuple[int, ...] = ()
         name = f"burner on {','.join(map(str, sorted(cpus)))}"
         settings = sorted(cpus), tuple(program)
         super().__init__("dwell.live.local.burner", name, settings, prefix=prefix)
 
     def start(self, threads: int = 0) -> None:
-        """Start it with so many threads.
+        """Start the burner's process and a number of threads.
 
-        Raises
-        ------
-        ProblemError
-            If the number is out of its bounds.
-        LiveError
-            If it has been started before, or does not start.
+        Raises a ProblemError if the number is out of bounds, and a LiveError if the burner has been
+        started before, or does not start.
         """
         super().start()
         self.set(threads)
 
     def set(self, threads: int) -> None:
-        """Have so many threads from now on.
+        """Change the number of threads.
 
-        Raises
-        ------
-        ProblemError
-            If the number is out of its bounds.
-        LiveError
-            If it does not run.
+        Raises a ProblemError if the number is out of bounds, and a LiveError if the burner is not
+        running.
         """
         from dwell.model.bounds import Bound  # the burner's own process does without the model
 
@@ -89,22 +74,16 @@ class Burner(Child):
         self.pids = tuple(self.ask(threads))
 
     def stop(self) -> None:
-        """End it, and with it all threads; safe to call twice."""
+        """End all threads; may be called twice."""
         super().stop()
         self.pids = ()
 
 
 def stress(prefix: Sequence[str], cpus: Collection[int] = ()) -> Burner:
-    """Return foreign work in a node's group, by stress-ng where it is installed.
+    """Return foreign load in a node's group: of stress-ng if it is installed, else of a loop.
 
-    To the kernel its processes, and those of the burner's own loop, are the same.
-
-    Parameters
-    ----------
-    prefix : sequence of str
-        First words of its command: ``groups.inside(node, [])``.
-    cpus : collection of int
-        Where its threads run; the CPUs of this process if empty.
+    `prefix` is ``groups.inside(node, [])``; `cpus` default to the CPUs of this process. The kernel
+    treats both kinds of load alike.
     """
     program = STRESS_NG if shutil.which(STRESS_NG[0]) else ()
     return Burner(cpus or os.sched_getaffinity(0), prefix=prefix, program=program)
@@ -114,7 +93,7 @@ def stress(prefix: Sequence[str], cpus: Collection[int] = ()) -> Burner:
 
 
 def main() -> None:
-    """Keep as many busy processes as the parent wants, until it ends."""
+    """Run as many busy processes as the parent orders, until it ends."""
     gc.freeze()
     fire = _Fire()
     try:
@@ -131,13 +110,13 @@ class _Fire:
         self._program: tuple[str, ...] = ()
 
     def begin(self, settings: tuple[list[int], tuple[str, ...]]) -> Callable[[int], list[int]]:
-        """Take over CPUs and program."""
+        """Apply the CPUs and the program; return the function for further requests."""
         cpus, self._program = settings
         os.sched_setaffinity(0, cpus)
         return self.burn
 
     def burn(self, threads: int) -> list[int]:
-        """Have so many of them; returns their ids."""
+        """Change the number of busy processes; return their ids."""
         while len(self._pids) < threads:
             self._pids.append(_fork(self._program))
         ended, self._pids = self._pids[threads:], self._pids[:threads]
@@ -149,7 +128,7 @@ class _Fire:
 
 
 def _fork(program: Sequence[str]) -> int:
-    """Start a busy process that leads a process group and ends with this one."""
+    """Start a busy process that leads a process group and ends with this process."""
     parent = os.getpid()
     pid = os.fork()
     if pid == 0:
@@ -160,7 +139,7 @@ def _fork(program: Sequence[str]) -> int:
             for _ in range(TURNS):
                 pass
         os._exit(0)
-    with contextlib.suppress(OSError):  # of both sides whoever comes first
+    with contextlib.suppress(OSError):  # parent and child both set the group
         os.setpgid(pid, pid)
     return pid
 

@@ -1,4 +1,4 @@
-"""Observer of a cell that runs: a class of the cell's own, named by ``live.observer``."""
+"""Observer of a running cell: a user's class, which ``live.observer`` names."""
 
 from __future__ import annotations
 
@@ -12,43 +12,27 @@ from dwell.model.user_classes import import_user_module
 
 
 class CellObserver(Protocol):
-    """Looks at what a cell controls, in the process that runs the cell.
+    """Observes the world that a cell controls, in the process that runs the cell.
 
-    It is made as ``Class(folder, begin_ns)``: with the folder of the cell's processes, which stages
-    find in the environment variable ``DWELL_WORLD`` as ``folder/world``, and the instant from which
-    the cell counts, ns of the monotonic clock.
+    Dwell makes it as ``Class(folder, begin_ns)``, with the folder of the cell's processes and the
+    begin of the cell in ns of the monotonic clock. Stages get ``folder/world`` in the environment
+    variable ``DWELL_WORLD``.
     """
 
     def look(self, now_ns: int) -> Mapping[str, float]:
-        """Return values seen now, by names with units: ``error_mm``; NaN where unknown."""
+        """Return present values by names with units, such as ``error_mm``; NaN if unknown."""
 
     def told(self, origin_ns: int) -> Mapping[str, object]:
-        """Return notes for the run's record, ready for JSON.
-
-        Parameters
-        ----------
-        origin_ns : int
-            First release of the run: where its time begins.
-        """
+        """Return notes for the run's record as JSON values; `origin_ns` is the first release."""
 
     def close(self) -> None:
-        """Look no more."""
+        """End the observation."""
 
 
 def load_observer(name: str, problem: Problem, folder: Path, begin_ns: int) -> CellObserver:
-    """Make an observer.
+    """Make the observer ``package.module:Name``, whose module may be next to the cell file.
 
-    Parameters
-    ----------
-    name : str
-        ``package.module:Name``.
-    problem : Problem
-        Its module may be in the folder of the cell file.
-
-    Raises
-    ------
-    LiveError
-        If it cannot be imported or made; the message says what it said.
+    Raises a LiveError with the reason if it cannot be imported or made.
     """
     who = f"observer {name}"
     module, _, attribute = name.partition(":")

@@ -1,4 +1,4 @@
-"""Where this machine keeps its groups of processes: cgroup v2, or the controllers of v1."""
+"""Control groups of this machine: cgroup v2, or the controllers of v1."""
 
 from __future__ import annotations
 
@@ -9,26 +9,20 @@ from pathlib import Path
 from dwell.errors import LiveError
 from dwell.live.roles.control_group import cgroup_mounts
 
-#: What v1 needs, and what it uses beside where it is mounted.
+#: Required controllers of v1, and all controllers that are used if mounted.
 NEEDED = ("cpu", "cpuacct")
 USED = (*NEEDED, "cpuset", "freezer")
 
 
 @dataclass(frozen=True, slots=True)
 class Cgroups:
-    """The hierarchies in which groups are made.
-
-    Parameters
-    ----------
-    folders : mapping of str to Path
-        Controller to the top of its hierarchy. With version 2 all are the same.
-    """
+    """Hierarchies for new groups: the top folder by controller (with v2 one for all)."""
 
     version: int
     folders: Mapping[str, Path]
 
     def groups(self, *names: str) -> list[Path]:
-        """Return the folders of a group, one in each hierarchy, whether they exist or not."""
+        """Return the folders of a group, one per hierarchy, even if they do not exist yet."""
         # v1 may have two controllers in one hierarchy.
         return [top.joinpath(*names) for top in dict.fromkeys(self.folders.values())]
 
@@ -38,12 +32,9 @@ class Cgroups:
 
 
 def find_cgroups(mounts: Path = Path("/proc/self/mountinfo")) -> Cgroups:
-    """Return where groups with a quota can be made: v2 where it has the CPU, otherwise v1.
+    """Return the hierarchies with the controller ``cpu``: v2 if it has ``cpu``, else v1.
 
-    Raises
-    ------
-    LiveError
-        If neither has it.
+    Raises a LiveError if neither has it.
     """
     try:
         mounted = list(cgroup_mounts(mounts.read_text()))

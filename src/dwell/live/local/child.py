@@ -16,22 +16,16 @@ from typing import Any, Self
 
 from dwell.errors import DwellError, LiveError
 
-# A start imports NumPy, and what else runs on the CPU may be a lot of busy threads.
+# A start imports NumPy, and many busy threads may run on the same CPU.
 START_S = 60.0
 ANSWER_S = 20.0
 STOP_S = 2.0
-#: How often a child looks for its parent, beside the end of their connection.
+#: Period of a child's checks whether its parent lives, in addition to the end of their connection.
 PARENT_CHECK_S = 0.5
 
 
 def run_command(*words: str, given: str = "") -> str:
-    """Run a command of the system to its end; returns its output.
-
-    Raises
-    ------
-    LiveError
-        If it fails, with its words and its reason.
-    """
+    """Run a command and return its output; raises a LiveError with the reason if it fails."""
     done = subprocess.run(words, input=given, capture_output=True, text=True, check=False)  # noqa: S603 - no shell
     if done.returncode:
         reason = done.stderr.strip() or f"status {done.returncode}"
@@ -40,22 +34,16 @@ def run_command(*words: str, given: str = "") -> str:
 
 
 class Started(ABC):
-    """Base of all that runs from the beginning of a ``with`` statement to its end.
+    """Base class of context managers that run during their ``with`` statement.
 
-    What its beginning has put on `_stack` is undone at the end, last in first out.
+    The end calls the callbacks that `_start` has pushed on `_stack`, the last first.
     """
 
     def __init__(self) -> None:
         self._stack = contextlib.ExitStack()
 
     def start(self) -> None:
-        """Start it; where that fails, what has begun is ended.
-
-        Raises
-        ------
-        LiveError
-            If something is missing, in the way, or does not start.
-        """
+        """Start all parts, or raise a LiveError after ending the parts that have started."""
         try:
             self._start()
         except BaseException:
@@ -66,7 +54,7 @@ class Started(ABC):
     def _start(self) -> None: ...
 
     def stop(self) -> None:
-        """End it; safe to call twice."""
+        """End all parts; may be called twice."""
         self._stack.close()
 
     def __enter__(self) -> Self:
@@ -80,28 +68,28 @@ class Started(ABC):
 
 
 class Child(Started):
-    """The parent's side; a context manager.
+    """The parent's side of a child process; a context manager.
 
-    The child stays in the parent's session: in one of its own, a kernel that shares the CPU by
-    session (autogroup) would give all of its threads together what one of the others gets.
+    The child stays in the parent's session: a kernel that shares the CPU by session (autogroup)
+    would give all threads of a separate session as much as one thread of the others.
 
     Parameters
     ----------
     module : str
         Run as ``python -m``; its main function makes a `Parent`.
     name : str
-        For messages.
+        Name for messages.
     settings : object
-        First request, which it is started with; it and all others are pickled.
+        First request; all requests are pickled.
     descriptors : sequence of int
-        Open files that it has under the same numbers.
+        Open files that the child inherits with the same numbers.
     prefix : sequence of str
-        Words of a command that runs the words behind them, in the same process.
+        Command that executes the command after it in the same process.
 
     Attributes
     ----------
     answered : object
-        Answer to the settings, once it has been started.
+        Answer to the settings, after the start.
     """
 
     def __init__(
@@ -125,24 +113,16 @@ class Child(Started):
 
     @property
     def pid(self) -> int:
-        """Process id.
-
-        Raises
-        ------
-        LiveError
-            If it has not been started.
-        """
+        """Process id; raises a LiveError before the start."""
         if self._process is None:
             raise LiveError(f"{self.name} has not been started")
         return self._process.pid
 
     def start(self) -> None:
-        """Start it, and wait for its answer to its settings.
+        """Start the child, and wait for its answer to its settings.
 
-        Raises
-        ------
-        LiveError
-            If it has been started before, or does not answer, or answers with an error.
+        Raises a LiveError if the child has been started before, does not answer, or answers with an
+        error.
         """
         if self._process is not None:
             raise LiveError(f"{self.name} has been started before")
@@ -151,7 +131,7 @@ class Child(Started):
     def _start(self) -> None:
         self._connection, theirs = Pipe()
         with theirs:
-            # Standard output and error are the parent's: a child that fails says why there.
+            # The child inherits standard output and error, for its error messages.
             self._process = subprocess.Popen(  # noqa: S603 (our own module)
                 [*self._prefix, sys.executable, "-P", "-m", self._module],
                 stdin=theirs.fileno(),
@@ -160,12 +140,10 @@ class Child(Started):
         self.answered = self.ask(self.settings, START_S)
 
     def ask(self, request: object, timeout_s: float = ANSWER_S) -> Any:
-        """Send a request and return the answer; safe from any thread.
+        """Send a request from any thread, and return the answer.
 
-        Raises
-        ------
-        LiveError
-            If it does not run, does not answer in time, or answers with an error.
+        Raises a LiveError if the child is not running, does not answer in time, or answers with an
+        error.
         """
         with self._lock:
             if self._connection is None:
@@ -183,7 +161,7 @@ class Child(Started):
         return answer
 
     def stop(self) -> None:
-        """End it and wait until it is gone; safe to call twice, and if it has ended by itself."""
+        """End the child and wait for its end; may be called twice, or after the child has ended."""
         with self._lock:
             if self._connection is not None:
                 self._connection.close()
@@ -198,9 +176,9 @@ class Child(Started):
 
 
 class Parent:
-    """The child's side: requests come on standard input, a socket.
+    """The child's side of the connection to its parent: a socket at standard input.
 
-    Ctrl-C in a terminal reaches the children too; it is left to the parent to end them.
+    Ctrl-C in a terminal also signals the child, which ignores it: the parent ends its children.
     """
 
     def __init__(self) -> None:
@@ -209,7 +187,7 @@ class Parent:
         self._connection: Connection[Any, Any] = Connection(os.dup(0))
 
     def fileno(self) -> int:
-        """Descriptor that is readable when there is a request, or the parent has gone."""
+        """Return a descriptor that is readable at a request, or after the parent's end."""
         return self._connection.fileno()
 
     @property
@@ -218,12 +196,9 @@ class Parent:
         return os.getppid() == self._pid
 
     def receive(self) -> Any:
-        """Return the next request; waits for it. The parent has at most one under way.
+        """Wait for the next request and return it.
 
-        Raises
-        ------
-        EOFError
-            If the parent has gone, or wants this process to end.
+        Raises an EOFError if the parent has ended, or closed the connection to end this process.
         """
         try:
             while not self._connection.poll(PARENT_CHECK_S):
@@ -234,17 +209,14 @@ class Parent:
             raise EOFError from None
 
     def answer(self, answer: object) -> None:
-        """Answer the request received last; with a DwellError, that it is refused."""
+        """Answer the last request; a DwellError as the answer refuses it."""
         with contextlib.suppress(ConnectionError):
             self._connection.send(answer)
 
     def serve(self, begin: Callable[[Any], Callable[[Any], object]]) -> None:
-        """Answer requests until the parent ends, or wants this to.
+        """Answer requests until the parent ends or closes the connection.
 
-        Parameters
-        ----------
-        begin : callable
-            Takes the settings, and returns what takes a request and returns its answer.
+        `begin` gets the settings, and returns the function that answers the further requests.
         """
         answering: Callable[[Any], object] | None = None
         with contextlib.suppress(EOFError):

@@ -1,8 +1,8 @@
-"""Clocks that are wrong on purpose: for trials in which nodes' clocks jump or drift.
+"""Clocks with emulated errors, for trials in which the clocks of nodes jump or drift.
 
-All nodes of a cell on one computer read one clock, which nobody may set. The processes of a node
-that `dwell.live.local.process` starts add to it what a file says of that node, and whoever made the
-file changes that while they run.
+All nodes of a cell on one computer read the same clock, which must not be set. Processes that
+`dwell.live.local.process` starts add their node's offset from a file. The writer of the file can
+change the offset at any time.
 """
 
 from __future__ import annotations
@@ -18,30 +18,18 @@ from dwell.live.local.mapped_file import HEAD, make_file, open_file
 PPB = 1_000_000_000
 
 _KIND = "clocks"
-# Which of the two settings holds. Both: since when, ahead by how much then, and by what rate since.
+# Index of the valid setting; then two settings: start, offset at the start, drift since then.
 _TURN = struct.Struct("<Q")
 _SETTING = struct.Struct("<qqq")
 _NODE_BYTES = _TURN.size + 2 * _SETTING.size
 
 
 class ClockFile:
-    """Faults of the nodes' clocks: the side that writes them.
+    """Writer of the errors of the nodes' clocks; replaces an existing file.
 
-    A setting is written beside the one that holds, which then gives way to it at once: who reads
-    sees the one or the other.
-
-    Parameters
-    ----------
-    path : Path
-        Made anew; processes that have one of this name open keep it.
-    nodes : sequence of str
-    clock : callable
-        The true clock, that of the processes.
-
-    Raises
-    ------
-    LiveError
-        If it cannot be written.
+    A new setting is written next to the valid setting, and then becomes valid at once, so a reader
+    gets either of them complete. `clock` is the true clock of the processes. Raises a LiveError if
+    the file cannot be written.
     """
 
     def __init__(self, path: Path, nodes: Sequence[str], clock: Callable[[], int]) -> None:
@@ -49,19 +37,9 @@ class ClockFile:
         self._map = make_file(path, _KIND, self.nodes, _NODE_BYTES * len(self.nodes))
 
     def set(self, node: str, *, jump_ns: int = 0, drift_ppb: int = 0) -> int:
-        """Have a node's clock jump now, and drift from now on; returns its offset, ns.
+        """Add a jump to a node's clock, and replace its drift; return its offset, ns.
 
-        Parameters
-        ----------
-        jump_ns : int
-            Added to what it is ahead by already.
-        drift_ppb : int
-            Instead of the drift before.
-
-        Raises
-        ------
-        LiveError
-            If there is no such node.
+        Raises a LiveError if the node is unknown.
         """
         if node not in self.nodes:
             raise LiveError(f"{self.path}: no node {node}; it has {', '.join(self.nodes)}")
@@ -76,17 +54,14 @@ class ClockFile:
         return ahead_ns
 
     def close(self) -> None:
-        """Write no more; the file stays."""
+        """Close the map; the file stays."""
         self._map.close()
 
 
 def wrong_clock(clock: Callable[[], int], path: Path, node: str) -> Callable[[], int]:
-    """Return a node's clock: the true one plus the offset in a `ClockFile`.
+    """Return a node's clock: the true clock plus the offset in a `ClockFile`.
 
-    Raises
-    ------
-    LiveError
-        If there is no such file, it is another kind of file, or has no such node.
+    Raises a LiveError if the file is missing, of another kind, or lacks the node.
     """
     content, names, _ = open_file(path, _KIND, node, lambda count: _NODE_BYTES * count)
     begin = HEAD.size + _NODE_BYTES * names.index(node)
@@ -100,6 +75,6 @@ def wrong_clock(clock: Callable[[], int], path: Path, node: str) -> Callable[[],
 
 
 def _read(content: mmap.mmap, begin: int) -> tuple[int, int, int, int]:
-    """Return which setting of a node holds, and the setting."""
+    """Return the index of a node's valid setting, and the setting."""
     (turn,) = _TURN.unpack_from(content, begin)
     return (turn, *_SETTING.unpack_from(content, begin + _TURN.size + turn * _SETTING.size))

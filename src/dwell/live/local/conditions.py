@@ -1,4 +1,4 @@
-"""Conditions of one direction of an emulated link, and what is drawn from them on the way."""
+"""Conditions of a direction of an emulated link, and samples of its delays and losses."""
 
 from __future__ import annotations
 
@@ -17,35 +17,35 @@ from dwell.model.instants import NEVER_NS
 from dwell.model.process import AR1, Constant, LogNormal, Process, Trace
 from dwell.model.scenario import ADDED_LOSS
 
-#: How a link's process gets the CPU: by real-time priority, with short time slices, as any other.
+#: Scheduling of a link's process: real-time priority, short time slices, or the default.
 Scheduling: TypeAlias = Literal["fifo", "short slices", "usual"]
 
-# Drawn at a time: a draw of one costs a hundred times as much a value.
+# Samples per block: sampling single values costs a hundred times as much per value.
 BLOCK = 256
 NS_PER_MS = 1e6
-#: Attempts at a message on a link that retransmits.
+#: Most attempts for a message on a link that retransmits.
 MOST_ATTEMPTS = 20
 
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """Conditions that a message meets on its way.
+    """Conditions of a link for a message.
 
     Parameters
     ----------
     delay_ms : Process
-        Propagation delay, one value a message.
+        Propagation delay, one value per message.
     add_delays_ms : tuple of Process
-        Extra delays of the link's disturbances, whether they are on or not.
+        Extra delays of all disturbances of the link, active or not.
     shares : tuple of float
-        How much of each of them is added now, in [0, 1].
+        Share of each extra delay that is added now, in [0, 1].
     rate_mbps : float
-        Serialisation rate that all connections share, Mbit/s; infinite where nothing queues.
+        Serialisation rate that all connections share, Mbit/s; infinite without queueing.
     loss : float
-        Probability that a message of data is lost, in [0, 1].
+        Probability that a data message is lost, in [0, 1].
     down : bool
-        Whether nothing begins its way. Data is lost, or waits until the link is up again where that
-        retransmits; what keeps the sessions going always waits.
+        Whether the link is down. Data is lost, or waits for the link if the link retransmits;
+        messages that keep the sessions alive always wait.
     """
 
     delay_ms: Process = field(default_factory=lambda: Constant(0.0))
@@ -66,23 +66,17 @@ class Conditions:
 
 
 def transmission_ns(size_bytes: int, rate_mbps: float) -> int:
-    """Return how long bytes take at a rate; no time at an infinite one."""
+    """Return the serialisation time at a rate; 0 at an infinite rate."""
     return round(size_bytes * 8e3 / rate_mbps)
 
 
 def fields_of(conditions: Conditions) -> dict[str, Any]:
-    """Return all fields by their names, as the links' `set` takes them."""
+    """Return all fields by name, as arguments for `set` of the links."""
     return {item.name: getattr(conditions, item.name) for item in fields(conditions)}
 
 
 def changed(way: str, conditions: Conditions, changes: Mapping[str, Any]) -> Conditions:
-    """Return conditions with some fields changed.
-
-    Raises
-    ------
-    LiveError
-        If a value is out of its bounds.
-    """
+    """Return conditions with changed fields; raises a LiveError if a value is out of bounds."""
     try:
         return replace(conditions, **changes)
     except ProblemError as error:
@@ -93,10 +87,10 @@ def changed(way: str, conditions: Conditions, changes: Mapping[str, Any]) -> Con
 
 
 def delays_ns(process: Process, rng: np.random.Generator) -> Iterator[int]:
-    """Draw one delay after another, for ever.
+    """Yield samples of a delay without end.
 
-    An `ar1` process has its memory, a trace is replayed from a random row and begins again at its
-    end; the values of all others are independent.
+    Samples of an `ar1` process are correlated. A trace starts at a random row, and repeats. Samples
+    of other processes are independent.
     """
     if isinstance(process, Constant):
         value = round(process.value * NS_PER_MS)
@@ -112,7 +106,7 @@ def delays_ns(process: Process, rng: np.random.Generator) -> Iterator[int]:
 
 
 def _whole_ns(delays_ms: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return delays in nanoseconds; one longer than a century is for ever."""
+    """Return delays in ns, bounded by `NEVER_NS`."""
     return np.rint(np.minimum(delays_ms * NS_PER_MS, NEVER_NS)).astype(np.int64)
 
 
@@ -128,14 +122,10 @@ def _remembering(process: AR1, rng: np.random.Generator) -> Iterator[int]:
 
 
 class Draws:
-    """Conditions that may change, and streams of their own for each delay and for losses.
+    """Samples of variable conditions, with a random stream per delay and a stream for losses.
 
-    A stream goes on for as long as its process stays, whether it counts or not.
-
-    Parameters
-    ----------
-    seed : (int, int)
-        Seed of the link, and number of the direction.
+    A stream continues as long as its process is the same, even while its share is 0. `seed` is the
+    seed of the link and the number of the direction.
     """
 
     def __init__(self, seed: tuple[int, int]) -> None:
@@ -145,7 +135,7 @@ class Draws:
         self._added: list[Iterator[int]] = []
 
     def apply(self, now: Conditions) -> None:
-        """Have other conditions; a delay that stays goes on where it is."""
+        """Replace the conditions; the streams of unchanged delays continue."""
         before, self.conditions = self.conditions, now
         if before.delay_ms != now.delay_ms:
             self._delays = delays_ns(now.delay_ms, self._delays_rng)
@@ -155,10 +145,10 @@ class Draws:
             self._added = [delays_ns(process, rng) for process, rng in pairs]
 
     def lose(self) -> bool:
-        """Draw whether the next message is lost."""
+        """Sample whether the next message is lost."""
         return self.conditions.loss > 0 and self._losses.random() < self.conditions.loss
 
     def delay_ns(self) -> int:
-        """Draw a delay."""
+        """Sample the delay of a message, with the present shares of the extra delays."""
         shares = zip(self._added, self.conditions.shares, strict=True)
         return next(self._delays) + sum(round(next(added) * share) for added, share in shares)

@@ -1,9 +1,9 @@
-"""A transport whose messages meet emulated links on their way.
+"""Transport with emulated links.
 
-A message that is for one node, which its key names (`target_of`), meets the link in the transport
-that sends it. All others go to several nodes by one put; they meet their links in each process that
-receives them, from the node that sent them, which they carry before their header. Either way a put
-returns at once: a thread hands on what has to wait, at its instant.
+The sending transport emulates the link of a message for a single node, which its key names
+(`target_of`). Other messages reach several nodes with one put: each receiving transport emulates
+the link from the sending node, whose name precedes the header. A put always returns at once, and a
+thread forwards delayed messages at their arrival time.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from dwell.live.failures import start_thread
 from dwell.live.local.message_links import HELD, LOST, LinkEnds, Way
 from dwell.live.wire.transport import Arrival, Lane, Receive, Transport
 
-#: Begins a header that says where its message comes from; MessagePack never uses this byte.
+#: First byte of a header with the source node; MessagePack never uses this byte.
 _SOURCE = b"\xc1"
-#: Keys whose fifth chunk is the one node that a message is for (see `Keys`).
+#: Kinds of keys whose fifth part is the target node (see `Keys`).
 _FOR_ONE_NODE = frozenset({"in", "state", "snapshot"})
-#: Between two looks whether a cut that holds messages has ended.
+#: Period of the checks whether a cut that holds messages has ended.
 LOOK_NS = 2_000_000
 MOST_STREAMS = 4_096
 
@@ -33,17 +33,17 @@ _LOG = logging.getLogger(__name__)
 
 
 def target_of(key: str) -> str | None:
-    """Return the node that a message is for, by its key; None where several nodes hear it.
+    """Return the target node of a key; None for keys with several receiving nodes.
 
-    ``dwell/CELL/in/TASK/NODE/KIND``, ``state/TASK/NODE/SOURCE`` and ``snapshot/TASK/NODE`` are for
-    one.
+    Keys with a target are ``dwell/CELL/in/TASK/NODE/KIND``, ``state/TASK/NODE/SOURCE`` and
+    ``snapshot/TASK/NODE``.
     """
     chunks = key.split("/")
     return chunks[4] if len(chunks) > 4 and chunks[2] in _FOR_ONE_NODE else None
 
 
 def without_source(header: bytes) -> tuple[str, bytes]:
-    """Return the node that a message comes from and its own header; no node where none is said."""
+    """Return the source node in a header (empty if it has none) and the rest of the header."""
     if not header.startswith(_SOURCE):
         return "", header
     end = len(_SOURCE) + 1 + header[len(_SOURCE)]
@@ -52,17 +52,17 @@ def without_source(header: bytes) -> tuple[str, bytes]:
 
 @dataclass(slots=True)
 class _Stream:
-    """Messages of one sender, key and lane, which keep their order."""
+    """Messages of a sender, key and lane, which stay in order."""
 
     way: Way
     latest_ns: int = 0
-    # On their way, and of them those that wait for the end of a cut: size and what hands it on.
+    # Number of messages on their way; and messages that wait for the end of a cut (size, action).
     moving: int = 0
     held: deque[tuple[int, Callable[[], None]]] | None = None
 
 
 class LinkedTransport:
-    """A transport with emulated links, those that end at the process's node; see `Transport`."""
+    """Transport with emulated links from and to the process's node; see `Transport`."""
 
     def __init__(self, transport: Transport, ends: LinkEnds) -> None:
         self._transport, self._ends = transport, ends
@@ -78,7 +78,7 @@ class LinkedTransport:
     def put(
         self, key: str, payload: bytes | memoryview, header: bytes = b"", *, lane: Lane = "control"
     ) -> None:
-        """Send a message; returns at once, however long its link takes."""
+        """Send a message without waiting for its link."""
         target = target_of(key)
         if target is None:
             self._transport.put(key, payload, self._source + header, lane=lane)
@@ -95,7 +95,7 @@ class LinkedTransport:
         self._begin(way, (key, lane, ""), len(data) + len(header), send)
 
     def subscribe(self, key: str, receive: Receive) -> None:
-        """Have `receive` called with every message under a key expression, when it is there."""
+        """Call `receive` for each message that matches a key expression, at its arrival time."""
 
         def met(sample: Arrival) -> None:
             source, header = without_source(sample.header)
@@ -110,7 +110,7 @@ class LinkedTransport:
         self._transport.subscribe(key, met)
 
     def close(self) -> None:
-        """Send and deliver nothing more; safe to call twice."""
+        """Stop sending and delivering messages; may be called twice."""
         with self._changed:
             self._closed = True
             self._waiting.clear()
@@ -120,7 +120,7 @@ class LinkedTransport:
     def _begin(
         self, way: Way, name: tuple[str, str, str], size: int, act: Callable[[], None]
     ) -> None:
-        """Let a message begin its way, and hand it on when it is there."""
+        """Start a message on its link, and call `act` at its arrival."""
         with self._changed:
             if self._closed:
                 return
@@ -146,7 +146,7 @@ class LinkedTransport:
         act()
 
     def _forget_some(self) -> None:
-        """Forget streams on which nothing is on its way, where there are many: keys of answers."""
+        """Remove idle streams if there are many, as each answer has its own key."""
         if len(self._streams) > MOST_STREAMS:
             busy = {name: one for name, one in self._streams.items() if one.moving or one.held}
             self._streams = busy
@@ -159,7 +159,7 @@ class LinkedTransport:
             self._changed.notify()
 
     def _hand_on(self) -> None:
-        """Hand on messages at their arrival, as long as the transport is open."""
+        """Forward messages at their arrival time until the transport is closed."""
         while True:
             with self._changed:
                 if self._closed:
@@ -183,7 +183,7 @@ class LinkedTransport:
                 stream.moving -= 1
 
     def _release(self, stream: _Stream, now_ns: int) -> None:
-        """Let messages that wait for the end of a cut begin their way, if it has come."""
+        """Start the held messages of a stream if the cut has ended."""
         held = stream.held
         while held:
             size, act = held[0]

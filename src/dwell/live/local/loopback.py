@@ -1,7 +1,6 @@
-"""A cell on this machine, without root: agents, controller, links of messages, busy threads.
+"""Testbed on this machine without root: agents, controller, emulated links, busy threads.
 
-Nothing here moves a stage: it plays a scenario of the cell file on the links and CPUs, and what the
-controller makes of it is the controller's.
+It applies a scenario of the cell file to the links and CPUs. Only the controller moves stages.
 """
 
 from __future__ import annotations
@@ -27,21 +26,18 @@ from dwell.live.wire.wiring import PORTS_PER_ROLE, roles
 from dwell.model import Problem
 
 ADDRESS = "127.0.0.1"
-#: Where ports are looked for; below what the kernel gives out by itself.
+#: First ports to try; below the kernel's ephemeral ports.
 PORTS = range(10_000, 32_000, 500)
 LINK_FILE = "links"
 
 
 def on_this_machine(problem: Problem) -> Problem:
-    """Return the cell with all its nodes on this machine, on ports that are free now.
+    """Return the cell with all nodes on free ports of this machine.
 
-    Raises
-    ------
-    LiveError
-        If there are not enough ports.
+    Raises a LiveError if too few consecutive ports are free.
     """
     count = PORTS_PER_ROLE * len(roles(problem))
-    # Ports are taken later: two processes that look at the same moment begin apart.
+    # The ports are opened later, so concurrent processes start the search at different ports.
     begin = os.getpid() % max(len(PORTS) // 3, 1)
     for base in (*PORTS[begin:], *PORTS[:begin]):
         if all(_free(port) for port in range(base, base + count)):
@@ -64,24 +60,24 @@ class Loopback(LocalTestbed):
     Parameters
     ----------
     problem : Problem
-        From `on_this_machine`.
+        Cell from `on_this_machine`.
     folder : Path
-        For the cell file, states, logs and runs.
+        Folder for the cell file, states, logs and runs.
     cpus : mapping of str to int
-        CPU of each node and of its burner; a node that is not there uses any, and has no burner.
+        CPU of each node and its burner; a missing node uses any CPU, and has no burner.
     seed : int
         Seed of delays and losses.
     environment : mapping of str to str, optional
-        Variables that all processes get as well.
+        Additional variables of all processes.
     clocks : Path, optional
-        File of a `ClockFile`, which says what is wrong with the nodes' clocks.
+        `ClockFile` with the errors of the nodes' clocks.
 
     Attributes
     ----------
     client : OperatorClient
-        Asks the controller, once it has been started.
+        Client of the controller, after the start.
     world : Path
-        Where the world is that its camera and arm share (see `World`).
+        Simulated world, which camera and arm share (see `World`).
     """
 
     own_cpus = False
@@ -113,7 +109,7 @@ class Loopback(LocalTestbed):
         self._threads: dict[str, int] = {}
 
     def _start(self) -> None:
-        """Start everything, and wait until every process is ready; the run began before that."""
+        """Start all parts, and wait until all processes are ready; the run begins before that."""
         self.processes.write()
         nodes, links = tuple(self.problem.fabric.nodes), tuple(self.problem.fabric.links.values())
         self._links = LinkFile(self.folder / LINK_FILE, nodes, links, seed=self.seed)
@@ -124,7 +120,7 @@ class Loopback(LocalTestbed):
             burner = self._stack.enter_context(Burner([cpu]))
             for node in (node for node, its in self.cpus.items() if its == cpu):
                 self.burners[node] = burner
-        # Processes end before links and burners do.
+        # The processes end before the links and burners.
         self._stack.callback(self.processes.stop)
         for node in self.problem.fabric.nodes:
             self.processes.start_agent(node)
@@ -144,7 +140,7 @@ class Loopback(LocalTestbed):
         self._links.set(link.source, link.target, **fields_of(now))
 
     def cut(self, source: str, target: str, at_ns: int) -> int:
-        """Lose messages that begin their way along a direction from an instant on; returns when."""
+        """Cut a direction at a time, so its later messages are lost; return the actual time."""
         time.sleep(max(at_ns - time.monotonic_ns(), 0) / 1e9)
         self._links.set(source, target, down=True)
         return time.monotonic_ns()
@@ -158,5 +154,5 @@ class Loopback(LocalTestbed):
         return self.client.ask("status", patience_s=patience_s)
 
     def taps(self) -> Mapping[tuple[str, ...], Sequence[str]]:
-        """Return how to run a command that reaches all nodes: as it is."""
+        """Return the empty command prefix, which reaches all nodes."""
         return {tuple(self.problem.fabric.nodes): ()}

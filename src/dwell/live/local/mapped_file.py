@@ -1,7 +1,7 @@
-"""Files about nodes that the processes of a testbed map into their memory, and one of them writes.
+"""Files about nodes that the processes of a testbed share as mapped memory.
 
-A file has a head, numbers whose meaning is its owner's (`dwell.live.local.clocks`,
-`dwell.live.local.message_links`), and the names of the nodes.
+A file has a head, the numbers of `dwell.live.local.clocks` or `dwell.live.local.message_links`, and
+the names of the nodes.
 """
 
 from __future__ import annotations
@@ -20,17 +20,9 @@ HEAD = struct.Struct("<8sQQ")
 
 
 def make_file(path: Path, kind: str, nodes: Sequence[str], size: int, seed: int = 0) -> mmap.mmap:
-    """Make a file anew, with zeros for numbers; processes that have an older one open keep it.
+    """Make a file with `size` bytes of zeros after `HEAD`; raises a LiveError if that fails.
 
-    Parameters
-    ----------
-    size : int
-        Bytes of the numbers, which begin behind `HEAD`.
-
-    Raises
-    ------
-    LiveError
-        If it cannot be written.
+    Processes that have mapped an older file with this path keep the older file.
     """
     names = json.dumps(list(nodes)).encode()
     content = HEAD.pack(kind.encode(), seed, len(names)) + bytes(size)
@@ -44,19 +36,10 @@ def make_file(path: Path, kind: str, nodes: Sequence[str], size: int, seed: int 
 def open_file(
     path: Path, kind: str, node: str, size_of: Callable[[int], int]
 ) -> tuple[mmap.mmap, tuple[str, ...], int]:
-    """Open a file that `make_file` has made; returns its content, nodes and seed.
+    """Map a file of `make_file`; return its content, nodes and seed.
 
-    Parameters
-    ----------
-    node : str
-        Node that has to be in it.
-    size_of : callable
-        Takes the number of nodes, and returns the bytes of the numbers.
-
-    Raises
-    ------
-    LiveError
-        If there is no such file, it is another kind of file, or has no such node.
+    `size_of` returns the bytes of the numbers for a number of nodes. Raises a LiveError if the file
+    is missing, of another kind, or lacks the node.
     """
     try:
         content = path.read_bytes()

@@ -1,15 +1,13 @@
-"""Links of messages, emulated in the transports of the processes at their ends.
+"""Emulated links of messages, in the transports of the processes at both ends.
 
-All processes of a testbed without root share one `LinkFile`: for every direction, what it is like
-now (`Conditions`), and its backlog. A message meets a link as in the simulator: it begins its
-transmission at max(now, end of the one before it), whichever process sent that, takes its bytes at
-the rate, and then a delay that is drawn for it. Delays and losses are drawn by streams of each
-process's own.
+All processes of a testbed without root share a `LinkFile`, with the present `Conditions` and the
+backlog of each direction. Links work as in the simulator: the transmission of a message begins at
+max(now, end of the previous transmission of any process), takes its bytes at the rate, and then a
+sampled delay. Each process samples delays and losses from its own streams.
 
-What differs from the simulator: messages of one sender under one key keep their order (a transport
-promises it); on a link that retransmits, a lost message is sent again after the time-out without
-taking its share of the rate again; and one that would leave more than `LONGEST_WAIT_S` from now is
-lost.
+Three differences from the simulator: messages of a sender and key stay in order, as transports
+guarantee it. On a link that retransmits, a lost message is sent again after the time-out without
+another share of the rate. A message that would wait longer than `LONGEST_WAIT_S` is lost.
 """
 
 from __future__ import annotations
@@ -39,33 +37,23 @@ from dwell.live.local.mapped_file import HEAD, make_file, open_file
 from dwell.model import Link
 
 _KIND = "links"
-# Of a direction: how often its conditions have changed, when it is free, its last arrival.
+# Fields of a direction: number of changes of its conditions, end of its last transmission, its
+# last arrival.
 _CHANGES, _FREE_NS, _LAST_NS = range(3)
 _WAY = struct.Struct("<3q")
-#: What waits longer for its turn is lost.
+#: Longest wait of a message for its transmission.
 LONGEST_WAIT_S = 10.0
-#: Instead of the arrival of a message that is lost, and of one that the sender has to hold: the
-#: direction lets nothing pass, and loses nothing.
+#: Arrival times of a lost message, and of a message that the sender has to hold while a direction
+#: is down but loses nothing.
 LOST, HELD = -1, -2
 
 
 class LinkFile:
-    """Conditions of the links of a testbed: the side that writes them.
+    """Writer of the conditions of a testbed's links.
 
-    Parameters
-    ----------
-    path : Path
-        Made anew; beside it, a file for the conditions of every direction.
-    nodes : sequence of str
-    links : sequence of Link
-        Directions that are not among them have no delay, loss or limit.
-    seed : int
-        Seed of delays and losses, in [0, 2**63).
-
-    Raises
-    ------
-    LiveError
-        If it cannot be written.
+    It replaces the file `path`, and writes one file per direction next to it. Directions without a
+    link have no delay, loss or limit. `seed` is in [0, 2**63). Raises a LiveError if a file cannot
+    be written.
     """
 
     def __init__(
@@ -82,17 +70,9 @@ class LinkFile:
                     self.set(source, target)
 
     def set(self, source: str, target: str, **changes: Any) -> None:
-        """Change some conditions of a direction for messages that begin their way from now on.
+        """Change some `Conditions` of a direction for all later messages.
 
-        Parameters
-        ----------
-        **changes
-            Fields of `Conditions`.
-
-        Raises
-        ------
-        LiveError
-            If there is no such direction or field, or a value is out of its bounds.
+        Raises a LiveError if the direction is unknown, or a value is out of bounds.
         """
         way = source, target
         if way not in self._conditions:
@@ -102,23 +82,23 @@ class LinkFile:
         retransmit_ms = None if kind is None else kind.retransmit_ms
         state = self._conditions[way], retransmit_ms, kind is not None and kind.in_order
         place = _place(self.nodes, source, target)
-        # Whoever sees the number reads the file, or a newer one.
+        # Write the file before the number: a reader of the number gets this file or a newer one.
         write_whole(_file_of(self.path, place), pickle.dumps(state), durable=False)
         (count,) = struct.unpack_from("<q", self._map, place)
         struct.pack_into("<q", self._map, place, count + 1)
 
     def close(self) -> None:
-        """Write no more; the files stay."""
+        """Close the map; the files stay."""
         self._map.close()
 
 
 def _size(count: int) -> int:
-    """Return how many bytes the directions between so many nodes take."""
+    """Return the bytes of all directions between a number of nodes."""
     return _WAY.size * count**2
 
 
 def _place(nodes: Sequence[str], source: str, target: str) -> int:
-    """Return where a direction begins in the file."""
+    """Return the offset of a direction in the file."""
     index = nodes.index(source) * len(nodes) + nodes.index(target)
     return HEAD.size + _WAY.size * index
 
@@ -128,16 +108,10 @@ def _file_of(path: Path, place: int) -> Path:
 
 
 class Way:
-    """A direction of a link, as one process meets it.
+    """A direction of a link in a process.
 
-    Parameters
-    ----------
-    place : int
-        Where the direction begins in the file.
-    memory : mmap
-        The file.
-    seed : (int, int)
-        Seed of this process's draws.
+    `memory` is the mapped file, `place` the offset of the direction in it, and `seed` the seed of
+    this process's samples.
     """
 
     def __init__(self, path: Path, place: int, memory: mmap.mmap, seed: tuple[int, int]) -> None:
@@ -146,19 +120,19 @@ class Way:
         self._retransmit_ms: float | None = None
         self._in_order = False
         self._seen = 0
-        # Locks of files do not keep a process's own threads apart.
+        # File locks do not exclude other threads of the same process.
         self._lock = threading.Lock()
         self._file = os.open(path, os.O_RDWR)
 
     def begin(self, size_bytes: int, now_ns: int) -> int:
-        """Let a message begin its way; returns when it arrives, or `LOST` or `HELD`.
+        """Start a message on the link; return its arrival time, or `LOST` or `HELD`.
 
-        `now_ns` is of the clock that all processes on this computer share.
+        All processes on this computer share the clock of `now_ns`.
         """
         with self._lock:
             self._refresh()
             conditions = self._draws.conditions
-            # Attempts that are all lost are none: the message waits as while the link is down.
+            # A link that loses all messages behaves like a link that is down.
             if conditions.down or conditions.loss == 1:
                 return LOST if self._retransmit_ms is None else HELD
             sent_ns, took_ns = now_ns, transmission_ns(size_bytes, conditions.rate_mbps)
@@ -176,7 +150,7 @@ class Way:
             return LOST
 
     def _refresh(self) -> None:
-        """Read the conditions where they have changed."""
+        """Read the conditions if they have changed."""
         (count,) = struct.unpack_from("<q", self._memory, self._place)
         if count == self._seen:
             return
@@ -186,13 +160,13 @@ class Way:
         self._seen = count
 
     def _later(self, field: int, at_ns: int, more_ns: int, most_ns: int | None = None) -> int:
-        """Set an instant that all processes share to max(it, at) + more, and return it."""
+        """Set a shared time to max(time, at) + more, and return it."""
         place = self._place + 8 * field
         fcntl.lockf(self._file, fcntl.LOCK_EX, 8, place)
         try:
             (known_ns,) = struct.unpack_from("<q", self._memory, place)
             found = max(known_ns, at_ns) + more_ns
-            # What is lost for waiting too long takes no time of those behind it.
+            # A message that is lost for its long wait does not delay later messages.
             if most_ns is None or found - at_ns <= most_ns:
                 struct.pack_into("<q", self._memory, place, found)
             return int(found)
@@ -201,19 +175,10 @@ class Way:
 
 
 class LinkEnds:
-    """The directions that begin or end at the node of a process.
+    """Directions that begin or end at the node of a process.
 
-    Parameters
-    ----------
-    path : Path
-        As `LinkFile` has written it.
-    who, node : str
-        Process, and its node. One that is started again draws from the beginning.
-
-    Raises
-    ------
-    LiveError
-        If there is no such file, it is another kind of file, or has no such node.
+    A restarted process repeats its samples from the beginning. Raises a LiveError if the `LinkFile`
+    is missing, of another kind, or lacks the node.
     """
 
     def __init__(self, path: Path, who: str, node: str) -> None:
@@ -226,6 +191,6 @@ class LinkEnds:
             return Way(path, _place(names, source, target), self._memory, (seed, stream))
 
         others = [name for name in names if name != node]
-        #: Those that begin here, by target, and that end here, by source.
+        #: Outgoing directions by target, and incoming directions by source.
         self.to: Mapping[str, Way] = {name: way(node, name) for name in others}
         self.since: Mapping[str, Way] = {name: way(name, node) for name in others}

@@ -1,4 +1,4 @@
-"""Playing: a scenario's changes are made to a cell that runs, and noted in its run."""
+"""Playing: applies a scenario's changes to a running testbed, and records them in its run."""
 
 from __future__ import annotations
 
@@ -23,24 +23,18 @@ from dwell.model.document import disturbance_document
 from dwell.record import Run, open_run, seal_run
 from dwell.record.journal import read_plain_journal
 
-#: Time between two looks at a cell.
+#: Period of the calls of `look`.
 LOOK_S = 0.5
-#: Utilisation of a node that is full, as far as counters of 10 ms can tell.
+#: Utilisation above which a node is full, given counters with steps of 10 ms.
 FULL = 0.97
 
 
 @dataclass(slots=True)
 class Played:
-    """Record of the changes made in a run: its controller knows nothing of them.
+    """Record of the applied changes in a run, which its controller does not know.
 
-    Instants are of the clock that the cell's processes read on this computer.
-
-    Parameters
-    ----------
-    made_ns : dict of (str, int) to int
-        When changes were made, by the place and the instant of each.
-    threads : dict of str to list of (int, int)
-        By node: since when it had how many foreign threads.
+    `made_ns` has the time of each change by its place and planned time. `threads` has (time, number
+    of foreign threads) by node. Times are of the clock of the cell's processes on this computer.
     """
 
     problem: Problem
@@ -51,24 +45,24 @@ class Played:
     threads: dict[str, list[tuple[int, int]]] = field(default_factory=dict)
 
     def changed(self, change: Change, at_ns: int | None = None) -> None:
-        """Note that a change has been made, at an instant or now."""
+        """Record that a change was made, at a time or now."""
         at_ns = clock_of(self.problem)() if at_ns is None else at_ns
         self.made_ns[change.place, change.at_ns] = at_ns
         if not isinstance(change.state, Conditions):
             self.threads.setdefault(change.place, []).append((at_ns, change.state.threads))
 
     def begun_ns(self, item: Disturbance) -> int | None:
-        """Return when a disturbance of the timeline has begun; None where it has not."""
+        """Return the begin of a disturbance of the timeline; None before it."""
         made_ns = self.made_ns.get((item.place, first_ns(item)))
         return None if made_ns is None else made_ns - step_ns(item)
 
     def ended_ns(self, item: Disturbance) -> int | None:
-        """Return when a disturbance of the timeline has ended; None where it has not."""
+        """Return the end of a disturbance of the timeline; None before it."""
         made_ns = self.made_ns.get((item.place, last_ns(item)))
         return None if made_ns is None else made_ns + step_ns(item)
 
     def active(self) -> list[Disturbance]:
-        """Return the disturbances that are on now."""
+        """Return the disturbances that have begun and not ended."""
         return [
             item
             for item in self.timeline.items
@@ -76,7 +70,7 @@ class Played:
         ]
 
     def least_threads(self, node: str, begin_ns: int, end_ns: int) -> int:
-        """Return how many foreign threads a node had at least between two instants."""
+        """Return the least number of foreign threads of a node between two times."""
         found = 0
         for at_ns, threads in self.threads.get(node, ()):
             if at_ns >= end_ns:
@@ -85,20 +79,15 @@ class Played:
         return found
 
     def note(self, folder: Path, span: tuple[int, int] | None = None, **more: Any) -> Run:
-        """Note in a run, whose time begins with the first release, what was played.
+        """Record the scenario and more values in a run, whose time begins with the first release.
 
-        Parameters
-        ----------
-        span : (int, int), optional
-            First and last release; what the run says of them if left out.
-        **more
-            To be said of it as well.
+        `span` has the first and the last release [default: from the run].
         """
         span = begun(open_run(folder)) if span is None else span
         return seal_run(folder, **self.notes(span), **more)
 
     def notes(self, span: tuple[int, int] | None) -> dict[str, object]:
-        """Return what is noted in a run with this first and last release, where it has any."""
+        """Return the record of the scenario for a run with this first and last release, if any."""
         notes: dict[str, object] = {"scenario": self.scenario, "seed": self.seed}
         if span is not None:
             items = (self._as_played(item, *span) for item in self.timeline.items)
@@ -108,9 +97,10 @@ class Played:
     def _as_played(
         self, item: Disturbance, origin_ns: int, end_ns: int
     ) -> Mapping[str, object] | None:
-        """Return a disturbance with its times in the run; None where it was not played.
+        """Return a disturbance with its times in the run; None if it has not begun.
 
-        A disturbance that was on at the end is told as on until then; a ramp keeps its slope.
+        A disturbance that has not ended is recorded until the end of the run, unless it has a ramp,
+        which keeps its planned length and slope.
         """
         begun_ns, ended_ns = self.begun_ns(item), self.ended_ns(item)
         if begun_ns is None:
@@ -118,7 +108,7 @@ class Played:
         at_s = round((begun_ns - origin_ns) / 1e9, 3)
         if item.ramp_s and ended_ns is None:
             return {**disturbance_document(item), "at_s": at_s}
-        # What has begun after the last release is told as on for no time.
+        # A disturbance that has begun after the last release is recorded with length 0.
         end_ns = max(end_ns if ended_ns is None else ended_ns, begun_ns)
         for_s = round((end_ns - begun_ns) / 1e9, 3)
         shorter = replace(item, ramp_s=min(item.ramp_s, for_s / 2, item.for_s / 2))
@@ -126,7 +116,7 @@ class Played:
 
 
 def begun(run: Run) -> tuple[int, int] | None:
-    """Return the first and the last release of a run, ns of its stamper's clock; None without."""
+    """Return first and last release of a run, ns of its stamper's clock; None without cycles."""
     origin_ns, cycles = run.meta.get("origin_ns"), run.cycles
     if not isinstance(origin_ns, int) or cycles.is_empty():
         return None
@@ -134,15 +124,15 @@ def begun(run: Run) -> tuple[int, int] | None:
 
 
 def crowded(run: Run, problem: Problem) -> list[str]:
-    """Return warnings of nodes that were full although nothing disturbed them.
+    """Return warnings about nodes that were full without a disturbance.
 
-    A node is full whose utilisation is 97 % or more in most of the windows without a disturbance;
-    the run's meta say when it was disturbed.
+    A node is full if its utilisation is at least `FULL` in most windows without a recorded
+    disturbance.
     """
     import polars as pl
 
     span_s = problem.window_ms / 1e3
-    # A window whose first cycle is missing from the record is left out.
+    # The join drops windows whose first cycle is missing from the record.
     begun = run.cycles.select(pl.col("release_ns") / 1e9, first_cycle="cycle")
     windows = run.windows.filter(~pl.col("warmup")).join(begun, on="first_cycle")
     at_s = pl.col("release_ns")
@@ -175,22 +165,19 @@ def _handled(numbers: Sequence[int], handler: Any) -> Iterator[None]:
 
 
 def interruptible() -> AbstractContextManager[None]:
-    """Have SIGTERM, and the end of the terminal, interrupt this process as Ctrl-C does."""
+    """Raise KeyboardInterrupt at SIGTERM and SIGHUP (end of the terminal), as at Ctrl-C."""
     return _handled((signal.SIGTERM, signal.SIGHUP), _interrupt)
 
 
 def undisturbed() -> AbstractContextManager[None]:
-    """Have no signal interrupt this process while it takes everything down."""
+    """Ignore signals while this process ends all parts of a testbed."""
     return _handled((signal.SIGINT, signal.SIGTERM, signal.SIGHUP), signal.SIG_IGN)
 
 
 def make_folder(out: Path, mark: str, whose: str) -> None:
-    """Make the folder of a run; a folder with the mark is replaced.
+    """Make the folder of a run, and replace a folder with the file `mark`.
 
-    Raises
-    ------
-    LiveError
-        If it holds something else.
+    Raises a LiveError if the path has other content.
     """
     if (out / mark).is_file():
         shutil.rmtree(out)
@@ -207,27 +194,17 @@ def play(
     apply: Callable[[Change], None],
     look: Callable[[float], None],
 ) -> None:
-    """Make the changes of a scenario at their times.
+    """Apply the changes of a scenario, sorted by time, at their times.
 
-    Parameters
-    ----------
-    changes : sequence of Change
-        In the order of time.
-    seconds : float
-        How long it is played.
-    now_s : callable
-        Returns the time since the beginning.
-    apply : callable
-        Makes a change.
-    look : callable
-        Takes the time; called after every change, and at every multiple of `LOOK_S`.
+    `now_s` returns the time since the begin. `look` is called with the time after each change, and
+    at each multiple of `LOOK_S`.
     """
     waiting = list(changes)
     while (at_s := now_s()) < seconds:
         while waiting and waiting[0].at_s <= at_s:
             apply(waiting.pop(0))
         look(at_s)
-        # Looks do not drift, and what begins or ends in between does so in time.
+        # Multiples of `LOOK_S` avoid a drift; changes between them are applied on time.
         following_s = min((math.floor(at_s / LOOK_S) + 1) * LOOK_S, seconds)
         if waiting:
             following_s = min(following_s, waiting[0].at_s)
@@ -240,14 +217,9 @@ def play_on(
     seconds: float,
     look: Callable[[float], None] = lambda at_s: None,
 ) -> None:
-    """Play a timeline on a testbed that has been started, and note when each change was made.
+    """Apply a timeline to a started testbed, and record the time of each change.
 
-    Parameters
-    ----------
-    seconds : float
-        From the first release on.
-    look : callable
-        As of `play`.
+    `seconds` count from the first release; `look` is called as in `play`.
     """
     clock = clock_of(played.problem)
 
@@ -260,13 +232,7 @@ def play_on(
 
 
 def require_run(out: Path) -> Path:
-    """Return the longest of the runs of a testbed's folder.
-
-    Raises
-    ------
-    LiveError
-        If there is none.
-    """
+    """Return the longest run in a testbed's folder; raises a LiveError without a run."""
     folder = longest_run(out / "runs")
     if folder is None:
         raise LiveError(f"{out}: the controller has written no run; see {out}/controller*.log")
@@ -274,12 +240,12 @@ def require_run(out: Path) -> Path:
 
 
 def longest_run(runs: Path) -> Path | None:
-    """Return the longest of the runs in a folder; None where there is none."""
+    """Return the longest run in a folder, if any."""
     return _longest(runs, lambda folder: int(open_run(folder).meta.get("windows", 0)))
 
 
 def longest_journal(runs: Path) -> Path | None:
-    """Return the longest of the runs that stay journals, where Polars is not installed."""
+    """Return the longest journal in a folder, if any: runs stay journals without Polars."""
     return _longest(runs, lambda folder: len(read_plain_journal(folder)[1]["windows"]["window"]))
 
 

@@ -1,9 +1,9 @@
-"""Agents, controllers and their processes with faults around them: a testbed's entry point.
+"""Entry point of agents, controllers and other processes with emulated faults, for a testbed.
 
-``python -m dwell.live.local.process [--links FILE] [--clocks FILE] COMMAND ...`` runs what
-``dwell COMMAND ...`` does (``agent`` or ``controller``, with the same options), and what
-``python -m dwell.live.host.role_command`` does where the command is ``process``. Its messages meet
-the links of a `LinkFile`, and its clock has the error that a `ClockFile` gives.
+``python -m dwell.live.local.process [--links FILE] [--clocks FILE] COMMAND ...`` works like ``dwell
+COMMAND ...`` for ``agent`` and ``controller`` (with the same options), and like ``python -m
+dwell.live.host.role_command`` for ``process``. A `LinkFile` delays and drops the messages of the
+process, and a `ClockFile` shifts its clock.
 """
 
 from __future__ import annotations
@@ -27,26 +27,14 @@ from dwell.model import Problem
 
 
 def program(*, links: Path | None = None, clocks: Path | None = None) -> tuple[str, ...]:
-    """Return the module, and its first arguments, that runs agents and controllers with faults.
-
-    Parameters
-    ----------
-    links, clocks : Path, optional
-        As a `LinkFile` and a `ClockFile` have written them.
-    """
+    """Return this module and its first arguments, for a `LinkFile` and a `ClockFile`."""
     given = {"--links": links, "--clocks": clocks}
     words = [word for name, path in given.items() if path is not None for word in (name, str(path))]
     return "dwell.live.local.process", *words
 
 
 class FaultyPlatform(Platform):
-    """Clock and transport with faults around them.
-
-    Parameters
-    ----------
-    links, clocks : Path, optional
-        Without, links are what they are, or clocks are right.
-    """
+    """Clock and transport with the faults of a `ClockFile` and a `LinkFile`, if given."""
 
     def __init__(self, *, links: Path | None = None, clocks: Path | None = None) -> None:
         self.program = (*program(links=links, clocks=clocks), "process")
@@ -66,7 +54,7 @@ class FaultyPlatform(Platform):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command until it is told to end; returns the exit code."""
+    """Run the command until a signal ends it; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--links", type=Path)
     parser.add_argument("--clocks", type=Path)
@@ -76,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     platform = FaultyPlatform(links=asked.links, clocks=asked.clocks)
     if asked.command == "process":
         return role_command.main(asked.words, platform)
-    # Pydantic would look for plugins in all that is installed; Dwell uses none.
+    # Pydantic would search all installed packages for plugins; Dwell uses none.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     return _run_node(asked.command, asked.words, platform)
 
@@ -128,7 +116,7 @@ def _controller_parser() -> argparse.ArgumentParser:
 
 
 def _parser(command: str) -> argparse.ArgumentParser:
-    """Return a parser with what an agent and a controller may both be told."""
+    """Return a parser with the common options of agents and controllers."""
     parser = argparse.ArgumentParser(command, allow_abbrev=False)
     parser.add_argument("--cpus")
     parser.add_argument("--keys", type=Path)
@@ -138,7 +126,7 @@ def _parser(command: str) -> argparse.ArgumentParser:
 
 
 def _set(variable: str) -> bool:
-    """Whether a variable of the environment says yes, as `dwell` reads it."""
+    """Return whether a variable of the environment is true, by the rules of the `dwell` command."""
     return os.environ.get(variable, "").lower() in ("1", "on", "t", "true", "y", "yes")
 
 

@@ -1,7 +1,7 @@
-"""Processes of a cell that a testbed starts: an agent on every node, and the controller.
+"""Processes that a testbed starts: the agent of each node, and the controller.
 
-All others are started by the agents. They end with the process that made this, whatever
-becomes of those in between, and leave no shared memory.
+The agents start the other processes. All end with the process that made `Processes`, even if an
+agent has died, and leave no shared memory.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ from dwell.live.wire.wiring import PORTS_PER_ROLE, roles
 from dwell.model import Host, Problem
 from dwell.model.document import to_document
 
-#: Takes a node and the words of a command; returns those that run it there, in the same process.
+#: Function of a node and a command; returns a command that runs it there, in the same process.
 Inside: TypeAlias = Callable[[str, Sequence[str]], Sequence[str]]
 
 STOP_S = 5.0
-#: A controller writes its run before it ends.
+#: Longest time for the end of a controller, which writes its run before.
 CONTROLLER_STOP_S = 30.0
 KILL_S = 10.0
 
 
 def outright(node: str, words: Sequence[str]) -> Sequence[str]:
-    """Return a command as it is: the node is this computer."""
+    """Return a command unchanged, as the node is this computer."""
     return words
 
 
 def without_keys() -> dict[str, str]:
-    """Return this process's environment but for the keyring, which is of a cell of its own."""
+    """Return this process's environment without the keyring, which belongs to another cell."""
     return {name: value for name, value in os.environ.items() if name != KEYS}
 
 
 def expected(problem: Problem, node: str | None = None) -> list[str]:
-    """Return the agent of a node and all that it starts; those of all nodes if none is named."""
+    """Return the names of a node's agent and its processes [default: of all nodes]."""
     return [
         role.who
         for role in roles(problem)
@@ -54,14 +54,10 @@ def expected(problem: Problem, node: str | None = None) -> list[str]:
 
 
 def with_hosts(problem: Problem, address: Callable[[str], str], first_port: int) -> Problem:
-    """Return a cell that knows where its nodes are.
+    """Return a cell with the addresses and ports of its nodes in `live.hosts`.
 
-    Parameters
-    ----------
-    address : callable
-        Returns the address of a node.
-    first_port : int
-        First one of the first node of an address; others have the ones behind.
+    `address` returns the address of a node. Nodes of the same address get consecutive ranges of
+    ports from `first_port` on.
     """
     counts = Counter(role.node for role in roles(problem))
     hosts, following = {}, defaultdict[str, int](lambda: first_port)
@@ -78,31 +74,31 @@ class Processes:
     Parameters
     ----------
     problem : Problem
-        With every node among `live.hosts`.
+        Cell with all nodes in `live.hosts`.
     folder : Path
-        For cell file, states and logs; the runs are in ``runs``.
+        Folder for cell file, states and logs; the runs are in ``runs``.
     inside : callable, optional
-        Has a command run on a node; on this computer if left out.
+        Returns a command that runs a command on a node [default: on this computer].
     environment : mapping of str to str, optional
-        Variables that all processes get as well. A keyring that this process has is of another
-        cell, and not theirs.
+        Additional variables of all processes, which do not get the keyring of this process.
     cpus : mapping of str to int, optional
-        CPU of each node; a node that is not there uses any.
+        CPU of each node; a missing node uses any CPU.
     more : sequence of str
         Further arguments of the controller.
     program : sequence of str
-        Module, and its first arguments, that runs agents and controllers.
+        Module that runs agents and controllers, and its first arguments.
     popen : callable
-        Starts a command, as `Popen`.
+        Starts a command like `Popen`.
     owner : str, optional
-        Process id, where they run, of the one that they end with; this process's own if left out.
+        Id of the process, on the computer of the nodes, with which all processes end [default: this
+        process].
 
     Attributes
     ----------
     running : dict of str to Popen
-        By name: ``agent@R1``, ``controller@E``.
+        Running processes by name, such as ``agent@R1`` and ``controller@E``.
     file : Path
-        The cell's.
+        Cell file.
     """
 
     def __init__(
@@ -120,7 +116,7 @@ class Processes:
     ) -> None:
         self.problem, self.folder, self.file = problem, folder, folder / "cell.yaml"
         self.running: dict[str, subprocess.Popen[bytes]] = {}
-        # Processes find modules beside the cell file.
+        # Processes import modules from the folder of the original cell file.
         paths = [problem.folder, os.environ.get("PYTHONPATH")] if problem.folder else []
         modules = {"PYTHONPATH": os.pathsep.join(filter(None, paths))} if paths else {}
         self.environment = {**modules, **(environment or {})}
@@ -138,18 +134,13 @@ class Processes:
         self.file.write_text(yaml_of(document), encoding="utf-8")
 
     def start_agent(self, node: str) -> None:
-        """Start a node's agent, or start it again."""
+        """Start or restart a node's agent."""
         self._start("agent", node, ["--node", node, "--state", str(self.folder / node)])
 
     def start_controller(self, *, out: Path | None = None, more: Sequence[str] = ()) -> None:
-        """Start the controller, or start it again.
+        """Start or restart the controller, with further arguments `more`.
 
-        Parameters
-        ----------
-        out : Path, optional
-            Where the runs' folders go; ``runs`` if left out.
-        more : sequence of str
-            Further arguments.
+        `out` is the folder for the runs' folders [default: ``runs``].
         """
         runs = self.folder / "runs" if out is None else out
         words = ["--out", str(runs), "--state", str(self.folder), *self._more, *more]
@@ -174,7 +165,7 @@ class Processes:
             )
 
     def forget(self, node: str) -> None:
-        """Take note that everything on a node has been killed."""
+        """Remove the processes of a node that have all been killed."""
         for who in list(self.running):
             if who.partition("@")[2] == node:
                 self.running.pop(who).wait(KILL_S)
@@ -187,7 +178,7 @@ class Processes:
         """End all processes, the agents after the controller, and remove their shared memory."""
         self.stop_controller()
         self._end("", STOP_S)
-        # On a full machine those of the lowest class outlive an agent that is killed.
+        # On a busy machine, processes of the lowest scheduling class outlive a killed agent.
         end_those_of(self._owner, self.file, KILL_S)
         if self._sweeper is not None:
             self._sweeper.kill()
@@ -196,13 +187,13 @@ class Processes:
         remove_orphans()
 
     def _end(self, begin: str, patience_s: float) -> None:
-        """End the processes whose names begin so."""
+        """End the processes whose names begin with a prefix."""
         names = [who for who in self.running if who.startswith(begin)]
         end_all([self.running.pop(who) for who in names], patience_s)
 
 
 def end_all(processes: Iterable[subprocess.Popen[bytes]], patience_s: float) -> None:
-    """Tell processes to end, and kill those that have not when patience is over."""
+    """Send SIGTERM to processes, and kill the processes that still run after `patience_s`."""
     ending = list(processes)
     for process in ending:
         process.terminate()

@@ -1,7 +1,7 @@
-"""Testbed: where a cell of real processes runs, and a scenario is played on it.
+"""Testbed: runs a cell of real processes under a scenario.
 
-Three there are: processes without root (`loopback`), hosts on this machine (`netns_testbed`), and
-the hosts of an inventory (`real_hosts`).
+The three kinds are processes without root (`loopback`), hosts on this machine (`netns_testbed`),
+and the hosts of an inventory (`real_hosts`).
 """
 
 from __future__ import annotations
@@ -23,31 +23,21 @@ from dwell.live.local.processes import Processes, expected
 from dwell.live.local.timeline import Change, NodeState
 from dwell.model import Problem
 
-#: Takes for how many seconds to wait, and returns how the cell is; a LiveError if nobody answers.
+#: Function of a time-out in s; returns the status of the cell, or raises a LiveError.
 Ask: TypeAlias = Callable[[float], Mapping[str, Any]]
-#: A folder with this file is a testbed's, and may be replaced by its next run.
+#: File that marks a folder of a testbed, which the next run may replace.
 MARK = ".dwell-testbed"
-#: Folder of what the cell did until everybody was there.
+#: Folder of the run before all processes were ready.
 STARTING = "starting"
 
 
 def come_up(
     ask: Ask, awaited: Sequence[str], folder: Path, *, patience_s: float
 ) -> Mapping[str, Any]:
-    """Wait until all processes are ready; returns the status of the cell then.
+    """Wait until all awaited processes are ready; return the status of the cell.
 
-    Parameters
-    ----------
-    ask : callable
-    awaited : sequence of str
-        Names of processes.
-    folder : Path
-        Where the logs are, for the message.
-
-    Raises
-    ------
-    LiveError
-        If they are not, with what is known of those that are missing.
+    After `patience_s`, raises a LiveError with the state of the missing processes and the folder of
+    the logs.
     """
     until = time.monotonic() + patience_s
     missing: Mapping[str, str] = {"the controller": "has not answered"}
@@ -76,9 +66,9 @@ def come_up(
 class Testbed(Started):
     """A cell on hosts, links and CPUs that can be disturbed; a context manager.
 
-    `start` starts everything, waits until every process is ready, and begins a run; `stop` ends
-    everything, the controller first, so that the run is written, and leaves nothing behind. It is
-    safe to call twice.
+    `start` starts all parts, waits until all processes are ready, and begins a run. `stop` ends all
+    parts and removes their traces, the controller first, as it writes the run. `stop` may be called
+    twice.
 
     Attributes
     ----------
@@ -87,22 +77,22 @@ class Testbed(Started):
     folder : Path
         Folder of cell file, states, logs and runs on this computer.
     processes : Processes
-        Agents and controller, once it has been started.
+        Agents and controller, after the start.
     begun_ns : int
-        First release of the run, by the clock that processes on this computer read.
+        First release of the run, on the clock of the processes on this computer.
     """
 
     problem: Problem
     folder: Path
     processes: Processes
     begun_ns: int
-    #: How long its processes may take to be ready: with a share of a CPU they take a while, s.
+    #: Longest time until all processes are ready, s; long, as they may have a share of a CPU only.
     start_s = 120.0
-    #: Run that is no part of any measurement any more.
+    #: Previous run, which is not part of the measurement.
     _past: object = None
 
     def apply(self, change: Change) -> None:
-        """Have a node or a link be as a change says, from now on."""
+        """Apply a change to a node or a link."""
         if isinstance(change.state, Conditions):
             self._apply_to_link(change.place, change.state)
         else:
@@ -116,40 +106,26 @@ class Testbed(Started):
 
     @abstractmethod
     def sample(self, patience_s: float) -> Mapping[str, Any]:
-        """Return the status of the cell, from its controller.
-
-        Raises
-        ------
-        LiveError
-            If nobody answers in time.
-        """
+        """Return the status from the cell's controller; raises a LiveError after the time-out."""
 
     def _came_up(self) -> Mapping[str, Any]:
-        """Return the status of the cell once all its processes are ready."""
+        """Wait until all processes are ready; return the status of the cell."""
         return come_up(self.sample, expected(self.problem), self.folder, patience_s=self.start_s)
 
     def _come_up(self) -> None:
         """Wait until all processes are ready, with the cell on its initial placement.
 
-        A controller that never moves anything looks after the cell until then; the run that it
-        writes is in `STARTING`, and no part of any measurement.
+        Until then a controller with a fixed placement runs. Its run, in `STARTING`, is not part of
+        the measurement.
         """
         more = ["--policy", self.problem.initial]
         self.processes.start_controller(out=self.folder / STARTING, more=more)
         self._past = self._came_up()["run"]
 
     def begin(self) -> int:
-        """Begin a new run, with a controller that knows nothing of the time before.
+        """Begin a new run with a new controller; return the first release, on the stamper's clock.
 
-        Returns
-        -------
-        int
-            First release, on the stamper's clock.
-
-        Raises
-        ------
-        LiveError
-            If the run does not begin, or somebody is missing.
+        Raises a LiveError if the run does not begin, or a process is missing.
         """
         self.processes.stop_controller()
         self._restart_stamper()
@@ -157,7 +133,7 @@ class Testbed(Started):
         until = time.monotonic() + self.start_s
         while time.monotonic() < until:
             status = self._came_up()
-            # A late answer of the controller before tells of the run before.
+            # A late answer of the previous controller names the previous run.
             new = status["run"] not in (None, self._past)
             if new and status.get("origin_ns") is not None:
                 self._past = status["run"]
@@ -168,18 +144,18 @@ class Testbed(Started):
 
     @abstractmethod
     def _restart_stamper(self) -> None:
-        """Have the stamper begin anew, as if its cell had never run."""
+        """Restart the stamper without its saved state."""
 
 
 class LocalTestbed(Testbed):
-    """A testbed on this machine: its links can be cut, and its nodes listened to.
+    """A testbed on this machine, whose links can be cut and whose nodes commands can reach.
 
     Attributes
     ----------
     own_cpus : bool
-        Whether every node has CPU time of its own, which foreign threads can load.
+        Whether each node has its own CPU time, which foreign threads can load.
     conditions : dict of str to Conditions
-        Conditions that hold now, by link.
+        Present conditions by link.
     """
 
     own_cpus: bool
@@ -191,14 +167,14 @@ class LocalTestbed(Testbed):
         mark = state / f"stamper@{node}.pid"
         pid = int(json.loads(mark.read_text(encoding="utf-8"))["pid"])
         with suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGSTOP)  # so that it writes no book any more
+            os.kill(pid, signal.SIGSTOP)  # it must not save its state again
         (state / f"stamper@{node}.book").unlink(missing_ok=True)
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
 
     @abstractmethod
     def cut(self, source: str, target: str, at_ns: int) -> int:
-        """Cut a direction of a link at an instant of the monotonic clock; returns when that was."""
+        """Cut a direction of a link at a time of the monotonic clock; return the actual time."""
 
     @abstractmethod
     def heal(self, source: str, target: str) -> None:
@@ -206,4 +182,4 @@ class LocalTestbed(Testbed):
 
     @abstractmethod
     def taps(self) -> Mapping[tuple[str, ...], Sequence[str]]:
-        """Return how to run a command that reaches nodes directly: words to put first, by nodes."""
+        """Return command prefixes by groups of nodes, which the prefixed command can reach."""

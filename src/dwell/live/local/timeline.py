@@ -1,8 +1,8 @@
-"""Timeline: the changes that a scenario's realisation makes to nodes and links.
+"""Timeline: the changes of nodes and links in a realisation of a scenario.
 
-It is the simulator's: the node changes and link segments that the run's seed draws there, so that
-episodes, ramps and several disturbances at once mean the same on a testbed. Only bursts, which
-belong to nodes and links and not to the scenario, are not played.
+The changes come from the simulator with the seed of the run. So episodes, ramps and simultaneous
+disturbances have the same meaning on a testbed. Bursts are left out, as they belong to nodes and
+links instead of the scenario.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ NS_PER_S = 1e9
 
 @dataclass(frozen=True, slots=True)
 class NodeState:
-    """State of a node: foreign threads that it has, and whether it is down."""
+    """State of a node: number of foreign threads, and whether it is down."""
 
     threads: int
     down: bool = False
@@ -33,16 +33,9 @@ class NodeState:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Change of a node or a link from an instant on.
+    """Change of a node or a link (``R1->E``) to a new complete state.
 
-    Parameters
-    ----------
-    at_ns : int
-        Since the first release.
-    place : str
-        Node, or link (``R1->E``).
-    state : NodeState or Conditions
-        All of what it is like from then on: of a node, or of a link.
+    `at_ns` counts from the first release.
     """
 
     at_ns: int
@@ -51,20 +44,15 @@ class Change:
 
     @property
     def at_s(self) -> float:
-        """The instant in seconds."""
+        """Time of the change in seconds."""
         return self.at_ns / 1e9
 
 
 @dataclass(frozen=True, slots=True)
 class Timeline:
-    """Changes of the nodes and links that a scenario disturbs.
+    """Changes of the nodes and links that a scenario disturbs, sorted by time.
 
-    Parameters
-    ----------
-    items : Scenario
-        The scenario with a disturbance for each of the episodes drawn.
-    changes : tuple of Change
-        In the order of time.
+    `items` is the scenario, with one disturbance per sampled episode.
     """
 
     items: Scenario = ()
@@ -74,23 +62,23 @@ class Timeline:
 def timeline_of(
     problem: Problem, scenario: str, *, seed: int, seconds: float, outages: bool = False
 ) -> Timeline:
-    """Return the changes of a scenario's realisation, for as long as a cell runs.
+    """Return the changes of a realisation of a scenario; a simulation with this seed has the same.
 
     Parameters
     ----------
     seed : int
-        At least 0; a simulation of this seed meets the same.
+        At least 0.
     seconds : float
-        How long it is played.
+        Length of the run.
     outages : bool
-        Whether nodes and links can be made to be down.
+        Whether the testbed can emulate nodes and links that are down.
 
     Raises
     ------
     ProblemError
-        If there is no such scenario, a link would lose everything, or it is too long.
+        If the scenario is unknown or too long, or a link would lose all messages.
     LiveError
-        If it has something that real links and CPUs cannot be made to do; all of it at once.
+        If the testbed cannot emulate the scenario; lists all reasons.
     """
     require_playable_scenario(problem, scenario, outages=outages)
     written = problem.scenario(scenario)
@@ -105,7 +93,7 @@ def timeline_of(
     problem = _without_bursts(problem)
     items, nodes, segments = draw_changes(problem, scenario=scenario, seed=seed, windows=windows)
     changes = [Change(one.at_ns, one.node, NodeState(one.threads, one.down)) for one in nodes]
-    # A link's first segment is the link as it is, unless something is on from the beginning.
+    # The first segment of a link is undisturbed, unless a disturbance begins at 0.
     at_once = {item.place for item in items if first_ns(item) == 0}
     changes += [
         Change(one.at_ns, one.link, _conditions(problem.fabric.links[one.link], one, written))
@@ -116,12 +104,12 @@ def timeline_of(
 
 
 def first_ns(item: Disturbance) -> int:
-    """Instant of the change with which a disturbance begins, since the first release."""
+    """Return the time of the first change of a disturbance, since the first release."""
     return round(item.at_s * NS_PER_S) + step_ns(item)
 
 
 def last_ns(item: Disturbance) -> int:
-    """Instant of the change after which a disturbance is over; beyond all of them if it lasts."""
+    """Return the time of the last change of a disturbance; `NEVER_NS` if it does not end."""
     if math.isinf(item.for_s):
         return NEVER_NS
     end_ns = round(min(round(item.at_s * NS_PER_S) + item.for_s * NS_PER_S, NEVER_NS))
@@ -129,20 +117,15 @@ def last_ns(item: Disturbance) -> int:
 
 
 def step_ns(item: Disturbance) -> int:
-    """Time of one step of a disturbance's ramp; 0 where it has none."""
+    """Return the length of a step of a disturbance's ramp; 0 without a ramp."""
     step: int = round(round(item.ramp_s * NS_PER_S) / RAMP_STEPS)
     return step
 
 
 def require_playable_scenario(problem: Problem, scenario: str, *, outages: bool) -> None:
-    """Refuse a scenario with something that real links and CPUs cannot be made to do.
+    """Raise a LiveError with all reasons if a testbed cannot emulate a scenario.
 
-    Raises
-    ------
-    ProblemError
-        If there is no such scenario.
-    LiveError
-        With all of it.
+    Raises a ProblemError if the scenario is unknown.
     """
     down = [item.place for item in problem.scenario(scenario) if item.down]
     if down and not outages:
@@ -158,7 +141,7 @@ def _without_bursts(problem: Problem) -> Problem:
 
 
 def usual_conditions(link: Link) -> Conditions:
-    """Return the conditions of a link that nothing disturbs."""
+    """Return the conditions of a link without disturbances."""
     return Conditions(delay_ms=link.delay_ms, rate_mbps=link.rate_mbps, loss=link.loss)
 
 
@@ -170,7 +153,7 @@ def _conditions(link: Link, segment: LinkSegment, scenario: Scenario) -> Conditi
             continue
         if item.add_delay_ms is None:
             continue
-        # Its layers are the digits of its strength.
+        # The layers are the binary digits of the disturbance's strength.
         level = sum(1 << (one - layer) for one in segment.layers if 0 <= one - layer < item.layers)
         delays.append(item.add_delay_ms)
         shares.append(level / ((1 << item.layers) - 1))

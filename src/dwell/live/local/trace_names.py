@@ -1,4 +1,4 @@
-"""Names of trace files in a cell that is written somewhere else."""
+"""Names of trace files in a cell file that is written to another folder."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def rename_traces(values: object, renamed: Callable[[str], str]) -> None:
-    """Give all trace files in a cell's plain values another name, in place."""
+    """Rename all trace files in the document of a cell, in place."""
     if isinstance(values, dict):
         trace = values.get("trace")
         if isinstance(trace, dict) and isinstance(trace.get("file"), str):
@@ -20,8 +20,8 @@ def rename_traces(values: object, renamed: Callable[[str], str]) -> None:
 
 
 def move_traces(values: object, folder: Path) -> None:
-    """Put a folder before the names of all trace files in a cell's plain values, in place.
+    """Make the names of all trace files in the document of a cell relative to a folder, in place.
 
-    Names that are absolute stay as they are.
+    Absolute names do not change.
     """
     rename_traces(values, lambda name: (folder / name).as_posix())

@@ -1,7 +1,7 @@
-"""Closes a session's descriptors in children of this process: a stage may fork.
+"""Closes a session's descriptors in children of this process, as a stage may fork.
 
-A child that kept them would keep the port of a process that has died, and the connections that
-tell its peers of that, and the locks of its shared memory. What a stage has opened stays.
+With open descriptors, a child of a dead process would keep its port, its connections (whose end
+informs the peers) and the locks of its shared memory. Descriptors of the stage stay open.
 """
 
 from __future__ import annotations
@@ -20,20 +20,14 @@ from dwell.live.wire.wiring import Locator, WiringEntry
 
 
 class SessionDescriptors:
-    """Those of a process's sessions: what listens, is accepted there, or connects to a peer.
-
-    Parameters
-    ----------
-    entry : WiringEntry
-        Where the sessions listen, and to whom they connect.
-    """
+    """Descriptors of a process's sessions: listening sockets, connections and shared memory."""
 
     def __init__(self, entry: WiringEntry) -> None:
         self._ports = {end.port for end in entry.listen.values()}
         self._peers: set[tuple[str, int]] = set()
         self._closed = False
         ends = [end for ends in entry.connect.values() for end in ends]
-        # A name may take long to be resolved.
+        # Resolving a host name may take long.
         start_thread("dwell-addresses", self._resolve, ends)
         close = weakref.WeakMethod(self._close)
 
@@ -44,7 +38,7 @@ class SessionDescriptors:
         os.register_at_fork(after_in_child=in_child)
 
     def stop(self) -> None:
-        """Have children keep what they inherit from now on."""
+        """Stop closing descriptors: later children keep all that they inherit."""
         self._closed = True
 
     def _resolve(self, ends: Iterable[Locator]) -> None:
@@ -54,7 +48,7 @@ class SessionDescriptors:
                 self._peers |= {(str(address[0]), end.port) for *_, address in found}
 
     def _close(self) -> None:
-        """Close them; called in a child, which has this thread alone."""
+        """Close the descriptors in a child, whose only thread this is."""
         if self._closed:
             return
         for number in map(int, os.listdir(OPEN)):

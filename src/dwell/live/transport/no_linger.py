@@ -1,9 +1,10 @@
 """Disables SO_LINGER on the TCP sockets of this process: closing a connection never blocks.
 
-Zenoh asks for ten seconds of SO_LINGER on every TCP and TLS connection
-(https://github.com/eclipse-zenoh/zenoh/issues/1101). Closing one whose peer is out of reach then
-waits for confirmations that do not come, in one of the few threads that read the messages of all
-other peers: a cable pulled at E would deafen R2 to R1. There is no setting for it.
+Zenoh sets ten seconds of SO_LINGER on every TCP and TLS connection
+(https://github.com/eclipse-zenoh/zenoh/issues/1101). If a peer is unreachable, closing its
+connection waits in vain for confirmations. This blocks one of the few threads that read the
+messages of all other peers: after the cable of E is pulled, R2 receives no messages from R1. Zenoh
+has no setting for this.
 """
 
 from __future__ import annotations
@@ -17,12 +18,13 @@ from contextlib import suppress
 
 from dwell.live.failures import start_thread
 
-#: Open files of this process, by number.
+#: Folder with the descriptors of this process.
 OPEN = "/dev/fd"
 _ON_FOR = "ii"
 _OFF = struct.pack(_ON_FOR, 0, 0)
-#: A connection is given up after a session's lease of silence, which is longer. Looking whenever
-#: Zenoh reports one cost several cycles when E came back after a freeze, and all were made at once.
+#: Period of the search, shorter than the lease after which Zenoh closes a silent connection. A
+#: search at each connection that Zenoh reports cost several cycles when E returned after a freeze,
+#: and all connections opened at once.
 EVERY_S = 0.5
 
 
@@ -34,21 +36,21 @@ class Connections:
         self._stopped = threading.Event()
 
     def start(self) -> None:
-        """Look for connections from now on."""
+        """Start the periodic search in a thread."""
         start_thread("dwell-lingering", self._run)
 
     def stop(self) -> None:
-        """Look no more."""
+        """Stop the search."""
         self._stopped.set()
 
     def _run(self) -> None:
         while not self._stopped.wait(EVERY_S):
-            # To look takes a file of its own, and there may be none left for a moment.
+            # The search needs a descriptor, and may fail while none is free.
             with suppress(OSError):
                 self.wait_for_nobody()
 
     def wait_for_nobody(self) -> None:
-        """Disable the lingering of all present connections."""
+        """Disable SO_LINGER on all present connections."""
         known = set()
         for number in map(int, os.listdir(OPEN)):
             try:
@@ -63,9 +65,9 @@ class Connections:
 
 
 def internet_stream(number: int) -> socket.socket | None:
-    """Return a copy of a TCP socket by its descriptor; None where it is another one, or gone."""
+    """Return a copy of a TCP socket by its descriptor; None for other or closed files."""
     try:
-        # A number of our own: the other may be closed at any time, and mean something else then.
+        # Work on a copy: Zenoh may close the descriptor at any time, and reuse its number.
         copy = os.dup(number)
     except OSError:
         return None
@@ -82,10 +84,10 @@ def internet_stream(number: int) -> socket.socket | None:
 
 
 def _released(number: int) -> bool:
-    """Disable a connection's lingering; return whether it need not be looked at again.
+    """Disable SO_LINGER on a connection; return whether the connection is done.
 
-    A connection that is still being made lingers only once it is there, which takes as long as its
-    peer is out of reach.
+    Zenoh sets SO_LINGER only after a connection is established, which takes as long as the peer is
+    unreachable.
     """
     connection = internet_stream(number)
     if connection is None:

@@ -1,8 +1,7 @@
-"""Shared memory that processes have left behind: Zenoh's files without anybody who holds them.
+"""Orphaned shared memory: files of Zenoh that no process has locked.
 
-Zenoh holds a lock on every file that it has mapped, and lets go of it when its process ends. What
-nobody holds is removed by the next process that uses shared memory; or here, where there may be no
-next one.
+Zenoh locks each file that it has mapped, until its process ends. The next process that uses shared
+memory removes the files without a lock. This module removes them if no such process may follow.
 """
 
 from __future__ import annotations
@@ -15,17 +14,17 @@ from pathlib import Path
 
 SHARED_MEMORY = Path("/dev/shm")  # noqa: S108 - where Linux keeps it
 _FILES = "*.zenoh"
-#: A file that young may be without its lock yet.
+#: Age below which a file may not have its lock yet.
 YOUNG_S = 0.5
 
 
 def is_shared_memory(path: str) -> bool:
-    """Whether a file is shared memory of Zenoh's."""
+    """Return whether a file is shared memory of Zenoh."""
     return Path(path).match(f"{SHARED_MEMORY}/{_FILES}")
 
 
 def remove_orphans(folder: Path = SHARED_MEMORY) -> int:
-    """Remove this user's files of Zenoh's that no process holds; returns how many."""
+    """Remove this user's orphaned files of Zenoh; return their number."""
     removed = 0
     for path in folder.glob(_FILES):
         with suppress(OSError):

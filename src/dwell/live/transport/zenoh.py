@@ -1,13 +1,12 @@
-"""Messages over Eclipse Zenoh: up to three sessions a process, explicit endpoints, nothing blocks.
+"""Transport over Eclipse Zenoh: up to three sessions per process, explicit endpoints, no blocking.
 
-Small messages and payloads have sessions of their own, because one TCP connection that is full of
-images delays everything behind them whatever its priority. Payloads that stay on their node have
-a third one, in which large ones go through shared memory.
+Small messages and payloads use separate sessions, because images that fill a TCP connection delay
+all later messages, whatever their priority. Payloads that stay on their node use a third session,
+with shared memory for large payloads.
 
-A put copies its message into the queue of every receiver and returns; where a queue is full, it is
-dropped there, and no other receiver notices. Payloads that fill a queue by themselves have to wait
-for the network, however fast it is: a thread for each of their keys does that, and puts what is
-newest.
+A put copies its message into the queue of each receiver and returns. A full queue drops the
+message without an effect on other receivers. A payload larger than a queue has to wait for the
+network: one thread per key waits, and then puts the newest payload.
 """
 
 from __future__ import annotations
@@ -38,39 +37,38 @@ from dwell.model import FrozenDict
 if TYPE_CHECKING:
     import zenoh
 
-# What was measured to work.
-#: Silence, ms, after which a peer counts as gone and its connection is given up. Nothing waits for
-#: it: who is there is known by beats, and a process that has died closes its connections.
+# These values were measured.
+#: Silence, ms, after which Zenoh closes the connection to a peer. Nothing depends on it: beats show
+#: which processes live, and the connections of a dead process are closed.
 LEASE_MS = 1_500
-#: Signs of life sent in that time. At one each 100 ms they were a third of what an idle worker took
-#: of a core.
+#: Keep-alive messages per lease. One per 100 ms took a third of the CPU time of an idle worker.
 KEEP_ALIVES = 3
 #: Shortest and longest pause between attempts to connect, ms.
 RETRY_MS = 50, 200
-#: Messages, or fragments of 48 kB, that wait for one peer at most, 1 to 16.
+#: Most messages, or fragments of 48 kB, that wait for one peer, 1 to 16.
 QUEUE_BATCHES = 16
-#: How long a put waits for room in a full queue before it drops the message, µs. Each batch that a
-#: larger message has found room for doubles that, until here for fragments.
+#: Longest wait of a put for space in a full queue before it drops the message, µs. For a larger
+#: message, each queued fragment doubles the wait, up to the second value.
 DROP_AFTER_US, DROP_FRAGMENTS_AFTER_US = 100, 50_000
-#: Payloads above that are put by a thread, which may wait as long as the former says.
+#: Size above which a thread puts a payload, as it may wait for `DROP_FRAGMENTS_AFTER_US`.
 PATIENT_BYTES = 150_000
-#: Payloads from here on go through shared memory where they stay on the node.
+#: Least size of a payload for shared memory, if the payload stays on its node.
 SHARED_BYTES = 100_000
-#: Shared memory for payloads under way from one process.
+#: Shared memory of one process for payloads on their way.
 POOL_BYTES = 16 << 20
-#: Longest message that is put together from its fragments; Zenoh's own limit is 1 GiB.
+#: Longest message that Zenoh assembles from fragments; its own limit is 1 GiB.
 LONGEST_BYTES = 64 << 20
-#: Begins an attachment that says which key it was put under. No header does: MessagePack never
-#: uses this byte.
+#: First byte of an attachment that contains the checksum of its key. No header begins with it, as
+#: MessagePack never uses it.
 MARK = b"\xc1"
 MARKED_BYTES = 5
 
 _LOG = logging.getLogger(__name__)
-#: Different failures of receivers that are logged.
+#: Most different failures of receivers to log.
 MOST_FAILURES = 100
-#: Publishers kept declared; more keys than a process ever puts, answers to questions aside.
+#: Most declared publishers, above the number of keys of any process (without answers to requests).
 _PUBLISHERS = 256
-#: Large payloads of one key that wait while another is on its way.
+#: Most large payloads of one key that wait while another payload is on its way.
 _WAITING = 2
 _PRIORITIES = (
     "control",
@@ -86,28 +84,24 @@ _PRIORITIES = (
 
 @lru_cache(maxsize=1_024)
 def _mark(key: str) -> bytes:
-    """Return the mark of a key, which every message that is put under it carries.
+    """Return the mark of a key, which is part of each message with this key.
 
-    Zenoh sends a number for a key that was declared in a session. Where sessions end and begin
-    anew, a message may be read with the numbers of another one, and be delivered under another key.
+    Zenoh sends a number instead of a key that was declared in a session. After a restart of a
+    session, the receiver may read the numbers of another session, and deliver the message under
+    another key.
     """
     return MARK + zlib.crc32(key.encode()).to_bytes(MARKED_BYTES - 1, "little")
 
 
 @dataclass(frozen=True, slots=True)
 class ZenohSettings:
-    """Bounds of a process's sessions, and what protects them.
+    """Bounds and protection of a process's sessions.
 
-    Parameters
-    ----------
-    longest_bytes, longest_control_bytes : int
-        Longest message that arrives in fragments, in a session for payloads and in `control`; of a
-        longer one what has come is dropped, with the connection. A peer can have a process keep
-        that much for each of its connections, of 8 priorities and 2 reliabilities.
-    most_peers : int
-        Processes that a session is connected to at most.
-    more : mapping of str to object
-        Further settings of Zenoh by path, as ``transport/link/tls/root_ca_certificate``.
+    `longest_bytes` and `longest_control_bytes` bound the messages that arrive in fragments, in a
+    session for payloads and in `control`. A longer message is dropped, and its connection closed. A
+    peer can make a process store that many bytes per connection, priority (8) and reliability (2).
+    `most_peers` bounds the processes that connect to a session. `more` has further settings of
+    Zenoh by path, such as ``transport/link/tls/root_ca_certificate``.
     """
 
     longest_bytes: int = LONGEST_BYTES
@@ -119,18 +113,8 @@ class ZenohSettings:
 class ZenohTransport:
     """Sessions of a process; see `Transport`.
 
-    It returns at once, whoever else is there yet, and connects in the background for as long as it
-    is open. Callbacks run in Zenoh's own threads.
-
-    Parameters
-    ----------
-    entry : WiringEntry
-        Where it listens and to whom it connects, from `Wiring.entry`.
-
-    Raises
-    ------
-    LiveError
-        If Zenoh is not installed, or it cannot listen.
+    The constructor does not wait for peers: the sessions connect in the background. Callbacks run
+    in Zenoh's threads. Raises a LiveError if Zenoh is missing, or a session cannot listen.
     """
 
     def __init__(self, entry: WiringEntry, settings: ZenohSettings | None = None) -> None:
@@ -147,12 +131,12 @@ class ZenohTransport:
         ports = (end.port for end in entry.listen.values())
         self._abandoned = AbandonedConnections(ports, self._renew)
         self._subscribed: list[tuple[str, Receive]] = []
-        #: Messages that arrived under another key than they were put under.
+        #: Number of messages that arrived under a wrong key.
         self.misled = 0
-        #: Messages that nobody could handle.
+        #: Number of messages whose receiver failed.
         self.failed = 0
         self._failures: set[str] = set()
-        # Read and filled without a lock: a publisher too many does no harm.
+        # Used without a lock: a superfluous publisher does no harm.
         self._routes: dict[tuple[str, Lane], _Route] = {}
         self._locks: dict[Lane, threading.RLock] = {
             "control": threading.RLock(),
@@ -175,11 +159,11 @@ class ZenohTransport:
     def put(
         self, key: str, payload: bytes | memoryview, header: bytes = b"", *, lane: Lane = "control"
     ) -> None:
-        """Send a message; returns at once, whatever the receivers do."""
+        """Send a message without waiting for the receivers."""
         route = self._routes.get((key, lane)) or self._route(key, lane)
         if route is None or self._closed:
             return
-        # Zenoh takes no views: whoever has one pays for a copy more.
+        # Zenoh accepts no views, so a view costs another copy.
         data = payload if isinstance(payload, bytes) else bytes(payload)
         if route.sender is None:
             content = route.content(data)
@@ -189,7 +173,7 @@ class ZenohTransport:
         self._sender(route).send(data, header)
 
     def subscribe(self, key: str, receive: Receive) -> None:
-        """Have `receive` called with every message under a key expression (``*``, ``**``)."""
+        """Call `receive` for each message that matches a key expression (``*``, ``**``)."""
         require_expression(key)
         self._subscribed.append((key, receive))
         for name, session in list(self._sessions.items()):
@@ -197,8 +181,8 @@ class ZenohTransport:
 
     def _declare(self, name: Session, session: zenoh.Session, key: str, receive: Receive) -> None:
         lock = self._locks["control" if name == "control" else "images"]
-        # Called in the thread that read the message: one hand-over less, and a receiver that
-        # is behind makes its senders drop instead of growing a queue here.
+        # Call it in the thread that reads the message. This saves a change of threads; and if a
+        # receiver is late, its senders drop messages, instead of a queue that grows here.
         session.declare_subscriber(
             key,
             self._zenoh.handlers.Callback(partial(self._deliver, receive, lock), indirect=False),
@@ -206,8 +190,8 @@ class ZenohTransport:
         )
 
     def close(self) -> None:
-        """Send and deliver nothing more; safe to call twice."""
-        # With both locks no callback is running, unless it is this thread's own.
+        """Stop sending and delivering messages; may be called twice."""
+        # While this thread has both locks, no other thread runs a callback.
         with self._locks["control"], self._locks["images"]:
             self._closed = True
             self._connections.stop()
@@ -223,9 +207,9 @@ class ZenohTransport:
             session.close()
 
     def _renew(self, port: int) -> None:
-        """Open the session that listens on a port anew, which closes all its connections.
+        """Reopen the session that listens on a port, which closes all its connections.
 
-        What is put meanwhile is lost; its peers connect again at once.
+        Messages that are put during this time are lost; the peers reconnect at once.
         """
         (name,) = (name for name, end in self.entry.listen.items() if end.port == port)
         with self._locks["control"], self._locks["images"]:
@@ -255,17 +239,11 @@ class ZenohTransport:
 
     @property
     def peers(self) -> Mapping[Session, int]:
-        """How many processes each session is connected to at the moment."""
+        """Present number of connected processes by session."""
         return {name: len(session.info.peers_zid()) for name, session in self._sessions.items()}
 
     def _open(self, name: Session) -> zenoh.Session:
-        """Open one session.
-
-        Raises
-        ------
-        LiveError
-            With where it should have listened, and why it cannot.
-        """
+        """Open a session; raises a LiveError with address and reason if it cannot listen."""
         config = self._zenoh.Config()
         for path, value in _configuration(self.entry, name, self.settings).items():
             config.insert_json5(path, json.dumps(value))
@@ -280,7 +258,7 @@ class ZenohTransport:
             ) from None
 
     def _route(self, key: str, lane: Lane) -> _Route | None:
-        """Declare a publisher in the session that a key and a lane belong to."""
+        """Declare a publisher in the session of a key and a lane; None if it is closed."""
         require_key(key)
         name = session_of(self.entry, lane, key)
         session = self._sessions.get(name)
@@ -312,7 +290,7 @@ class ZenohTransport:
         return route
 
     def _sender(self, route: _Route) -> _Sender:
-        """Return the thread that puts for a key; from then on it puts everything for it."""
+        """Return the thread of a key, which puts all further messages of the key."""
         with self._growing:
             if route.sender is None:
                 route.sender = _Sender(route, self._send)
@@ -328,7 +306,7 @@ class ZenohTransport:
                 raise
 
     def _deliver(self, receive: Receive, lock: threading.RLock, sample: zenoh.Sample) -> None:
-        """Hand a message to a receiver, in Zenoh's thread; log each kind of failure once."""
+        """Pass a message to a receiver in Zenoh's thread; log each kind of failure once."""
         _keep_thread_state()
         attachment, key = sample.attachment, str(sample.key_expr)
         header = b"" if attachment is None else attachment.to_bytes()
@@ -357,9 +335,10 @@ _kept = threading.local()
 
 
 def _keep_thread_state() -> None:
-    """Have Python keep what it knows of this thread, which is Zenoh's, until the thread ends.
+    """Keep Python's state of this thread of Zenoh until the thread ends.
 
-    It would be made anew for every message: a third of what taking one costs (55 instead of 80 µs).
+    Otherwise Python would create the state for each message, which would then take 80 instead of
+    55 µs.
     """
     if not getattr(_kept, "done", False):
         ctypes.pythonapi.PyGILState_Ensure()
@@ -368,25 +347,25 @@ def _keep_thread_state() -> None:
 
 @dataclass(slots=True)
 class _Route:
-    """How messages of a key and lane go out."""
+    """Publisher of a key and lane."""
 
     put: Callable[..., None]
     pool: _Pool | None
-    #: Once there is one, everything goes through it, so that the order stays.
+    #: Thread that sends all messages of the key after its first large payload, to keep their order.
     sender: _Sender | None = None
     mark: bytes = b""
-    #: Whether its session has been closed.
+    #: Whether the session has been closed.
     closed: bool = False
 
     def content(self, data: bytes) -> Any:
-        """Return a payload as Zenoh is handed it: in shared memory, or as it is."""
+        """Return a large payload in shared memory, if the key has a pool, else the payload."""
         if self.pool is None or len(data) < SHARED_BYTES:
             return data
         return self.pool.filled(data)
 
 
 class _Sender:
-    """Puts the newest messages of one key in a thread of its own, which may have to wait."""
+    """Thread that puts the newest messages of one key, and may wait for the network."""
 
     def __init__(self, route: _Route, send: Callable[[_Route, Any, bytes], None]) -> None:
         self._route = route
@@ -397,13 +376,13 @@ class _Sender:
         self._thread = start_thread("dwell-sender", self._run)
 
     def send(self, data: bytes, header: bytes) -> None:
-        """Have a message put next; the oldest that waits is dropped where there are too many."""
+        """Queue a message; drop the oldest waiting message if the queue is full."""
         with self._changed:
             self._waiting.append((data, header))
             self._changed.notify()
 
     def stop(self) -> None:
-        """Put nothing more."""
+        """Stop the thread."""
         with self._changed:
             self._stopped = True
             self._changed.notify()
@@ -423,24 +402,24 @@ class _Sender:
 
 
 class _Pool:
-    """Shared memory that payloads are copied into for as long as a receiver needs them."""
+    """Shared memory for copies of payloads, which stay as long as a receiver needs them."""
 
     def __init__(self, pool_bytes: int) -> None:
         from zenoh import ZError, shm
 
         self._error = ZError
         self._provider = shm.ShmProvider.default_backend(pool_bytes)
-        # What receivers have let go of is collected only where there is no room.
+        # Payloads that receivers have released are collected only when the pool is full.
         self._policy = shm.Defragment(shm.GarbageCollect())
 
     @classmethod
     def of(cls, pool_bytes: int = POOL_BYTES) -> _Pool | None:
-        """Return a pool, or None where there is no shared memory for it."""
+        """Return a pool, or None if the system lacks shared memory for it."""
         try:
             room = os.statvfs(SHARED_MEMORY)
         except OSError:
             return None
-        # The file is sparse: writing to one that does not fit would kill the process.
+        # The file is sparse: writes beyond the free memory would kill the process.
         if room.f_bavail * room.f_frsize < 2 * pool_bytes:
             _LOG.warning(
                 "%s has less than %d bytes free: images are copied through sockets",
@@ -453,7 +432,7 @@ class _Pool:
         try:
             return cls(pool_bytes)
         except ZError as error:
-            # Zenoh locks it into memory, of which a user may lock 8 MB only by default.
+            # Zenoh locks the pool into memory; by default a user may lock only 8 MB.
             _LOG.warning(
                 "no %d bytes of shared memory can be had (%s; LimitMEMLOCK, ulimit -l): images are "
                 "copied through sockets",
@@ -463,7 +442,7 @@ class _Pool:
             return None
 
     def filled(self, payload: bytes) -> Any:
-        """Return the payload in shared memory, or as it is where there is no room."""
+        """Return the payload in shared memory, or the payload itself if the pool is full."""
         try:
             buffer = self._provider.alloc(len(payload), self._policy)
         except self._error:
@@ -473,20 +452,20 @@ class _Pool:
 
 
 def _configuration(entry: WiringEntry, name: Session, settings: ZenohSettings) -> dict[str, object]:
-    """Zenoh's settings for one session, by path."""
+    """Return Zenoh's settings for a session, by path."""
     listen = entry.listen.get(name)
     first_ms, last_ms = RETRY_MS
     retry = {"period_init_ms": first_ms, "period_max_ms": last_ms, "period_increase_factor": 2}
     queue = "transport/link/tx/queue"
     return {
         "mode": "peer",
-        # Nobody is looked for: who is there stands in the cell file.
+        # No search for peers: the cell file lists them.
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "open/return_conditions/connect_scouted": False,
         "open/return_conditions/declares": False,
         "listen/endpoints": [] if listen is None else [str(listen)],
-        # A predecessor that has just been killed may hold the port for a moment.
+        # A predecessor that was just killed may still occupy the port.
         "listen/timeout_ms": 1_000,
         "listen/retry": {"period_init_ms": 20, "period_max_ms": 100, "period_increase_factor": 2},
         "connect/endpoints": [str(end) for end in entry.connect.get(name, ())],
@@ -495,7 +474,7 @@ def _configuration(entry: WiringEntry, name: Session, settings: ZenohSettings) -
         "connect/retry": retry,
         "transport/link/tx/lease": LEASE_MS,
         "transport/link/tx/keep_alive": KEEP_ALIVES,
-        # One message is one batch: nothing waits for company, and 100 kB cost 25 us, not 130.
+        # Send each message as one batch, without waiting: 100 kB cost 25 us instead of 130.
         f"{queue}/batching/enabled": False,
         f"{queue}/size": dict.fromkeys(_PRIORITIES, QUEUE_BATCHES),
         f"{queue}/congestion_control/drop/wait_before_drop": DROP_AFTER_US,
@@ -505,7 +484,7 @@ def _configuration(entry: WiringEntry, name: Session, settings: ZenohSettings) -
         ),
         "transport/unicast/max_sessions": settings.most_peers,
         "transport/shared_memory/enabled": name == "local",
-        # Payloads are put there by `_Pool`, with a plain copy where it is full.
+        # `_Pool` puts payloads there, and falls back to sockets when it is full.
         "transport/shared_memory/transport_optimization/enabled": False,
         **settings.more,
     }

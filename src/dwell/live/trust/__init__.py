@@ -1,8 +1,7 @@
-"""Who may do what in a live cell: certificates of its own authority, and what is signed with them.
+"""Permissions in a live cell: certificates of the cell's own authority, and signatures.
 
-`authority` issues and revokes; `keyring` is what a host has of it; `roster` the list of all
-subjects that both agree on. Every subject has one Ed25519 key (RFC 8032): for mutual TLS, and for
-what is signed end to end.
+`authority` issues and revokes certificates; `keyring` contains a host's keys; `roster` lists all
+subjects. Each subject has one Ed25519 key (RFC 8032) for mutual TLS and for signed messages.
 """
 
 from __future__ import annotations

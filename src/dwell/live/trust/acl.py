@@ -1,8 +1,8 @@
-"""Access control of a Zenoh session: who may put what to it, by the names in certificates.
+"""Access control of a Zenoh session: permitted senders by key and name in the certificate.
 
-Nothing is allowed that is not listed, and nobody who has been revoked is. Zenoh looks at the
-certificate of the process at the other end of a connection; a message that may not pass is dropped
-without a word to its sender.
+Only listed messages are permitted, and only from subjects that are not revoked. Zenoh checks the
+certificate of the process at the other end of a connection, and drops other messages without a
+report to the sender.
 """
 
 from __future__ import annotations
@@ -21,15 +21,9 @@ def access_control(
 ) -> AccessControl:
     """Return the settings of a session's access control.
 
-    Every subject of the roster may hear what is put under the root, and be sent it.
-
-    Parameters
-    ----------
-    root : str
-        Beginning of all keys of the cell.
-    may_put : mapping of str to iterable of str
-        By key expression: names of the subjects who may put there. Those that the roster does not
-        have are left out.
+    Each subject of the roster may receive all messages below `root`, the prefix of the cell's keys.
+    `may_put` gives the permitted senders of each key expression; names outside the roster are
+    ignored.
     """
     below = f"{root}/**"
     rules: list[dict[str, Any]] = [
@@ -40,7 +34,7 @@ def access_control(
     everybody = [subject.common_name for subject in roster.certificates]
     if everybody:
         policies.append({"rules": ["hear", "send"], "subjects": everybody})
-    # Keys of the same senders share a rule.
+    # Keys with the same senders share a rule.
     together: dict[frozenset[str], list[str]] = {}
     for expression, names in may_put.items():
         allowed = frozenset(names)

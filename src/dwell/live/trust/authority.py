@@ -1,4 +1,4 @@
-"""Authority: the certificates of a cell, issued and revoked where its own key is kept."""
+"""Authority of a cell: issues and revokes the certificates with its own key."""
 
 from __future__ import annotations
 
@@ -28,22 +28,19 @@ from dwell.live.trust.request import (
 )
 from dwell.live.trust.roster import ROLES, Role, Roster, Subject, write_private
 
-#: Folder of the authority's own key, which stays where the others are issued.
+#: Folder of the authority's own key, which stays on the computer that issues certificates.
 AUTHORITY = "ca"
-#: How long certificates hold, unless asked otherwise; the authority's own holds ten times that.
+#: Default validity of certificates; the authority's own certificate is valid ten times as long.
 DAYS = 365
 MOST_DAYS = 3_650
-#: Clocks of hosts may be behind by that.
+#: Age of new certificates, as the clocks of hosts may be late.
 BACKDATED = timedelta(hours=1)
 
 
 class Authority:
-    """Issues and revokes; every change is written to the folders of all subjects.
+    """Issues and revokes certificates; each change is written to the folders of all subjects.
 
-    Parameters
-    ----------
-    folder : Path
-        With a folder for the authority, and one for each subject, to be taken to its host.
+    `folder` contains one folder for the authority, and one keyring per subject to copy to its host.
     """
 
     def __init__(
@@ -53,12 +50,9 @@ class Authority:
 
     @classmethod
     def create(cls, folder: Path, cell: str, *, days: int = DAYS) -> Authority:
-        """Make an authority with a key of its own, and nobody yet.
+        """Make an authority with a new key and without subjects.
 
-        Raises
-        ------
-        TrustError
-            If the folder has one already, or cannot be made.
+        Raises a TrustError if the folder has an authority already, or cannot be made.
         """
         _require_days(days)
         if (folder / AUTHORITY).exists():
@@ -92,13 +86,7 @@ class Authority:
 
     @classmethod
     def open(cls, folder: Path) -> Authority:
-        """Read an authority.
-
-        Raises
-        ------
-        TrustError
-            If it is missing or damaged.
-        """
+        """Read an authority; raises a TrustError if it is missing or damaged."""
         own = folder / AUTHORITY
         try:
             key = load_pem_private_key((own / "key.pem").read_bytes(), password=None)
@@ -124,26 +112,26 @@ class Authority:
         *,
         days: int = DAYS,
     ) -> Path:
-        """Issue a certificate with a new key; those before hold until they end.
+        """Issue a certificate with a new key; earlier certificates stay valid until they expire.
 
         Parameters
         ----------
         role : {"node", "controller", "operator", "observer"}, optional
-            The one that it had if left out.
+            Role of the subject [default: the role of its last certificate].
         addresses : collection of str, optional
-            Where it is reached: host names and IP addresses; those it had if left out.
+            Host names and IP addresses [default: the addresses of its last certificate].
         days : int
-            How long it holds, 1 to 3650.
+            Validity, 1 to 3650.
 
         Returns
         -------
         Path
-            Folder of its keyring.
+            Folder of the subject's keyring.
 
         Raises
         ------
         TrustError
-            If the name or role or time is not valid, or it cannot be written.
+            If the name, role or validity is invalid, or a file cannot be written.
         """
         key = Ed25519PrivateKey.generate()
         return self._certify(name, key.public_key(), role, addresses, days, secret=key)
@@ -156,22 +144,10 @@ class Authority:
         *,
         days: int = DAYS,
     ) -> Path:
-        """Issue a certificate for a key that was made elsewhere; the rest as for `issue`.
+        """Issue a certificate for a request of `request_certificate` (see `issue`).
 
-        Parameters
-        ----------
-        request : Path
-            File that `dwell.live.trust.request.request_certificate` has written.
-
-        Returns
-        -------
-        Path
-            Folder of its keyring, which lacks the private key.
-
-        Raises
-        ------
-        TrustError
-            As `issue`, or if the request is none.
+        Returns the folder of a keyring without the private key. Also raises a TrustError if the
+        request is invalid.
         """
         name, key = read_request(request)
         return self._certify(name, key, role, addresses, days)
@@ -219,12 +195,9 @@ class Authority:
         return folder
 
     def revoke(self, name: str) -> None:
-        """Take a subject's certificates back; hosts know once they have the new roster.
+        """Revoke a subject's certificates, which takes effect on hosts with the new roster.
 
-        Raises
-        ------
-        TrustError
-            If there is no such subject.
+        Raises a TrustError if the subject is unknown.
         """
         roster = self.roster
         if name not in roster.subjects:
@@ -236,7 +209,7 @@ class Authority:
         self._publish(replace(roster, subjects=rest, revoked=revoked, earlier=earlier))
 
     def _last(self, name: str) -> x509.Certificate | None:
-        """Return the newest certificate that a subject's folder has."""
+        """Return the newest certificate of a subject, from its folder."""
         try:
             return x509.load_pem_x509_certificate((self.folder / name / "cert.pem").read_bytes())
         except (OSError, ValueError):
@@ -250,7 +223,7 @@ class Authority:
         return int(found.rpartition(".")[2])
 
     def _names(self, name: str) -> Iterable[x509.GeneralName]:
-        """Return the addresses that a subject had."""
+        """Return the addresses in a subject's newest certificate."""
         last = self._last(name)
         if last is None:
             return ()
@@ -260,7 +233,7 @@ class Authority:
             return ()
 
     def _publish(self, roster: Roster) -> None:
-        """Write the roster to everybody's folder, those of the revoked aside."""
+        """Write the roster to the folders of all subjects that are not revoked."""
         self.roster = replace(roster, number=roster.number + 1)
         signed = self.roster.signed(self._key)
         for name in (AUTHORITY, *self.roster.subjects):

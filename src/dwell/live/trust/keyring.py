@@ -1,4 +1,4 @@
-"""Keyring: what a host has of its cell's authority: its own key, and the roster of all."""
+"""Keyring of a subject: its key and certificate, and the roster of all subjects."""
 
 from __future__ import annotations
 
@@ -17,20 +17,15 @@ from dwell.errors import TrustError
 from dwell.live.trust.request import key_file
 from dwell.live.trust.roster import Roster, Subject
 
-#: From how many days before its end on a certificate is warned of.
+#: Remaining days of a certificate below which Dwell warns.
 SOON_DAYS = 30
 
 
 @dataclass(frozen=True, slots=True)
 class Keyring:
-    """A subject's own key and certificate, and whom it knows.
+    """A subject's key and certificate, and the roster.
 
-    Parameters
-    ----------
-    folder : Path
-        With ``ca.pem``, ``cert.pem``, ``key.pem`` and ``roster.json``.
-    key_file : Path
-        Where its own key is.
+    `folder` contains ``ca.pem``, ``cert.pem``, ``roster.json`` and the key (see `key_file`).
     """
 
     folder: Path
@@ -42,17 +37,10 @@ class Keyring:
 
     @classmethod
     def open(cls, folder: Path, *, cell: str | None = None) -> Keyring:
-        """Read a keyring and check that its parts belong together.
+        """Read a keyring, and check that its parts match each other and the cell, if given.
 
-        Parameters
-        ----------
-        cell : str, optional
-            Cell that it has to be of.
-
-        Raises
-        ------
-        TrustError
-            If something is missing, readable by others, damaged, revoked, expired, or another's.
+        Raises a TrustError if a file is missing, damaged or readable by other users, or if the
+        certificate is revoked, expired, or belongs to another cell.
         """
         authority, certificate, key, path = _read(folder)
         public = authority.public_key()
@@ -86,7 +74,7 @@ class Keyring:
         return cls(folder, own, roster, expires, path, key)
 
     def warning(self, now: datetime | None = None) -> str:
-        """Return that the certificate ends soon; nothing where it does not."""
+        """Return a warning if the certificate expires soon, else an empty text."""
         days = (self.expires - (now or datetime.now(UTC))).days
         if days >= SOON_DAYS:
             return ""
@@ -96,7 +84,7 @@ class Keyring:
         )
 
     def sign(self, domain: bytes, data: bytes) -> bytes:
-        """Sign data for one purpose; 64 bytes."""
+        """Return a signature (64 bytes) of data, which is valid only for this domain."""
         return self._key.sign(domain + b"\0" + data)
 
 

@@ -1,7 +1,7 @@
-"""Permissions: whose certificate may put under which key of a cell.
+"""Permissions: the certificates that may put messages to each key of a cell.
 
-All processes of a node share its certificate, so what is told apart here are nodes, the controller
-and people. A key that is not listed is nobody's.
+All processes of a node share its certificate, so permissions distinguish nodes, the controller,
+operators and observers. No certificate may put to a key that is not listed.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from dwell.model import Problem
 
 
 def senders(problem: Problem) -> dict[str, frozenset[str]]:
-    """Return who may put, by key; the names are those of nodes, and `CONTROLLER`.
+    """Return the permitted senders by key: names of nodes, and `CONTROLLER`.
 
-    Questions are missing: who may ask them is in nobody's cell file.
+    Keys for requests of operators and observers are missing, as cell files do not list people.
     """
     keys, pipeline = Keys(problem.name), problem.pipeline
     stamper, relay = problem.stamper_node, problem.relay_node
@@ -40,13 +40,13 @@ def senders(problem: Problem) -> dict[str, frozenset[str]]:
         by_key[keys.beat(role.node, role.who)] = frozenset([sender])
     for node in problem.fabric.nodes:
         by_key[keys.load(node)] = frozenset([node])
-    # What is sent twice may be handed to the relay by whoever may send it.
+    # Senders of messages that are sent twice may also send them to the relay.
     by_key |= {keys.relay(key): who for key, who in by_key.items() if keys.word(key) in TWICE}
     return by_key
 
 
 def _of_stages(problem: Problem, keys: Keys) -> dict[str, frozenset[str]]:
-    """Return who may put stages' messages to one another, and messages about their states."""
+    """Return the permitted senders, by key, of messages between stages and about their states."""
     pipeline = problem.pipeline
     by_key: dict[str, frozenset[str]] = {}
     restored: set[str] = set()
@@ -73,10 +73,10 @@ def _of_stages(problem: Problem, keys: Keys) -> dict[str, frozenset[str]]:
 
 
 def subjects(problem: Problem, roster: Roster) -> dict[str, Collection[str]]:
-    """Return who of a roster may put, by key."""
+    """Return the subjects of a roster that may put messages, by key."""
     keys = Keys(problem.name)
     everybody = roster.subjects.values()
-    # The roster has to have each name in the role that the cell file takes it for.
+    # Skip subjects whose role in the roster differs from their role in the cell file.
     known = {
         one.name
         for one in everybody

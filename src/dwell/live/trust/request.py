@@ -1,4 +1,4 @@
-"""Requests for certificates: a key is made where it is used, and its public half is signed."""
+"""Requests for certificates: a host makes its key, and the authority signs the public half."""
 
 from __future__ import annotations
 
@@ -20,23 +20,17 @@ from dwell.live.trust.roster import require_name, write_private
 
 
 def common_name(text: str) -> x509.Name:
-    """Return the name of a certificate's subject."""
+    """Return the X.509 name with this common name."""
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, text)])
 
 
 def private_pem(key: Ed25519PrivateKey) -> bytes:
-    """Return a key as the content of its file."""
+    """Return a key in PKCS 8 as PEM, without encryption."""
     return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
 
 
 def make_private_folder(folder: Path) -> None:
-    """Make a folder that only its owner can read.
-
-    Raises
-    ------
-    TrustError
-        If it cannot be made.
-    """
+    """Make a folder that only its owner can read; raises a TrustError if that fails."""
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         folder.chmod(0o700)
@@ -45,10 +39,10 @@ def make_private_folder(folder: Path) -> None:
 
 
 def key_file(folder: Path, public: object) -> Path:
-    """Return the file in which a keyring has the private half of a key.
+    """Return the file of a keyring with the private half of a key.
 
-    A key that was requested with has a file of its own, so that a request for the next certificate
-    leaves the key of the present one in place.
+    Each requested key has a separate file, so a request for the next certificate keeps the key of
+    the present certificate.
     """
     if isinstance(public, Ed25519PublicKey):
         own = own_key_file(folder, public)
@@ -58,28 +52,16 @@ def key_file(folder: Path, public: object) -> Path:
 
 
 def own_key_file(folder: Path, public: Ed25519PublicKey) -> Path:
-    """Return the file of a keyring that is for one key alone, by its public half."""
+    """Return the separate file of a requested key, which is named after its public half."""
     digits = public.public_bytes(Encoding.Raw, PublicFormat.Raw).hex()
     return folder / f"key-{digits[:16]}.pem"
 
 
 def request_certificate(out: Path, name: str) -> Path:
-    """Make a key in a subject's keyring, and a request for its certificate.
+    """Make a key in the keyring ``OUT/NAME``, and a request for its certificate.
 
-    Parameters
-    ----------
-    out : Path
-        Folder that has the keyring by the subject's name.
-
-    Returns
-    -------
-    Path
-        The request (PKCS 10), which may travel.
-
-    Raises
-    ------
-    TrustError
-        If the name is not valid, or a file cannot be written.
+    Returns the request (PKCS 10), which contains no secret. Raises a TrustError if the name is
+    invalid, or a file cannot be written.
     """
     require_name(name)
     key = Ed25519PrivateKey.generate()
@@ -92,12 +74,9 @@ def request_certificate(out: Path, name: str) -> Path:
 
 
 def read_request(path: Path) -> tuple[str, Ed25519PublicKey]:
-    """Return the name and the key that a request is for.
+    """Return the name and the key of a request.
 
-    Raises
-    ------
-    TrustError
-        If it cannot be read, is none, or was not signed with the key itself.
+    Raises a TrustError if the request cannot be read, is invalid, or is not signed with its key.
     """
     try:
         request = x509.load_pem_x509_csr(path.read_bytes())

@@ -1,4 +1,4 @@
-"""Roster: the subjects of a cell, as its authority has signed them."""
+"""Roster: the list of a cell's subjects, signed by its authority."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey,
 from dwell.errors import TrustError
 from dwell.files import write_whole
 
-#: A `node` runs an agent and what it starts; the `controller` orders; an `operator` asks for pins
-#: and drains; an `observer` reads.
+#: A `node` runs an agent and its processes; the `controller` orders placements; an `operator` pins
+#: candidates and drains nodes; an `observer` reads the status.
 Role: TypeAlias = Literal["node", "controller", "operator", "observer"]
 ROLES: tuple[Role, ...] = ("node", "controller", "operator", "observer")
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,47}")
 VERSION = 2
 MAX_BYTES = 1 << 20
-#: From when on before a certificate's end the status warns; a third of its life, if that is less.
+#: Remaining validity below which the status warns, at most a third of the total validity.
 WARNING = timedelta(days=14)
 DOMAIN = b"dwell roster 1\0"
 
 
 def require_name(name: object) -> None:
-    """Raise a TrustError unless a subject can have a name."""
+    """Raise a TrustError if a subject's name is invalid."""
     if not isinstance(name, str) or not NAME.fullmatch(name):
         raise TrustError(
             f"{name!r} is no name of a subject; write letters, digits, - and _, "
@@ -42,19 +42,11 @@ def require_name(name: object) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """A holder of a certificate.
+    """Owner of a certificate.
 
-    Parameters
-    ----------
-    name : str
-        A node's name, or another one.
-    generation : int
-        Counts its certificates from 1: the name in a certificate has it, so that one that was
-        revoked is not taken for the one that followed.
-    public_key : str
-        Ed25519, base64.
-    issued, expires : str
-        ISO 8601, with the offset to UTC.
+    `generation` counts the subject's certificates from 1. It is part of the common name, which
+    distinguishes a revoked certificate from its successor. `public_key` is Ed25519 in base64;
+    `issued` and `expires` are ISO 8601 with an offset to UTC.
     """
 
     name: str
@@ -79,29 +71,23 @@ class Subject:
 
     @property
     def ends(self) -> datetime:
-        """Instant at which its certificate ends."""
+        """Time at which the certificate expires."""
         return datetime.fromisoformat(self.expires)
 
     @property
     def warns_from(self) -> datetime:
-        """Instant from which the cell's status warns of the end."""
+        """Time from which the cell's status warns that the certificate will expire."""
         life = self.ends - datetime.fromisoformat(self.issued)
         return self.ends - min(WARNING, life / 3)
 
     @property
     def common_name(self) -> str:
-        """Name in its certificate."""
+        """Name in the certificate."""
         return f"{self.name}.{self.generation}"
 
     @property
     def key(self) -> Ed25519PublicKey:
-        """Key that verifies its signatures.
-
-        Raises
-        ------
-        TrustError
-            If it is not a key.
-        """
+        """Key that verifies the subject's signatures; raises a TrustError if it is invalid."""
         try:
             data = base64.b64decode(self.public_key, validate=True)
             return Ed25519PublicKey.from_public_bytes(data)
@@ -111,19 +97,11 @@ class Subject:
 
 @dataclass(frozen=True, slots=True)
 class Roster:
-    """Subjects of a cell.
+    """Subjects of a cell, by name, with their newest certificates.
 
-    Parameters
-    ----------
-    number : int
-        Grows with every change.
-    subjects : mapping of str to Subject
-        Subjects with their newest certificates, by name.
-    revoked : tuple of int
-        Serial numbers of certificates that are not in force.
-    earlier : tuple of Subject
-        Certificates before the newest that are in force until they end, so that hosts may take
-        the newest in any order.
+    `number` grows with each change. `revoked` has serial numbers of revoked certificates. `earlier`
+    has older certificates that are valid until they expire, so hosts may get their newest
+    certificates in any order.
     """
 
     cell: str
@@ -134,7 +112,7 @@ class Roster:
 
     @property
     def certificates(self) -> tuple[Subject, ...]:
-        """All that are in force; of one name the newest is the last."""
+        """All valid certificates; the newest certificate of a name is its last."""
         return *self.earlier, *self.subjects.values()
 
     def of(self, name: str) -> list[Subject]:
@@ -142,7 +120,7 @@ class Roster:
         return [one for one in reversed(self.certificates) if one.name == name]
 
     def signed(self, key: Ed25519PrivateKey) -> str:
-        """Return it as JSON, signed by the authority."""
+        """Return the roster as JSON, with a signature by the authority's key."""
         document = self._document()
         signature = key.sign(DOMAIN + _canonical(document))
         document["signature"] = base64.b64encode(signature).decode()
@@ -159,12 +137,9 @@ class Roster:
 
     @classmethod
     def read(cls, path: Path, authority: Ed25519PublicKey) -> Roster:
-        """Read a roster and check who has signed it.
+        """Read a roster and verify its signature.
 
-        Raises
-        ------
-        TrustError
-            If it is missing, not a roster, or not signed by the authority.
+        Raises a TrustError if it is missing or invalid, or the authority has not signed it.
         """
         try:
             if path.stat().st_size > MAX_BYTES:
@@ -194,13 +169,7 @@ def _canonical(document: Mapping[str, Any]) -> bytes:
 
 
 def write_private(path: Path, data: bytes | str) -> None:
-    """Write a file that only its owner can read, as a whole or not at all.
-
-    Raises
-    ------
-    TrustError
-        If it cannot be written.
-    """
+    """Write a file atomically, readable only by its owner; raises a TrustError if that fails."""
     try:
         write_whole(path, data, private=True)
     except OSError as error:

@@ -1,8 +1,8 @@
-"""Seals: signatures that say who has written a message, whichever way it came.
+"""Seals: signatures that prove the author of a message, even if another process relayed it.
 
-A sealed message is a signature of 64 bytes (Ed25519, RFC 8032) and the message as it was encoded.
-What is signed begins with the cell and what kind of message it is: none passes for one of another
-kind, or of another cell. That it is not an old one has to follow from what it says.
+A sealed message is a signature of 64 bytes (Ed25519, RFC 8032) and the encoded message. The signed
+data begins with the cell and the kind of the message, so a signature is invalid for other kinds and
+cells. The content of a message has to show that it is not a replayed old message.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from dwell.errors import TrustError
 from dwell.live.trust.keyring import Keyring
 from dwell.live.wire.messages import SIGNATURE_BYTES
 
-#: Sealed messages that are known to be good, so that the second copy of each costs nothing.
+#: Number of verified messages to remember: the second copy of a message needs no verification.
 REMEMBERED = 512
 
 
 class Seals:
-    """Signs a process's messages, and checks those of others."""
+    """Signs a process's messages, and verifies messages of other processes."""
 
     def __init__(self, keyring: Keyring) -> None:
         self.keyring = keyring
@@ -28,23 +28,14 @@ class Seals:
         self._good: dict[tuple[str, str, bytes], None] = {}
 
     def seal(self, word: str, data: bytes) -> bytes:
-        """Return a message with this process's signature before it.
+        """Return this process's signature followed by the message.
 
-        Parameters
-        ----------
-        word : str
-            Kind of the message, by the first word of its key.
+        `word` is the kind of the message: the first word of its key.
         """
         return self.keyring.sign(self._of(word), data) + data
 
     def require(self, word: str, name: str, sealed: bytes) -> None:
-        """Raise a TrustError unless a subject has sealed a message.
-
-        Parameters
-        ----------
-        name : str
-            Name of the subject, who may have used the key of any certificate that is in force.
-        """
+        """Raise a TrustError unless a subject has sealed a message, with any of its valid keys."""
         known = word, name, sealed
         if known in self._good:
             return
