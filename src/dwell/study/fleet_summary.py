@@ -70,10 +70,11 @@ def fleet_numbers(run: FleetRun) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``cells``: means over the windows after the warm-up and number of moves per cell, with the
-        word of its verdict (`dwell.study.verdict`), the worst cell first; ``cost``, the mean over cells; ``load`` by shared resource; ``moves``,
-        ``guard_moves``; ``refused``, the number of refusals by the first word of the reason;
-        ``rounds``, each with Φ before and after it and the cells that moved.
+        ``cells``: means over the windows after the warm-up, number of moves and the word of the
+        verdict (`dwell.study.verdict`) per cell, the worst cell first; ``cost``, the mean over
+        cells; ``load`` by shared resource; ``moves``, ``guard_moves``; ``refused``, the number of
+        refusals by the first word of the reason; ``rounds``, each with Φ before and after it and
+        the cells that moved.
     """
     import polars as pl
 
