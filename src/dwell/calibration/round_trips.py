@@ -7,12 +7,11 @@ message without payload and then one with it.
 
 From these two round trips, r0 and r1::
 
-    delay_ms  = r0 / 2                                  one sample a round
+    delay_ms  = r0 / 2                                  one sample per round
     rate_mbps = 8 bytes / (1e3 median(r1 - r0))
 
-Half of a round trip is the way there only if both ways take equally long: that is an assumption.
-Nothing is subtracted, so that the delay includes what both ends need to pass a message on, and the
-rate is what a TCP connection has got at this pace, not what the medium could carry.
+This assumes equal delays in both directions. The delay includes the processing of a message at both
+ends. The rate is the rate of a TCP connection at this pace, not the capacity of the medium.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ HEADER = struct.Struct("!4sIQ")
 MAGIC = b"DWL1"
 MAX_BYTES = 64_000_000
 CHUNK_BYTES = 2**16
-#: What the peer is asked before the rounds begin, for messages.
+#: Name of the first exchange, before the rounds, in error messages.
 FIRST = "the first message"
 
 PAYLOAD_BYTES = Bound(1, MAX_BYTES, whole=True)
@@ -341,12 +340,12 @@ def measure_link(
 
 
 def rate_mbps(payload_bytes: int, longer_ms: float) -> float | None:
-    """Rate at which a payload makes a round trip so much longer, Mbit/s.
+    """Return the rate of a link in Mbit/s, from the extra round-trip time of a payload.
 
     Returns
     -------
     float or None
-        None where the payload makes it no longer, or there is no such rate in a cell.
+        None if the extra time is not positive, or a cell does not allow the rate.
     """
     if longer_ms <= 0:
         return None
