@@ -66,9 +66,9 @@ def listen(
 ) -> None:
     """Answer the messages of peers, one connection at a time, until interrupted.
 
-    One at a time because two measurements would disturb each other; the next peer waits. A
-    connection that sends something else, announces more than `MAX_BYTES` or says nothing for
-    `idle_s` is closed. Whatever is sent, no more than `CHUNK_BYTES` of it are kept.
+    Two measurements at once would disturb each other, so the next peer waits. The listener closes a
+    connection that sends another protocol, announces more than `MAX_BYTES`, or is silent for
+    `idle_s`. It keeps at most `CHUNK_BYTES` of a payload in memory.
 
     Parameters
     ----------
