@@ -135,7 +135,7 @@ def _answer(connection: socket.socket, idle_s: float) -> tuple[int, str]:
 
 
 def _reason(error: OSError) -> str:
-    # Python adds to strerror what it was about to do; those of name resolution have no errno.
+    # Python adds its operation to strerror; errors of name resolution have no system errno.
     if error.errno is None or error.errno < 0:
         return str(error.strerror or error)
     return os.strerror(error.errno)
@@ -175,12 +175,12 @@ class RoundTrips(NamedTuple):
 
 
 def parse_address(text: str) -> tuple[str, int]:
-    """Return host and port of ``HOST:PORT``; an IPv6 address stands in brackets.
+    """Return host and port of ``HOST:PORT``, or of ``[HOST]:PORT`` for IPv6.
 
     Raises
     ------
     ProfileError
-        If it is something else.
+        If the text has another form.
     """
     host, _, port = text.rpartition(":")
     host = host.removeprefix("[").removesuffix("]") if host.startswith("[") else host
@@ -292,7 +292,7 @@ def measure_link(
     payload_bytes: int,
     settings: Settings,
 ) -> Measurement:
-    """Measure the link from this node to another one, where a `listen` runs.
+    """Measure the link from this node to another node that runs `listen`.
 
     Parameters
     ----------
