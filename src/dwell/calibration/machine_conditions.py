@@ -1,4 +1,4 @@
-"""Conditions of the machine while something was measured, as far as Linux says them."""
+"""Conditions of the machine during a measurement, from Linux."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ STOLEN_MOST = 0.02
 
 @dataclass(frozen=True, slots=True)
 class MachineConditions:
-    """How quiet the machine was; None where Linux does not say.
+    """Load, frequency and disturbances of the machine during a measurement; None if unknown.
 
     Parameters
     ----------
     load : float
-        Runnable threads on the whole machine, mean of the minute before.
+        Load average of the machine over the minute before the measurement.
     cpus : int
-        How many the machine has online.
+        Number of CPUs of the machine.
     governor : str or None
-        Who chooses the frequency of the first of the cores.
+        Frequency governor of the first core.
     frequency_mhz : tuple of float or None
-        Frequency of that core, before and after.
+        Frequency of the first core, before and after.
     steal : float or None
-        Share of the cores' time that the hypervisor gave to others.
+        Share of the cores' time that the hypervisor gave to other virtual machines.
     preemptions : int
-        How often a thread of ours that wanted to go on was taken off its core.
+        Involuntary context switches of this process.
     cpu_s : float
-        CPU time of this process meanwhile, all threads, seconds.
+        CPU time of all threads of this process, in seconds.
     """
 
     load: float
@@ -47,7 +47,7 @@ class MachineConditions:
 
 
 class MachineCounters:
-    """Counters of the cores in use, taken when this is made; returns their differences."""
+    """Counters of the cores and this process at the start of a measurement."""
 
     def __init__(self, cores: Collection[int]) -> None:
         self._cores = sorted(cores)
@@ -58,7 +58,7 @@ class MachineCounters:
         self._preemptions = resource.getrusage(resource.RUSAGE_SELF).ru_nivcsw
 
     def conditions(self) -> MachineConditions:
-        """Return the conditions since this was made."""
+        """Return the conditions since the counters were read."""
         preemptions = resource.getrusage(resource.RUSAGE_SELF).ru_nivcsw - self._preemptions
         cpu_s = time.process_time() - self._cpu_s
         ticks = _ticks(self._cores)
@@ -77,7 +77,7 @@ class MachineCounters:
 
 
 def processor() -> str:
-    """Return the name of the processor, or its architecture where Linux has none."""
+    """Return the name of the processor, or its architecture if Linux gives no name."""
     match = re.search(r"^(?:model name|Model)\s*:\s*(.+)$", _text("/proc/cpuinfo"), re.MULTILINE)
     return match[1].strip() if match else platform.machine()
 

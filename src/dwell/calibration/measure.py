@@ -1,17 +1,16 @@
-"""Measure: runs of one callable, each timed on its own.
+"""Measurement of a task: separately timed runs of one callable.
 
-Every run is timed by two clocks: wall time (``perf_counter_ns``) and, around it, the CPU time of
-the whole process (all its threads; processes that it starts are not in it). Their quotient is the
-number of cores used. Nothing is subtracted; what timing itself takes is measured with an empty
-callable and kept beside the samples.
+Two clocks time every run: wall time (``perf_counter_ns``) and, around it, the CPU time of the
+process (all threads, no child processes). CPU time / wall time is the number of cores used. The
+samples include the overhead of timing; runs of an empty callable measure it, and the profile has it
+as ``empty_wall_ms`` and ``empty_cpu_ms``.
 
-The garbage collector stays as it is, on unless the module measured turns it off: it is on in a
-live process too, and its pauses belong to the tail. It is run once before the warm-up, and what
-had been imported for measuring is kept out of its sight, so that it is not slower here than there.
+The garbage collector stays on unless the measured module turns it off: it is on in a live process,
+too, and its pauses belong to the tail. It runs once before the warm-up. `undisturbed_collector`
+hides existing objects from it, because the imports of the measurement would slow it down.
 
-What a run returns is freed after the clocks were read. Inputs are made before the clocks are
-read, and where there is a pace before the wait, so that the core is as idle before a run as it
-would be.
+The result of a run is freed after the clocks are read. Inputs are made before the wait for the next
+release and before the clocks are read.
 """
 
 from __future__ import annotations
@@ -38,14 +37,14 @@ EMPTY_RUNS = 1000
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """How something is measured.
+    """Settings of a measurement.
 
     Parameters
     ----------
     warmup : int
-        Runs before those that are kept.
+        Number of discarded runs at the start.
     period_ms : float or None
-        Time between the begins of two runs; None begins each when the one before has ended.
+        Time between the starts of two runs; None starts each run at the end of the last.
     """
 
     runs: int = 500
@@ -60,10 +59,9 @@ class Settings:
 
 
 class Pace:
-    """Releases at multiples of a period after the first: errors do not add up.
+    """Releases at multiples of a period after the first; errors do not add up.
 
-    A release that has passed already is not waited for, and counted as late; the ones after it
-    stay where they are.
+    `wait` returns at once for a past release and counts it as late; later releases do not shift.
 
     Parameters
     ----------
@@ -88,7 +86,7 @@ class Pace:
         self.late = 0
 
     def wait(self) -> None:
-        """Return at the next release, or at once where there is none to wait for."""
+        """Wait for the next release; return at once without a period or after the release."""
         if self._period_ns is None:
             return
         now_ns = self._clock()
@@ -110,9 +108,9 @@ class Timing:
     wall_ns, cpu_ns : int64 array, shape (runs,)
         In the order of the runs.
     first_ns : int
-        Wall time of the very first run, of the warm-up where there is one.
+        Wall time of the first run, warm-up included.
     late : int
-        Runs that began after their release, because those before took too long.
+        Runs that started after their release, because earlier runs took too long.
     collections : tuple of int
         Garbage collections during the runs, by generation.
     """
@@ -135,10 +133,10 @@ def time_runs(
     Parameters
     ----------
     call : callable
-        Takes nothing, or what `inputs` returns.
+        Takes the result of `inputs`; without `inputs`, no argument.
     inputs : callable, optional
-        Called before every run with its number, from 0 (the warm-up counts from 0 as well), so
-        that run k has the same inputs on every node.
+        Called before every run with its number, from 0 (in the warm-up, too): run k has the same
+        inputs on every node.
 
     Raises
     ------
@@ -195,7 +193,7 @@ def _series(
         when = what.format(run)
         if not prepared:
             given, when = "the number of the run", f"inputs of {when}"
-        # By the call itself, and not inside of what it called.
+        # Whether the call itself failed, such as for wrong arguments, or code inside it.
         raised_here = error.__traceback__ is not None and error.__traceback__.tb_next is None
         wrong_call = isinstance(error, TypeError) and raised_here
         hint = f"; it is called with {given}" if wrong_call else ""
@@ -205,7 +203,7 @@ def _series(
 
 @contextmanager
 def undisturbed_collector() -> Iterator[None]:
-    """Keep all objects that exist now out of the garbage collector's sight."""
+    """Hide all existing objects from the garbage collector."""
     ours = gc.get_freeze_count() == 0
     if ours:
         gc.freeze()
@@ -235,8 +233,7 @@ def measure_task(
     call, settings, inputs
         See `time_runs`.
     source, inputs_source : str, optional
-        Names of `call` and `inputs` that the file is to have; their own names if not
-        given.
+        Names of `call` and `inputs` in the profile; default: their Python names.
 
     Returns
     -------
@@ -246,7 +243,7 @@ def measure_task(
     Raises
     ------
     ProfileError
-        If a name cannot be one in a cell.
+        If a name is not allowed in a cell.
     MeasurementError
         If a run raises; it names the task and the run.
     """

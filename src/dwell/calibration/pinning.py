@@ -1,4 +1,4 @@
-"""Pinning: the cores that this process runs on, for as long as something is measured."""
+"""Pinning: the cores of this process during a measurement."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ RANGE = re.compile(r"(\d{1,6})(?:-(\d{1,6}))?")
 
 
 def choose_cores(text: str | None) -> frozenset[int]:
-    """Return the cores that a list as ``2``, ``0,2`` or ``0-3`` names.
+    """Return the cores of a list such as ``2``, ``0,2`` or ``0-3``.
 
     Parameters
     ----------
     text : str or None
-        The list; None is the highest core that this process may use (the lowest ones usually
-        serve the interrupts).
+        The list; None selects the highest core that this process may use, because the lowest cores
+        usually serve the interrupts.
 
     Raises
     ------
     ProfileError
-        If it is no list of cores, or this process may not use one of them.
+        If the text is not a list of cores, or this process may not use all of them.
     """
     allowed = os.sched_getaffinity(0)
     if text is None:
@@ -53,10 +53,10 @@ def choose_cores(text: str | None) -> frozenset[int]:
 
 @contextmanager
 def pinned(cores: Collection[int]) -> Iterator[None]:
-    """Run every thread of this process on `cores` only; afterwards where it ran before.
+    """Run every thread of this process on `cores` only; restore the old cores at the end.
 
-    Threads that start meanwhile inherit the cores of the one that starts them. They are given
-    back what the calling thread had.
+    A thread started in between inherits its parent's cores; at the end it gets the cores that the
+    calling thread had at the start.
     """
     usual = os.sched_getaffinity(0)
     before = {}
@@ -79,7 +79,7 @@ def _threads() -> list[int]:
 def _shown(cores: Collection[int]) -> str:
     """Return cores as a list with ranges: 0-3,6."""
     parts = []
-    # In a row of cores the distance to their places stays.
+    # Core number minus index is constant within a run of consecutive cores.
     for _, row in groupby(enumerate(sorted(cores)), lambda pair: pair[1] - pair[0]):
         run = [core for _, core in row]
         parts.append(f"{run[0]}-{run[-1]}" if len(run) > 1 else str(run[0]))

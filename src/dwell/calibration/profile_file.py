@@ -1,8 +1,8 @@
-"""Profile file: samples of tasks and links in one Parquet file, a column for each.
+"""Profile file: samples of tasks and links in one Parquet file, in one column each.
 
-The columns ``task@node`` and ``from->to`` are what cells replay (`trace`). All columns have the
-same number of rows, since those of one file share their rows when they are replayed; samples of
-another length go into a file of their own. How each was measured is JSON in the file's metadata.
+Cells replay the columns ``task@node`` and ``from->to`` (`trace`). All columns have the same number
+of rows, because a replay shares the rows of a file; samples of another length need another file.
+The file's metadata describes each measurement as JSON.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ class Measurement:
     name : str
         ``task@node`` or ``from->to``.
     columns : mapping of str to array of float64, shape (rows,)
-        Milliseconds; first the one that a cell replays, which has the measurement's name.
+        Milliseconds; the first column has the measurement's name, and cells replay it.
     about : mapping
-        JSON-able: how it was measured.
+        Description of the measurement, for JSON.
     """
 
     name: str

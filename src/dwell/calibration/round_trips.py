@@ -7,12 +7,11 @@ message without payload and then one with it.
 
 From these two round trips, r0 and r1::
 
-    delay_ms  = r0 / 2                                  one sample a round
+    delay_ms  = r0 / 2                                  one sample per round
     rate_mbps = 8 bytes / (1e3 median(r1 - r0))
 
-Half of a round trip is the way there only if both ways take equally long: that is an assumption.
-Nothing is subtracted, so that the delay includes what both ends need to pass a message on, and the
-rate is what a TCP connection has got at this pace, not what the medium could carry.
+This assumes equal delays in both directions. The delay includes the processing of a message at both
+ends. The rate is the rate of a TCP connection at this pace, not the capacity of the medium.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ HEADER = struct.Struct("!4sIQ")
 MAGIC = b"DWL1"
 MAX_BYTES = 64_000_000
 CHUNK_BYTES = 2**16
-#: What the peer is asked before the rounds begin, for messages.
+#: Name of the first exchange, before the rounds, in error messages.
 FIRST = "the first message"
 
 PAYLOAD_BYTES = Bound(1, MAX_BYTES, whole=True)
@@ -67,9 +66,9 @@ def listen(
 ) -> None:
     """Answer the messages of peers, one connection at a time, until interrupted.
 
-    One at a time because two measurements would disturb each other; the next peer waits. A
-    connection that sends something else, announces more than `MAX_BYTES` or says nothing for
-    `idle_s` is closed. Whatever is sent, no more than `CHUNK_BYTES` of it are kept.
+    Two measurements at once would disturb each other, so the next peer waits. The listener closes a
+    connection that sends another protocol, announces more than `MAX_BYTES`, or is silent for
+    `idle_s`. It keeps at most `CHUNK_BYTES` of a payload in memory.
 
     Parameters
     ----------
@@ -136,7 +135,7 @@ def _answer(connection: socket.socket, idle_s: float) -> tuple[int, str]:
 
 
 def _reason(error: OSError) -> str:
-    # Python adds to strerror what it was about to do; those of name resolution have no errno.
+    # Python adds its operation to strerror; errors of name resolution have no system errno.
     if error.errno is None or error.errno < 0:
         return str(error.strerror or error)
     return os.strerror(error.errno)
@@ -176,12 +175,12 @@ class RoundTrips(NamedTuple):
 
 
 def parse_address(text: str) -> tuple[str, int]:
-    """Return host and port of ``HOST:PORT``; an IPv6 address stands in brackets.
+    """Return host and port of ``HOST:PORT``, or of ``[HOST]:PORT`` for IPv6.
 
     Raises
     ------
     ProfileError
-        If it is something else.
+        If the text has another form.
     """
     host, _, port = text.rpartition(":")
     host = host.removeprefix("[").removesuffix("]") if host.startswith("[") else host
@@ -293,7 +292,7 @@ def measure_link(
     payload_bytes: int,
     settings: Settings,
 ) -> Measurement:
-    """Measure the link from this node to another one, where a `listen` runs.
+    """Measure the link from this node to another node that runs `listen`.
 
     Parameters
     ----------
@@ -341,12 +340,12 @@ def measure_link(
 
 
 def rate_mbps(payload_bytes: int, longer_ms: float) -> float | None:
-    """Rate at which a payload makes a round trip so much longer, Mbit/s.
+    """Return the rate of a link in Mbit/s, from the extra round-trip time of a payload.
 
     Returns
     -------
     float or None
-        None where the payload makes it no longer, or there is no such rate in a cell.
+        None if the extra time is not positive, or a cell does not allow the rate.
     """
     if longer_ms <= 0:
         return None

@@ -12,8 +12,8 @@ from dwell.calibration.profile_file import Measurement
 from dwell.model.number_arrays import Floats
 from dwell.model.order_statistic import percentile
 
-# Above these a measurement is called into question. A busy loop on a core of its own was taken
-# off it some 4 times a second by the kernel's own threads, and 250 times where it shared the core.
+# Bounds beyond which a measurement is doubtful. Threads of the kernel preempted a busy loop on its
+# own core about 4 times per second; on a shared core it was preempted 250 times per second.
 STEAL = 0.01
 PREEMPTIONS = 5
 PREEMPTIONS_PER_S = 25
@@ -24,7 +24,7 @@ OVERHEAD = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Statistics:
-    """Statistics of n samples, ms; `lag1` is None where all are the same, or there is one."""
+    """Statistics of n samples, in ms; `lag1` is None for one sample or for equal samples."""
 
     n: int
     mean: float
@@ -37,11 +37,11 @@ class Statistics:
 
 
 def describe(samples: Floats) -> Statistics:
-    """Sum up samples, at least one, in the order in which they were taken.
+    """Return statistics of at least one sample, in order of measurement.
 
-    Percentiles are samples, never interpolated (see `percentile`); cv is the standard deviation
-    over the mean, of the samples as they are (divisor n); `lag1` the correlation of neighbours, sum
-    of (x[i] - m)(x[i+1] - m) over sum of (x[i] - m)^2.
+    Percentiles are samples, never interpolated (see `percentile`). `cv` is the standard deviation
+    (divisor n) divided by the mean. `lag1` is the correlation of neighbours: the sum of
+    (x[i] - m)(x[i+1] - m) divided by the sum of (x[i] - m)^2.
     """
     mean = float(samples.mean())
     centred = samples - mean
@@ -62,7 +62,7 @@ def describe(samples: Floats) -> Statistics:
 
 
 def find_doubts(measurement: Measurement) -> Iterator[str]:
-    """Yield doubts about a measurement; none where all is well."""
+    """Yield doubts about a measurement, each as a sentence without a full stop."""
     about = measurement.about
     yield from _disturbed(about.get("conditions") or {})
     if about.get("kind") == "task":
@@ -101,7 +101,7 @@ def _preempted(conditions: Mapping[str, Any]) -> bool:
 def _unlike_a_job(measurement: Measurement) -> Iterator[str]:
     """Yield reasons why the samples may not be execution times as `exec_ms` means them."""
     about = measurement.about
-    # Where others had its core, that is what it waited for.
+    # A preempted task waited for its core, so low use of cores proves nothing.
     if about["cores_used"] < CORES_USED and not _preempted(about.get("conditions") or {}):
         yield (
             f"it used {about['cores_used']:.2f} cores: the rest of its time it waited (sleep, "

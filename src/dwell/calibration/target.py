@@ -1,4 +1,4 @@
-"""Target: the callable that ``package.module:function`` names."""
+"""Target of a measurement: the callable of a name such as ``package.module:function``."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from dwell.errors import ProfileError, describe_raised
 
 
 def find_callable(name: str, option: str) -> Callable[..., object]:
-    """Import the callable that `name` says.
+    """Import a callable by name.
 
     Parameters
     ----------
     name : str
-        ``package.module:function``; after the colon also ``object.method``, to any depth.
+        ``package.module:function`` or ``package.module:object.method``, to any depth.
     option : str
-        Option that it was given as, for messages: ``--task perception``.
+        Option of the command, for messages: ``--task perception``.
 
     Raises
     ------
     ProfileError
-        If there is no such module or attribute, importing fails, or it cannot be timed: it is not
-        callable, or calling it runs nothing yet (coroutines, generators).
+        If the module or attribute is missing, the import fails, or the object is not a callable
+        that runs when called (classes, coroutines and generators are refused).
     """
     module_name, colon, path = name.partition(":")
     if not colon or not all(part.isidentifier() for part in f"{module_name}.{path}".split(".")):
@@ -56,7 +56,7 @@ def _import(module_name: str, name: str, option: str) -> object:
 
 
 def _is_part(missing: str | None, module_name: str) -> bool:
-    """Whether the missing module is the one asked for, or a package around it."""
+    """Whether the missing module is `module_name` or a package around it."""
     return missing is not None and f"{module_name}.".startswith(f"{missing}.")
 
 

@@ -1,8 +1,8 @@
-"""Forms: what may stand at a place of a file, how it is read, and its JSON Schema.
+"""Forms: allowed values at a place in a file, how to read them, and their JSON Schema.
 
-A form reads a value into what the file says with it, or records what is wrong and returns `FAULTY`.
-Reading goes on beside a fault: an optional key at fault counts as left out, one that has to be
-there gets a stand-in where there is a harmless one, and takes its mapping with it elsewhere.
+A form converts a value, or records a fault and returns `FAULTY`. Reading continues after a fault:
+a faulty optional key counts as absent; a faulty or missing required key gets its stand-in; if the
+key has no stand-in, the mapping around it is faulty, too.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from dwell.model.dotted_paths import Step, beneath
 from dwell.model.semantics import closest, nearest
 
 JsonSchema: TypeAlias = dict[str, Any]
-#: Schemas of the forms that have a name, by it.
+#: JSON Schemas of the named forms, by name.
 Definitions: TypeAlias = dict[str, JsonSchema]
 
-#: What a form returns of a value that is at fault.
+#: Result of a form for a faulty value.
 FAULTY: Final = object()
-# How like a required key an unknown one has to be to stand for it: `teir` for `tier`.
+# Least similarity at which an unknown key counts as a misspelt required key: `teir` for `tier`.
 MISSPELT = 0.7
 
 
@@ -37,19 +37,19 @@ def removing(step: Step) -> str:
 
 
 class Form(ABC):
-    """What may stand at a place."""
+    """Allowed values at a place in a file."""
 
     @abstractmethod
     def read(self, value: Any, path: str, faults: Faults) -> Any:
-        """Return what a value says, or `FAULTY` beside a fault."""
+        """Return the converted value; record a fault and return `FAULTY` if it is not allowed."""
 
     @abstractmethod
     def schema(self, definitions: Definitions) -> JsonSchema:
-        """Return the JSON Schema; what has a name is put into the definitions."""
+        """Return the JSON Schema; add the schemas of named forms to the definitions."""
 
 
 def not_allowed(value: object, bound: str) -> str:
-    """Return what is wrong with a value that must be something else."""
+    """Return the message for a value outside its bound."""
     return f"{as_read(value)} is not allowed; it must be {bound}"
 
 
@@ -60,7 +60,7 @@ def refused(value: object, bound: str, path: str, faults: Faults) -> Any:
 
 
 def _read_by(reader: Callable[[Any], Any], value: Any, path: str, faults: Faults) -> Any:
-    """Return what a reader makes of a value, or record what its ValueError says."""
+    """Return the reader's result; record the message of its ValueError as a fault."""
     try:
         return reader(value)
     except ValueError as error:
@@ -78,17 +78,11 @@ class NumberForm(Form):
     bound: Bound
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
-        """Return the number, a float where the bound is none of whole numbers, or the word."""
+        """Return an int if the bound is for integers, else a float; or return the bound's word."""
         return _read_by(self.number, value, path, faults)
 
     def number(self, value: Any) -> Any:
-        """Return the number.
-
-        Raises
-        ------
-        ValueError
-            With what is wrong.
-        """
+        """Return the number or the bound's word; raise a ValueError if it is not allowed."""
         if isinstance(value, str) and self.bound.holds(value):
             return value
         if isinstance(value, bool) or not isinstance(value, int | float):
@@ -96,7 +90,7 @@ class NumberForm(Form):
             raise ValueError(not_allowed(value, f"{self.bound}{remedy}"))
         if abs(value) > sys.float_info.max and self.bound.high == math.inf:
             raise ValueError(f"{as_read(value)} is not allowed; leave the key out for no limit")
-        # A whole number may be written 6e4; JSON Schema says the same of its integers.
+        # Accept 6e4 as an integer, as JSON Schema does.
         if self.bound.whole and isinstance(value, float) and value.is_integer():
             value = int(value)
         if not self.bound.holds(value):
@@ -115,7 +109,7 @@ class NumberForm(Form):
 
 
 def unquoted(text: str) -> str:
-    """Return a remedy for a text that was meant as a number."""
+    """Return a remedy for a quoted number; empty for other texts."""
     try:
         number = float(text)
     except ValueError:
@@ -125,21 +119,13 @@ def unquoted(text: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class TextForm(Form):
-    """A text.
-
-    Parameters
-    ----------
-    bound : Pattern, optional
-        What it must match.
-    known : tuple of str
-        Texts that an editor may complete; others are right, too.
-    """
+    """A text; editors may complete the `known` texts, other texts are allowed, too."""
 
     bound: Pattern | None = None
     known: tuple[str, ...] = ()
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
-        """Return the text; that of a key which is no text, where it stands for one."""
+        """Return the text if it matches the bound."""
         if not isinstance(value, str):
             what = "a text" if isinstance(value, dict | list) else "a text; put it in quotes"
             return refused(value, what, path, faults)
@@ -192,16 +178,16 @@ class ChoiceForm(Form):
 
 @dataclass(frozen=True, slots=True)
 class WrittenForm(Form):
-    """A value that may be written in several ways.
+    """A value with several notations.
 
     Parameters
     ----------
     ways : str
-        What it may be, in words.
+        The notations, in words.
     reader : callable
-        Returns what the value says; raises a ValueError with what is wrong.
+        Converts the value; raises a ValueError if it is not allowed.
     may_be_empty : bool
-        Whether nothing may be given for a key within it.
+        Whether keys directly inside the value may be empty.
     shown : mapping
         JSON Schema.
     """
@@ -212,7 +198,7 @@ class WrittenForm(Form):
     shown: Mapping[str, Any] = field(default_factory=dict)
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
-        """Return what the reader makes of the value."""
+        """Return the reader's result; record a fault for each empty place that is not allowed."""
         for place, step in _empty_places(value, path):
             within = place.removeprefix(path)
             if not (self.may_be_empty and within == f".{step}") and not faults.at(place):
@@ -225,7 +211,7 @@ class WrittenForm(Form):
 
 
 def _empty_places(value: Any, path: str) -> Iterator[tuple[str, Step]]:
-    """Yield the places within a value at which nothing is given, with their last step."""
+    """Yield the path and last step of each empty place within a value."""
     steps: Any = ()
     if isinstance(value, dict | list):
         steps = value.items() if isinstance(value, dict) else enumerate(value)
@@ -240,13 +226,7 @@ def _empty_places(value: Any, path: str) -> Iterator[tuple[str, Step]]:
 
 
 def take(form: Form, value: Any, path: str, faults: Faults, remedy: str) -> Any:
-    """Return what a value says, or `FAULTY`; nothing at all is a fault, too.
-
-    Parameters
-    ----------
-    remedy : str
-        What to do where nothing is given.
-    """
+    """Return the converted value, or `FAULTY`; an empty value is a fault with this remedy."""
     if isinstance(form, TextForm) and (text := faults.unquoted(value)) is not None:
         value = text
     if value is None:
@@ -263,9 +243,9 @@ class MappingForm(Form):
     Parameters
     ----------
     keeps : bool
-        Whether the name of one at fault is kept, with None; elsewhere it takes all with it.
+        Whether a faulty value becomes None; if false, it makes the mapping faulty.
     least : int
-        How many there have to be, for editors.
+        Smallest number of values; only in the JSON Schema.
     """
 
     form: Form
@@ -273,7 +253,7 @@ class MappingForm(Form):
     least: int = 0
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
-        """Return a dict of what they say."""
+        """Return a dict of the converted values."""
         if not isinstance(value, dict):
             return refused(value, "a mapping", path, faults)
         found = {
@@ -301,7 +281,7 @@ class ListForm(Form):
     keeps: bool = False
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
-        """Return a list of what they say."""
+        """Return a list of the converted values."""
         if not isinstance(value, list):
             return refused(value, "a list; for none, write []", path, faults)
         found = [
@@ -324,17 +304,17 @@ class FormKey:
     Parameters
     ----------
     name : str
-        Field or argument that it is read for.
+        Field or argument that receives the value.
     named : str
-        The key itself.
+        The key in the file.
     says : str
-        One sentence.
+        Description, one sentence.
     usual : str
-        What holds where it is left out, in words.
+        Default, in words.
     stand_in : object
-        Stands for a value at fault where the key is required; `FAULTY`: the mapping goes.
+        Replaces a missing or faulty value of a required key; `FAULTY` makes the mapping faulty.
     breaks : bool
-        Whether a value at fault takes the mapping with it though the key is optional.
+        Whether a faulty value of an optional key makes the mapping faulty.
     tier : str
         See `Declaration`.
     """
@@ -351,7 +331,7 @@ class FormKey:
 
     @property
     def described(self) -> str:
-        """The sentence, with what is usual."""
+        """The description with the default."""
         return f"{self.says[:-1]}; default: {self.usual}." if self.usual else self.says
 
 
@@ -364,7 +344,7 @@ def optional(
     named: str = "",
     tier: KeyTier = "tuning",
 ) -> FormKey:
-    """Return a key that may be left out; `named` where the file has another name for it."""
+    """Return an optional key; `named` is its name in the file if that differs from `name`."""
     return FormKey(name, named or name, form, says, usual=usual, tier=tier)
 
 
@@ -377,21 +357,21 @@ def required(
     named: str = "",
     tier: KeyTier = "first",
 ) -> FormKey:
-    """Return a key that has to be there; see `optional`."""
+    """Return a required key; see `optional`."""
     return FormKey(name, named or name, form, says, True, "", stand_in, tier=tier)
 
 
 class Entry:
-    """What a mapping says: its values by the names of fields, None for what is left out.
+    """Converted values of a mapping, as attributes by field name; None for absent keys.
 
     Parameters
     ----------
     shape : Shape
-        What it is read by.
+        Form of the mapping.
     path : str
-        Where it is.
+        Place of the mapping in the file.
     values : mapping of str to object
-        What is given.
+        The given values by field name.
     """
 
     __slots__ = ("path", "shape", "values")
@@ -417,15 +397,13 @@ class Shape(Form):
     Parameters
     ----------
     title : str
-        Its name in the JSON Schema.
+        Name in the JSON Schema.
     says : str
-        One sentence.
-    keys : tuple of FormKey
-        In their order.
+        Description, one sentence.
     kind : type, optional
-        Class of the model that its values are the arguments of.
+        Class of the model; the values are its arguments.
     extra : mapping
-        What its JSON Schema has besides.
+        Further entries of the JSON Schema.
     """
 
     title: str
@@ -436,17 +414,17 @@ class Shape(Form):
 
     @property
     def names(self) -> list[str]:
-        """Its keys."""
+        """The keys as the file names them."""
         return [key.named for key in self.keys]
 
     @property
     def by_tier(self) -> list[FormKey]:
-        """Its keys, those that a first cell needs first."""
+        """The keys by tier, starting with the keys for a first cell."""
         tiers = get_args(KeyTier)
         return sorted(self.keys, key=lambda key: tiers.index(key.tier))
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
-        """Return an `Entry` with what is given."""
+        """Return an `Entry` with the given values."""
         if not isinstance(value, dict):
             return refused(value, f"a mapping of {', '.join(self.names)}", path, faults)
         names = self.names
@@ -481,14 +459,14 @@ class Shape(Form):
         return take(key.form, value[key.named], path, faults, remedy)
 
     def schema(self, definitions: Definitions) -> JsonSchema:
-        """Return a reference to its definition."""
+        """Return a reference to the shape's definition; add the definition if it is missing."""
         if self.title not in definitions:
             definitions[self.title] = {}
             definitions[self.title] = self.definition(definitions)
         return {"$ref": f"#/$defs/{self.title}"}
 
     def definition(self, definitions: Definitions) -> JsonSchema:
-        """Return its schema itself."""
+        """Return the complete schema."""
         properties = {
             key.named: {**key.form.schema(definitions), "description": key.described}
             for key in self.by_tier
@@ -531,7 +509,7 @@ def _shown(default: Any) -> str:
 
 
 def form_of(one: DeclaredField, forms: Mapping[Any, Form]) -> Form:
-    """Return the form of a field: that of its type in `forms`, else what the type says."""
+    """Return the form of a field: the entry of its type in `forms`, or a form for the type."""
     if one.kind in forms:
         return forms[one.kind]
     origin, inner = get_origin(one.kind), get_args(one.kind)
@@ -568,15 +546,15 @@ def shape_of(
     Parameters
     ----------
     forms : mapping
-        Forms of types that are no single values.
+        Forms by type, for types with several values.
     without : tuple of str
-        Fields that are no keys.
+        Fields without a key.
     instead : mapping of str to Form or FormKey
-        What fields have in place of the form of their type.
+        Forms or keys of single fields; they replace the form of the field's type.
     further : tuple of FormKey
-        Keys that are no fields; they come last.
+        Last keys, without a field.
     says : str
-        The first line of the class's docstring where empty.
+        Description; if empty, the first line of the class's docstring.
     """
     keys = []
     for one in declared_fields(kind):
@@ -592,7 +570,7 @@ def shape_of(
 
 
 def entries_of(value: Any) -> Iterator[Entry]:
-    """Yield every entry within what was read, the outer ones first."""
+    """Yield every entry within a converted value, outer entries first."""
     if isinstance(value, Entry):
         yield value
         for inner in value.values.values():

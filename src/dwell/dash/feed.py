@@ -1,4 +1,4 @@
-"""Feed: the last of a stream of items, for readers who may fall behind."""
+"""Feed: the newest items of a stream, for readers at their own pace."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ T = TypeVar("T")
 
 
 class News(NamedTuple, Generic[T]):
-    """Items that a reader has not had.
+    """New items for a reader.
 
     Parameters
     ----------
     items : list
         Oldest first.
     upto : int
-        How many the feed has had in all: what the reader asks with the next time.
+        Total number of items so far; the argument of the reader's next `Feed.since`.
     dropped : int
-        Items between the reader's last and the first of these, which are gone.
+        Number of items that left the feed before the reader took them.
     """
 
     items: list[T]
@@ -29,12 +29,12 @@ class News(NamedTuple, Generic[T]):
 
 
 class Feed(Generic[T]):
-    """Keeps the last `most` items; a writer never waits for a reader.
+    """The last `most` items of a stream; a slow reader misses items and does not delay the writer.
 
     Attributes
     ----------
     upto : int
-        How many items it has had.
+        Total number of items so far.
     """
 
     def __init__(self, most: int) -> None:
@@ -48,13 +48,13 @@ class Feed(Generic[T]):
         return self._items[-1] if self._items else None
 
     def append(self, item: T) -> None:
-        """Add an item; the oldest makes room."""
+        """Add an item; remove the oldest if the feed is full."""
         with self._lock:
             self._items.append(item)
             self.upto += 1
 
     def since(self, upto: int) -> News[T]:
-        """Return the items after the first `upto` ones, as far as they are kept."""
+        """Return the items after the first `upto` that are still in the feed."""
         with self._lock:
             first = self.upto - len(self._items)
             items = list(islice(self._items, max(upto - first, 0), None))

@@ -1,10 +1,10 @@
-"""Gate: who may see the page, and who may act.
+"""Gate: access control of the page.
 
-The page's process listens on loopback alone. Other users of the computer, and pages of other sites
-in the same browser, reach it there all the same. So every request says whom it is for (`Host`: a
-name that was rebound to loopback gives itself away), and has the token: in the address, as a
-cookie, or as a bearer's. What acts has to come from a page of this server, by `Origin` and by a
-header that no other site's form or image can set.
+The server listens on loopback only. Other users of the computer and other sites in the same browser
+can still reach it. Every request therefore needs a loopback name in `Host` (against DNS rebinding)
+and, except for the paths in `OPEN`, the token: in the address, as a cookie or as a bearer token. A
+request that changes something also needs this server's `Origin`, and a header that forms and images
+of other sites cannot set.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from starlette.responses import JSONResponse
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-#: Names of this computer by which a browser may call it, at any port: `ssh -L` changes that.
+#: Allowed `Host` names, with any port: `ssh -L` changes the port.
 HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?", re.IGNORECASE)
-#: What anybody may ask, and what it says is nothing of the cell's.
+#: Paths without a token; their answers contain no data of the cell.
 OPEN = frozenset({"/healthz", "/readyz"})
-#: Header that a request which acts has to have.
+#: Header required in requests that change something.
 ACTS = "x-dwell-act"
 TOKEN_BYTES = 32
 
@@ -50,20 +50,18 @@ HEADERS = {
 
 
 def new_token() -> str:
-    """Return a token that nobody guesses."""
+    """Return a random token of `TOKEN_BYTES` bytes, as URL-safe text."""
     return secrets.token_urlsafe(TOKEN_BYTES)
 
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """Lets through to an application whoever may pass; see the module.
+    """ASGI wrapper that passes only allowed requests to an application.
 
     Parameters
     ----------
-    app : ASGI application
     port : int
-        Of the server: cookies of one host are shared by all its ports, so that theirs have names
-        of their own.
+        Port of the server; part of the cookie's name, because all ports of a host share cookies.
     """
 
     app: ASGIApp
@@ -102,7 +100,7 @@ class Gate:
     def _refusal(
         self, scope: Scope, headers: Mapping[str, str], *, brings: bool
     ) -> tuple[HTTPStatus, str] | None:
-        """Return why a request may not pass; None where it may."""
+        """Return the status and reason of a refusal; None if the request may pass."""
         host = headers.get("host", "")
         if not HOST.fullmatch(host):
             return HTTPStatus.FORBIDDEN, "this page is asked for by the name of this computer only"
@@ -124,7 +122,7 @@ class Gate:
         return None
 
     def _known(self, headers: Mapping[str, str]) -> bool:
-        """Whether a request has the token, as a cookie or as a bearer's."""
+        """Whether a request has the token, as a cookie or as a bearer token."""
         scheme, _, bearer = headers.get("authorization", "").partition(" ")
         if scheme.lower() == "bearer" and self._is(bearer.strip()):
             return True
@@ -135,7 +133,7 @@ class Gate:
 
 
 def _single(raw: list[tuple[bytes, bytes]]) -> dict[str, str]:
-    """Return headers by name; one that comes twice is none that counts."""
+    """Return headers by name, without repeated headers."""
     pairs = [(name.decode("latin-1").lower(), value.decode("latin-1")) for name, value in raw]
     counts = Counter(name for name, _ in pairs)
     return {name: value for name, value in pairs if counts[name] == 1}

@@ -1,8 +1,8 @@
-"""Metrics: a live cell in numbers for Prometheus, by what an observer hears of it.
+"""Prometheus metrics of a live cell, from an observer.
 
-Names and units follow Prometheus' conventions. Values of labels are names of the cell file, of its
-certificates and of the protocol, never text of a message. A series whose value nobody knows is
-absent, not 0.
+Names and units follow Prometheus' conventions. Values of labels are names from the cell file, its
+certificates and the protocol, never text of a message. A series with an unknown value is absent,
+not 0.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from dwell.live.wire.wiring import roles
 
 Kind: TypeAlias = Literal["counter", "gauge", "info", "summary"]
 
-#: Upper bounds of the latencies that are counted together; the cell's deadline is one more.
+#: Upper bounds of the latency histogram's buckets; the cell's deadline is another bound.
 BUCKETS_S = (
     *(0.001, 0.002, 0.005, 0.01, 0.015, 0.02, 0.025, 0.03, 0.04, 0.05, 0.075, 0.1, 0.15, 0.2),
     *(0.3, 0.5, 1.0, 2.0, 5.0),
 )
-#: Time between two looks at the cycles: the observer does not keep them for long.
+#: Time between two readings of the cycle feed, which keeps only the newest cycles.
 EVERY_S = 2.0
-#: What each metric but the histogram of latencies says, by its kind.
+#: Help text of each metric except the latency histogram, by kind.
 SENTENCES: Mapping[Kind, Mapping[str, str]] = {
     "gauge": {
         "dwell_health": "1 of the health that the cell has, 0 of every other.",
@@ -75,22 +75,22 @@ SENTENCES: Mapping[Kind, Mapping[str, str]] = {
         "dwell_flow_bytes": "Payloads sent in a flow since its sender's state folder was made.",
     },
 }
-#: What follows the name of a metric in its samples.
+#: Suffix of a metric's name in its samples.
 SUFFIXES: Mapping[Kind, str] = {"counter": "_total", "gauge": "", "info": "_info", "summary": ""}
 
-#: Labels beside the cell's, and the value; None where nobody knows it.
+#: Labels without the cell's, and the value; None if it is unknown.
 Samples: TypeAlias = Iterable[tuple[Mapping[str, str], float | None]]
 
 
 class CellMetrics(Collector):
-    """Collects the metrics of an observed cell whenever they are asked for.
+    """Collector of the metrics of an observed cell.
 
-    As a context manager it counts cycles meanwhile, however seldom it is asked.
+    As a context manager it also counts cycles between two requests, every `EVERY_S`.
 
     Attributes
     ----------
     counted : int
-        Cycles that the observer has had, as far as they are counted here.
+        Position in the observer's feed of cycles.
     """
 
     def __init__(self, observer: Observer) -> None:
@@ -108,27 +108,21 @@ class CellMetrics(Collector):
         self._lock, self._stopped = threading.Lock(), threading.Event()
 
     def __enter__(self) -> CellMetrics:
-        """Begin to count."""
+        """Start the thread that counts cycles."""
         start_thread("metrics", self._keep_up)
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Count no more."""
+        """Stop the thread that counts cycles."""
         self._stopped.set()
 
     def page(self, accept: str) -> tuple[bytes, str]:
-        """Return the metrics as Prometheus reads them, as text or OpenMetrics, and the page's type.
-
-        Parameters
-        ----------
-        accept : str
-            Header of the request.
-        """
+        """Return the metrics, as text or OpenMetrics by the `Accept` header, and the MIME type."""
         encode, content_type = choose_encoder(accept)
         return encode(self), content_type
 
     def collect(self) -> Iterator[Metric]:
-        """Yield all metrics as they are now."""
+        """Yield the current metrics."""
         self._count()
         yield from self._latency.collect()
         samples = self._samples()
@@ -145,7 +139,7 @@ class CellMetrics(Collector):
         now, problem = self._observer.now(), self._problem
         health, placement = now.status["health"], now.placement
         placed: Mapping[str, str] = problem.candidates.get(placement, {})
-        # Of a controller that does not answer, nothing is known.
+        # Ignore the old status if the controller does not answer.
         status: Mapping[str, Any] = {} if health == "absent" else now.status
         window, moves, processes, stages, flows = (
             status.get(name) or {} for name in ("window", "moves", "processes", "stages", "flows")
@@ -218,7 +212,7 @@ class CellMetrics(Collector):
             self._count()
 
     def _count(self) -> None:
-        """Count the cycles that have been heard of since the last time."""
+        """Count the new cycles of the feed."""
         with self._lock:
             news = self._observer.cycles.since(self.counted)
             self.counted, self._unread = news.upto, self._unread + news.dropped

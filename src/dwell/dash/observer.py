@@ -1,12 +1,11 @@
-"""Observer: hears a live cell from outside, and changes nothing in it.
+"""Observer of a live cell, from outside.
 
-It subscribes to channels that the protocol has anyway, and to no more of them than one controller
-does: the stamps of the stamper, and what the relay's agent gathers for the controller (beats,
-completions, answers, loads). Beside that it asks the controller for its status, as
-`dwell live status` does. With keys it takes those of an operator or an observer, and believes what
-is signed alone.
+It subscribes to two channels of the protocol, like a controller: the stamps of the stamper, and the
+messages that the relay's agent gathers (beats, completions, answers, loads). It also requests the
+status of the controller, like `dwell live status`. With keys it signs as an operator or observer
+and accepts only signed messages.
 
-Instants are put on the stamper's clock, as the controller does it (`dwell.live.roles.offsets`,
+Instants are converted to the stamper's clock, as in the controller (`dwell.live.roles.offsets`,
 `dwell.live.roles.cycle_ledger`), and count from the first release of the run.
 """
 
@@ -34,14 +33,14 @@ from dwell.live.wire.wiring import Role
 from dwell.model import Problem
 from dwell.model.instants import NEVER_NS
 
-#: Cycles with their jobs (2 to 3 kB each), windows and events that are kept.
+#: Largest number of cycles (with jobs, 2 to 3 kB each), windows and events in memory.
 MOST_CYCLES, MOST_WINDOWS, MOST_EVENTS = 4_000, 4_000, 1_000
-#: Time between two questions to the controller, at least and at most.
+#: Least and largest time between two status requests to the controller.
 LEAST_ASK_S, MOST_ASK_S = 0.1, 0.5
-#: A cycle that nobody has told the end of is given up so long after its deadline.
+#: Wait for a cycle's completion after its deadline.
 LATE_S = 1.0
 
-#: What may become of a cycle, as far as it can be heard.
+#: Outcomes of a cycle that an observer can distinguish.
 OUTCOMES = ("actuated", "not_applied", "behind", "stale", "replaced", "lost", "untold")
 
 EventKind: TypeAlias = Literal["move", "guard", "refused", "pin", "drain", "health"]
@@ -49,23 +48,23 @@ EventKind: TypeAlias = Literal["move", "guard", "refused", "pin", "drain", "heal
 
 @dataclass(frozen=True, slots=True)
 class ObservedCycle:
-    """A cycle whose end is known, or given up.
+    """A cycle that has ended, or whose completion is too late to wait for.
 
     Parameters
     ----------
     number : int
-        As stamped.
+        Number in the stamp.
     release_ns : int
         Since the first release of the run.
     latency_ns : int or None
-        None where no sink has completed it, or it is not known when.
+        None if no sink has completed the cycle, or the time of completion is unknown.
     known : bool
-        False where it could not be heard what became of it, or when; it is then not missed.
+        Whether the outcome and the time of completion are known; if not, `missed` is false.
     outcome : str
         One of `OUTCOMES`.
     jobs : tuple of mapping
-        Rows of the table ``jobs`` (`dwell.model.table_columns`), its shadow's included; ``cycle``
-        is its number.
+        Rows of the table ``jobs`` (`dwell.model.table_columns`), with the jobs of the shadow;
+        ``cycle`` is the cycle's number.
     """
 
     run: int
@@ -82,16 +81,17 @@ class ObservedCycle:
 
 @dataclass(frozen=True, slots=True)
 class ObservedWindow:
-    """A decision and its cycles, by the controller's status.
+    """A decision and its cycles, from the controller's status.
 
-    The cycles are a window, or the last W at most if `decide_cycles` is below W.
+    The cycles are one window, or the last W at most if `decide_cycles` is below W.
 
     Parameters
     ----------
     number : int
-        Window of the last of its cycles.
+        Window of the last cycle.
     at_s : float
-        Its close, in seconds since the first release of the run; as exact as the status is young.
+        End of the window, in seconds since the first release of the run; its error is the delay of
+        the status.
     said : mapping
         ``window`` of `dwell.live.roles.controlled_cell.ControlledCell.status`.
     """
@@ -103,12 +103,12 @@ class ObservedWindow:
 
 @dataclass(frozen=True, slots=True)
 class CellEvent:
-    """Something that happened to a cell.
+    """A move, refusal, pin, drain or change of health of a cell.
 
     Parameters
     ----------
     text : str
-        What happened, and why; it may hold words of the cell's.
+        The event and its reason; it may contain text from the cell.
     """
 
     at_s: float
@@ -118,23 +118,23 @@ class CellEvent:
 
 @dataclass(frozen=True, slots=True)
 class ObservedCell:
-    """A cell at an instant, as far as it is heard.
+    """State of a cell at an instant, from the messages received.
 
     Parameters
     ----------
     at_s : float
-        Time since the first release of the run; 0 before a cycle was heard of.
+        Time since the first release of the run; 0 before the first stamp.
     status : mapping
-        Last answer of the controller (`ControlledCell.status`); with ``health`` ``absent`` where
-        nobody answers.
+        Last answer of the controller (`ControlledCell.status`); ``health`` is ``absent`` if the
+        controller does not answer.
     answer_age_s : float or None
-        Age of that answer; None where there was none.
+        Age of the last answer; None before the first.
     placement : str
-        Of the newest stamp, else of the status; empty where neither says.
+        Placement in the newest stamp; without stamps, in the status; else empty.
     cycles : mapping of str to int
-        Cycles since the observer began, by outcome.
+        Cycles since the start of the observer, by outcome.
     missed : int
-        Those of them that missed.
+        Cycles among them that missed the deadline.
     """
 
     at_s: float
@@ -146,7 +146,7 @@ class ObservedCell:
 
 
 class _SeenMove(NamedTuple):
-    """A change of placement, by the stamps."""
+    """A change of placement between two stamps."""
 
     at_s: float
     run: int
@@ -156,15 +156,15 @@ class _SeenMove(NamedTuple):
 
 
 class Observer:
-    """Hears one cell; a context manager.
+    """Observer of one live cell; a context manager.
 
-    Whoever wants more than the present reads the feeds, each at a pace of its own: what a slow
-    reader misses is counted for it, and holds nobody up.
+    `now` returns the current state; the feeds contain the recent cycles, windows and events. Each
+    reader of a feed has its own pace; the feed counts the items that a slow reader misses.
 
     Parameters
     ----------
     environment : mapping of str to str, optional
-        With the variables of `dwell.live.host.security`; this process's own if left out.
+        Variables of `dwell.live.host.security`; default: the environment of this process.
 
     Attributes
     ----------
@@ -177,9 +177,9 @@ class Observer:
     Raises
     ------
     LiveError
-        If the cell leaves this computer, and there are no keys.
+        If the cell uses other computers and this process has no keys.
     TrustError
-        If the keys are not those of somebody who visits.
+        If the keys do not belong to a visitor (operator or observer).
     """
 
     def __init__(self, problem: Problem, environment: Mapping[str, str] | None = None) -> None:
@@ -195,7 +195,7 @@ class Observer:
         role = Role(who, problem.controller_node, "visitor")
         self.security = Security.of(problem, role, environment)
         transport = self.security.visit(who, stamper, f"agent@{relay}")
-        # Its own clock is none of the cell's.
+        # The observer's clock does not belong to the cell: the place has no node.
         self._place = self.security.place(who, "", transport, lambda _: None)
         self._transport = transport
         self._pulse = Pulse(self._place, lambda: (True, ""), hears=[("*", "*")])
@@ -204,7 +204,7 @@ class Observer:
         self._deadline_ns = problem.pipeline.deadline_ns
         # First release of the run, on the stamper's clock.
         self._origin_ns = 0
-        # Cycles that are not settled, by run and number, in the order of their stamps.
+        # Cycles without an outcome, by run and number, in the order of their stamps.
         self._open: dict[tuple[int, int], LiveCycle] = {}
         self._newest: tuple[LiveCycle, int] | None = None
         self._told_ns = 0
@@ -212,11 +212,11 @@ class Observer:
         self._missed = 0
         self._status: Mapping[str, Any] = {"health": ""}
         self._answered_s: float | None = None
-        # Moves that no answer has told the reason of yet.
+        # Moves whose reason is still unknown: the status does not include them yet.
         self._moves: deque[_SeenMove] = deque(maxlen=MOST_EVENTS)
 
     def __enter__(self) -> Observer:
-        """Begin to listen."""
+        """Request the status once, then subscribe and start the thread of requests."""
         self._look()
         keys = self._place.keys
         for key in (keys.stamped(), keys.gathered()):
@@ -225,29 +225,29 @@ class Observer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Listen no more."""
+        """Stop the requests and close the connections."""
         self._stopped.set()
         self._transport.close()
         self._client.__exit__()
 
     def act(self, what: str, about: str = "") -> Mapping[str, Any]:
-        """Have the controller pin, unpin, drain or undrain; returns its status.
+        """Send a command to the controller: pin, unpin, drain or undrain; return its status.
 
         Raises
         ------
         LiveError
-            If it is refused, or nobody answers.
+            If the controller refuses the command or does not answer.
         TrustError
-            If the keys are those of somebody who may only look.
+            If the keys allow only reading.
         """
-        # A client of its own: the other one is asking.
+        # The thread of requests uses the other client.
         with OperatorClient(self.problem, self._environment) as client:
             status = client.ask(what, about)
         self._answer(status)
         return status
 
     def now(self) -> ObservedCell:
-        """Return how the cell is."""
+        """Return the current state of the cell."""
         with self._lock:
             age_s = None if self._answered_s is None else time.monotonic() - self._answered_s
             newest = self._newest
@@ -262,13 +262,13 @@ class Observer:
             )
 
     def _now_s(self) -> float:
-        """Return the time since the first release: by the newest stamp, and its age here."""
+        """Return the seconds since the first release: newest release + age of its stamp."""
         if self._newest is None:
             return 0.0
         cycle, heard_ns = self._newest
         return (cycle.at_ns + max(time.monotonic_ns() - heard_ns, 0)) / 1e9
 
-    # ------------------------------------------------------------------------ hearing
+    # ------------------------------------------------------------------------ messages
 
     def _heard(self, sample: Arrival) -> None:
         with self._lock:
@@ -321,7 +321,7 @@ class Observer:
             self._moves.append(_SeenMove(cycle.at_ns / 1e9, *where))
 
     def _begin_ns(self, stamp: Stamped, before: LiveCycle | None) -> int:
-        """Return the first release of a run; that of a later run goes on with the time."""
+        """Return the origin of a run's instants; a later run continues the time of the first."""
         if before is not None:
             return stamp.released_ns - before.at_ns - self._place.period_ns
         origin_ns = self._status.get("origin_ns")
@@ -330,7 +330,7 @@ class Observer:
         return stamp.released_ns
 
     def _settle(self) -> None:
-        """Let go of the cycles that have ended, and of those that nobody will tell the end of."""
+        """Close the cycles that are complete or too late."""
         if self._newest is None:
             return
         late_ns = self._deadline_ns + round(LATE_S * 1e9)
@@ -343,11 +343,11 @@ class Observer:
             self._close(cycle)
 
     def _close(self, cycle: LiveCycle) -> None:
-        # Nothing came from the relay since: who knows.
+        # The outcome is unknown if the relay has sent nothing for LATE_S.
         quiet_ns = time.monotonic_ns() - self._told_ns
         cycle.deaf = quiet_ns > round(LATE_S * 1e9)
         outcome, completed = _outcome(cycle), cycle.latency_ns < NEVER_NS
-        # Before the clocks are compared, nobody knows when it was completed.
+        # The time of completion is unknown until the clocks are compared.
         known = not cycle.untold and (completed or outcome not in ("actuated", "behind"))
         missed = known and cycle.missed(self._deadline_ns)
         jobs = tuple({**row, "cycle": cycle.number} for row in self._ledger.jobs(cycle))
@@ -368,10 +368,10 @@ class Observer:
         self._outcomes[outcome] += 1
         self._missed += missed
 
-    # ------------------------------------------------------------------------ asking
+    # ------------------------------------------------------------------------ status
 
     def _ask_on(self) -> None:
-        """Ask the controller again and again, so often that few decisions are left out."""
+        """Request the status twice per decision, within `LEAST_ASK_S` and `MOST_ASK_S`."""
         apart_ms = self.problem.decide_cycles * self.problem.pipeline.period_ms
         every_s = min(max(apart_ms / 2e3, LEAST_ASK_S), MOST_ASK_S)
         while not self._stopped.wait(every_s):
@@ -384,7 +384,7 @@ class Observer:
         self._answer(status)
 
     def _answer(self, status: Mapping[str, Any]) -> None:
-        """Take in how the cell is, and what has happened since the answer before."""
+        """Store a status; add its window and the events since the last status to the feeds."""
         with self._lock:
             before, self._status = self._status, status
             if status["health"] != "absent":
@@ -401,7 +401,7 @@ class Observer:
     def _events(
         self, before: Mapping[str, Any], status: Mapping[str, Any], at_s: float
     ) -> Iterator[CellEvent]:
-        """Yield what has happened between two answers."""
+        """Yield the events between two answers of the controller."""
         if before["health"] not in ("", status["health"]):
             why = status.get("headline")
             yield CellEvent(at_s, "health", f"{status['health']}{f': {why}' if why else ''}")
@@ -427,7 +427,7 @@ class Observer:
 
 
 def _why(answers: Sequence[Mapping[str, Any]], new: str, *, guarded: bool) -> str:
-    """Return why a cell was moved, by the answers of the controller about it, the newest first."""
+    """Return the reason of a move, from the controller's answers, newest first."""
     if guarded:
         return "guard"
     if any(status.get("pinned") == new for status in answers):
@@ -439,9 +439,9 @@ def _why(answers: Sequence[Mapping[str, Any]], new: str, *, guarded: bool) -> st
 
 
 def _outcome(cycle: LiveCycle) -> str:
-    """Return what became of a cycle, in a word."""
+    """Return the outcome of a cycle, one of `OUTCOMES`."""
     words: Sequence[str] = [done.outcome for done in cycle.reports.values()]
-    # The worst of what its sinks say.
+    # The worst outcome that a sink reports.
     for word in ("not_applied", "stale", "behind"):
         if word in words:
             return word

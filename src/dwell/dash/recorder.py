@@ -1,8 +1,8 @@
-"""Recorder: writes what an observer hears of a live cell to an MCAP file, while it goes on.
+"""Recorder of a live cell: writes the cycles and windows of an observer to an MCAP file.
 
-The rows are those of a run's tables as far as they can be heard from outside; cycles have the
-numbers of their stamps. It reads the observer's feeds at its own pace. Cycles and windows that it
-is too late for, and those that the disk has no room for, are dropped, and counted.
+The rows have the columns of a run's tables, as far as an observer knows them; cycles have the
+numbers of their stamps. The recorder reads the observer's feeds at its own pace. It drops and
+counts cycles and windows that have left the feed or that it cannot write.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from dwell.model.table_columns import LIVE
 from dwell.record import column_types
 from dwell.record.mcap_file import TIME_OF_DAY, McapFile, Message
 
-#: Time between two looks at the feeds, which is what a kill costs.
+#: Time between two readings of the feeds; a killed recorder loses this time.
 EVERY_S = 2.0
 TABLES = ("cycles", "windows", "decisions", "jobs")
-#: What a run calls the outcomes that are heard; a cycle of any other was done.
+#: Outcomes in a run's tables by the observer's outcomes; every other outcome is ``done``.
 OUTCOMES = {
     "not_applied": "not_applied",
     "replaced": "replaced",
@@ -35,24 +35,24 @@ T = TypeVar("T")
 
 
 class CellRecorder:
-    """Records one cell; a context manager.
+    """Recorder of one cell; a context manager.
 
     Parameters
     ----------
     path : Path
-        File to make; there must be none.
+        New file; it must not exist.
     say : callable
-        Takes a line where the file cannot be written, where it can be again, and at the end.
+        Prints a line when writing fails, when it works again, and at the end.
 
     Attributes
     ----------
     published, recorded, dropped : int
-        Cycles and windows that the observer has had meanwhile, and what became of them.
+        Number of cycles and windows since the start: all, written and not written.
 
     Raises
     ------
     OSError
-        If there is one, or it cannot be made.
+        If the file exists or cannot be created.
     """
 
     def __init__(self, observer: Observer, path: Path, say: Callable[[str], object]) -> None:
@@ -74,12 +74,12 @@ class CellRecorder:
             raise OSError(error.errno, error.strerror, str(path)) from None
 
     def __enter__(self) -> CellRecorder:
-        """Begin to record."""
+        """Start the thread that reads the feeds."""
         self._thread = start_thread("recorder", self._go_on)
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Record what is left, and make the file whole."""
+        """Write the remaining cycles and windows, then finish and close the file."""
         self._stopped.set()
         self._thread.join()
         self._look(last=True)
@@ -97,7 +97,7 @@ class CellRecorder:
             self._look()
 
     def _look(self, *, last: bool = False) -> None:
-        """Write what is new, once a cycle says when it was."""
+        """Write new cycles and windows, once the first stamp has set the origin of time."""
         observer = self._observer
         if self._origin_ns is None:
             at_s = observer.now().at_s

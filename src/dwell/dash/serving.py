@@ -1,4 +1,4 @@
-"""Serves a page: its port, its address, the browser that opens it, and its end."""
+"""Server of a page: port, address, browser and shutdown."""
 
 from __future__ import annotations
 
@@ -26,36 +26,36 @@ from dwell.dash.server import Dash
 from dwell.errors import DwellError
 
 LOOPBACK = "127.0.0.1"
-#: Connections at a time, and how long one may take to ask for something.
+#: Largest number of connections, and the longest wait for the first request of a connection.
 MOST_CONNECTIONS, REQUEST_S = 512, 10.0
-#: How long requests may take to end when the process is to.
+#: Longest wait for open requests at shutdown.
 GRACE_S = 1
 
 
 def serve(
     dash: Dash, port: int, *, browser: bool, say: Callable[[str], None], token: str | None = None
 ) -> None:
-    """Serve a page until this process is interrupted.
+    """Serve a page until SIGINT or SIGTERM.
 
-    Its address, with the token, is the only line on stdout.
+    The only line on stdout is the address with the token.
 
     Parameters
     ----------
     port : int
-        0 takes one that is free.
+        Port, or 0 for any free port.
     browser : bool
-        Whether to open it in one.
+        Whether to open the page in a browser.
     say : callable
         Prints a line for people.
     token : str, optional
-        What the page is asked for with; a new one where left out.
+        Token of the page; default: a new token.
 
     Raises
     ------
     DwellError
-        If the port is taken.
+        If the port is not available.
     KeyboardInterrupt
-        If that is what ended it.
+        After SIGINT.
     """
     with _listening(port) as listener:
         gate = Gate(dash.application(), listener.getsockname()[1], token or new_token())
@@ -80,7 +80,7 @@ def _listening(port: int) -> Iterator[socket.socket]:
 
 
 class _Protocol(H11Protocol):
-    """HTTP that closes connections which never ask for anything."""
+    """HTTP protocol that closes a connection without a request after `REQUEST_S`."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -92,7 +92,7 @@ class _Protocol(H11Protocol):
 
 
 class _Server(uvicorn.Server):
-    """A server that leaves signals to whoever runs it."""
+    """A server that leaves signals to its caller."""
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -102,7 +102,7 @@ class _Server(uvicorn.Server):
 async def _served(
     gate: Gate, dash: Dash, listener: socket.socket, ready: Callable[[], None]
 ) -> int | None:
-    """Serve until a signal, and return it; `ready` is called once a signal ends it in order."""
+    """Serve until a signal and return it; call `ready` once the signal handlers are installed."""
     logging.getLogger("uvicorn").setLevel(logging.ERROR)
     server = _Server(
         uvicorn.Config(
@@ -135,10 +135,10 @@ async def _served(
 
 @contextmanager
 def _opened(address: str, say: Callable[[str], None]) -> Iterator[None]:
-    """Open an address in a browser, as long as this lasts.
+    """Open an address in a browser, through a temporary file.
 
-    What a process is started with, others can read. So the browser is given a file that only this
-    user can read, which leads to the address.
+    Other users can read the arguments of a process, and the address contains the token. The browser
+    therefore opens a file that only this user can read; the file redirects to the address.
     """
     if sys.platform == "linux" and not (os.environ.keys() & {"DISPLAY", "WAYLAND_DISPLAY"}):
         say("no display here: open the address in a browser; from elsewhere, through `ssh -L`")
@@ -156,7 +156,7 @@ def _opened(address: str, say: Callable[[str], None]) -> Iterator[None]:
                 f'<meta http-equiv="refresh" content="0; url={escaped}">'
                 f'<a href="{escaped}">Open the page</a>\n'
             )
-        # Some browsers are waited for, and all of them for the page.
+        # A thread: `webbrowser.open` may block, and the server must run before the page loads.
         threading.Thread(target=_show, args=(page.as_uri(), say), daemon=True).start()
         yield
     finally:

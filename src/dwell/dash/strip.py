@@ -1,8 +1,8 @@
-"""Strip: cycles along a time line, drawn in few bins without one miss less.
+"""Strip: cycles along a time line, in bins that keep every miss.
 
-A page has some hundred columns of pixels, a run a million cycles. A bin says the least and the
-largest latency of its cycles, and how many of them missed and were lost; where there are fewer
-cycles than bins, a bin is a cycle.
+A page has some hundred columns of pixels; a run has up to a million cycles. A bin has the least and
+the largest latency of its cycles, and the numbers of missed and lost cycles. If the cycles are
+fewer than the bins, each bin contains one cycle.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from dwell.model.number_arrays import Floats
 
-#: Most stretches of one placement that are told one by one.
+#: Largest number of stretches (of one placement each) in an exact ribbon.
 MOST_STRETCHES = 800
-#: Bins of the ribbon where there are more.
+#: Largest number of bins of a ribbon with more stretches.
 RIBBON_BINS = 400
 
 
@@ -29,12 +29,12 @@ class Strip:
     Parameters
     ----------
     at : float64 array, shape (n,)
-        Their places on the time line.
+        Places on the time line.
     latency_ms : float64 array, shape (n,)
-        NaN where no sink has completed the cycle.
+        NaN for cycles that no sink has completed.
     missed : bool array, shape (n,)
     placement : integer array, shape (n,)
-        Places of their placements among the cell's candidates.
+        Index of the placement in the cell's candidates.
     number : int64 array, shape (n,)
     """
 
@@ -45,7 +45,7 @@ class Strip:
     number: NDArray[np.int64]
 
     def followed_by(self, other: Strip, most: int) -> Strip:
-        """Return this and what comes next, in order of instants; the newest `most` of both."""
+        """Return both strips merged in order of `at`; only the last `most` cycles."""
         named = [field.name for field in fields(self)]
         columns = [np.concatenate((getattr(self, one), getattr(other, one))) for one in named]
         order = np.argsort(columns[0], kind="stable")[-most:]
@@ -57,16 +57,16 @@ class Strip:
         return slice(int(low), int(high))
 
     def view(self, begin: float, end: float, bins: int) -> dict[str, Any]:
-        """Return the cycles between two places, and where they were placed.
+        """Return the cycles between two places in bins, and a ribbon of their placements.
 
         Returns
         -------
         dict
-            ``cycles`` (how many), ``missed`` (how many); ``bins``: ``at`` (the first cycle's
-            place), ``number`` (of that cycle), ``count``, ``low`` and ``high`` (ms; None where all
-            are lost), ``missed``, ``lost``; ``ribbon``: ``begin``, ``end`` and ``placement`` of
-            stretches. Where stretches are too many they are bins in which there is a placement at
-            all, and ``exact`` is false.
+            Numbers of ``cycles`` and ``missed``; ``bins``: ``at`` and ``number`` of the first
+            cycle, ``count``, ``low`` and ``high`` (ms; None if all cycles are lost), ``missed``,
+            ``lost``; ``ribbon``: ``begin``, ``end`` and ``placement`` of stretches. With too many
+            stretches ``exact`` is false, and the ribbon has, for each placement, the bins that
+            contain it.
         """
         rows = self.rows(begin, end)
         at, latency_ms, missed = self.at[rows], self.latency_ms[rows], self.missed[rows]
@@ -95,7 +95,7 @@ class Strip:
         changes = np.concatenate(([0], np.flatnonzero(np.diff(placement)) + 1))
         exact = len(changes) <= min(bins, MOST_STRETCHES)
         if exact:
-            # The placement that comes first held before, too.
+            # After earlier cycles, the first placement starts at the left edge.
             first = begin if rows.start else at[0]
             begins = np.concatenate(([first], at[changes[1:]]))
             ends, codes = np.append(begins[1:], end), placement[changes]
@@ -117,7 +117,7 @@ class Strip:
 
 
 def bin_starts(at: Floats, begin: float, end: float, bins: int) -> NDArray[np.intp]:
-    """Return the first row of each bin that has rows; a bin a row where there are few."""
+    """Return the first row of each bin with rows; one bin per row if rows are at most `bins`."""
     if len(at) <= bins:
         return np.arange(len(at))
     starts = np.unique(np.searchsorted(at, np.linspace(begin, end, bins, endpoint=False)))
@@ -127,14 +127,14 @@ def bin_starts(at: Floats, begin: float, end: float, bins: int) -> NDArray[np.in
 def binned_means(
     at: Floats, columns: Mapping[str, Floats], begin: float, end: float, bins: int
 ) -> dict[str, Any]:
-    """Return columns between two places: their means in each bin, of what is not NaN.
+    """Return the means of columns in each bin between two places, without NaN.
 
-    The row before and the row after are told, too, so that a line leads in and out.
+    The rows before and after the range are included: lines then continue to the edges.
 
     Returns
     -------
     dict
-        ``at``, and ``of`` the columns by name.
+        ``at`` (first place of each bin) and ``of`` (means by column).
     """
     low, high = np.searchsorted(at, (begin, end))
     low, high = max(int(low) - 1, 0), int(high) + 1
@@ -152,7 +152,7 @@ def binned_means(
 
 
 def _reduced(how: np.ufunc, values: NDArray[Any], starts: NDArray[np.intp]) -> NDArray[Any]:
-    """Reduce the rows of each bin; `reduceat` takes no empty arrays."""
+    """Reduce the rows of each bin; `reduceat` alone fails on empty arrays."""
     if not len(starts):
         return values[:0]
     reduced: NDArray[Any] = how.reduceat(values, starts)
@@ -160,7 +160,7 @@ def _reduced(how: np.ufunc, values: NDArray[Any], starts: NDArray[np.intp]) -> N
 
 
 def plain(values: Floats, digits: int) -> Sequence[float | None]:
-    """Return numbers ready for JSON: what is not finite is None."""
+    """Return rounded numbers for JSON, with None for NaN and infinity."""
     rounded = np.round(values, digits)
     numbers: list[float | None] = rounded.tolist()
     for row in np.flatnonzero(~np.isfinite(rounded)).tolist():

@@ -15,11 +15,11 @@ from dwell.study.over_seeds import RUN, UNIT
 if TYPE_CHECKING:
     import polars as pl
 
-#: What has to stand beside everything that shows ATP.
+#: Note for every page and table that shows ATP.
 OURS = "ATP is our reconstruction."
-#: Fewer make intervals that say little, and this is said beside them.
+#: Fewer seeds give wide intervals; pages then recommend more seeds.
 FEW_SEEDS = 5
-#: Why windows of a run are not independent, and what follows.
+#: Reason why the windows of a run are not independent, and the consequence.
 LASTING = (
     "a trace is replayed, or what comes and goes takes longer than a run; there limits of V_D rest "
     "on the number of runs alone"
@@ -35,17 +35,17 @@ class Measure(NamedTuple):
     Parameters
     ----------
     column : str
-        Key of the rows; of those of many runs a column of ``Comparison.runs``.
+        Key of the rows; for many runs a column of ``Comparison.runs``.
     name : str
-        Heading.
+        Heading without the unit.
     unit : str
-        Stands behind the name; empty where there is none.
+        Unit after the name; empty for numbers without a unit.
     factor : float
-        From the column's unit to the one shown.
+        Factor from the column's unit to the shown unit.
     ends : bool
-        Whether the interval is always written by its ends.
+        Whether the interval is always written as ``[low, high]``.
     signed : bool
-        Whether a plus stands before what is above 0.
+        Whether positive numbers have a plus sign.
     """
 
     column: str
@@ -58,13 +58,13 @@ class Measure(NamedTuple):
 
     @property
     def heading(self) -> str:
-        """``L95 (ms)``."""
+        """The name with its unit: ``L95 (ms)``."""
         return f"{self.name} ({self.unit})" if self.unit else self.name
 
     def for_size(self, *values: float) -> Measure:
-        """Return the measure with decimals for the largest of these numbers.
+        """Return the measure with enough decimals for the largest of these numbers.
 
-        Times have more where all would be written as nothing.
+        Only times get more decimals, if all of them would be rounded to 0.
         """
         size = max((abs(value) for value in values if math.isfinite(value)), default=0.0)
         if self.unit not in ("ms", "s") or size >= 10.0**-self.decimals:
@@ -74,7 +74,7 @@ class Measure(NamedTuple):
 
 RATE = Measure("violation_rate", "V_D", "%", 100.0)
 L95 = Measure("l95_ms", "L95", "ms")
-#: Of the latencies that cycles had in the end.
+#: L95 of the final latencies of cycles.
 FINAL_L95 = L95._replace(name="L95 final")
 COST = Measure("cost", "J", decimals=2)
 MIGRATIONS = Measure("migrations", "migrations")
@@ -88,7 +88,7 @@ def own_measures(metrics: Iterable[str]) -> list[Measure]:
 
 
 class Written(NamedTuple):
-    """A number and what is known of its error, each as text."""
+    """A number and its interval, each as text."""
 
     value: str
     error: str
@@ -99,9 +99,9 @@ class Written(NamedTuple):
 
 
 def write_number(value: float, decimals: int = 1, *, signed: bool = False) -> str:
-    """Write a number with three digits that count, or fewer decimals where it is large.
+    """Write a number with `decimals` decimals, or fewer if that makes more than three digits.
 
-    Thousands are parted by thin spaces, infinity is ∞, and what is not known is a dash.
+    Thin spaces separate thousands; infinity is ∞; NaN is a dash.
     """
     if math.isnan(value):
         return "–"
@@ -117,17 +117,17 @@ def write_ms(value: float) -> str:
 
 
 def write_interval(interval: Interval, measure: Measure, *, larger_half: bool = False) -> Written:
-    """Write a number over seeds with its 95 % interval.
+    """Write a mean over seeds with its 95 % interval.
 
-    Intervals become ``± half``, the larger one, where the halves differ by no more than a unit of
-    the last digit, and the sign is as certain as the ends say; others ``[low, high]``. Where every
-    seed showed the same number, nothing stands beside it, but beside a share of none or of all.
+    The interval is ``± half`` with the larger half if the halves differ by at most one unit of the
+    last digit and ``±`` gives both ends the right sign; else it is ``[low, high]``. An unknown
+    interval, or an interval of width 0, is left out; ``± <0.1`` means a half that rounds to 0.
 
     Parameters
     ----------
     larger_half : bool
-        Whether ``±`` stands before the larger half however much they differ, as long as it is
-        finite: for tables that are short of room and say so.
+        Whether to write ``±`` and the larger half for every finite interval: for narrow tables that
+        explain it.
     """
     value, low, high = (end * measure.factor for end in interval)
     text = write_number(value, measure.decimals, signed=measure.signed) if value else "0"
@@ -147,22 +147,22 @@ def write_interval(interval: Interval, measure: Measure, *, larger_half: bool = 
 
 
 def _is_even(value: float, low: float, high: float, least: float) -> bool:
-    """Whether the larger half says, to the last digit and in its sign, what the ends say."""
+    """Whether both halves are equal to the last digit, and ``±`` keeps the signs of the ends."""
     below, above = value - low, high - value
     half = max(below, above)
-    # A hair more, for what rounding does to halves that differ by exactly a unit.
+    # The tolerance allows for rounding when the halves differ by exactly one unit.
     alike = abs(above - below) <= least * (1 + 1e-6)
     return alike and (value - half < 0) == (low < 0) and (value + half > 0) == (high > 0)
 
 
 def _places(value: float, decimals: int) -> int:
-    """Decimals that leave three digits, at most `decimals`."""
+    """Return the number of decimals for three digits in total, at most `decimals`."""
     whole = 1 + math.floor(math.log10(abs(value))) if value else 1
     return max(0, min(decimals, 3 - whole))
 
 
 def _fixed(value: float, places: int) -> str:
-    # What rounds to nothing has no sign.
+    # Adding 0.0 turns -0.0 into 0.0.
     return f"{round(value, places) + 0.0:,.{places}f}".replace(",", "\u2009").replace("-", "−")
 
 
@@ -172,14 +172,14 @@ def _between(low: float, high: float, measure: Measure) -> str:
 
 
 def few_seeds(count: int) -> str:
-    """Return the end of a text that asks for more seeds; nothing where they are enough."""
+    """Return the end of a sentence that recommends more seeds; empty for enough seeds."""
     if count >= FEW_SEEDS:
         return ""
     return f". Few seeds: give at least {FEW_SEEDS} for intervals that say something."
 
 
 def independent_runs(runs: pl.DataFrame) -> str:
-    """Return the sentence about scenarios in which only whole runs are independent, if any."""
+    """Return a sentence on scenarios whose runs, not windows, are independent; empty if none."""
     names = list(dict.fromkeys(runs.filter(unit=RUN)["scenario"])) if UNIT in runs.columns else []
     if not names:
         return ""
@@ -193,15 +193,15 @@ def percent(share: float, decimals: int = 0) -> str:
 
 
 def shown_policy(name: str) -> str:
-    """``dtp+corrected`` as ``DTP (corrected)``, where nothing beside it says what ATP is."""
+    """Return a policy's name for display: ``DTP (corrected)``; ATP gets "our reconstruction"."""
     known = contended(name)
     return _shown(name, "our reconstruction" if known and known.family == "atp" else "")
 
 
 def shown_contender(name: str) -> str:
-    """``dtp+corrected`` as ``DTP (corrected)``; what is no policy of ours stays what it is.
+    """Return a contender's name for display: ``DTP (corrected)``; unknown names stay as they are.
 
-    What ATP is has to be said beside what shows this name (see `OURS`).
+    The caller adds the note on ATP (`OURS`).
     """
     return _shown(name)
 
@@ -219,14 +219,14 @@ def _shown(name: str, remark: str = "") -> str:
 
 
 def shown_scenario(name: str) -> str:
-    """``robot-cpu-stress`` as ``Robot CPU stress``."""
+    """Return a scenario's name for display: ``Robot CPU stress`` for ``robot-cpu-stress``."""
     words = name.replace("_", "-").split("-")
     text = " ".join(ABBREVIATIONS.get(word, word) for word in words)
     return text[:1].upper() + text[1:]
 
 
 def listed(items: Iterable[str], last: str = "and") -> str:
-    """``a``, ``a and b``, ``a, b and c``."""
+    """Return the items as a list in words: ``a``, ``a and b``, ``a, b and c``."""
     words = list(items)
     if len(words) < 2:
         return "".join(words)

@@ -1,9 +1,9 @@
-"""Colours: one a placement, the same in every figure, told apart by colour-blind readers too.
+"""Colours of placements and policies: the same in every figure, distinct for colour-blind readers.
 
-Candidates have the hues of `dwell.display`, from the front; a policy that moves has a colour of its
-own, DTP that of the text and several DTPs one each, and a marker and dashes that say what it
-believes, so that no two lines differ by their colour alone. Colours of text, rules and paper are
-CSS variables that the page gives a value to, light or dark, and paper another.
+Candidates take the hues of `dwell.display` from the front. Each family of moving policies has its
+own colour; DTP has the colour of the text, and further DTPs have further colours. Family and
+estimator decide the marker and the dashes, so lines differ in more than colour. Colours of text,
+rules and paper are CSS variables: pages set light or dark values, `PRINTED` has those for print.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ Dashes: TypeAlias = tuple[int, ...]
 
 INK, MUTED, RULE = "var(--ink)", "var(--muted)", "var(--rule)"
 PAPER, SHADE, BAD = "var(--paper)", "var(--shade)", "var(--bad)"
-#: Of values that have an order and are neither placements nor policies, the first to the last.
+#: Colours of ordered values, first to last; for values other than placements and policies.
 RAMP = tuple(f"var(--ramp-{place})" for place in range(6))
-#: Where the time of a cycle goes: no placement's colours.
+#: Colours of the parts of a cycle's latency; no placement has them.
 PARTS = {part: f"var(--{part})" for part in ("compute", "queue", "network")}
-#: Of several DTPs, which differ in what they believe, the second and the third: apart from the
-#: hues, the text and each other for colour-blind readers, too.
+#: Colours of the second and third DTP, with other estimators; colour-blind readers can distinguish
+#: them from the hues, the text and each other.
 APART = ("var(--apart-0)", "var(--apart-1)")
-#: What a paper's figures have for the variables of a page.
+#: Values of a page's variables in printed figures.
 PRINTED = {
     INK: "#000000",
     MUTED: "#444444",
@@ -58,8 +58,7 @@ DASHES: tuple[Dashes, ...] = (
     (14, 4),
 )
 
-#: Policies that move, by family, and the references that stand beside them: their labels, their
-#: hues, from the back of the placements', and a sentence each.
+#: Families of moving policies, and references: label, colour and a sentence each.
 FAMILIES = {
     **registry.FAMILIES,
     "clairvoyant": registry.PolicyEntry(
@@ -87,12 +86,12 @@ FAMILIES = {
 COLOURS = {
     name: {"ink": INK, "muted": MUTED}.get(one.colour, one.colour) for name, one in FAMILIES.items()
 }
-#: Places of what a policy believes: each has its marker and dashes, whoever else is shown.
+#: Estimators in the order of their markers and dashes, which are fixed for each estimator.
 BELIEFS = (*sorted(ESTIMATORS, key=lambda name: ESTIMATORS[name].style), "hindsight")
 
 
 class Contended(NamedTuple):
-    """A contender's name, taken apart; what it does not have is empty.
+    """Parts of a contender's name; missing parts are empty.
 
     Parameters
     ----------
@@ -120,7 +119,7 @@ NAME = re.compile(
 
 
 def contended(name: str) -> Contended | None:
-    """Take a contender's name apart; None where no policy is meant."""
+    """Return the parts of a contender's name; None if it names no known family."""
     found = NAME.fullmatch(name)
     if found is None:
         return None
@@ -149,17 +148,17 @@ class Palette:
     def of(
         cls, candidates: Iterable[str], policies: Iterable[str] = (), estimator: str = ""
     ) -> Palette:
-        """Give every candidate a colour and every policy a style.
+        """Return a colour for every candidate and a style for every policy.
 
-        A policy with a candidate's name is that placement and has its colour.
+        A policy with a candidate's name is a static placement and has the candidate's colour.
 
         Parameters
         ----------
         policies : iterable of str
-            With what they believe in brackets, where that tells them apart.
+            Names of policies; the estimator may follow in brackets or after ``+``.
         estimator : str
-            Estimator that the cell gives its policies. Where any of them says so itself, the others
-            are drawn as who believes this: ``dtp`` is then another line than ``dtp+corrected``.
+            The cell's estimator. If any policy names its estimator, a policy without one gets the
+            style of this estimator: ``dtp`` then differs from ``dtp+corrected``.
         """
         placements = placement_hues(candidates)
         policies = tuple(dict.fromkeys(policies))
@@ -169,7 +168,7 @@ class Palette:
                 if known and known == Contended(known.family):
                     moving[name] = known._replace(belief=estimator)
         spare = [hue for hue in reversed(HUES) if hue not in placements.values()]
-        # Hues that a family has by its name are not given to others while there are more.
+        # Unknown policies take the hues of families last.
         spare.sort(key=lambda hue: hue in COLOURS.values())
         styles = {name: Style(hue, CIRCLE, SOLID) for name, hue in placements.items()}
         variants: dict[str, int] = {}
@@ -192,7 +191,7 @@ class Palette:
 
 
 def _place(known: Contended, variants: dict[str, int]) -> int:
-    """Return the place of a contender in its family; what it believes has a fixed one."""
+    """Return the place of a contender in its family; an estimator has a fixed place."""
     if not known.variant and not known.rest and known.belief in ("", *BELIEFS):
         return BELIEFS.index(known.belief) if known.belief else 0
     place = variants.get(known.family, len(BELIEFS))
@@ -201,7 +200,7 @@ def _place(known: Contended, variants: dict[str, int]) -> int:
 
 
 def _of_several(place: int) -> str:
-    """Return the colour of a contender of the family that has the text's, by its place there."""
+    """Return the colour for a place in the family that has the text's colour (DTP)."""
     colours = (INK, *APART, MUTED)
     if place < len(BELIEFS):
         return colours[min(place, len(colours) - 1)]
@@ -213,10 +212,10 @@ def _style(colour: str, place: int) -> Style:
 
 
 def ramp_styles(names: Iterable[str]) -> dict[str, Style]:
-    """Give a style to each of several values that have an order, the last the darkest."""
+    """Return a style for each of several ordered values; the last is the darkest in print."""
     names = tuple(names)
     last = max(len(names) - 1, 1)
-    # Two are told apart best by the middle and the end.
+    # Skip the first colour if possible.
     first = 1 if len(names) < len(RAMP) else 0
     span = len(RAMP) - 1 - first
     return {
