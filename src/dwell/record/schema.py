@@ -177,12 +177,12 @@ def row_of(types: Types, values: Values) -> Row:
     types : mapping of str to str, or to the names of an Enum
         Types of the table's columns.
     values : mapping of str to object
-        By column.
+        Values by column.
 
     Raises
     ------
     ValueError
-        If a column has no value, or a value no column.
+        If the names of the columns and of the values differ.
     """
     _require_columns(types, values)
     return tuple(values[name] for name in types)
