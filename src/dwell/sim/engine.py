@@ -301,7 +301,7 @@ class _Stamper:
         self.release_ns = realisation.release_ns
         self.cycles = realisation.cycles
         self.window_cycles, self.every = problem.window_cycles, problem.decide_cycles
-        #: Whether decisions come more often than windows close.
+        #: Whether decisions are more frequent than windows.
         self.looks = self.every < self.window_cycles
         self.names = tuple(problem.candidates)
         self.code = {name: i for i, name in enumerate(self.names)}
