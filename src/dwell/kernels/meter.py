@@ -115,13 +115,13 @@ class WindowRows:
         return WindowRows(self.table.copy(), self.tasks, self.flows, self.beside)
 
     def unknown(self, limit_ns: int) -> tuple[bool, bool, bool]:
-        """Return what has to be looked at.
+        """Return which kinds of unknown values the window has.
 
         Returns
         -------
         tuple of bool
-            Whether an own job that began before `limit_ns` has not ended; whether the work of an
-            own job that has ended is not known; whether the work of a shadow's is not known.
+            Whether an own job that began before `limit_ns` is unfinished; whether the work of a
+            completed own job is unknown; whether the work of a completed shadow job is unknown.
         """
         found = _unknown()(self.tasks, self.flows, byref(self.row), limit_ns)
         return bool(found & 1), bool(found & 2), bool(found & 4)
