@@ -1,4 +1,4 @@
-"""The event loop, as Python calls it (see ``advance.h``)."""
+"""Python interface of the event loop (see ``advance.h``)."""
 
 from __future__ import annotations
 
@@ -24,14 +24,10 @@ _logged = foreign(
 
 
 def play(arrays: Arrays) -> Status:
-    """Advance to the next pause or to the end, enlarging what has become too small.
+    """Advance to the next pause or to the end, and enlarge tables that are full.
 
-    A call of the kernel ends after a counted number of events, so that Python sees Ctrl-C.
-
-    Returns
-    -------
-    Status
-        PAUSED, STEP or FINISHED.
+    The kernel returns after a fixed number of events, which lets Python handle Ctrl-C. The result
+    is PAUSED, STEP or FINISHED.
     """
     advance = _advance()
     while True:
@@ -45,19 +41,14 @@ def play(arrays: Arrays) -> Status:
 
 
 def post_event(of: CellArrays, at_ns: int, kind: EventKind, cycle: int = 0, item: int = 0) -> None:
-    """Add an event of a cell; there is always room for a few (see `play`)."""
+    """Add an event of a cell; the queue always has room for a few (see `play`)."""
     _post()(of.whole.address, at_ns, make_key(kind, of.part.row, cycle, item))
 
 
 def logged_window(of: CellArrays, first: int, last: int, flows: Ints) -> WindowRows:
-    """Return what the logs still have of a cell's cycles, and of its shadow, if it has one.
+    """Return the logs of the cycles `first` to `last` - 1 of a cell and of its shadow, if any.
 
-    Parameters
-    ----------
-    first, last : int
-        Cycles, the last excluded.
-    flows : int64 array, shape (flows,)
-        Which flows, in the order of the kernel's.
+    `flows` contains the flows of the result as indices into the kernel's flows.
     """
     part, tasks, count = of.part, of.part.tasks, len(flows)
     table = np.empty((last - first, part.rows * (1 + 4 * tasks + count)), np.int64)
@@ -75,21 +66,21 @@ def logged_window(of: CellArrays, first: int, last: int, flows: Ints) -> WindowR
 def send_state(
     of: CellArrays, hop: int, cycle: int, attempt: int, arrival: int, now_ns: int
 ) -> tuple[int, int]:
-    """Send the state of a task that moves, reliably, whatever the link does; post its arrival.
+    """Attempt to send the state of a task that moves, and post its arrival.
 
     Parameters
     ----------
     hop : int
-        Which of the realisation's.
+        Index of the hop in the realisation.
     arrival : int
-        Key of the event of its arrival.
+        Key of the arrival event.
 
     Returns
     -------
     at_ns : int
-        Instant of the next attempt; -1 if this one succeeds, or the link is down for good.
+        Instant of the next attempt; -1 if this attempt succeeds, or the link stays down.
     attempt : int
-        Number of the next attempt; waiting for the end of an outage is none.
+        Number of the next attempt; a wait for the end of an outage does not count.
     """
     following = (c_int64 * 2)()
     hop += of.part.hop_0
@@ -98,5 +89,5 @@ def send_state(
 
 
 def end_repeats(of: CellArrays, arrival: int, now_ns: int) -> None:
-    """Let messages wait no longer for state that is not sent again; `arrival` is its key."""
+    """Release the messages that wait for a cancelled state; `arrival` is the key of its arrival."""
     _end_repeats()(of.whole.address, arrival, now_ns)

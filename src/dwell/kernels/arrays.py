@@ -1,4 +1,4 @@
-"""Lay cells and their realisations out as the tables that the kernel works on."""
+"""Conversion of cells and their realisations to the tables of the kernel."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ from dwell.model.window_close import close_after_ns, window_close_ns
 
 SCHEDULERS = {"fair": Scheduler.FAIR, "fifo": Scheduler.FIFO, "priority": Scheduler.PRIORITY}
 RING_START = 64
-#: A shadow is given up where a window and so many cycles have been released since.
+#: A shadow is given up after the release of a window and this many further cycles.
 GIVEN_UP_AFTER = 64
-#: Events after which a call of the kernel ends for a moment: some 20 ms.
+#: Number of events after which the kernel returns to Python, about every 20 ms.
 BUDGET = 200_000
-#: What a core draws on the pool of a quota at a time (sched_cfs_bandwidth_slice_us), and the least
-#: run time of a turn (sched_base_slice of two CPUs; eight and more have twice as much), ms.
+#: Slice that a core takes from the pool of a quota (sched_cfs_bandwidth_slice_us), and least run
+#: time of a turn (sched_base_slice of two CPUs; twice as much for eight and more), ms.
 DRAWN_MS, LEAST_MS = 5.0, 1.4
-#: Of what shares of a resource are told: busy, own, of shadows, of other cells that have it, too.
+#: Number of shares of a resource: busy, own, of shadows, of other cells.
 PARTS = 4
-#: Tables of a state that is in one piece begin at multiples of so many bytes.
+#: Alignment in bytes of the tables of a state in one block of memory.
 LINE = 64
 
 
 class CellPart(NamedTuple):
-    """Where a cell is in the kernel's tables.
+    """Position of a cell in the kernel's tables.
 
     Parameters
     ----------
     row, rows : int
-        Its row, and how many it has: two where a shadow is behind it.
+        First row of the cell and number of its rows: two with a shadow, else one.
     cycles, windows, tasks, resources, candidates : int
-        How many it has of them.
+        Numbers of these items in the cell.
     candidate_0, hop_0, site_0 : int
         Rows of its first candidate, hop and site.
     """
@@ -61,21 +61,21 @@ class CellPart(NamedTuple):
 
 
 class Arrays:
-    """The kernel's tables, and where each cell is in them.
+    """The kernel's tables, and the position of each cell in them.
 
     Attributes
     ----------
     tables : Tables
-        What the kernel works on; replaced as a whole when a part of it grows.
+        The tables of the kernel; replaced by a new object when one of them grows.
     parts : tuple of CellPart
-        By cell.
+        Positions of the cells.
     address : int
-        What the kernel is handed.
+        Argument of the kernel's functions: address of the tables' addresses.
     """
 
     def __init__(self, tables: Tables, parts: tuple[CellPart, ...], behind: Sequence[Ints]) -> None:
         self.parts = parts
-        # Rows have addresses in these.
+        # Keep the arrays whose addresses are in the tables.
         self._behind = behind
         self._use(tables)
 
@@ -83,17 +83,17 @@ class Arrays:
         self.tables = tables
         self._addresses = tables.addresses()
         self.address = self._addresses.ctypes.data
-        #: The state in one piece of memory, of tables that are a copy.
+        #: The state in one block of memory, if the tables are a copy.
         self._state: NDArray[np.uint8] | None = None
 
     def copy(self) -> Arrays:
-        """Return tables that share what is fixed with these, and have a state of their own."""
+        """Return tables with their own state, which share the fixed tables."""
         other = Arrays(self.tables, self.parts, self._behind)
         other.restart(self)
         return other
 
     def restart(self, first: Arrays) -> None:
-        """Go back to the state of tables that have not been played, of which these are a copy."""
+        """Restore the state of the unused tables of which these are a copy."""
         if self._state is not None and first._state is not None:
             np.copyto(self._state, first._state)
             return
@@ -102,7 +102,7 @@ class Arrays:
         self._state = state
 
     def replace(self, **tables: NDArray[Any]) -> None:
-        """Use other tables in the place of some that are fixed."""
+        """Replace fixed tables."""
         self.tables = self.tables._replace(**tables)
         for name, table in tables.items():
             row = self.tables._fields.index(name)
@@ -114,14 +114,10 @@ class Arrays:
         options: Mapping[str, NDArray[np.float64]],
         **tables: NDArray[Any],
     ) -> None:
-        """Have the kernel decide at closes; of a single cell without a shadow.
+        """Let the kernel decide at closes; for a single cell without a shadow.
 
-        Parameters
-        ----------
-        numbers, options : mapping
-            Columns of the tables `rule` and `options`.
-        **tables : array
-            `work`, `switching` and `tiers`.
+        `numbers` and `options` contain columns of the tables `rule` and `options`. The further
+        tables are `work`, `switching` and `tiers`.
         """
         candidates, resources = tables["work"].shape
         decisions = self.tables.looked.shape[1] or self.tables.seen.shape[1]
@@ -143,19 +139,19 @@ class Arrays:
         )
 
     def grow_events(self) -> None:
-        """Double the room of the queue of events, and of held messages."""
+        """Double the capacity of the queue of events and of the held messages."""
         t = self.tables
         room = 2 * len(t.events)
         names = ("events", "following", "held")
         self._use(t._replace(**{name: np.resize(getattr(t, name), room) for name in names}))
 
     def grow_ring(self) -> None:
-        """Double the number of cycles that may be in flight, and move those that are."""
+        """Double the capacity for cycles in flight, and move the present cycles."""
         t = self.tables
         clock = t.clock[0]
         n_slots, cells = int(clock["n_slots"]), len(t.cells)
         old = np.arange(cells * n_slots)
-        # A slot that was never used names cycle 0; only one of them can be its slot.
+        # Unused slots have cycle 0, which belongs to one slot only.
         old = old[t.slots["cycle"] % n_slots == old % n_slots]
         cycle = t.slots["cycle"][old]
         new = (old // n_slots) * 2 * n_slots + (cycle & (2 * n_slots - 1))
@@ -177,7 +173,7 @@ class Arrays:
         self._use(t._replace(**{name: larger(table) for name, table in rings.items()}))
 
 
-#: Tables of which every cell has a row.
+#: Tables with rows by cell.
 BY_CELL = (
     *("cells", "stamps", "latency_ns", "compute_ns", "network_ns", "outcome"),
     *("opened", "closed", "seen", "shares"),
@@ -186,14 +182,7 @@ BY_CELL = (
 
 
 class CellArrays:
-    """A cell's part of the kernel's tables: it is row 0 of each, and its shadow row 1.
-
-    Parameters
-    ----------
-    whole : Arrays
-    index : int
-        Which of the cells.
-    """
+    """A cell's part of the kernel's tables; row 0 is the cell, and row 1 its shadow."""
 
     def __init__(self, whole: Arrays, index: int = 0) -> None:
         self.whole, self.part = whole, whole.parts[index]
@@ -202,7 +191,7 @@ class CellArrays:
 
     @property
     def tables(self) -> Tables:
-        """The tables as if there were no other cell."""
+        """The tables, restricted to this cell."""
         whole, part = self.whole.tables, self.part
         if whole is not self._of:
             self._of = whole
@@ -223,10 +212,10 @@ class CellArrays:
         return self._tables
 
     def logs(self) -> tuple[Rows, NDArray[np.int8], Ints]:
-        """Every job's instants and outcome, and every message's arrival, where all are kept.
+        """Return the instants and outcomes of all jobs, and the arrivals of all messages.
 
-        Shapes (rows, cycles, tasks) and (rows, cycles, flows); flows stand as `flow_rows` says, and
-        what did not arrive is -1.
+        The shapes are (rows, cycles, tasks) and (rows, cycles, flows), with flows in the order of
+        `flow_rows`; an arrival is -1 if the message did not arrive. Needs a log of all jobs.
         """
         whole, part = self.whole.tables, self.part
         shape = len(whole.cells), int(whole.clock[0]["n_cycles"]), -1
@@ -250,23 +239,23 @@ def lay_out(
     Parameters
     ----------
     shared : collection of str
-        Names of nodes that all cells have in common; such a node, with its stress and outages, is
-        that of the first cell. Links are never shared.
+        Names of nodes that all cells share. Their stress and outages are taken from the first
+        cell. Links are never shared.
     log_jobs : bool
-        Whether every job's instants are kept.
+        Whether to record the instants of all jobs.
     log_windows : bool
-        Whether those of a window are kept until it has closed.
+        Whether to record the instants of the jobs of a window until it closes.
     decides : bool
-        Whether `look` tables are kept for decisions that come more often than windows close.
+        Whether to fill the `look` tables if decisions are more frequent than windows.
     shadows : sequence of Realisation
-        By cell, draws for its shadow jobs (see `draw_shadows`): it gets a shadow then; None: it has
-        none.
+        Samples for the shadow jobs of each cell (see `draw_shadows`); None for a cell without a
+        shadow.
     """
     return _Layout(cells, shared, log_jobs, log_windows, decides, shadows).arrays()
 
 
 class _Layout:
-    """Rows being laid out, cell after cell."""
+    """Builder of the tables, cell after cell."""
 
     def __init__(
         self,
@@ -279,7 +268,7 @@ class _Layout:
     ) -> None:
         self.cells, self.shared = cells, frozenset(shared)
         self.logs_all, self.logs_windows = logs_all, logs_windows
-        #: Cycles between two decisions of each cell; 0 where windows are decided on.
+        #: Cycles between two decisions of each cell; 0 if each window has one decision.
         self.decide_cycles = [
             problem.decide_cycles
             if decides and problem.decide_cycles < problem.window_cycles
@@ -329,7 +318,7 @@ class _Layout:
         return Arrays(self._tables(), tuple(self.parts), self.behind)
 
     def _begun(self, problem: Problem, real: Realisation) -> CellPart:
-        """Return where the cell that is added next is in the tables."""
+        """Return the position of the next cell in the tables."""
         return CellPart(
             row=len(self.rows["cells"]),
             rows=1,

@@ -1,56 +1,57 @@
-"""Codes that the kernel's tables hold, and the packing of event keys: those of ``codes.h``."""
+"""Codes in the kernel's tables, and packing of event keys; the same as in ``codes.h``."""
 
 from __future__ import annotations
 
 from enum import IntEnum
 
-#: An instant that never comes: the largest that is exact as int64 and as float64.
+#: Instant for events that never happen: the largest one that is exact as int64 and as float64.
 LAST_NS = (1 << 63) - 1024
 
 
 class CycleOutcome(IntEnum):
-    """What became of a cycle or a job."""
+    """Outcome of a cycle or a job."""
 
     IN_FLIGHT, DONE, DROPPED, REPLACED, NODE_DOWN = range(5)
 
 
 class Scheduler(IntEnum):
-    """How a server gives out its cores; TURNS: fair, with a quota that is noticed at ticks."""
+    """How a server schedules its cores; TURNS is fair, with a quota that is checked at ticks."""
 
     FAIR, FIFO, PRIORITY, TURNS = range(4)
 
 
 class ShadowPart(IntEnum):
-    """What a task is to the shadow of a cycle."""
+    """Role of a task in the shadow of a cycle."""
 
     SHARED, SHADOWED, DISCARDED = range(3)
 
 
 class Status(IntEnum):
-    """What a call of the event loop ends with.
+    """Result of a call of the event loop.
 
-    PAUSED: a decision is due; stamp the next cycles and go on. FINISHED: no window is left to
-    close. GROW_EVENTS, GROW_RING: enlarge the queue, or the ring of cycles in flight, and go on;
-    nothing was lost. STEP: the caller's event is due. BUSY: the budget of events is spent; go on.
+    PAUSED: a decision is due; stamp the next cycles and call again. FINISHED: all windows have
+    closed. GROW_EVENTS, GROW_RING: enlarge the queue, or the ring of cycles in flight, and call
+    again; all events are intact. STEP: an event for the caller is due. BUSY: the budget of events
+    is used up; call again.
     """
 
     PAUSED, FINISHED, GROW_EVENTS, GROW_RING, STEP, BUSY = range(6)
 
 
 class BuiltInPolicy(IntEnum):
-    """Policies that the kernel has a second body of."""
+    """Policies that the kernel implements, too."""
 
     STATIC, DTP, CUSUM, LATENCY_FIRST, ATP = range(5)
 
 
 class Tier(IntEnum):
-    """Tiers of nodes in J; of a node in none caps alone take notice."""
+    """Tiers of nodes in J; a node without a tier affects caps only."""
 
     ROBOT, EDGE, CLOUD, NONE = range(4)
 
 
 class EventKind(IntEnum):
-    """Kinds of events, in the order in which equal times are handled."""
+    """Kinds of events, in the order of events at equal times."""
 
     (
         COMPLETION,
@@ -67,14 +68,14 @@ class EventKind(IntEnum):
     ) = range(11)
 
 
-# A key packs (kind, cell, cycle, item), so that keys order as the tuple does. The item is a task
-# or a flow of the cell, a site, or nothing, according to the kind.
+# A key packs (kind, cell, cycle, item) and sorts like this tuple. The item depends on the kind: a
+# task or a flow of the cell, a site, or nothing.
 ITEM_BITS, CYCLE_BITS, CELL_BITS = 14, 32, 13
 CYCLE_SHIFT = ITEM_BITS
 CELL_SHIFT = CYCLE_SHIFT + CYCLE_BITS
 KIND_SHIFT = CELL_SHIFT + CELL_BITS
 ITEM_MASK, CYCLE_MASK, CELL_MASK = (1 << ITEM_BITS) - 1, (1 << CYCLE_BITS) - 1, (1 << CELL_BITS) - 1
-#: Most flows of a cell: the bit above marks what is lost on its link.
+#: Largest number of flows of a cell; the next bit marks messages that are lost on their link.
 MOST_FLOWS = (1 << (ITEM_BITS - 1)) - 1
 
 
@@ -84,20 +85,20 @@ def make_key(kind: EventKind, cell: int = 0, cycle: int = 0, item: int = 0) -> i
 
 
 def kind_of(key: int) -> EventKind:
-    """EventKind of the event that a key names."""
+    """Return the kind of an event from its key."""
     return EventKind(key >> KIND_SHIFT)
 
 
 def cell_of(key: int) -> int:
-    """Row of the cell of the event that a key names."""
+    """Return the row of an event's cell from its key."""
     return (key >> CELL_SHIFT) & CELL_MASK
 
 
 def cycle_of(key: int) -> int:
-    """Cycle, or what else the caller counts, of the event that a key names."""
+    """Return the cycle of an event, or the caller's own number, from its key."""
     return (key >> CYCLE_SHIFT) & CYCLE_MASK
 
 
 def item_of(key: int) -> int:
-    """Task, flow or site of the event that a key names."""
+    """Return the task, flow or site of an event from its key."""
     return key & ITEM_MASK

@@ -1,4 +1,4 @@
-"""What nodes and links go through: the disturbances of each, which come and go, merged in time."""
+"""Combined disturbances of nodes and links over time."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from dwell.model.number_arrays import Floats, Ints
 
 
 class NodeEffect(NamedTuple):
-    """What one disturbance does to a node.
+    """Effect of one disturbance on a node.
 
     Parameters
     ----------
     intervals : OnOffIntervals
-        When it is on, and at which level.
+        Times and levels of the disturbance.
     node : int
         Number of the node.
     threads : float64 array, shape (LEVELS,)
-        Foreign threads at each level, whole numbers.
+        Number of foreign threads at each level.
     down : bool
         Whether the node is down.
     """
@@ -37,18 +37,18 @@ class NodeEffect(NamedTuple):
 
 
 class LinkFault(NamedTuple):
-    """What one disturbance does to a link.
+    """Effect of one disturbance on a link.
 
     Parameters
     ----------
     intervals : OnOffIntervals
-        When it is on, and at which level.
+        Times and levels of the disturbance.
     layers : int64 array, shape (LEVELS,)
         Layers of extra delay at each level, as bits.
     arriving : float64 array, shape (LEVELS,)
-        Share of the attempts that it does not lose.
+        Share of the attempts that arrive in spite of the disturbance.
     rate_mbps : float64 array, shape (LEVELS,)
-        Rate that the link has at most; infinite where it is the link's own.
+        Upper bound of the link's rate; infinite if the disturbance sets none.
     down : bool
         Whether the link is down.
     """
@@ -61,20 +61,9 @@ class LinkFault(NamedTuple):
 
 
 def node_changes(effects: Sequence[NodeEffect], nodes: int, last_ns: int) -> Ints:
-    """Sum up what nodes go through, from quiet and up on, to an instant.
+    """Return the changes of all nodes up to an instant, as the table of `NodeChanges`.
 
-    Parameters
-    ----------
-    effects : sequence of NodeEffect
-    nodes : int
-        Number of nodes.
-    last_ns : int
-        No change comes later.
-
-    Returns
-    -------
-    int64 array, shape (changes, 4)
-        Table of `dwell.kernels.realisation.NodeChanges`.
+    Nodes begin without foreign threads and up. The result has the shape (changes, 4).
     """
     kind = structs()["NodeEffect"]
     rows = [kind(_pointers(i), node, down, _levels(threads)) for i, node, threads, down in effects]
@@ -87,20 +76,10 @@ def node_changes(effects: Sequence[NodeEffect], nodes: int, last_ns: int) -> Int
 def link_segments(
     faults: Sequence[LinkFault], link: int, rate_mbps: float, loss: float
 ) -> tuple[Ints, Floats]:
-    """Sum up what a link goes through: the faults of it, which come and go, and its own state.
+    """Return the segments of a link, as the two tables of `LinkSegments`.
 
-    Parameters
-    ----------
-    faults : sequence of LinkFault
-    link : int
-        Number of the link.
-    rate_mbps, loss : float
-        Its own.
-
-    Returns
-    -------
-    int64 array, shape (segments, 4); float64 array, shape (segments, 2)
-        Tables of `dwell.kernels.realisation.LinkSegments`.
+    The tables have the shapes (segments, 4) and (segments, 2). `rate_mbps` and `loss` are those of
+    the undisturbed link.
     """
     kind, shares = structs()["LinkFault"], PLAIN["Shares"]
     rows = (kind * len(faults))(
@@ -122,7 +101,7 @@ def _most_changes(disturbances: Sequence[NodeEffect] | Sequence[LinkFault]) -> i
 
 
 def _pointers(intervals: OnOffIntervals) -> Any:
-    """Point to arrays, which must outlive the struct."""
+    """Return a struct with pointers to arrays, which must outlive it."""
     columns = (column.ctypes.data for column in intervals)
     return structs()["OnOffIntervals"](*columns, len(intervals.begin), 0)
 

@@ -1,4 +1,4 @@
-"""Paths of random processes, a value a cycle: drawn as far as they are asked for."""
+"""Paths of random processes, one value per cycle, sampled on demand."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from dwell.kernels.rows import FLOATS_IN, INTS_OUT, structs
 from dwell.model import AR1, Constant, LogNormal, Normal, Process, Uniform
 from dwell.model.number_arrays import Floats, Ints
 
-#: Cycles at a time: what NumPy draws of a path stays in the second-level cache.
+#: Cycles per block; the NumPy samples of a block fit in the second-level cache.
 BLOCK: Final = 65536
 
 CONSTANT, UNIFORM, NORMAL, LOGNORMAL = range(4)
 
 
 def path_of(process: Process, rng: np.random.Generator, *, independent: bool = False) -> Path:
-    """Return the path that a process takes on a random stream, from the stream's present state.
+    """Return the path of a process on a random stream, from the current state of the stream.
 
     Parameters
     ----------
     process : Process
-        Not a trace, whose rows belong to cycles (see `ReplayedPath`).
+        Any process except a trace (see `ReplayedPath`).
     rng : Generator
-        With bits of SFC64; with others, values of an AR(1) process are independent.
+        With an SFC64 bit generator; with others, values of an AR(1) process are independent.
     independent : bool
-        Whether values of an AR(1) process are drawn without its memory.
+        Whether to sample an AR(1) process without its correlation.
     """
     if isinstance(process, AR1) and independent:
         process = LogNormal(process.mean, process.cv)
@@ -42,32 +42,28 @@ def path_of(process: Process, rng: np.random.Generator, *, independent: bool = F
 
 
 def independent(process: Process) -> bool:
-    """Whether a process has no memory, so that any values of a path do for any cycles."""
+    """Whether a process has no memory; its values are then exchangeable between cycles."""
     return not isinstance(process, AR1)
 
 
 class Path(ABC):
-    """Values of one process, in order; each call goes on where the one before ended."""
+    """Values of one process, in order; each call returns or fills in the next ones."""
 
     @abstractmethod
     def values(self, count: int) -> Floats:
         """Return the next values, which the caller may change."""
 
     def fill_ns(self, out: Ints, factors: Floats | None = None) -> None:
-        """Fill an array with the next values, milliseconds, in whole nanoseconds.
+        """Fill an array with the next values, converted from ms to integer ns.
 
-        Parameters
-        ----------
-        out : int64 array, shape (n,)
-        factors : float64 array, shape (n,), optional
-            What the values are multiplied by before they are rounded.
+        Both arrays have the shape (n,). Values are multiplied by `factors` before they are rounded.
         """
         ms = self.values(len(out))
         _round_ns()(ms, len(out), _pointer(factors), out)
 
 
 class SampledPath(Path):
-    """Independent values of a process, by its own `marginal`."""
+    """Independent values of a process, sampled by its method `marginal`."""
 
     def __init__(self, process: Process, rng: np.random.Generator) -> None:
         self.process, self.rng = process, rng
@@ -78,7 +74,7 @@ class SampledPath(Path):
 
 
 class ReplayedPath(Path):
-    """Values that are known, of a trace or of a whole path, in the order of some rows."""
+    """Known values, of a trace or of a complete path, selected by rows."""
 
     def __init__(self, known: Floats, rows: Ints) -> None:
         self.known, self.rows, self.taken = known, rows, 0
@@ -91,7 +87,7 @@ class ReplayedPath(Path):
 
 
 class DrawnPath(Path):
-    """A path that compiled code draws: its numbers are those that NumPy draws from the stream."""
+    """A path that compiled code samples, with the same random numbers as NumPy."""
 
     def __init__(self, row: Mapping[str, float], bits: np.random.SFC64) -> None:
         self._row = structs()["DrawnPath"](**row)
@@ -104,12 +100,12 @@ class DrawnPath(Path):
         return out
 
     def fill_ns(self, out: Ints, factors: Floats | None = None) -> None:
-        """Fill an array with the next values, milliseconds, in whole nanoseconds (see `Path`)."""
+        """Fill an array with the next values, converted from ms to integer ns (see `Path`)."""
         _draw_ns()(byref(self._row), len(out), _pointer(factors), out)
 
 
 def _row(process: Process) -> dict[str, float] | None:
-    """Return what compiled code needs of a process; None where only NumPy draws it."""
+    """Return the parameters of a process for compiled code; None if only NumPy can sample it."""
     match process:
         case Constant():
             return {"kind": CONSTANT, "location": process.value}
@@ -129,7 +125,7 @@ def _row(process: Process) -> dict[str, float] | None:
 
 def _logarithm(process: LogNormal | AR1) -> dict[str, float]:
     mu, sigma = LogNormal(process.mean, process.cv).log_parameters
-    # All smaller ones are 0 ns, too, and an exponential of ours is exact from -700 on.
+    # Values below e^-600 ms are 0 ns, too, and the kernel's exponential is exact only from -700 on.
     return {"kind": LOGNORMAL, "location": max(mu, -600.0), "spread": sigma}
 
 

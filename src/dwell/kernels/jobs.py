@@ -1,4 +1,4 @@
-"""What the jobs of a window say of waits and of foreign threads (see ``jobs.cpp``)."""
+"""Estimates of waits and of foreign threads from the jobs of a window (see ``jobs.cpp``)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dwell.kernels.meter import WindowRows
 from dwell.kernels.rows import structs
 from dwell.model.number_arrays import Floats
 
-#: Numbers of scratch for each job of a window, own jobs and shadow jobs.
+#: Scratch numbers per job of a window, for own jobs and shadow jobs.
 SCRATCH = 40
 
 
@@ -23,13 +23,13 @@ class NodeJobs(NamedTuple):
     Parameters
     ----------
     cores : float64 array, shape (candidates, tasks)
-        Cores of the job of each task under each candidate; 0 where it runs elsewhere.
+        Cores of each task's job under each candidate; 0 if it runs on another node.
     is_fair : bool
         Whether jobs share the cores as threads of equal weight.
     n_cores, spare : float
-        Cores of the node, and cores that its background leaves.
+        Cores of the node, and cores without its background load.
     bursts : float
-        Share of the time in which there are bursts.
+        Share of the time with bursts.
     """
 
     cores: Floats
@@ -57,15 +57,15 @@ class WaitingJobs:
         self._nodes, self._flows = tuple(nodes), flows
         rows = [node.row(flows) for node in nodes]
         self._rows: Array[Any] = (structs()["NodeJobs"] * len(rows))(*rows)
-        # Memory of this size takes the system longer to give than the kernel to use.
+        # Reuse the memory: to allocate it takes longer than the computation.
         self._scratch = np.empty(0)
 
     def __reduce__(self) -> tuple[type[WaitingJobs], tuple[Sequence[NodeJobs], int]]:
-        # A copy has addresses of its own.
+        # A copy needs its own addresses.
         return WaitingJobs, (self._nodes, self._flows)
 
     def add(self, window: WindowRows, foreign_threads: Sequence[float]) -> None:
-        """Add to the work of own jobs in a window what most jobs of their task waited for."""
+        """Add the typical wait of each task's jobs to the work of own jobs in a window."""
         for row, threads in zip(self._rows, foreign_threads, strict=True):
             row.foreign = threads
         if len(self._scratch) < len(window.table) * window.tasks * SCRATCH:
@@ -77,19 +77,19 @@ class WaitingJobs:
 def level(
     node: NodeJobs, window: WindowRows, *, shadows: bool, is_shared: bool = False
 ) -> tuple[float, float, bool] | None:
-    """Tell beside how many foreign threads the jobs of a node ran since the last change.
+    """Estimate the number of foreign threads on a node since their last change.
 
     Parameters
     ----------
     shadows : bool
-        Whether shadow jobs count where there are too few own jobs.
+        Whether shadow jobs count if own jobs are too few.
     is_shared : bool
-        Whether jobs of other cells run there, too (`WindowRows.beside`).
+        Whether jobs of other cells run on the node, too (`WindowRows.beside`).
 
     Returns
     -------
     tuple of (threads, error, is_slowed), or None
-        See `dwell.estimators.foreign_threads.Level`; None where jobs say nothing.
+        See `dwell.estimators.foreign_threads.Level`; None if the jobs allow no estimate.
     """
     out, row, scratch = (c_double * 2)(), node.row(window.flows), _scratch(window)
     beside = window.beside_address if is_shared else None

@@ -1,7 +1,7 @@
-"""The compiled kernel, a library of C functions: found beside its sources, checked, and opened.
+"""Loading of the compiled kernel, a library of C functions in the folder of its sources.
 
-Python's lock is not held during a call (`ctypes.CDLL`); two threads may call at once, since the
-library has no state of its own. The build hook (`hatch_build.py`) makes the file.
+Calls release Python's global lock (`ctypes.CDLL`). Two threads may call at the same time, because
+the library has no global state. The build hook (`hatch_build.py`) makes the file.
 """
 
 from __future__ import annotations
@@ -18,31 +18,26 @@ from typing import Any, Final
 from dwell.errors import DISTRIBUTION, KernelError
 from dwell.kernels.library_file import NAME, is_of, read_header, source_digest
 
-#: The line that builds the library in a checkout.
+#: Command that builds the library in a checkout.
 BUILD: Final = "apt-get install g++ && make env"
-#: The line that mends an installed package.
+#: Command that repairs an installed package.
 INSTALL_AGAIN: Final = f"pip install --force-reinstall {DISTRIBUTION}"
 
 
 @cache
 def library() -> ctypes.CDLL:
-    """Return the library that was built of the sources beside this module.
+    """Return the library built from the sources in this package.
 
-    Raises
-    ------
-    KernelError
-        If it is missing, damaged, of other sources or for another processor.
+    Raises KernelError if it is missing, damaged, from other sources or for another processor.
     """
     return load(files(__package__))
 
 
 def foreign(name: str, result: Any, *arguments: Any) -> Callable[[], Any]:
-    """Declare a function of the library, by the types of its result and of its arguments.
+    """Declare a function of the library by the types of its result and its arguments.
 
-    Returns
-    -------
-    callable
-        Returns the function; the first call loads the library, and raises what `library` does.
+    The result is a callable that returns the function. Its first call loads the library and may
+    raise the errors of `library`.
     """
 
     @cache
@@ -55,7 +50,7 @@ def foreign(name: str, result: Any, *arguments: Any) -> Callable[[], Any]:
 
 
 def digest() -> str:
-    """Return the SHA-256 of the sources that the library was built of."""
+    """Return the SHA-256 of the sources of the library."""
     return str(foreign("dwell_digest", ctypes.c_char_p)()(), "ascii")
 
 
@@ -67,8 +62,8 @@ def compiler() -> str:
 def load(folder: Traversable) -> ctypes.CDLL:
     """Check the library in a folder against the sources there, and open it.
 
-    It is checked before it is mapped into memory, where reading a part that the file does not have
-    would end the process.
+    The check precedes the mapping into memory, because access to a missing part of a mapped file
+    ends the process.
     """
     file = folder.joinpath(NAME)
     remedy = f"rm {shlex.quote(str(file))} && make env"
@@ -87,7 +82,7 @@ def load(folder: Traversable) -> ctypes.CDLL:
 
 
 def _flaw(content: bytes, digest: str) -> str:
-    """Return what is wrong with a library; empty where nothing is."""
+    """Return the fault of a library as text; empty if it is valid."""
     header, machine = read_header(content), platform.machine()
     if header is None:
         return "is no library"

@@ -1,7 +1,7 @@
-"""The file of the compiled kernel: its name, the sources that it is of, and whether it is whole.
+"""The file of the compiled kernel: its name, the digest of its sources, and its completeness.
 
-The build hook (`hatch_build.py`) runs this module before anything is installed, so that it imports
-the standard library alone.
+The build hook (`hatch_build.py`) runs this module before any package is installed. The module
+therefore imports only the standard library.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from importlib.resources.abc import Traversable
 from typing import Final, NamedTuple
 
 NAME: Final = "libdwell_kernel.so"
-#: Options of the compiler, one a line; clang-tidy and editors read the same file.
+#: Options of the compiler, one per line; clang-tidy and editors read the same file.
 FLAGS: Final = "compile_flags.txt"
 
-#: Machines by their number in the header of an ELF file, with the name that `uname -m` has.
+#: Names of machines as in `uname -m`, by their number in the header of an ELF file.
 MACHINES: Final = {62: "x86_64", 183: "aarch64"}
-#: The header of an ELF file of 64 bits: magic number, machine, where its table of sections begins,
-#: and the size and number of the table's entries.
+#: The header of a 64-bit ELF file: magic number, machine, offset of the table of sections, and the
+#: size and number of the table's entries.
 _HEADER: Final = struct.Struct("<4s14xH20xQ10xHH2x")
 
 
 def source_digest(folder: Traversable) -> str:
-    """Return the SHA-256 of the C++ sources in a folder, and of the flags they are compiled by."""
+    """Return the SHA-256 of the C++ sources in a folder, and of the compiler's options."""
     digest = hashlib.sha256()
     for entry in sorted(folder.iterdir(), key=lambda entry: entry.name):
         if entry.name.endswith((".cpp", ".h")) or entry.name == FLAGS:
@@ -34,14 +34,14 @@ def source_digest(folder: Traversable) -> str:
 
 
 class LibraryHeader(NamedTuple):
-    """What the header of a library tells.
+    """Contents of a library's header.
 
     Parameters
     ----------
     machine : str
-        The processor it is for, as ``x86_64``.
+        Processor of the library, such as ``x86_64``.
     n_bytes : int
-        What the file has at least where it is whole: the table of sections is its end.
+        Least size of the complete file, which ends with the table of sections.
     """
 
     machine: str
@@ -49,7 +49,7 @@ class LibraryHeader(NamedTuple):
 
 
 def read_header(content: bytes) -> LibraryHeader | None:
-    """Return what the header tells; None where the content does not begin as a library does."""
+    """Return the header; None if the content does not begin like an ELF file."""
     if len(content) < _HEADER.size:
         return None
     magic, machine, sections, entry_bytes, entries = _HEADER.unpack_from(content)
@@ -60,7 +60,7 @@ def read_header(content: bytes) -> LibraryHeader | None:
 
 
 def is_of(content: bytes, *texts: str) -> bool:
-    """Return whether a whole library has some texts, each of them to its end."""
+    """Return whether a library is complete and contains all texts as null-terminated strings."""
     header = read_header(content)
     whole = header is not None and len(content) >= header.n_bytes
     return whole and all(text.encode() + b"\0" in content for text in texts)

@@ -15,7 +15,7 @@ from dwell.model.number_arrays import Floats, Ints
 
 
 class CyclesLayout:
-    """What cycles under one candidate, and their shadows, go through.
+    """Parts (jobs and messages) of the cycles under one candidate, and of their shadows.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class CyclesLayout:
 
     def __init__(self, sources: Ints, parts: Ints, shared: NDArray[np.bool_]) -> None:
         flows = len(sources)
-        # Rows have addresses in these.
+        # Keep the arrays whose addresses are in the row.
         self._behind = tuple(map(np.ascontiguousarray, (sources, parts, shared)))
         addresses = (table.ctypes.data for table in self._behind)
         self.row = structs()["Layout"](parts.shape[1] - flows, flows, *addresses)
@@ -41,7 +41,7 @@ class CyclesLayout:
 
 
 class WindowRows:
-    """The instants of a window's cycles, as functions of the kernel take them.
+    """The instants of a window's cycles, as an argument of the kernel's functions.
 
     Parameters
     ----------
@@ -65,20 +65,19 @@ class WindowRows:
         cycles: Sequence[NDArray[np.integer]],
         shadows: Sequence[NDArray[np.integer]] | None = None,
     ) -> WindowRows:
-        """Put the instants of cycles, and of their shadows, into one table.
+        """Return the instants of cycles, and of their shadows, as one table.
 
         Parameters
         ----------
         cycles, shadows : sequence of six int64 arrays
-            The candidate that each went through, shape (n,), -1 for none; when its jobs became
-            ready and when they had completed, (n, tasks); when its messages arrived, (n, flows);
-            the core time of its jobs, and when they started, (n, tasks). -1 for an instant that had
-            not come, and for what is not known.
+            Candidate of each cycle, shape (n,), -1 for none; readiness and completion of its jobs,
+            both (n, tasks); arrival of its messages, (n, flows); core time and start of its jobs,
+            both (n, tasks). Future instants and unknown values are -1.
         """
         columns = [cycles[0][:, None], *cycles[1:]]
         if shadows is not None:
             columns += [shadows[0][:, None], *shadows[1:]]
-        # One table has one address, which takes as long to find as to copy it.
+        # One table has one address; to look up an address takes as long as a copy.
         table = np.concatenate(columns, axis=1, dtype=np.int64)
         return cls(table, cycles[1].shape[1], cycles[3].shape[1])
 
@@ -112,17 +111,17 @@ class WindowRows:
         return WindowRows, (self.table, self.tasks, self.flows, self.beside)
 
     def copy(self) -> WindowRows:
-        """Return a copy, for what changes it."""
+        """Return a copy with its own table."""
         return WindowRows(self.table.copy(), self.tasks, self.flows, self.beside)
 
     def unknown(self, limit_ns: int) -> tuple[bool, bool, bool]:
-        """Return what has to be looked at.
+        """Return which kinds of unknown values the window has.
 
         Returns
         -------
         tuple of bool
-            Whether an own job that began before `limit_ns` has not ended; whether the work of an
-            own job that has ended is not known; whether the work of a shadow's is not known.
+            Whether an own job that began before `limit_ns` is unfinished; whether the work of a
+            completed own job is unknown; whether the work of a completed shadow job is unknown.
         """
         found = _unknown()(self.tasks, self.flows, byref(self.row), limit_ns)
         return bool(found & 1), bool(found & 2), bool(found & 4)

@@ -1,4 +1,4 @@
-"""Times and strengths of a disturbance: all its time, in episodes, or along a ramp."""
+"""Times and strengths of a disturbance: constant, in episodes, or with ramps."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from dwell.model.scenario import RAMP_STEPS
 
 
 class OnOffIntervals(NamedTuple):
-    """Times during which something is on; they are ascending and never overlap.
+    """Ascending intervals without overlap during which a disturbance is on.
 
     Parameters
     ----------
     begin, end : int64 array, shape (intervals,)
-        Nanoseconds; the end is outside.
+        Nanoseconds; the end is exclusive.
     level : int64 array, shape (intervals,)
-        Strength, counted in steps of a ramp: `RAMP_STEPS` is the whole of it.
+        Strength in steps of a ramp; `RAMP_STEPS` is the full strength.
     """
 
     begin: Ints
@@ -32,7 +32,7 @@ class OnOffIntervals(NamedTuple):
     level: Ints
 
     def until(self, end_ns: int) -> OnOffIntervals:
-        """Return what is left if all is off from an instant on."""
+        """Return the intervals cut off at an instant."""
         left = int(np.searchsorted(self.begin, end_ns))
         end = np.minimum(self.end[:left], end_ns)
         return OnOffIntervals(self.begin[:left], end, self.level[:left])
@@ -44,10 +44,10 @@ def interval(begin_ns: int, end_ns: int) -> OnOffIntervals:
 
 
 def ramp(begin_ns: int, end_ns: int, ramp_ns: int) -> OnOffIntervals:
-    """Return an interval that grows in equal steps, and falls in as many, each time for `ramp_ns`.
+    """Return a disturbance that rises in equal steps for `ramp_ns`, and falls in the same way.
 
-    Step n is reached n / `RAMP_STEPS` of that time after the begin, and left as long before the
-    end. One that ends no earlier than `HORIZON_NS` does not fall.
+    Level n begins n / `RAMP_STEPS` of `ramp_ns` after the begin, and ends by the same time before
+    the end. A disturbance that lasts until `HORIZON_NS` or longer does not fall.
     """
     step = np.arange(1, RAMP_STEPS + 1)
     after = np.rint(step * (ramp_ns / RAMP_STEPS)).astype(np.int64)
@@ -55,7 +55,7 @@ def ramp(begin_ns: int, end_ns: int, ramp_ns: int) -> OnOffIntervals:
     if end_ns < HORIZON_NS:
         begin = np.concatenate((begin, end_ns - after[:0:-1]))
         level, last = np.concatenate((step, step[-2::-1])), end_ns - int(after[0])
-    # Where growing and falling meet, rounding must not put the one behind the other.
+    # Keep the begins ascending if rounding reverses two of them between rise and fall.
     begin = np.maximum.accumulate(begin)
     return OnOffIntervals(begin, np.append(begin[1:], last), level)
 
@@ -68,16 +68,16 @@ def drawn_intervals(
     begin_ns: int,
     horizon_ns: int,
 ) -> OnOffIntervals:
-    """Draw an alternating renewal process: off for `every`, then on for `length`, and so on.
+    """Sample an alternating renewal process: off for `every`, on for `length`, and so on.
 
     Parameters
     ----------
     unit_ns : float
-        Unit of their values.
+        Unit of the values of both processes.
     rngs : pair of Generator
-        Random streams of the times off, and of the times on.
+        Random streams of the times off and of the times on.
     begin_ns, horizon_ns : int
-        Where the first time off begins, and from where on no interval begins any more.
+        Begin of the first time off, and instant before which all intervals begin.
     """
     mean_ns = (every.expectation + length.expectation) * unit_ns
     count = 64 + round(1.1 * max(horizon_ns - begin_ns, 0) / mean_ns)
@@ -86,7 +86,7 @@ def drawn_intervals(
     parts = [np.empty((2, 0), np.int64)]
     since_ns = float(begin_ns)
     while since_ns < horizon_ns:
-        # Times are added up anew every `count` intervals, as many as a run most likely has.
+        # Sum the times in parts of `count` intervals; most runs need only one part.
         part, elapsed_ns, begun = np.empty((2, count), np.int64), c_double(0.0), 0
         for at in range(0, count, BLOCK):
             rows = min(BLOCK, count - at)

@@ -1,4 +1,4 @@
-"""Draw a realisation: everything random in a scenario, each thing from a stream of its own name."""
+"""Sampling of realisations; each random quantity has its own named stream."""
 
 from __future__ import annotations
 
@@ -37,20 +37,20 @@ from dwell.model.scenario import RAMP_STEPS
 
 NS_PER_MS = 1e6
 NS_PER_S = 1e9
-# Streams that belong to one job or message, not to the cycle or the fabric.
+# Prefixes of the streams of single jobs and messages.
 OF_A_JOB = ("exec/", "delay/", "extra/", "loss/")
-# Numbers of a cycle beside its draws: release, latency and its parts, and the columns of a Run.
+# Numbers per cycle without its samples: release, latency and its parts, and columns of a Run.
 OF_A_CYCLE = 8
-# By level of a disturbance: its share of the full strength, and whether it is on.
+# Share of the full strength at each level of a disturbance, and whether it is on.
 STRENGTHS = np.arange(LEVELS) / RAMP_STEPS
 ON = np.arange(LEVELS).clip(max=1)
 
 
 def stream(seed: int, name: str) -> np.random.SeedSequence:
-    """Seed of the stream called `name` in the run with this seed.
+    """Return the seed of the stream `name` in the run with a given seed.
 
-    The name, hashed, is the spawn key of the run's one SeedSequence, so that adding a node, a link
-    or a task shifts nobody else's draws.
+    The spawn key is a hash of the name. A new node, link or task therefore leaves the samples of
+    all others unchanged.
     """
     digest = hashlib.blake2b(name.encode(), digest_size=16).digest()
     words = tuple(int(word) for word in np.frombuffer(digest, dtype="<u4"))
@@ -67,27 +67,27 @@ def draw(
     shared: Collection[str] = (),
     disturbances: Scenario = (),
 ) -> Realisation:
-    """Draw a realisation of a scenario.
+    """Sample a realisation of a scenario.
 
     Parameters
     ----------
     scenario : str
-        Name of one of its scenarios.
+        Name of a scenario of the problem.
     seed : int
         At least 0; the same seed gives the same realisation on any machine.
     windows : int
         Number of windows, at least 1; the run has ``windows * window_cycles`` cycles.
     streams : str
-        What the names of its streams begin with, where several are drawn of one seed.
+        Prefix of the names of the streams, if several cells use one seed.
     shared : collection of str
-        Nodes that the cell shares with others; their changes are drawn without `streams`.
+        Nodes that the cell shares with others; their changes are sampled without the prefix.
     disturbances : sequence of Disturbance
-        All disturbances of shared nodes; the scenario's own ones of these nodes do not count.
+        All disturbances of shared nodes; they replace those of the scenario for these nodes.
 
     Raises
     ------
     ProblemError
-        If there is no such scenario, or 64 bits do not hold the cycles or their instants.
+        If the scenario does not exist, or 64 bits are too few for the cycles or their instants.
     TraceError
         If a trace that does not wrap is shorter than the run.
     SimulationError
@@ -142,14 +142,14 @@ def drawn_scenario(
     shared: Collection[str] = (),
     disturbances: Scenario = (),
 ) -> Scenario:
-    """Return a scenario as a realisation has it (see `draw`): its drawn episodes as disturbances.
+    """Return a scenario with its sampled episodes as disturbances (see `draw`).
 
     Raises
     ------
     ProblemError
-        If there is no such scenario.
+        If the scenario does not exist.
     TraceError
-        If the times of episodes are a trace that is too short or is not there.
+        If the times of episodes come from a trace that is too short or missing.
     """
     return Drawing(
         *(problem, scenario),
@@ -164,9 +164,9 @@ def drawn_scenario(
 def draw_changes(
     problem: Problem, *, scenario: str, seed: int, windows: int
 ) -> tuple[Scenario, NodeChanges, LinkSegments]:
-    """Draw what a realisation says of nodes and links, and nothing of its jobs and messages.
+    """Sample only the changes of nodes and links of a realisation.
 
-    First comes the scenario that they are of, as `drawn_scenario` returns it and with its errors.
+    The first item is the scenario from `drawn_scenario`, which raises the same errors.
     """
     drawing = Drawing(problem, scenario, seed=seed, windows=windows)
     return drawing.episodes(), *drawing.changes
@@ -180,20 +180,19 @@ def draw_shadows(
     others: bool = False,
     wraps: bool = False,
 ) -> Realisation:
-    """Draw what shadow jobs meet in a realisation: times, delays and losses of their own.
+    """Sample execution times, delays and losses of the shadow jobs in a realisation.
 
-    Releases, disturbances, scales and the rows of traces are those of the realisation itself: they
-    belong to the cycle or to the fabric, not to a job.
+    Releases, disturbances, scales and the rows of traces equal those of the realisation, because
+    they belong to the cycle or to the fabric.
 
     Parameters
     ----------
     sent : int64 array, optional
-        Cycles that are known to be sent as shadows, ascending; no other is drawn (its times are 0).
-        Every cycle where None.
+        Cycles with a shadow, ascending; the times of other cycles are 0. All cycles if None.
     others : bool
-        Whether other cycles than `sent` are drawn, too; these are then drawn as without them.
+        Whether to sample the other cycles, too; this does not change the samples of `sent`.
     wraps : bool
-        Whether every trace begins anew where it ends, as in the realisation.
+        Whether every trace restarts at its end, as in the realisation.
     """
 
     def drawing(sent: Ints | None) -> Drawing:
@@ -207,7 +206,7 @@ def draw_shadows(
             streams=realisation.streams,
         )
         drawing.sent = sent
-        # Rows of traces follow the releases of whole windows.
+        # Rows of traces depend on the releases of complete windows.
         if realisation.cycles == drawing.cycles:
             drawing.release_ns = realisation.release_ns
         return drawing
@@ -227,12 +226,10 @@ def draw_on_off(
     begin_ns: int,
     horizon_ns: int,
 ) -> OnOffIntervals:
-    """Draw the intervals of an on/off process from its two streams (see `drawn_intervals`).
+    """Sample the intervals of an on/off process from its two streams (see `drawn_intervals`).
 
-    Parameters
-    ----------
-    name : str
-        What the names of the streams begin with: ``bursts/R1->E``, after the prefix of the run.
+    `name` is the common part of the streams' names, such as ``bursts/R1->E`` after the prefix of
+    the run.
     """
     rngs = (
         _generator(stream(seed, f"{name}/every")),
@@ -246,31 +243,31 @@ def _generator(sequence: np.random.SeedSequence) -> np.random.Generator:
 
 
 class Drawing:
-    """A realisation that is drawn some windows at a time: every stream goes on where it was left.
+    """A realisation that is sampled in successive parts of some windows each.
 
-    Releases, and what nodes and links go through, are drawn for the whole run.
+    Releases and the changes of nodes and links are sampled for the entire run.
 
     Parameters
     ----------
     problem : Problem
     scenario : str
-        Name of one of its scenarios.
+        Name of a scenario of the problem.
     seed : int
     windows : int
-        Windows of the whole run.
+        Number of windows of the entire run.
     shadow : bool
-        Whether what belongs to one job or message is drawn for shadow jobs.
+        Whether to sample the quantities of single jobs and messages for shadow jobs.
     wraps : bool
-        Whether every trace begins anew where it ends.
+        Whether every trace restarts at its end.
     streams : str
-        What the names of its streams begin with.
+        Prefix of the names of the streams.
     shared, disturbances
         As in `draw`.
 
     Raises
     ------
     ProblemError
-        If there is no such scenario, or the run is too long.
+        If the scenario does not exist, or the run is too long.
     """
 
     def __init__(
@@ -293,7 +290,7 @@ class Drawing:
         self.streams = streams
         self.cycles = problem.cycles_of(windows)
         self.drawn = 0
-        #: The cycles that are drawn, where it is not every one (see `draw_shadows`).
+        #: The sampled cycles; None for all (see `draw_shadows`).
         self.sent: Ints | None = None
         tasks = problem.pipeline.tasks
         self.sites = tuple((task, node) for task in tasks for node in tasks[task].on)
@@ -303,18 +300,9 @@ class Drawing:
         self.release_ns = self._releases()
 
     def take(self, windows: int) -> Realisation:
-        """Draw the next windows.
+        """Sample the next windows; raise ValueError if fewer remain.
 
-        Returns
-        -------
-        Realisation
-            Of these windows, but for the changes of nodes and the segments of links, which are
-            those of the whole run.
-
-        Raises
-        ------
-        ValueError
-            If fewer are left.
+        The changes of nodes and the segments of links in the result cover the entire run.
         """
         begin, cycles = self.drawn, windows * self.problem.window_cycles
         if begin + cycles > self.cycles:
@@ -344,7 +332,7 @@ class Drawing:
         )
 
     def take_sent(self, realisation: Realisation, whole: Realisation | None) -> Realisation:
-        """Draw the cycles that are sent; the others are those of `whole`, or 0."""
+        """Sample the cycles in `sent`; the others are taken from `whole`, or are 0."""
         drawn = self._filled(0 if self.sent is None else len(self.sent))
         table = np.zeros((len(drawn), self.cycles), np.int64)
         if whole is not None:
@@ -361,8 +349,8 @@ class Drawing:
         )
 
     def _filled(self, cycles: int) -> Ints:
-        """Draw the next cycles: a row for each site, then hop, then layer of extra delay."""
-        # One piece of memory: the system maps large ones by larger pages.
+        """Sample the next cycles, with one row per site, then per hop, then per extra delay."""
+        # One block of memory: the system uses larger pages for large blocks.
         rows = len(self.sites) + len(self.hops) + len(self._layers())
         table = np.empty((rows, cycles), np.int64)
         for at in range(0, cycles, BLOCK):
@@ -382,15 +370,15 @@ class Drawing:
 
     @cached_property
     def changes(self) -> tuple[NodeChanges, LinkSegments]:
-        """What nodes and links go through in the whole run."""
+        """Changes of nodes and segments of links in the entire run."""
         return self._node_changes(), self._link_segments()
 
     def episodes(self) -> Scenario:
-        """Return the scenario with a disturbance for each of the episodes drawn."""
+        """Return the scenario with one disturbance for each sampled episode."""
         return tuple(one for item in self.scenario for one in self._episodes_of(item))
 
     def _phases(self) -> dict[str, Phase]:
-        """Draw where periods and ticks are when the run begins, where a quota is bound to ticks."""
+        """Sample the phases of quota periods and ticks for nodes that check quotas at ticks."""
         phases = {}
         for name, node in self.problem.fabric.nodes.items():
             if node.quota is not None and node.quota.tick_ms > 0:
@@ -409,13 +397,13 @@ class Drawing:
 
     def _stream(self, name: str) -> np.random.SeedSequence:
         if self.shadow and name.startswith(OF_A_JOB):
-            # Losses have a key, whichever cycles are drawn.
+            # The key of the losses does not depend on the sampled cycles.
             sent = self.sent is not None and not name.startswith("loss/")
             name = f"shadow/sent/{name}" if sent else f"shadow/{name}"
         return stream(self.seed, f"{self.streams}{name}")
 
     def _path(self, process: Process, name: str) -> Path:
-        """Return the path of a stream, from where it was left."""
+        """Return the path of a stream, which continues after its last value."""
         if name not in self.paths:
             if isinstance(process, Trace):
                 rows = self._table_rows(process.table)
@@ -427,13 +415,13 @@ class Drawing:
                 if self.sent is not None and not (
                     name.startswith(OF_A_JOB) and independent(process)
                 ):
-                    # Drawn for every cycle, and taken for those that are sent.
+                    # Sample all cycles and select those with a shadow.
                     path = ReplayedPath(path.values(self.cycles), self.sent)
             self.paths[name] = path
         return self.paths[name]
 
     def _releases(self) -> Ints:
-        """Draw the instant of every release, and of that of the first cycle beyond the run."""
+        """Sample the instants of all releases, and of the first release after the run."""
         pipeline, count = self.problem.pipeline, self.cycles + 1
         release = np.empty(count, np.int64)
         for at in range(0, count, BLOCK):
@@ -444,7 +432,7 @@ class Drawing:
         jitter = pipeline.release_jitter_ms
         if jitter == Constant(0.0):
             return release
-        # Rows of a trace follow the releases; for its own jitter they follow the nominal ones.
+        # Rows of a trace depend on the releases; a trace of the jitter uses the nominal releases.
         self.release_ns = release
         path, last_ns = self._path(jitter, "release"), int(release[-1])
         for at in range(0, self.cycles, BLOCK):
@@ -459,24 +447,24 @@ class Drawing:
                 )
                 raise ProblemError([Fault("release_jitter_ms", message)])
             block += late
-        # A cycle is never released before the one ahead of it.
+        # A cycle is never released before its predecessor.
         return np.maximum.accumulate(release, out=release)
 
     def _table_rows(self, table: TraceTable) -> Ints:
         if id(table) not in self.rows:
             rng = self._rng(f"trace/{table.stream}/{table.by}/{table.group}")
-            # The last release only closes the last window; no cycle needs a row for it.
+            # The last release only ends the last window and needs no row.
             release_ms = self.release_ns[:-1] / NS_PER_MS
             self.rows[id(table)] = table, table.replay(rng, release_ms, wraps=self.wraps)
         return self.rows[id(table)][1]
 
     def _trace_starts(self) -> Iterator[TraceStart]:
-        """Yield where each trace that has been replayed began."""
+        """Yield the first row of each replayed trace."""
         for table, rows in self.rows.values():
             yield TraceStart(table.file, tuple(table.columns), int(rows[0]) + 1)
 
     def _fill_executions(self, out: Ints) -> None:
-        """Draw the next execution times, a row a site."""
+        """Sample the next execution times, one row per site."""
         pipeline = self.problem.pipeline
         factors: dict[str, Floats] = {}
         for row, (task, node) in zip(out, self.sites, strict=True):
@@ -489,13 +477,13 @@ class Drawing:
             path.fill_ns(row, factors[scale] if scale is not None else None)
 
     def _fill_delays(self, out: Ints) -> None:
-        """Draw the next delays, a row a hop."""
+        """Sample the next delays, one row per hop."""
         links = self.problem.fabric.links
         for row, hop in zip(out, self.hops, strict=True):
             self._path(links[hop[2]].delay_ms, f"delay/{_hop_name(hop)}").fill_ns(row)
 
     def _fill_extra(self, out: Ints) -> None:
-        """Draw the next extra delays, a row a layer."""
+        """Sample the next extra delays, one row per layer."""
         row = 0
         for hop in self.hops:
             for ordinal, (process, count) in enumerate(self._added(hop[2])):
@@ -506,7 +494,7 @@ class Drawing:
                 row += count
 
     def _layers(self) -> tuple[tuple[int, int], ...]:
-        """Hop and number of each layer of extra delay."""
+        """Return the hop and number of each layer of extra delay."""
         return tuple(
             (i, layer)
             for i, hop in enumerate(self.hops)
@@ -514,7 +502,7 @@ class Drawing:
         )
 
     def _added(self, name: str) -> list[tuple[Process, int]]:
-        """Extra delays of a link and their layers: its bursts first, then the scenario's items."""
+        """Return a link's extra delays with their layers: first bursts, then disturbances."""
         bursts = self.problem.fabric.links[name].bursts
         added = [(bursts.add_delay_ms, 1)] if bursts is not None else []
         items = self._on_link(name)
@@ -527,7 +515,7 @@ class Drawing:
         return [i for i in self.scenario if isinstance(i, LinkDisturbance) and i.link == link]
 
     def _bursts(self, bursts: Bursts, name: str) -> OnOffIntervals:
-        """Draw the bursts of the node or link of this name, up to the end of the run."""
+        """Sample the bursts of a node or link up to the end of the run."""
         streams = "" if name in self.shared else self.streams
         horizon_ns, name = int(self.release_ns[-1]), f"{streams}bursts/{name}"
         return draw_on_off(
@@ -535,7 +523,7 @@ class Drawing:
         )
 
     def _intervals(self, item: Disturbance) -> OnOffIntervals:
-        """Return the times at which a disturbance is on, up to the end of the run."""
+        """Return the intervals of a disturbance up to the end of the run."""
         begin_ns = round(item.at_s * NS_PER_S)
         end_ns = max(begin_ns, round(min(begin_ns + item.for_s * NS_PER_S, HORIZON_NS)))
         if item.ramp_s:
@@ -543,14 +531,14 @@ class Drawing:
         if item.episodes is None:
             return interval(begin_ns, end_ns)
         episodes, horizon_ns = item.episodes, min(end_ns, int(self.release_ns[-1]))
-        # The stream has the name of the episodes alone: what shares it comes and goes together.
+        # The stream is named after the episodes: disturbances with the same name are simultaneous.
         name, every, length = episodes.name, episodes.every_s, episodes.for_s
         name = f"{'' if self._is_shared(item) else self.streams}episodes/{name}"
         drawn = draw_on_off(self.seed, name, every, length, NS_PER_S, begin_ns, horizon_ns)
         return drawn.until(end_ns)
 
     def _episodes_of(self, item: Disturbance) -> Iterator[Disturbance]:
-        """Yield a disturbance for each time that one is on; itself where it has no episodes."""
+        """Yield one disturbance per episode; a disturbance without episodes is unchanged."""
         if item.episodes is None:
             yield item
             return
@@ -560,7 +548,7 @@ class Drawing:
             yield replace(item, at_s=begin_ns / NS_PER_S, for_s=length_s, episodes=None)
 
     def _node_changes(self) -> NodeChanges:
-        """Merge stress, bursts and outages of nodes into the states they go through."""
+        """Merge stress, bursts and outages of nodes into their changes over time."""
         nodes = self.problem.fabric.nodes
         effects = []
         for number, node in enumerate(nodes.values()):
@@ -584,7 +572,7 @@ class Drawing:
         )
 
     def _link_segments(self) -> LinkSegments:
-        """Merge bursts and faults of each link into the segments of its time."""
+        """Merge bursts and faults of each link into segments."""
         links = self.problem.fabric.links
         tables = [(np.empty((0, 4), np.int64), np.empty((0, 2)))]
         for number, link in enumerate(links.values()):
@@ -598,7 +586,7 @@ class Drawing:
             for item in self._on_link(link.name):
                 layers = np.zeros(LEVELS, np.int64)
                 if item.layers:
-                    # The level of a ramp in binary says which of its layers are on.
+                    # The bits of a ramp's level are its active layers.
                     layers = (np.arange(LEVELS) if item.ramp_s else ON) << layer
                     layer += item.layers
                 arriving = 1 - item.loss * STRENGTHS
@@ -611,16 +599,16 @@ class Drawing:
 
 
 def _split(rows: Ints) -> None:
-    """Split the last row into layers that weigh 1, 2, 4, ... of `RAMP_STEPS` and sum up to it."""
+    """Split the last row into layers with the weights 1, 2, 4, ... of `RAMP_STEPS`."""
     weights = 2 ** np.arange(len(rows) - 1)
-    # The whole and the rest apart: 64 bits may not hold the product.
+    # Multiply quotient and remainder separately: the product may need more than 64 bits.
     whole, rest = np.divmod(rows[-1], RAMP_STEPS)
     rows[:-1] = whole * weights[:, None] + rest * weights[:, None] // RAMP_STEPS
     rows[-1] -= rows[:-1].sum(axis=0)
 
 
 def _rates(own_mbps: float, mbps: float) -> Floats:
-    """Rate of a link at each level of a disturbance: the time that a bit takes grows evenly."""
+    """Return the rate of a link at each level of a disturbance; the time per bit is linear."""
     rates = np.full(LEVELS, math.inf)
     if mbps < math.inf:
         rates[1:] = 1 / ((1 - STRENGTHS[1:]) / own_mbps + STRENGTHS[1:] / mbps)
@@ -634,7 +622,7 @@ def _hop_name(hop: tuple[str, str, str]) -> str:
 
 
 def _hops(problem: Problem) -> tuple[tuple[str, str, str], ...]:
-    """Flows on the links they cross in some candidate, in the order of flows and links."""
+    """Return flows with the links that they use in some candidate, by flow, then by link."""
     hops: dict[tuple[str, str, str], None] = {}
     for flow in problem.pipeline.flows:
         crossed = {
@@ -644,12 +632,12 @@ def _hops(problem: Problem) -> tuple[tuple[str, str, str], ...]:
         for link in problem.fabric.links:
             if link in crossed:
                 hops[flow.source, flow.target, link] = None
-    # Whether migrations are cold or warm, so that both meet the same realisation.
+    # Always add the hops of states: cold and warm migrations then have the same realisation.
     return (*hops, *_state_hops(problem))
 
 
 def _state_hops(problem: Problem) -> Iterator[tuple[str, str, str]]:
-    """State of tasks on the links it crosses when they move: a flow from a task to itself."""
+    """Yield the state of tasks with the links that it may use, as a flow from a task to itself."""
     for name, task in problem.pipeline.tasks.items():
         if task.state_bytes == 0:
             continue

@@ -1,4 +1,4 @@
-"""Realisation: one draw of everything random in a scenario, before any policy acts."""
+"""Realisation: one sample of all random quantities of a scenario, independent of the policy."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dwell.model.bounds import counted
 
 
 class NodeChange(NamedTuple):
-    """From `at_ns` on, a node has `threads` foreign threads in all, and is `down` or not."""
+    """State of a node from `at_ns` on: number of foreign threads, and whether it is down."""
 
     at_ns: int
     node: str
@@ -23,20 +23,20 @@ class NodeChange(NamedTuple):
 
 
 class LinkSegment(NamedTuple):
-    """From `at_ns` until the link's next segment: its whole state, its own loss and rate included.
+    """Complete state of a link from `at_ns` until the link's next segment.
 
     Parameters
     ----------
     at_ns : int
         Begin; the first segment of a link begins at 0.
     link : str
-        ``R1->E``.
+        Name of the link, such as ``R1->E``.
     loss : float
-        Probability that one attempt is lost.
+        Probability that an attempt is lost, from the link itself and from disturbances.
     rate_mbps : float
-        Infinite where messages do not queue.
+        Infinite if messages do not queue.
     layers : tuple of int
-        Which of the link's extra-delay layers add to the delay of every message.
+        Active layers of extra delay, which add to the delay of every message.
     """
 
     at_ns: int
@@ -48,16 +48,14 @@ class LinkSegment(NamedTuple):
 
 
 class Phase(NamedTuple):
-    """Instants at which the kernel of a node looks at its quota.
+    """Phase of the quota periods and timer ticks of a node.
 
     Parameters
     ----------
     period_ago_ns, tick_ago_ns : int
-        How long before time 0 a period of the quota had begun, and how long before it the last tick
-        was.
+        Time from the begin of a quota period, and from the last tick, to time 0.
     wakes : int
-        Stream of the times between two wakes of the background (see
-        ``attempts.h``), 63 bits.
+        Random stream of the times between wakes of the background (see ``attempts.h``), 63 bits.
     """
 
     period_ago_ns: int = 0
@@ -66,16 +64,16 @@ class Phase(NamedTuple):
 
 
 class TraceStart(NamedTuple):
-    """Where the replay of a trace begins.
+    """First row of the replay of a trace.
 
     Parameters
     ----------
     file : str
-        As written in the cell file.
+        Name of the trace file in the cell file.
     columns : tuple of str
-        The columns of it that are replayed from there, together.
+        Columns that are replayed from this row on.
     row : int
-        Row of the first cycle, from 1; rows that ``on_negative: drop`` leaves out do not count.
+        Row of the first cycle, counted from 1 without the rows that ``on_negative: drop`` omits.
     """
 
     file: str
@@ -84,12 +82,12 @@ class TraceStart(NamedTuple):
 
 
 class NodeChanges(Sequence[NodeChange]):
-    """The changes of all nodes, ascending in time: rows of arrays that read as `NodeChange`.
+    """Changes of all nodes, in ascending order of time; a sequence of `NodeChange`.
 
     Attributes
     ----------
     nodes : tuple of str
-        Nodes, in the order that the column `node` counts.
+        Names of the nodes; the column `node` contains indices into them.
     table : int64 array, shape (changes, 4)
         Columns at_ns, node, threads, down.
     """
@@ -99,7 +97,7 @@ class NodeChanges(Sequence[NodeChange]):
 
     @classmethod
     def of(cls, changes: Iterable[NodeChange]) -> NodeChanges:
-        """Make them from single changes."""
+        """Return changes as arrays."""
         if isinstance(changes, NodeChanges):
             return changes
         rows = list(changes)
@@ -127,12 +125,12 @@ class NodeChanges(Sequence[NodeChange]):
 
 
 class LinkSegments(Sequence[LinkSegment]):
-    """The segments of all links, per link ascending in time, that read as `LinkSegment`.
+    """Segments of all links, in ascending order of time per link; a sequence of `LinkSegment`.
 
     Attributes
     ----------
     links : tuple of str
-        Links, in the order that the column `link` counts.
+        Names of the links; the column `link` contains indices into them.
     table : int64 array, shape (segments, 4)
         Columns at_ns, link, down, and the layers as bits.
     table_f : float64 array, shape (segments, 2)
@@ -146,7 +144,7 @@ class LinkSegments(Sequence[LinkSegment]):
 
     @classmethod
     def of(cls, segments: Iterable[LinkSegment]) -> LinkSegments:
-        """Make them from single segments."""
+        """Return segments as arrays."""
         if isinstance(segments, LinkSegments):
             return segments
         rows = list(segments)
@@ -183,27 +181,26 @@ class LinkSegments(Sequence[LinkSegment]):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Realisation:
-    """All that is random in a run of N cycles, for every feasible (task, node) and every link.
+    """All random quantities of a run of N cycles, for every feasible (task, node) and every link.
 
     Parameters
     ----------
     seed : int or None
-        None where it was recorded, not drawn.
+        None if the realisation was recorded.
     windows : int
-        Windows of W cycles the run has; N = windows * W, or less where the last is incomplete.
+        Number of windows of W cycles; N = windows * W, or less if the last window is incomplete.
     release_ns : int64 array, shape (N + 1,)
-        Release instant of every cycle, ascending; the last entry is that of the first cycle beyond
-        the last window.
+        Release instant of every cycle, ascending; the last entry is the release after the N cycles.
     sites : tuple of (task, node)
         Rows of `exec_ns`.
     exec_ns : int64 array, shape (sites, N)
         Execution time of each cycle's job, scale included.
     hops : tuple of (source task, target task, link)
-        Rows of `delay_ns` and `loss_keys`: a flow on a link that it crosses in some candidate.
+        Rows of `delay_ns` and `loss_keys`: a flow and a link that it uses in some candidate.
     delay_ns : int64 array, shape (hops, N)
         Propagation delay of each cycle's message, without disturbances.
     loss_keys : uint64 array, shape (hops,)
-        Stream of the attempts of each hop (see ``attempts.h``).
+        Random stream of the attempts of each hop (see ``attempts.h``).
     layers : tuple of (hop index, layer)
         Rows of `extra_ns`; `layer` counts per link.
     extra_ns : int64 array, shape (layers, N)
@@ -213,11 +210,11 @@ class Realisation:
     link_segments : sequence of LinkSegment
         Per link ascending in time; kept as `LinkSegments`.
     phases : mapping of str to Phase
-        Phases of the nodes whose kernel checks quotas at ticks; a node left out has phase 0.
+        Phases of the nodes whose kernel checks quotas at ticks; other nodes have phase 0.
     trace_starts : tuple of TraceStart
-        Where each replayed trace began.
+        First row of each replayed trace.
     streams : str
-        What the names of its streams begin with.
+        Prefix of the names of the random streams.
     """
 
     scenario: str
@@ -249,7 +246,7 @@ class Realisation:
         )
 
     def until(self, cycles: int) -> Realisation:
-        """Return its first cycles; its last window is incomplete where they end in it."""
+        """Return the first cycles; the last window may become incomplete."""
         if cycles == self.cycles:
             return self
         return replace(
@@ -261,10 +258,10 @@ class Realisation:
         )
 
     def is_cut(self, problem: Problem) -> bool:
-        """Whether its last window is incomplete."""
+        """Whether the last window is incomplete."""
         return self.cycles < self.windows * problem.window_cycles
 
     @property
     def cycles(self) -> int:
-        """N."""
+        """Number of cycles."""
         return len(self.release_ns) - 1

@@ -1,4 +1,4 @@
-"""What the kernel is handed: the structs of ``rows.h``, and tables whose rows they are."""
+"""Arguments of the kernel: the structs of ``rows.h``, and tables with them as rows."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from dwell.kernels.library import foreign
 from dwell.model.number_arrays import Floats, Ints
 from dwell.model.scenario import RAMP_STEPS
 
-#: Rows of structs, whose fields `row_types` has.
+#: Rows of structs, with the fields in `row_types`.
 Rows: TypeAlias = NDArray[np.void]
 Row: TypeAlias = Any
 
-#: How strong a disturbance may be: not at all, or as strong as after each step of a ramp.
+#: Number of levels of a disturbance: off, and one per step of a ramp.
 LEVELS = RAMP_STEPS + 1
 
-#: Arrays as functions of the library take them: of one type, in one piece.
+#: Types of array arguments of the library's functions: one element type, contiguous.
 FLOATS_IN = np.ctypeslib.ndpointer(np.float64, ndim=1, flags="C_CONTIGUOUS")
 INTS_OUT, INT_ROWS_OUT, FLOATS_OUT, FLOAT_ROWS_OUT = (
     np.ctypeslib.ndpointer(kind, ndim=ndim, flags=("C_CONTIGUOUS", "WRITEABLE"))
@@ -29,7 +29,7 @@ INTS_OUT, INT_ROWS_OUT, FLOATS_OUT, FLOAT_ROWS_OUT = (
     for ndim in (1, 2)
 )
 
-#: Types of fields that are no structs; a pointer, as to times, is an address.
+#: Types of fields other than structs; a pointer is an address.
 PLAIN: dict[str, Any] = {
     "i8": ctypes.c_int8,
     "i16": ctypes.c_int16,
@@ -81,10 +81,10 @@ def row_types() -> dict[str, np.dtype[Any]]:
 class Tables(NamedTuple):
     """Every array of a simulation, in the kernel's order.
 
-    Fixed: what the problem and the realisation say. State: what changes as the clock goes on.
-    Outputs: per cycle, per window, and logs where they are kept. Columns of a table of structs
-    are those of its row in ``rows.h``. N is the number of cycles, "tasks" and "flows" of a cell are
-    those of the cell with most.
+    Fixed tables describe the problem and the realisation. State tables change during the
+    simulation. Outputs are tables per cycle and per window, and optional logs. ``rows.h`` declares
+    the columns of tables of structs. N is the number of cycles; the dimensions "tasks" and "flows"
+    of a cell are maxima over all cells.
     """
 
     clock: Rows  # (1,)
@@ -154,12 +154,9 @@ class Tables(NamedTuple):
     log_arrived: Ints  # (cells * L, flows), or empty
 
     def addresses(self) -> NDArray[np.uint64]:
-        """Return what the kernel is handed: address and length of every table.
+        """Return the address and length of every table.
 
-        Raises
-        ------
-        TypeError
-            If a table's rows are not the kernel's, or not one after another.
+        Raises TypeError if a table has another row type than the kernel's, or is not contiguous.
         """
         tables: tuple[NDArray[Any], ...] = self
         for (name, kind), table in zip(row_types().items(), tables, strict=True):

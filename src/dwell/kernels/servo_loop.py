@@ -1,19 +1,19 @@
-"""The reference visual-servo loop: a plant that follows a moving target, exactly between events.
+"""The reference visual-servo loop: a plant that follows a moving target, with exact solutions.
 
 The plant has one axis: an integrator x' = u, or a double integrator x'' = u. The target moves as
-r(t) = A sin(w t). At the release of a cycle the camera sees the error e = r - x (and, for the
-double integrator, its rate), and the control law makes a command of it:
+r(t) = A sin(w t). At the release of a cycle the camera measures the error e = r - x (and, for the
+double integrator, its rate), from which the control law computes a command:
 
     u = K e                for the integrator: eq. 4 of Chaumette and Hutchinson 2006, DOI
                            10.1109/MRA.2006.250573, on one axis
     u = K e + B e'         for the double integrator
 
-The command takes effect at the cycle's actuation and is held until that of the next one (zero-order
-hold). Between two actuations x is therefore a polynomial in t, and nothing is integrated step by
-step. The two integrals of the error, of e^2 and of |e|, are taken over pieces of a hold that are so
-short (w h <= 0.2) that a Taylor polynomial of degree 4 about their middle stands for the target: it
-is off by less than A (w h / 2)^5 / 120 < 1e-7 A. e^2 is integrated in closed form; |e| too, between
-the zeros of e, which are found where the error changes its sign or turns inside the piece.
+The command takes effect at the cycle's actuation and is held until the next actuation (zero-order
+hold). Between two actuations x is a polynomial in t, known in closed form. The integrals of e^2 and
+|e| are sums over short pieces of a hold (w h <= 0.2). In each piece a Taylor polynomial of degree 4
+about the midpoint replaces the target; its error is less than A (w h / 2)^5 / 120 < 1e-7 A. Both
+integrals are in closed form; |e| is integrated between the zeros of e, which the loop searches if
+the error changes its sign or has an extremum inside the piece.
 
 Times are seconds from the start of the run. `servo_loop.cpp` has the loop.
 """
@@ -31,7 +31,7 @@ from dwell.model.number_arrays import Floats
 
 # Status.
 DONE, DIVERGED = 0, 1
-# Columns of a state: since when, and position, velocity and acceleration then.
+# Columns of a state: its instant, and position, velocity and acceleration at that instant.
 SINCE, POSITION, VELOCITY, ACCELERATION = 0, 1, 2, 3
 N_STATE = 4
 
@@ -39,27 +39,27 @@ N_STATE = 4
 def follow(
     servo: Servo, measured_s: Floats, actuated_s: Floats, begin_s: float, end_s: float
 ) -> tuple[int, Floats, Floats]:
-    """Play the loop from rest at 0 and integrate its error.
+    """Simulate the loop from rest at 0 and integrate its error.
 
     Parameters
     ----------
     servo : Servo
         Plant, control law and target.
     measured_s, actuated_s : float64 array, shape (n,)
-        Instants at which the error of each command was seen, and at which it took effect; both
-        ascending, none seen after it took effect.
+        Instants of measurement and actuation of each command; both ascending, and no actuation
+        before its measurement.
     begin_s, end_s : float
-        What the integrals are taken over.
+        Limits of the integrals.
 
     Returns
     -------
     status : int
-        DONE, or DIVERGED where the position went beyond 10^6 amplitudes; the integrals are then
-        not complete.
+        DONE, or DIVERGED if the position exceeded 10^6 amplitudes; the integrals are then
+        incomplete.
     integrals : float64 array, shape (2,)
-        Of e^2 and of |e|, in units of the amplitude squared times s, and of the amplitude times s.
+        Integrals of e^2 and |e|, in amplitude squared times s, and in amplitude times s.
     states : float64 array, shape (n + 1, N_STATE)
-        The state at the begin of every hold; the first is 0.
+        The state at the start of every hold; the first is 0.
     """
     n, target = len(actuated_s), servo.target
     if len(measured_s) != n:

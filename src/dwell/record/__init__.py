@@ -1,4 +1,4 @@
-"""The Run: its schema, tables, open, save; the journal of one that is still going on."""
+"""Records of runs: schema and tables, files of finished runs, and journals of live runs."""
 
 from dwell.model.table_columns import Feature
 from dwell.record.fleet_run import FleetRun, is_fleet, open_fleet

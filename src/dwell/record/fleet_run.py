@@ -1,7 +1,7 @@
-"""FleetRun: the runs of the cells of a fleet that were played together.
+"""FleetRun: the runs of all cells of a fleet, which were simulated together.
 
-Its folder has a run's folder for every cell, ``fleet-windows.parquet`` with the load of the shared
-nodes, and ``fleet.json``, which is put in its place when all the others are there.
+The folder of a fleet contains one run folder per cell, ``fleet-windows.parquet`` with the load of
+the shared nodes, and ``fleet.json``, which gets this name after all other files are complete.
 """
 
 from __future__ import annotations
@@ -28,35 +28,35 @@ if TYPE_CHECKING:
     import polars as pl
     from numpy.typing import NDArray
 
-#: `FLEET` until all the rest is written.
+#: Name of `FLEET` until all other files are written.
 UNFINISHED = f".{FLEET}.unfinished"
 LOAD = "fleet-windows.parquet"
-#: How many runs that are not whole are told of.
+#: Largest number of incomplete runs that a message lists.
 LISTED = 4
 
 
 class FleetRun:
-    """What became of a fleet.
+    """Runs of the cells of a fleet, and the load of the nodes that they share.
 
     Parameters
     ----------
     fleet : Fleet
-        As it was played.
+        The simulated fleet.
     cells : mapping of str to Run
-        By the cells' names.
+        Runs by the names of the cells.
     load : mapping of str to array, or function that makes a DataFrame
-        Of every shared node over time (see `dwell.sim.shared_load`).
+        Load of every shared node over time (see `dwell.sim.shared_load`).
     seed : int
     seconds : float
-        Length of the run: every cell is released until then.
+        Length of the run; every cell releases cycles until then.
     guard : bool
         Whether guards acted.
     phases_ms : mapping of str to float
         Offset of every cell's releases.
     faults : sequence of str
-        Why cells of the fleet are not among these.
+        Reasons why runs of the fleet are missing from `cells`.
     finished : bool
-        Whether all was written.
+        Whether all files of the fleet were written.
     """
 
     def __init__(
@@ -82,14 +82,14 @@ class FleetRun:
 
     @property
     def windows(self) -> pl.DataFrame:
-        """Windows of all cells, with a column `cell`; what a cell does not have is null."""
+        """Windows of all cells, with a column `cell`; columns that a cell lacks are null."""
         return self._all("windows")
 
     @property
     def decisions(self) -> pl.DataFrame:
-        """Decisions of all cells, with a column `cell`; what a cell does not have is null.
+        """Decisions of all cells, with a column `cell`; columns that a cell lacks are null.
 
-        Φ and rounds are there also where nobody was asked.
+        The columns of Φ and the round always exist; without coordination they are null.
         """
         import polars as pl
 
@@ -112,7 +112,7 @@ class FleetRun:
             getattr(run, table).select(pl.lit(name).alias("cell"), pl.all())
             for name, run in self.cells.items()
         ]
-        # A column of names has those of all cells.
+        # Merge the categories of all cells for each Enum column.
         names: dict[str, dict[str, None]] = {}
         for frame in frames:
             for column, kind in frame.schema.items():
@@ -123,18 +123,17 @@ class FleetRun:
         return pl.concat(casts, how="diagonal_relaxed")
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the fleet's folder: a run's folder a cell, and ``fleet.json`` last.
+        """Write the fleet's folder: one run folder per cell, and ``fleet.json`` last.
 
         Parameters
         ----------
         path : path-like
-            Folder to make. One that holds this fleet's runs already gets them again; anything else
-            is refused.
+            Folder to make. Runs of the same fleet and settings in it are replaced.
 
         Raises
         ------
         RunError
-            If the folder holds something else, or cannot be written.
+            If the folder holds anything else, or cannot be written.
         """
         folder = Path(path)
         described = self._described()
@@ -164,12 +163,9 @@ class FleetRun:
 
 
 def describe_fleet(fleet: Fleet, **settings: Any) -> dict[str, Any]:
-    """Return what ``fleet.json`` says of a fleet that was played with some settings.
+    """Return the content of ``fleet.json``.
 
-    Parameters
-    ----------
-    **settings : JSON-able
-        Seed, seconds, guard, versions, and the phases as drawn, ms by cell.
+    The settings are seed, seconds, guard, versions, and the phases (ms by cell), all JSON-able.
     """
     document = fleet_document(fleet)
     digest = hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
@@ -186,7 +182,7 @@ def describe_fleet(fleet: Fleet, **settings: Any) -> dict[str, Any]:
 
 
 def fleet_document(fleet: Fleet) -> Document:
-    """Return a fleet as plain values: as its file has it, but with every cell in its place."""
+    """Return a fleet as JSON-able values, with the complete cell in every entry."""
     entries = [{"cell": to_document(entry.cell), **_keys(entry)} for entry in fleet.entries]
     return {"name": fleet.name, "cells": entries, **_keys(fleet)}
 
@@ -211,12 +207,12 @@ def _fleet_of(document: Mapping[str, Any], file: str) -> Fleet:
 
 
 def require_free_or_same(folder: Path, described: Mapping[str, Any]) -> None:
-    """Refuse a folder to which a fleet's runs may not be written.
+    """Refuse a folder unless it is empty, missing, or of the same fleet and settings.
 
     Raises
     ------
     RunError
-        If it holds anything but the runs of this fleet under the same settings.
+        If the folder holds anything else.
     """
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
@@ -229,27 +225,28 @@ def require_free_or_same(folder: Path, described: Mapping[str, Any]) -> None:
 
 
 def _described_in(folder: Path) -> Path | None:
-    """Return the file that says which fleet's folder it is; None where it is none."""
+    """Return the file that describes a fleet's folder; None in any other folder."""
     return next((folder / one for one in (FLEET, UNFINISHED) if (folder / one).is_file()), None)
 
 
 def is_fleet(path: str | os.PathLike[str]) -> bool:
-    """Whether a folder has a fleet's runs in it, all of them or some."""
+    """Whether a folder holds the runs of a fleet, complete or not."""
     return _described_in(Path(path)) is not None
 
 
 def open_fleet(path: str | os.PathLike[str], *, whole: bool = True) -> FleetRun:
-    """Open a fleet's folder; tables are read when first asked for.
+    """Open a fleet's folder; each table is read at the first access.
 
     Parameters
     ----------
     whole : bool
-        Whether all runs have to be there; else those that are not are among the faults.
+        Whether to require all runs. Otherwise `FleetRun.faults` explains the missing runs.
 
     Raises
     ------
     RunError
-        If the folder is missing or none of a fleet, or not all runs are whole.
+        If the folder is missing or not of a fleet, if it has no complete run, or if a run is
+        incomplete and `whole` is true.
     """
     folder = Path(path)
     if not folder.is_dir():
@@ -292,11 +289,11 @@ def open_fleet(path: str | os.PathLike[str], *, whole: bool = True) -> FleetRun:
 
 
 def how_many_are_whole(count: int, of: int) -> str:
-    """Return how many runs of a fleet there are."""
+    """Return a message about the number of complete runs."""
     return f"{count} of {of} runs are whole"
 
 
 def listed(faults: Sequence[str]) -> list[str]:
-    """Return the first of some faults, and how many more there are."""
+    """Return the first `LISTED` faults, and a line with the number of further ones."""
     more = [f"and {len(faults) - LISTED} more"] if len(faults) > LISTED else []
     return [*faults[:LISTED], *more]

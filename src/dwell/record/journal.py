@@ -1,13 +1,13 @@
-"""Journal: the rows of a run that is still going on, written so that a kill costs little.
+"""Journal of a live run: a kill at any moment loses at most the frame that is being written.
 
-A run's tables are written when it ends. A live run may end at any moment, so that its rows go to
-one file first, ``journal.bin`` in the run's folder, as frames of what belongs together (a window
-with its cycles and its decision): a frame is there as a whole, or not at all. Rows of cycles and
-windows may come again with what has become known since; the last one counts. `open_run` reads a
-folder that has only a journal; sealing it writes the tables, then ``run.json``, and removes it.
+A live run appends its rows to ``journal.bin`` in its folder. Each frame contains rows that belong
+together, such as a window with its cycles and its decision; readers take complete frames only. A
+later row of a cycle or window replaces an earlier row with the same number. `open_run` reads a
+folder that has only a journal. `seal_run` writes the tables, then ``run.json``, and removes the
+journal.
 
-A frame is a mark that occurs nowhere else, the length of its text, a checksum of both, and the text
-(JSON, ASCII). What was torn by a kill is cut off; what was damaged is skipped, up to the next mark.
+A frame consists of a mark, the length of its text, a checksum of both, and the text (JSON, ASCII;
+the mark is not ASCII). A writer cuts off a torn end; a reader skips damage up to the next mark.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ TYPES = ("Int64", "Float64", "Boolean", "String")
 MARK = b"\xd3DJ1"
 HEAD = struct.Struct("<II")
 BEGIN = len(MARK) + HEAD.size
-#: Longer frames are not written, and a length beyond it is damage.
+#: Largest text of a frame that is written.
 MAX_FRAME_BYTES = 1 << 28
-#: Rows that are kept as Python objects before they become a table.
+#: Number of rows that are kept as Python objects before they become a table.
 CHUNK_ROWS = 20_000
 
 
@@ -56,7 +56,7 @@ def _frame(content: Mapping[str, object]) -> bytes:
 
 
 def _plain(value: object) -> object:
-    """Numbers of NumPy as plain ones."""
+    """Return a NumPy number as a Python number."""
     item = getattr(value, "item", None)
     if item is None:
         raise TypeError(f"{value!r} cannot be written to a journal")
@@ -68,7 +68,7 @@ def _checksum(text: bytes) -> int:
 
 
 def _frames(data: bytes | mmap.mmap) -> Iterator[tuple[int, bytes]]:
-    """Yield the place and the text of every frame that is whole."""
+    """Yield the offset and the text of every complete frame."""
     place = data.find(MARK)
     while place >= 0:
         text = _text_at(place, data)
@@ -88,7 +88,7 @@ def _text_at(place: int, data: bytes | mmap.mmap) -> bytes | None:
 
 
 class _Table:
-    """Rows of one table as they come, kept as columns; as they are where they are not packed."""
+    """Rows of one table; packed rows become a data frame, other rows remain lists."""
 
     def __init__(self, name: str, columns: Types, *, packed: bool) -> None:
         self.name, self.columns, self.packed = name, columns, packed
@@ -112,7 +112,7 @@ class _Table:
         self.rows = []
 
     def frame(self) -> pl.DataFrame:
-        """Return the table: one row a number, in their order."""
+        """Return the table; a numbered table has one row per number, in ascending order."""
         import polars as pl
 
         if self.rows or not self.chunks:
@@ -124,7 +124,7 @@ class _Table:
         return frame
 
     def plain(self) -> dict[str, list[Any]]:
-        """Return the same as plain columns, of rows that are not packed."""
+        """Return the columns as lists; needs rows that are not packed."""
         rows: Sequence[Sequence[Any]] = self.rows
         if self.name in NUMBERED:
             last = {row[0]: row for row in rows}
@@ -134,16 +134,16 @@ class _Table:
 
 @dataclass(slots=True)
 class _Contents:
-    """Frames of a journal put together, with or without their rows.
+    """Combined frames of a journal, with or without their rows.
 
     Parameters
     ----------
     end : int
-        Where the last whole frame ends.
+        Offset of the end of the last complete frame.
     damaged : list of int
-        Bytes of every place between frames that is none.
+        Length in bytes of each damaged part before a complete frame.
     torn_bytes : int
-        Bytes after the last whole frame.
+        Number of bytes after the last complete frame.
     """
 
     run: str | None = None
@@ -203,18 +203,18 @@ def _read(data: bytes | mmap.mmap, *, keep: bool = True, packed: bool = True) ->
 def read_journal(
     folder: str | os.PathLike[str],
 ) -> tuple[dict[str, Any], dict[str, pl.DataFrame]]:
-    """Read what a folder's journal holds, also while it is written.
+    """Read a folder's journal as data frames, also while a process writes it.
 
     Returns
     -------
     meta : dict
-        Metadata that the writer gave the run, and under ``recovered`` what was lost.
+        Metadata from the writer; ``recovered`` counts the losses.
     tables : dict of str to DataFrame
 
     Raises
     ------
     RunError
-        If there is none, or nothing of it can be read.
+        If the journal is missing or unreadable.
     """
     contents, tables = _parsed(Path(folder) / JOURNAL, _Table.frame, packed=True)
     recovered = {
@@ -236,19 +236,19 @@ def read_journal(
 def read_plain_journal(
     folder: str | os.PathLike[str],
 ) -> tuple[dict[str, Any], dict[str, dict[str, list[Any]]]]:
-    """Read what a folder's journal holds, where Polars is not installed.
+    """Read a folder's journal as lists, without Polars.
 
     Returns
     -------
     meta : dict
-        Metadata that the writer gave the run.
+        Metadata from the writer.
     tables : dict of str to dict of str to list
         Columns of each table.
 
     Raises
     ------
     RunError
-        If there is none, or nothing of it can be read.
+        If the journal is missing or unreadable.
     """
     contents, tables = _parsed(Path(folder) / JOURNAL, _Table.plain, packed=False)
     return contents.meta, tables
@@ -257,7 +257,7 @@ def read_plain_journal(
 def _parsed(
     file: Path, made: Callable[[_Table], T], *, packed: bool
 ) -> tuple[_Contents, dict[str, T]]:
-    """Put a journal's frames together; returns them, and what each table was made."""
+    """Combine the frames of a journal; return them and each table as converted by `made`."""
     try:
         with file.open("rb") as stream:
             if os.fstat(stream.fileno()).st_size == 0:
@@ -279,12 +279,12 @@ def _parsed(
 
 
 def note_in_journal(folder: str | os.PathLike[str], **meta: object) -> None:
-    """Say something more of a run that has ended, and stays a journal.
+    """Add metadata to the journal of a run that has ended without being sealed.
 
     Raises
     ------
     RunError
-        If somebody is writing it, or it cannot be written.
+        If a process is writing the journal, or it cannot be written.
     """
     file = Path(folder) / JOURNAL
     try:
@@ -304,13 +304,13 @@ class Journal:
     Parameters
     ----------
     folder : path-like
-        The run's; made where it is missing. A journal of the same run there is gone on with: its
-        torn end is cut off.
+        Folder of the run, created if missing. A journal of the same run is continued after its
+        torn end, if any, has been cut off.
     run : str
         Id of the run.
     meta : mapping
-        JSON-able: what the run is the record of (see `Run`). Where a journal that can be opened has
-        no room for it, it is written with the first rows that find some.
+        JSON-able metadata of the run (see `Run`). If the disk is full when the journal opens, the
+        metadata are written with the first rows that fit.
     columns : mapping
         Type of every column of ``cycles``, ``windows``, ``decisions`` and other tables.
 
@@ -319,15 +319,15 @@ class Journal:
     cut_bytes : int
         Length of the torn end that was cut off.
     meta : dict
-        Metadata of the run, of this writer and of those before it.
+        Metadata of the run, from this writer and earlier writers.
 
     Raises
     ------
     RunError
-        If the folder holds a finished run, the journal of another run or with other columns, one
-        that somebody is writing, or something else.
+        If the folder holds a finished run, the journal of another run, a journal with other
+        columns or with a writer, or other files.
     UnwritableError
-        If it cannot be made, or opened.
+        If the journal cannot be created or opened.
     """
 
     def __init__(
@@ -349,7 +349,7 @@ class Journal:
         _require_types(self.columns)
         self.cut_bytes = 0
         self.file = self.folder / JOURNAL
-        # Anything that cannot be written must not leave half a journal.
+        # Encode the header before the file is created: an error must not leave half a journal.
         version = {"schema_version": SCHEMA_VERSION}
         header = {"run": run, **version, "meta": dict(meta), "columns": self.columns}
         _frame({**header, "opened": 1})
@@ -365,7 +365,7 @@ class Journal:
             self._following = contents.following
             self.meta: dict[str, Any] = {**contents.meta, **meta}
             frame = _frame({**header, "opened": contents.opened + 1})
-            # The header stands twice, so that damage at one place loses no more than that place.
+            # Write the header twice: the second copy serves if the first is damaged.
             self._header = frame + frame if contents.opened == 0 else frame
             with suppress(UnwritableError):
                 self._write(b"")
@@ -393,7 +393,7 @@ class Journal:
             raise RunError(f"{self.file}: another process is writing this run") from None
 
     def _go_on(self) -> _Contents:
-        """Read what is there, cut its torn end off, and stand at the end."""
+        """Read the existing frames, cut off the torn end, and seek to the end."""
         size = os.fstat(self._descriptor).st_size
         if size == 0:
             return _Contents()
@@ -417,9 +417,9 @@ class Journal:
         return UnwritableError(f"{self.file}: cannot be written ({error.strerror})")
 
     def _write(self, data: bytes) -> None:
-        """Hand bytes to the operating system: they survive the process, not a loss of power.
+        """Write bytes without a sync: they survive the end of the process, but not a power loss.
 
-        What does not fit as a whole leaves nothing behind.
+        If the disk has too little room, the file keeps its former length.
         """
         if self._descriptor < 0:
             raise RunError(f"{self.file}: the journal is closed")
@@ -436,25 +436,25 @@ class Journal:
         self._header = b""
 
     def following(self, table: str) -> int:
-        """Return the number after the last row's of a numbered table; 0 where it has none."""
+        """Return the next row number of a numbered table; 0 if the table is empty."""
         return self._following.get(table, 0)
 
     def append(self, rows: Rows, **meta: object) -> None:
-        """Write rows that belong together; they will be found all, or none.
+        """Write rows as one frame, which readers take completely or skip.
 
         Parameters
         ----------
         rows : mapping of str to sequence of rows
-            By table; values in the order of its columns, None for null.
+            Rows by table, with values in the order of the columns and None for null.
         **meta : JSON-able
-            Said of the run from now on.
+            Metadata to add to the run.
 
         Raises
         ------
         RunError
-            If a row has not as many values as its table has columns.
+            If the number of values in a row differs from the number of columns.
         UnwritableError
-            If there is no room for them: they can be appended again.
+            If the disk is full or fails; the rows can be appended again.
         """
         for name, of in rows.items():
             width = len(self.columns.get(name, ()))
@@ -472,7 +472,7 @@ class Journal:
 
     @staticmethod
     def written(folder: str | os.PathLike[str]) -> bool:
-        """Whether somebody is writing a folder's journal."""
+        """Whether a process is writing a folder's journal."""
         try:
             with (Path(folder) / JOURNAL).open("rb") as stream:
                 fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -483,7 +483,7 @@ class Journal:
         return False
 
     def close(self) -> None:
-        """Stop writing; the journal can be gone on with, or sealed. Safe to call twice."""
+        """Stop writing; the journal can be continued or sealed. Safe to call twice."""
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1

@@ -1,4 +1,4 @@
-"""JSON documents: what stands in the files beside tables, and what may stand in any."""
+"""JSON documents: reading of files, and conversion of values to JSON-able ones."""
 
 from __future__ import annotations
 
@@ -12,12 +12,9 @@ from dwell.errors import RunError
 
 
 def read_document(file: Path) -> dict[str, Any]:
-    """Read a file that holds a mapping; of any other JSON an empty one.
+    """Read a JSON object from a file; return an empty mapping for any other JSON value.
 
-    Raises
-    ------
-    RunError
-        If it cannot be read, or is no JSON.
+    Raises RunError if the file is unreadable or not JSON.
     """
     try:
         document = json.loads(file.read_text(encoding="utf-8"))
@@ -27,7 +24,7 @@ def read_document(file: Path) -> dict[str, Any]:
 
 
 def json_ready(value: Any) -> Any:
-    """Return a value as JSON has it: null for a number that is not finite, a path as text."""
+    """Return a value for JSON: None for numbers that are not finite, text for paths."""
     if isinstance(value, Mapping):
         return {str(key): json_ready(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -1,10 +1,10 @@
-"""MCAP files of a run's rows, as Foxglove, PlotJuggler and others open them.
+"""MCAP files of a run's rows, for Foxglove, PlotJuggler and other viewers.
 
-A table is a topic, a row a JSON message of it, with the JSON Schema of the table's columns
-(`dwell.record.schema.json_schema`). A cycle stands at its release, a window at its close, a
-decision at the close that it was made at, a job where it became ready; in a simulated run in ns
-since its beginning, in a live one by time of day, so that it lies beside whatever else was recorded
-of the robot. The format: https://mcap.dev/spec.
+Each table becomes a topic, and each row a JSON message with the JSON Schema of the table
+(`dwell.record.schema.json_schema`). A cycle has the time of its release, a job the time of its
+readiness. A window or decision has the time when its last cycle was due: the later of deadline and
+period + grace after the release. Simulated runs count ns from their start. Live runs use the time
+of day, which aligns them with other recordings of the robot. The format: https://mcap.dev/spec.
 """
 
 from __future__ import annotations
@@ -30,45 +30,45 @@ if TYPE_CHECKING:
 
     from dwell.record.run import Run
 
-#: Bytes of messages that are compressed together.
+#: Size in bytes above which messages are compressed as one chunk.
 CHUNK_BYTES = 1 << 20
-#: Most bytes beside the content: of a message, with its place in an index; of a chunk, with its
-#: place in the summary; and of a summary, beside the schemas.
+#: Upper bounds of the overhead in bytes: of a message with its index entry, of a chunk with its
+#: summary entry, and of a summary without the schemas.
 MESSAGE_BYTES, INDEX_BYTES, SUMMARY_BYTES = 64, 512, 1 << 16
-#: Name of the record that says what the file is of, and of all schemas before a dot.
+#: Name of the metadata record, and prefix of the schema names.
 NAMESPACE = "dwell"
-#: What a run says of itself that stands there.
+#: Keys of `Run.meta` that the metadata record contains.
 ABOUT = ("kind", "scenario", "policy", "estimator", "seed")
-#: Column of a row's instant.
+#: Column with the time of a row.
 AT = "at_ns"
-#: How instants count.
+#: Names of the clocks.
 SINCE_BEGINNING, TIME_OF_DAY = "ns since the beginning of the run", "ns since 1970, UTC"
 
-#: Instant, ns; table; values of a row.
+#: Time (ns), table, and values of a row.
 Message: TypeAlias = tuple[int, str, Values]
 
 _encode = json.JSONEncoder(separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode
 
 
 class McapFile:
-    """Writes rows to an MCAP file.
+    """Writer of rows to an MCAP file.
 
-    The disk's space is taken before it is needed: where it has no room for a row and what follows
-    the last one, the row is refused, and the file can be finished with all rows before.
+    Disk space is reserved in advance, for each row and for the end of the file. If the disk is
+    full, `add` raises, and the file can still be finished with all earlier rows.
 
     Parameters
     ----------
     file : binary file
         Empty, open for writing.
     columns : mapping of str to collection of str
-        By table: the columns that its rows have.
+        Columns of the rows, by table.
     """
 
     def __init__(
         self, file: BinaryIO, problem: Problem, columns: Mapping[str, Collection[str]]
     ) -> None:
         self._file = file
-        # Chunks end where this class ends them, so that it knows what is still to be written.
+        # Only `flush` ends a chunk, because this class counts the unwritten bytes.
         self._writer = Writer(file, chunk_size=sys.maxsize)
         schemas = {
             table: _encode(json_schema(table, problem, of)).encode()
@@ -92,12 +92,12 @@ class McapFile:
         return f"<McapFile of {', '.join(self._channels)}>"
 
     def add(self, *messages: Message) -> None:
-        """Write rows: all of them, or none.
+        """Write all rows; write none if the disk is full.
 
         Raises
         ------
         OSError
-            If there is no room for them.
+            If the disk is full.
         """
         texts = [_text(values) for _, _, values in messages]
         self._reserve(sum(len(text) + MESSAGE_BYTES for text in texts))
@@ -108,7 +108,7 @@ class McapFile:
             self.flush()
 
     def _reserve(self, more_bytes: int) -> None:
-        """Take the disk's space for what is to be written, and as much again for what follows."""
+        """Reserve disk space for all unwritten bytes and for the end of the file."""
         unwritten = self._unwritten + more_bytes
         needed = self._written + unwritten + self._ending
         if needed > self._reserved:
@@ -117,7 +117,7 @@ class McapFile:
         self._unwritten = unwritten
 
     def flush(self) -> None:
-        """Hand all rows to the operating system, compressed together."""
+        """Write all pending rows as one compressed chunk."""
         if not self._rows:
             return
         self._writer.flush()
@@ -125,13 +125,7 @@ class McapFile:
         self._ending += INDEX_BYTES
 
     def finish(self, about: Mapping[str, object]) -> None:
-        """Write what makes the file whole.
-
-        Parameters
-        ----------
-        about : mapping
-            What the file is of, for its metadata.
-        """
+        """Write the metadata and the summary, and truncate the file to its length."""
         self.flush()
         self._writer.add_metadata(NAMESPACE, {name: str(value) for name, value in about.items()})
         self._writer.finish()
@@ -140,7 +134,7 @@ class McapFile:
 
 
 def _text(values: Values) -> bytes:
-    """Return a row as JSON, without what that has no word for: nulls, NaN and infinities."""
+    """Return a row as JSON, without nulls, NaN and infinities."""
     known = {
         name: value
         for name, value in values.items()
@@ -150,19 +144,14 @@ def _text(values: Values) -> bytes:
 
 
 def write_mcap(run: Run, path: Path) -> None:
-    """Write a run to an MCAP file.
-
-    Parameters
-    ----------
-    path : Path
-        An empty file, as `dwell.files.write_whole` gives one.
+    """Write a run to an empty file.
 
     Raises
     ------
     RunError
-        If the run's record of its cell is incomplete.
+        If the record of the cell is incomplete.
     OSError
-        If there is no room for it.
+        If the disk is full.
     """
     origin_ns, tables = _instants(run)
     clock = SINCE_BEGINNING if origin_ns is None else TIME_OF_DAY
@@ -176,7 +165,7 @@ def write_mcap(run: Run, path: Path) -> None:
 
 
 def _instants(run: Run) -> tuple[int | None, dict[str, pl.DataFrame]]:
-    """Return the time of day of a live run's beginning, and its tables with an instant a row."""
+    """Return the start of a live run (ns since 1970), and the tables with the time of each row."""
     import polars as pl
 
     problem = run.problem
@@ -184,7 +173,7 @@ def _instants(run: Run) -> tuple[int | None, dict[str, pl.DataFrame]]:
     after_ns = round(max(pipeline.period_ms + grace_ms, pipeline.deadline_ms) * 1e6)
     releases = run.cycles.select("cycle", (pl.col("release_ns") + after_ns).alias(AT))
     windows = run.windows.with_columns(cycle=pl.col("first_cycle") + problem.window_cycles - 1)
-    # A cycle whose row was lost is stood for by the one before.
+    # If the row of a window's last cycle was lost, use the last cycle before it.
     windows = windows.join_asof(releases, on="cycle").drop("cycle")
     closes = windows.select("window", AT)
     tables = {
@@ -201,14 +190,14 @@ def _instants(run: Run) -> tuple[int | None, dict[str, pl.DataFrame]]:
     origins = windows.select(pl.col("^closed_unix_ns$") - pl.col(AT)).drop_nulls()
     if origins.is_empty():
         return None, tables
-    # A clock that was put right meanwhile, and a close that came late, move the middle one least.
+    # The median is robust against late windows and corrections of the clock.
     return origins.to_series().sort()[len(origins) // 2], tables
 
 
 def _messages(table: str, rows: pl.DataFrame, origin_ns: int) -> Iterator[Message]:
     import polars as pl
 
-    # Before the first close there is no instant, and before 1970 none can be written.
+    # Use 0 for rows without a time; MCAP has no times before 1970.
     instants = (pl.col(AT).fill_null(0) + origin_ns).clip(0)
     for row in rows.with_columns(instants).sort(AT, maintain_order=True).iter_rows(named=True):
         yield row.pop(AT), table, row

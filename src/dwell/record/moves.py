@@ -1,4 +1,4 @@
-"""Moves of a run: which they are, when, from where to where, and whose."""
+"""Moves of a run: their time, source, target and reason."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ GUARD = "guard"
 
 
 class _Columns(Protocol):
-    """A table by columns: a frame, or the lists of a journal."""
+    """A table with columns by name: a data frame, or the lists of a journal."""
 
     def __getitem__(self, name: str, /) -> Sequence[Any] | Any: ...
 
@@ -31,7 +31,7 @@ class Move(NamedTuple):
     window : int
         The last window before it.
     cycle : int
-        The first cycle after those that the decision looked at.
+        The first cycle after the cycles that the decision evaluated.
     source, target : str
         The placements before and after.
     reason : str
@@ -52,7 +52,7 @@ class Move(NamedTuple):
 
 
 def moves(run: Run | FleetRun) -> list[Move]:
-    """Return the moves of a run, in their order; of a fleet those of all cells."""
+    """Return the moves of a run, or of all cells of a fleet, in the order of the decisions."""
     return moves_in(run.decisions)
 
 

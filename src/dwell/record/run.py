@@ -1,4 +1,4 @@
-"""Run: the record of a policy on a realisation, or of a live system; one schema for both."""
+"""Run: the record of a simulated run or of a live one; one schema for both."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     import polars as pl
 
 ALWAYS = tuple(name for name, table in TABLES.items() if not table.on_request)
-#: Scenario by which a cell has the disturbances as they were played.
+#: Name of the scenario that holds the disturbances applied to a run.
 PLAYED = "played"
-#: Last file of a fleet's folder (see `dwell.record.fleet_run`).
+#: File of a fleet's folder that is written last (see `dwell.record.fleet_run`).
 FLEET = "fleet.json"
 ON_REQUEST = tuple(name for name, table in TABLES.items() if table.on_request)
 
-#: What is said of each loss of a journal.
+#: Sentences about the losses of a journal.
 LOSSES = {
     "torn_bytes": "{} bytes at the journal's end were torn by a kill; what they said is not here.",
     "damaged_bytes": "{} bytes within the journal were damaged; what they said is not here.",
@@ -40,24 +40,24 @@ LOSSES = {
     "missing_windows": "Windows missing from the run: {}.",
 }
 
-#: Why a measured run has no jobs.
+#: Message if a measured run has no jobs.
 NO_JOBS = "this run kept no jobs; `dwell controller --jobs` keeps them"
 
 Table: TypeAlias = "pl.DataFrame | Callable[[], pl.DataFrame]"
 
 
 class Run(Displayed):
-    """Tables of one run and what they are the record of.
+    """Tables and metadata of one run.
 
     Parameters
     ----------
     meta : mapping, or function that makes it
-        JSON-able: problem, scenario, policy, seed, versions, schema version.
+        Problem, scenario, policy, seed and versions, as JSON-able values.
     tables : mapping of str to DataFrame, or to a function that makes it
-        ``cycles``, ``windows``, ``decisions`` and, on request, ``jobs`` and ``processes``; made
-        when first asked for.
+        ``cycles``, ``windows``, ``decisions`` and, on request, ``jobs`` and ``processes``. A
+        function is called at the first access.
     arrays : mapping of str to function that makes `TableArrays`, optional
-        The tables that need not be frames to be computed with.
+        Tables that are available as arrays without Polars.
     """
 
     def __init__(
@@ -81,12 +81,12 @@ class Run(Displayed):
 
     @cached_property
     def meta(self) -> dict[str, Any]:
-        """What it is the record of, ready for JSON."""
+        """Metadata of the run, ready for JSON."""
         meta = self._meta() if callable(self._meta) else self._meta
         return {**meta, "schema_version": SCHEMA_VERSION}
 
     def with_facts(self, **facts: object) -> Run:
-        """Return the same run with more in `meta`, ready for JSON."""
+        """Return the same run with further JSON-able entries in `meta`."""
         return Run({**self.meta, **facts}, self._tables, self._arrays)
 
     def _table(self, name: str) -> pl.DataFrame:
@@ -94,48 +94,48 @@ class Run(Displayed):
         if callable(table):
             table = table()
             self._tables[name] = table
-            # What it was made of is let go.
+            # Release the arrays that the table was made from.
             self._arrays.pop(name, None)
         return table
 
     def arrays(self, name: str) -> TableArrays:
-        """Columns of a table as arrays: of ``cycles``, ``windows`` or ``decisions``."""
+        """Return the columns of a table as arrays."""
         if name in self._arrays:
             return self._arrays[name]()
         return arrays_of(self._table(name))
 
     @cached_property
     def problem(self) -> Problem:
-        """The cell that it is a run of; traces are named, their data are elsewhere.
+        """The cell of the run. The record names its traces and does not contain their data.
 
         Raises
         ------
         RunError
-            If the run does not say it, or it cannot be read.
+            If the record of the cell is missing or cannot be read.
         """
         return self._cell_with({})
 
     @cached_property
     def played(self) -> Scenario | None:
-        """Disturbances as they were played, from the first release on; None where it says none.
+        """Disturbances applied to the run, from the first release on; None if not recorded.
 
-        Such a run was disturbed as its scenario has it.
+        If they are not recorded, the disturbances of the scenario apply.
 
         Raises
         ------
         RunError
-            If what the run says of them, or of its cell, cannot be read.
+            If the record of the disturbances or of the cell cannot be read.
         """
         return self._scenario("played")
 
     @cached_property
     def shared_disturbances(self) -> Scenario:
-        """What happened to the nodes that a cell of a fleet shares, as scenarios have it.
+        """Disturbances of the nodes that a cell shares with its fleet.
 
         Raises
         ------
         RunError
-            As `played`.
+            If the record of the disturbances or of the cell cannot be read.
         """
         return self._scenario("disturbances") or ()
 
@@ -149,12 +149,12 @@ class Run(Displayed):
 
     @property
     def disturbances(self) -> Scenario:
-        """Disturbances of nodes and links: as they were played, else as the scenario has them.
+        """Disturbances of nodes and links: the recorded ones, or else those in the scenario.
 
         Raises
         ------
         RunError
-            If the run's record of it cannot be read.
+            If the record of the disturbances or of the cell cannot be read.
         """
         if self.played is not None:
             return self.played
@@ -175,33 +175,33 @@ class Run(Displayed):
 
     @property
     def cycles(self) -> pl.DataFrame:
-        """One row a cycle: release, placement, latency and its parts, outcome."""
+        """One row per cycle: release, placement, latency and its parts, outcome."""
         return self._table("cycles")
 
     @property
     def last_window_end(self) -> int:
-        """Number of rows of `cycles` up to the end of the last window; statistics end there."""
+        """Number of rows of `cycles` up to the end of the last window, where statistics end."""
         (within,) = (~self.arrays("cycles")["lead"]).nonzero()
         return int(within[-1]) + 1 if len(within) else 0
 
     @property
     def windows(self) -> pl.DataFrame:
-        """One row a window: what it showed, and what the controller saw of it."""
+        """One row per window: its final metrics, and the metrics that the controller saw."""
         return self._table("windows")
 
     @property
     def decisions(self) -> pl.DataFrame:
-        """One row a decision: incumbent, choice, reason, costs and estimates."""
+        """One row per decision: incumbent, choice, reason, costs and estimates."""
         return self._table("decisions")
 
     @property
     def jobs(self) -> pl.DataFrame:
-        """One row a job that became ready: task, node, instants, outcome.
+        """One row per job that became ready: task, node, instants, outcome.
 
         Raises
         ------
         RunError
-            If the run was made without them.
+            If the run recorded no jobs.
         """
         if "jobs" not in self._tables:
             how = "simulate with jobs=True (`dwell run --jobs`)"
@@ -210,12 +210,12 @@ class Run(Displayed):
 
     @property
     def processes(self) -> pl.DataFrame:
-        """One row a window and process of a live cell: CPU time that it took.
+        """CPU time used by the processes of a live cell: one row per window and process.
 
         Raises
         ------
         RunError
-            If the run was made without them, or simulated.
+            If the run was simulated or recorded no processes.
         """
         if "processes" not in self._tables:
             raise RunError("this run kept no processes; `dwell controller --jobs` does")
@@ -223,34 +223,34 @@ class Run(Displayed):
 
     @property
     def has_processes(self) -> bool:
-        """Whether the run kept what each process took of the CPUs."""
+        """Whether the run recorded the CPU time of each process."""
         return "processes" in self._tables
 
     @property
     def run_id(self) -> str | None:
-        """Id that the stamps of a live run carry; None for a simulated run."""
+        """Id of a live run, as in its stamps; None for a simulated run."""
         if "run" not in self.cycles.columns or self.cycles.is_empty():
             return None
         return str(self.cycles["run"][0])
 
     @property
     def is_simulated(self) -> bool:
-        """Whether a simulator made it; a live run was measured."""
+        """Whether the run was simulated; a live run was measured."""
         return str(self.meta.get("kind", "simulated")) == "simulated"
 
     @property
     def has_jobs(self) -> bool:
-        """Whether the run kept its jobs."""
+        """Whether the run recorded its jobs."""
         return "jobs" in self._tables
 
     @property
     def unfinished(self) -> bool:
-        """Whether its journal was not closed: it goes on, or its controller was killed."""
+        """Whether the run has only an open journal: it is running, or its controller was killed."""
         return not self.meta.get("recovered", {}).get("sealed", True)
 
     @property
     def losses(self) -> list[str]:
-        """Sentences on what is not in it because something was killed or damaged."""
+        """Sentences about data that the run lacks because of a kill or of damage."""
         recovered = self.meta.get("recovered", {})
         told = [
             text.format(recovered[name]) for name, text in LOSSES.items() if recovered.get(name)
@@ -265,12 +265,12 @@ class Run(Displayed):
         return told
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the run's folder; it appears complete, or not at all.
+        """Write the run's folder in one atomic step.
 
         Parameters
         ----------
         path : path-like
-            Folder to make. One that holds a run already is replaced; anything else is refused.
+            Folder to make. An older run in it is replaced.
 
         Raises
         ------
@@ -307,7 +307,7 @@ def _end_s(item: Mapping[str, Any]) -> float:
 
 
 def _from_the_start(item: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a disturbance that was played without its part before the first release."""
+    """Return a recorded disturbance without its part before the first release."""
     if _at_s(item) >= 0:
         return dict(item)
     shorter = {"for_s": _end_s(item)} if "for_s" in item else {}
@@ -315,17 +315,12 @@ def _from_the_start(item: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def require_free(path: str | os.PathLike[str]) -> None:
-    """Refuse a folder that a run may not be saved to.
-
-    Parameters
-    ----------
-    path : path-like
-        Fine where it does not exist, is empty, or holds a run.
+    """Refuse a path unless it is free, an empty folder, or the folder of a finished run.
 
     Raises
     ------
     RunError
-        If it holds something else, or is no folder.
+        If the path holds something else, such as the journal of a live run.
     """
     target = Path(path)
     if (target / JOURNAL).is_file() and not (target / "run.json").is_file():
@@ -337,7 +332,7 @@ def require_free(path: str | os.PathLike[str]) -> None:
 
 
 def _replace(draft: Path, target: Path) -> None:
-    """Put a finished folder in its place; an older run there survives until that moment."""
+    """Rename a finished folder to its target; if that fails, restore the older run."""
     if target.exists():
         old = Path(tempfile.mkdtemp(prefix=f".{target.name}-old-", dir=target.parent))
         kept = old / target.name
@@ -355,15 +350,15 @@ def _replace(draft: Path, target: Path) -> None:
 
 
 def is_run(path: str | os.PathLike[str]) -> bool:
-    """Whether a folder has a run in it, finished, or a live one that goes on or was killed."""
+    """Whether a folder holds a finished run or the journal of a live one."""
     return any((Path(path) / name).is_file() for name in ("run.json", JOURNAL))
 
 
 def open_run(path: str | os.PathLike[str]) -> Run:
-    """Open a run's folder; tables are read when first asked for.
+    """Open a run's folder; each table is read at the first access.
 
-    The folder of a live run that is still going on, or was killed, has a journal only: everything
-    is read from it, and the meta say under ``recovered`` what was lost.
+    If the folder has only a journal, because the run is still active or was killed, all data are
+    read from the journal at once, and ``recovered`` in `Run.meta` counts the losses.
 
     Raises
     ------
@@ -397,13 +392,13 @@ def open_run(path: str | os.PathLike[str]) -> Run:
 
 
 def _read_checked(run: Run, name: str, folder: Path) -> pl.DataFrame:
-    """Read a table of a run, and refuse one that is none."""
+    """Read a table of a run and check its columns."""
     file = folder / f"{name}.parquet"
     table = read_table(file)()
     try:
         problem = run.problem
     except RunError:
-        return table  # whoever needs the cell is refused
+        return table  # without the cell there is nothing to check; `Run.problem` raises
     require_table(name, problem, table, str(file))
     if name == "cycles" and run.is_simulated and len(windows := run.windows):
         last = int(str(windows["first_cycle"].max())) + problem.window_cycles
@@ -413,19 +408,20 @@ def _read_checked(run: Run, name: str, folder: Path) -> pl.DataFrame:
 
 
 def seal_run(path: str | os.PathLike[str], **meta: object) -> Run:
-    """Turn a live run's journal into tables; a kill at any moment leaves one or the other.
+    """Convert a live run's journal to tables; a kill leaves the journal or the tables complete.
 
     Parameters
     ----------
     path : path-like
-        The run's folder. The tables of one that is sealed already are left as they are.
+        The run's folder. If the run is sealed already, its tables stay unchanged.
     **meta : JSON-able
-        Said of the run beside what its journal says, also of one that is sealed already.
+        Entries to add to `Run.meta`, also for a run that is sealed already.
 
     Raises
     ------
     RunError
-        If the journal is being written, cannot be read, or the tables cannot be written.
+        If a process is writing the journal, the journal cannot be read, or the tables cannot be
+        written.
     """
     folder = Path(path)
     journal, file = folder / JOURNAL, folder / "run.json"
@@ -442,11 +438,11 @@ def seal_run(path: str | os.PathLike[str], **meta: object) -> Run:
             for name in () if sealed else run._tables:
                 table = partial(write_table, run._table(name))
                 write_whole(folder / f"{name}.parquet", table)
-            # From here on the folder is a finished run.
+            # With this file the folder is a finished run.
             write_whole(file, text)
         except OSError as error:
             raise RunError(f"{folder}: cannot be written ({error.strerror or error})") from None
-    # Whoever was killed at sealing it left a draft.
+    # Remove the drafts of a process that was killed while it sealed the run.
     for draft in folder.glob(".*.draft"):
         draft.unlink(missing_ok=True)
     journal.unlink(missing_ok=True)
@@ -454,7 +450,7 @@ def seal_run(path: str | os.PathLike[str], **meta: object) -> Run:
 
 
 def write_table(table: pl.DataFrame, file: Path) -> None:
-    """Write a table; a disk that is full is an OSError, whatever Polars calls it."""
+    """Write a table; raise OSError if Polars reports an error, such as a full disk."""
     import polars as pl
 
     try:
@@ -464,7 +460,7 @@ def write_table(table: pl.DataFrame, file: Path) -> None:
 
 
 def read_table(file: Path, remedy: str = "") -> Callable[[], pl.DataFrame]:
-    """Return the function that reads a table; `remedy` ends the message where it cannot."""
+    """Return the function that reads a table; `remedy` ends its error message."""
 
     def read() -> pl.DataFrame:
         import polars as pl

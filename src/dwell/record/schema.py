@@ -1,9 +1,8 @@
-"""The schema of a Run, of the columns that `dwell.model.table_columns` declares.
+"""Schema of a Run, made from the columns that `dwell.model.table_columns` declares.
 
-`column_types` gives the types of a table's columns for one cell, `json_schema` what a row is as a
-JSON object; `row_of` and `frame_of` bring values that go by the columns' names into their order, as
-a row of a journal or as a table. A new column is a declaration there and a value, of its name,
-where it is computed.
+`column_types` returns the types of a table's columns for one cell, `json_schema` the JSON Schema of
+a row. `row_of` and `frame_of` take values by column name and return a row of a journal or a table.
+To add a column, declare it in `table_columns` and add its value to the code that fills the table.
 """
 
 from __future__ import annotations
@@ -20,10 +19,10 @@ from dwell.record.table_arrays import Names
 if TYPE_CHECKING:
     import polars as pl
 
-#: Version of the folders of runs and fleets; no other version is read.
+#: Version of the folders of runs and fleets; Dwell reads this version only.
 SCHEMA_VERSION = 3
 
-#: What became of a cycle or a job. Their order is that of the kernels' codes.
+#: Outcomes of a cycle or a job, in the order of the kernels' codes.
 OUTCOMES = ("in_flight", "done", "dropped", "replaced", "node_down", "not_applied")
 OUTCOME_SENTENCES: Mapping[str, str] = {
     "done": "it was completed",
@@ -33,7 +32,7 @@ OUTCOME_SENTENCES: Mapping[str, str] = {
     "not_applied": "its command was ready, and the actuator raised",
     "in_flight": "unfinished at the end",
 }
-#: Why it was decided so, by the rule that made the decision.
+#: Explanation of each reason of a decision.
 REASON_SENTENCES: Mapping[Reason, str] = {
     "dwell": "too soon after the last migration",
     "hold": "no other placement promised enough",
@@ -43,7 +42,7 @@ REASON_SENTENCES: Mapping[Reason, str] = {
     "guard": "the robot moved by itself",
 }
 
-#: Types of Polars' as JSON Schema calls them; names are an enumeration.
+#: Polars types and their names in JSON Schema; names become an enumeration.
 JSON_TYPES: Mapping[str, str] = {
     "Int64": "integer",
     "Float64": "number",
@@ -51,9 +50,9 @@ JSON_TYPES: Mapping[str, str] = {
     "String": "string",
 }
 
-#: Types of a table's columns: a name of Polars', or the categories of an Enum.
+#: Types of a table's columns: the name of a Polars type, or the categories of an Enum.
 Types: TypeAlias = Mapping[str, str | Sequence[str]]
-#: Those of every table.
+#: Types of the columns, by table.
 Columns: TypeAlias = Mapping[str, Types]
 Row: TypeAlias = tuple[object, ...]
 #: Values of a row by column.
@@ -61,12 +60,12 @@ Values: TypeAlias = Mapping[str, object]
 
 
 def require_version(written: Mapping[str, Any], source: str = "") -> None:
-    """Refuse the record of a run or fleet that has another version.
+    """Refuse the record of a run or fleet with another version of the schema.
 
     Raises
     ------
     RunError
-        If it has; `source` begins the message.
+        If the version differs; the message begins with `source`.
     """
     version = written.get("schema_version")
     if version != SCHEMA_VERSION:
@@ -77,14 +76,14 @@ def require_version(written: Mapping[str, Any], source: str = "") -> None:
 
 
 def column_types(table: str, problem: Problem, features: Collection[Feature] = ()) -> Types:
-    """Return the types of a table's columns, in their order.
+    """Return the types of a table's columns, in the order of the columns.
 
     Parameters
     ----------
     table : str
         One of `TABLES`.
     problem : Problem
-        Its nodes, tasks and candidates.
+        The cell, whose nodes, tasks and candidates appear in names and types.
     features : collection of {"live", "shadows", "support"}
         Features of the run.
     """
@@ -94,14 +93,14 @@ def column_types(table: str, problem: Problem, features: Collection[Feature] = (
 def json_schema(table: str, problem: Problem, columns: Collection[str]) -> dict[str, Any]:
     """Return the JSON Schema of a table's rows as objects.
 
-    A value that a row does not have is left out of its object, and so is an infinite one.
+    The JSON object of a row omits null and infinite values.
 
     Parameters
     ----------
     table : str
         One of `TABLES`.
     columns : collection of str
-        Columns that there are; of those that are not declared nothing is said.
+        Columns of the table; undeclared columns are ignored.
     """
     properties = {}
     for name, column, kind in _columns(table, problem, get_args(Feature)):
@@ -123,7 +122,7 @@ def json_schema(table: str, problem: Problem, columns: Collection[str]) -> dict[
 def _columns(
     table: str, problem: Problem, features: Collection[Feature]
 ) -> Iterator[tuple[str, Column, str | list[str]]]:
-    """Yield name, declaration and type of every column: by resources, then by candidates."""
+    """Yield the name, declaration and type of every column, in the order of the table."""
     names: dict[str, list[str]] = {
         "candidate": list(problem.candidates),
         "node": list(problem.fabric.nodes),
@@ -139,12 +138,12 @@ def _columns(
 
 
 def require_table(table: str, problem: Problem, frame: pl.DataFrame, source: str) -> None:
-    """Refuse a table without the columns of its kind, or with other values in them.
+    """Check that a table has its required columns, with values of the declared types.
 
     Raises
     ------
     RunError
-        If it is one; `source` begins the message.
+        If a column is missing or has invalid values; the message begins with `source`.
     """
     import polars as pl
 
@@ -178,12 +177,12 @@ def row_of(types: Types, values: Values) -> Row:
     types : mapping of str to str, or to the names of an Enum
         Types of the table's columns.
     values : mapping of str to object
-        By column.
+        Values by column.
 
     Raises
     ------
     ValueError
-        If a column has no value, or a value no column.
+        If the names of the columns and of the values differ.
     """
     _require_columns(types, values)
     return tuple(values[name] for name in types)
@@ -192,21 +191,21 @@ def row_of(types: Types, values: Values) -> Row:
 def frame_of(
     table: str, problem: Problem, values: Mapping[str, object], features: Collection[Feature] = ()
 ) -> pl.DataFrame:
-    """Return a table; NaN and `NEVER_NS` of a column that may be null are null.
+    """Return a table; NaN and `NEVER_NS` become null in columns that may be null.
 
     Parameters
     ----------
     table : str
         One of `TABLES`.
     values : mapping of str to sequence, array, Series or `Names`
-        By column; all of one length.
+        Values by column, all of the same length.
     features : collection of {"live", "shadows", "support"}
         Features of the run.
 
     Raises
     ------
     ValueError
-        If a column has no values, or values no column.
+        If the names of the columns and of the values differ.
     """
     import polars as pl
 
@@ -216,7 +215,7 @@ def frame_of(
         if column.null:
             nullable.add(name)
     _require_columns(types, values)
-    # Column by column: a query over all of them costs more than a short table.
+    # Cast column by column: one query over all columns is slower than that for a short table.
     made = []
     for name, dtype in polars_schema(types).items():
         series = _series(name, values[name], dtype, nullable=name in nullable)
@@ -241,10 +240,10 @@ def _series(name: str, values: object, dtype: pl.DataType, *, nullable: bool) ->
 
 
 def polars_schema(types: Types) -> dict[str, pl.DataType]:
-    """Return types as Polars has them."""
+    """Return the Polars data types of columns."""
     import polars as pl
 
-    # Most Enums of a table are of the same names, and each is costly to make.
+    # Make each Enum once: most columns share one, and an Enum is slow to make.
     enums = {id(kind): kind for kind in types.values() if not isinstance(kind, str)}
     made = {key: pl.Enum(names) for key, names in enums.items()}
     return {

@@ -1,4 +1,4 @@
-"""The columns of a table as arrays: who computes with them needs no frame, nor Polars."""
+"""The columns of a table as arrays, which work without Polars."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ if TYPE_CHECKING:
     import polars as pl
     from numpy.typing import NDArray
 
-#: Values of a column, or what makes them: an array, a sequence, `Names`.
+#: Values of a column (an array, a sequence, or `Names`), or a function that makes them.
 Made: TypeAlias = "object | Callable[[], object]"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Names:
-    """Names, one a row.
+    """Names, one per row.
 
     Parameters
     ----------
     places : integer array, shape (n,)
-        Place of each among `known`.
+        Index of each name in `known`.
     known : tuple of str
-        All that a row may have.
+        All possible names.
     """
 
     places: NDArray[np.integer]
@@ -38,7 +38,7 @@ class Names:
 
     @classmethod
     def of(cls, names: Sequence[str], known: Sequence[str]) -> Names:
-        """Find names among those that are known."""
+        """Return names as indices into the known names."""
         import numpy as np
 
         place = {name: i for i, name in enumerate(known)}
@@ -49,7 +49,7 @@ class Names:
         return Names(self.places[rows], self.known)
 
     def equal(self, name: str) -> NDArray[np.bool_]:
-        """Whether each row has a name."""
+        """Return whether each row has the given name."""
         place = self.known.index(name) if name in self.known else -1
         equal: NDArray[np.bool_] = self.places == place
         return equal
@@ -60,9 +60,9 @@ class Names:
 
 
 class TableArrays:
-    """Columns of a table by name, each made when it is first asked for.
+    """Columns of a table by name, each made at the first access.
 
-    Where a row has no value, a float is NaN and an integer `NEVER_NS`.
+    A missing value is NaN in a column of floats and `NEVER_NS` in a column of integers.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ class TableArrays:
         import numpy as np
 
         array = np.asarray(self._made(name))
-        # None among numbers.
+        # Numbers with None among them become floats with NaN.
         return array.astype(np.float64) if array.dtype == np.object_ else array
 
     def names(self, name: str) -> Names:
@@ -102,7 +102,7 @@ class TableArrays:
 
 
 def arrays_of(frame: pl.DataFrame) -> TableArrays:
-    """Return the columns of a table that is a frame."""
+    """Return the columns of a data frame."""
     return TableArrays({name: partial(_column, frame[name]) for name in frame.columns})
 
 

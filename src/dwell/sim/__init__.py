@@ -1,4 +1,4 @@
-"""The simulator: a realisation through the kernels, beside a policy, to a Run."""
+"""The simulator: samples realisations and simulates them under policies."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Import the engine where it is asked for (PEP 562): drawing needs none of it."""
+    """Import the engine at the first access (PEP 562); sampling does not need it."""
     if name not in __all__:
         raise AttributeError(f"module 'dwell.sim' has no attribute {name!r}")
     return getattr(import_module("dwell.sim.engine"), name)

@@ -1,4 +1,4 @@
-"""Cold migrations: workers are started and state is carried before an order takes effect."""
+"""Cold migrations: workers start and receive state before an order takes effect."""
 
 from __future__ import annotations
 
@@ -8,23 +8,20 @@ from dwell.kernels.codes import CYCLE_BITS, EventKind, cycle_of, item_of, make_k
 from dwell.kernels.realisation import Realisation
 from dwell.model import Problem
 
-# The cycle field of an event: number of the migration, attempt, whether it is ready.
+# The cycle field of an event contains the number of the migration, the attempt, and a ready bit.
 NUMBER_SHIFT = 20
 ATTEMPTS = (1 << (NUMBER_SHIFT - 1)) - 1
 NUMBERS = (1 << (CYCLE_BITS - NUMBER_SHIFT)) - 1
 
 
 class ColdMigration:
-    """The one cold migration of a cell that may be under way.
+    """The current cold migration of a cell, if any.
 
-    Its steps are events like any others, which `dwell.kernels.advance` hands back: a worker is
-    ready, or state must be sent again, or has arrived. An event's cycle field says which, and
-    counts the attempts, and the migrations; its item is the task.
+    `dwell.kernels.advance` returns its events to Python: a worker has started, state has arrived,
+    or state must be sent again. An event's item is the task. Its cycle field contains the number of
+    the migration, the attempt, and whether the task is ready.
 
-    Attributes
-    ----------
-    boundary : int
-        First cycle after the window at whose close it was ordered.
+    `boundary` is the first cycle after the window that led to the order.
     """
 
     def __init__(self, problem: Problem, realisation: Realisation) -> None:
@@ -32,7 +29,7 @@ class ColdMigration:
         self.tasks = tuple(problem.pipeline.tasks.values())
         self.hop_row = {hop: row for row, hop in enumerate(realisation.hops)}
         self.boundary = self.number = 0
-        # Of the tasks that are not ready yet: the hop that their state takes, -1 for none.
+        # Hop for the state of each task that is not ready yet; -1 for a task without state.
         self.hops: dict[int, int] = {}
 
     def moves(self, incumbent: str, order: str) -> bool:
@@ -42,7 +39,7 @@ class ColdMigration:
     def begin(
         self, arrays: CellArrays, incumbent: str, order: str, boundary: int, arrival_ns: int
     ) -> None:
-        """Start a worker of every task that an order moves."""
+        """Start a worker for every task that an order moves."""
         self.boundary, self.number = boundary, self.number + 1
         old, new = self.candidates[incumbent], self.candidates[order]
         for row, task in enumerate(self.tasks):
@@ -53,7 +50,7 @@ class ColdMigration:
                 self._announce(arrays, row, 0, self.hops[row] < 0, started_ns)
 
     def step(self, arrays: CellArrays) -> bool:
-        """Take the step that is due; True if the last task is ready now."""
+        """Process the current event; return True if the last task is ready now."""
         clock = arrays.tables.clock[0]
         key, now = int(clock["step_key"]), int(clock["step_ns"])
         field, row = cycle_of(key), item_of(key)
@@ -61,7 +58,7 @@ class ColdMigration:
         number = field >> NUMBER_SHIFT
         arrival = make_key(EventKind.MIGRATE, arrays.part.row, number << NUMBER_SHIFT | 1, row)
         if not self.hops or number != self.number & NUMBERS:
-            # A step of a migration that the guard has cut short.
+            # The event belongs to a migration that the guard has cancelled.
             end_repeats(arrays, arrival, now)
             return False
         if ready:
@@ -73,7 +70,7 @@ class ColdMigration:
         return False
 
     def stop(self) -> None:
-        """Forget the migration that is under way, if there is one: its order is void."""
+        """Cancel the current migration, if any, and its order."""
         self.hops.clear()
 
     def _announce(self, arrays: CellArrays, row: int, attempt: int, ready: bool, t: int) -> None:

@@ -1,4 +1,4 @@
-"""The simulator: a realisation in, a policy beside it, a Run out."""
+"""The simulator: runs a realisation under a policy and returns a Run."""
 
 from __future__ import annotations
 
@@ -52,31 +52,31 @@ def simulate(
     jobs: bool = False,
     guard: bool = False,
 ) -> Run:
-    """Draw a realisation of a scenario and play it under a policy.
+    """Sample a realisation of a scenario and simulate it under a policy.
 
     Parameters
     ----------
     scenario : str
-        Name of one of the problem's scenarios; ``baseline`` exists always.
+        Name of a scenario of the problem; ``baseline`` always exists.
     policy : policy, str, or None
         An object with ``decide``, a policy's name (``cusum``, or with its estimator
-        ``cusum+corrected``), a candidate's name for the placement that never moves, or None for
-        what the cell file says. The caller's object is not changed.
+        ``cusum+corrected``), a candidate's name for a fixed placement, or None for the policy of
+        the cell file. The simulation leaves the caller's object unchanged.
     estimator : Estimator, str, or None
-        An object with ``estimate``, an estimator's name, or None for what the cell file says.
+        An object with ``estimate``, an estimator's name, or None for that of the cell file.
     seed : int
-        Seed of all random streams; policies under one seed meet the same realisation.
+        Seed of all random streams; one seed gives all policies the same realisation.
     windows : int
         Number of windows, at least 1.
     jobs : bool
-        Whether the run keeps every job's instants (48 bytes a cycle and task).
+        Whether the run records the instants of all jobs (48 bytes per cycle and task).
     guard : bool
-        Whether the cell's guard acts, where it has fallbacks and the policy may move.
+        Whether the cell's guard acts, if the cell has fallbacks and the policy may move.
 
     Raises
     ------
     ProblemError, PolicyError, TraceError, SimulationError
-        If something named is unknown, or the run cannot be drawn.
+        If a name is unknown, or the realisation cannot be sampled.
     """
     realisation = draw(problem, scenario=scenario, seed=seed, windows=windows)
     return simulate_realisation(
@@ -94,18 +94,18 @@ def simulate_realisation(
     guard: bool = False,
     by_window: bool = False,
 ) -> Run:
-    """Play a realisation under a policy (see `simulate`).
+    """Simulate a realisation under a policy (see `simulate`).
 
     Parameters
     ----------
     by_window : bool
-        Stop at every window even where nothing that is decided could matter; the Run is the same.
+        Whether Python decides after every window, even if the kernel could; the Run is the same.
     """
     _check_fit(problem, realisation)
     require_apart(tuple(resources_of(problem.fabric.nodes)), tuple(problem.candidates))
     asked = problem, realisation, policy, estimator, jobs, guard, by_window
-    # Until the first probe is sent a shadow changes nothing, so that the second one repeats what
-    # the first has played. Shadows in every run that may want probes would cost all runs more.
+    # Simulate without shadows first, which is faster, and again with shadows only if the guard
+    # wants probes. Both give the same up to the first probe.
     played = cast("PlayedRealisation", _play(*asked) or _play(*asked, shadow=True))
     meta = partial(
         meta_of,
@@ -128,18 +128,18 @@ def describe(
     windows: int = 300,
     guard: bool = False,
 ) -> dict[str, Any]:
-    """Return what the record of a run would say of it, without playing it (see `simulate`).
+    """Return the metadata of a run without simulating it (see `simulate`).
 
     Returns
     -------
     dict
-        ``meta`` of the Run that `simulate` makes of these arguments, ready for JSON, provided that
-        a policy that is an object keeps nothing of what it saw in its `repr` and parameters.
+        `Run.meta` that `simulate` would return for the same arguments, ready for JSON. A policy
+        object must not change its `repr` or parameters during a run.
 
     Raises
     ------
     ProblemError, PolicyError
-        If something named is unknown.
+        If a name is unknown.
     """
     problem.scenario(scenario)
     controller = Controller(problem, policy, estimator)
@@ -158,7 +158,7 @@ def _play(
     *,
     shadow: bool = False,
 ) -> PlayedRealisation | None:
-    """Play a realisation with or without a shadow; None where probes are wanted and it has none."""
+    """Simulate a realisation; return None if the guard wants probes and there is no shadow."""
     controller = Controller(problem, policy, estimator)
     cell = PlayedCell(problem, realisation, controller, guard and controller.guarded)
     played = play_cells([cell], jobs=jobs, by_window=by_window, shadow=shadow)
@@ -166,14 +166,14 @@ def _play(
 
 
 class PlayedCell(NamedTuple):
-    """A cell that is to be played.
+    """A cell to simulate.
 
     Parameters
     ----------
     problem, realisation, controller
-        What decides has seen no window.
+        The controller must be new.
     guarded : bool
-        Whether its guard acts.
+        Whether the cell's guard acts.
     """
 
     problem: Problem
@@ -191,20 +191,20 @@ def play_cells(
     shadow: bool = False,
     progress: Progress | None = None,
 ) -> list[PlayedRealisation] | None:
-    """Play cells together; None where probes are wanted of a cell without a shadow.
+    """Simulate cells together; return None if a cell without a shadow wants probes.
 
     Parameters
     ----------
     shared : collection of str
-        Nodes that they have in common.
+        Nodes that the cells share.
     jobs : bool
-        Whether every job is kept.
+        Whether to record all jobs.
     by_window : bool
         See `simulate_realisation`.
     shadow : bool
-        Whether guarded cells have a shadow, too, whose estimators want none.
+        Whether all guarded cells have a shadow, even if their estimators send none.
     progress : callable, optional
-        Told how many of how many windows have closed.
+        Receives the number of closed windows and the number of all windows.
     """
     plans = [_shadow_plan(cell, shadow and cell.guarded) for cell in cells]
     whole = lay_out(
@@ -214,7 +214,7 @@ def play_cells(
         log_windows=any(cell.controller.learns for cell in cells),
         decides=True,
         shadows=[
-            # Probes may be of any cycle.
+            # Any cycle of a guarded cell may become a probe.
             draw_shadows(cell.problem, cell.realisation, plan.sent, others=cell.guarded)
             if plan is not None
             else None
@@ -256,7 +256,7 @@ def play_cells(
 
 
 def _shadow_plan(cell: PlayedCell, probes: bool) -> ShadowPlan | None:
-    """Return which cycles of a cell have a shadow; None where it needs none."""
+    """Return the plan of a cell's shadows; None if it needs none."""
     if not (probes or cell.controller.sends_shadows):
         return None
     return ShadowPlan(0, cell.realisation.cycles, [*cell.controller.shadow_fractions.values()])
@@ -280,14 +280,14 @@ def _check_fit(problem: Problem, realisation: Realisation) -> None:
 
 
 def _host_changes(problem: Problem, realisation: Realisation) -> NDArray[np.int64]:
-    """Return the rows of `NodeChanges` that are about the controller's node."""
+    """Return the rows of `NodeChanges` for the controller's node."""
     changes = NodeChanges.of(realisation.node_changes)
     mine = [i for i, name in enumerate(changes.nodes) if name == problem.controller_node]
     return changes.table[np.isin(changes.table[:, 1], mine)]
 
 
 class _Stamper:
-    """Carries closed windows to the controller, and its orders to the cycles they stamp."""
+    """Passes closed windows to the controller, and stamps cycles with the ordered placement."""
 
     def __init__(
         self,
@@ -301,7 +301,7 @@ class _Stamper:
         self.release_ns = realisation.release_ns
         self.cycles = realisation.cycles
         self.window_cycles, self.every = problem.window_cycles, problem.decide_cycles
-        #: Whether decisions come more often than windows close.
+        #: Whether decisions are more frequent than windows.
         self.looks = self.every < self.window_cycles
         self.names = tuple(problem.candidates)
         self.code = {name: i for i, name in enumerate(self.names)}
@@ -313,20 +313,20 @@ class _Stamper:
         self.host_at_ns, self.host_down = table[:, 0].tolist(), table[:, 3].tolist()
         self.cold = ColdMigration(problem, realisation) if settings.migration == "cold" else None
         self.plan = plan
-        #: Whether shadows may be sent to shared nodes with each cycle, and who is there.
+        #: Whether each cycle may send shadows to shared nodes.
         self.turns: NDArray[np.bool_] | None = None
         if plan is not None and controller.coordination is not None:
             self.turns = controller.coordination.turns(realisation.release_ns[:-1])
         placed = problem.candidates.values()
         self.there = [i for i, one in enumerate(placed) if not set(shared).isdisjoint(one.values())]
-        #: Whether probes are wanted of a run that was laid out without a shadow.
+        #: Whether the guard wants probes in a run without a shadow.
         self.lacks_shadow = False
         self.course = controller.course
-        #: L95 (ms), violation rate and cost of every window, as the controller saw them; none where
-        #: decisions come more often.
+        #: L95 (ms), violation rate and cost of every window as the controller saw them; empty if
+        #: decisions are more frequent than windows.
         self.metrics: list[tuple[float | None, ...]] = []
         self.evidence = _evidence(problem, realisation, arrays) if controller.learns else None
-        # What every decision reads; these tables never grow.
+        # Tables that every decision reads; they never grow.
         tables = arrays.tables
         self.stamps, self.cell = tables.stamps, tables.cells[0]
         self.closed, self.firsts = tables.cells["window"], tables.seen["first_cycle"]
@@ -334,7 +334,7 @@ class _Stamper:
         self.seen = [seen[name] for name in SEEN]
         self.made = tables.cells["look" if self.looks else "window"]
         self.shares = tables.look_shares if self.looks else tables.shares
-        #: Incumbent and stamped cycles of the kernel's rule, where it decides.
+        #: Incumbent and number of stamped cycles in the kernel's rule, if the kernel decides.
         self.decided = self.rule_stamped = np.zeros(0, np.int64)
         tables.clock[0]["pauses"] = 1
         self.watch = SimulatedGuard(problem, realisation, arrays) if guarded else None
@@ -342,7 +342,7 @@ class _Stamper:
         self._stamp(0, self.stamped)
 
     def _stamp(self, start: int, stop: int, placement: str | None = None) -> None:
-        """Stamp cycles with a placement, the course's where None, and with their shadows."""
+        """Stamp cycles with a placement (by default the incumbent) and with their shadows."""
         if start >= stop:
             return
         stamps, code = self.stamps, self.code[placement or self.course.placement]
@@ -357,7 +357,7 @@ class _Stamper:
             self.watch.stamp(start, stop)
 
     def _reach(self, boundary: int) -> int:
-        """Cycles that may be released before the decision of the window closing at `boundary`."""
+        """Return the number of cycles released by the decision on the window before `boundary`."""
         if boundary > self.cycles:
             return boundary
         close_ns = self._close_ns(boundary)
@@ -366,12 +366,12 @@ class _Stamper:
         return int(np.searchsorted(self.release_ns, close_ns, side="right"))
 
     def _close_ns(self, boundary: int) -> int:
-        """Close of the window that ends before the cycle `boundary` (see `window_close_ns`)."""
+        """Return when the window before the cycle `boundary` closes (see `window_close_ns`)."""
         due_ns: int = self.release_ns.item(boundary - 1) + self.due_ns
         return max(due_ns, self.release_ns.item(boundary) + self.grace_ns)
 
     def leave_to_kernel(self) -> None:
-        """Have the kernel decide at closes, if it has a second body of the controller's rule."""
+        """Let the kernel decide if it implements the controller's rule."""
         plain = plain_rule(self.controller)
         if plain is None:
             return
@@ -392,7 +392,7 @@ class _Stamper:
         self.decided, self.rule_stamped = rule["incumbent"], rule["stamped"]
 
     def decide(self) -> None:
-        """Carry out what was decided on what has just been seen, or have it decided."""
+        """Decide on the newest window, or read the kernel's decision, and carry it out."""
         index = self.made.item(0) - 1
         cycles = self.seen[1].item(0, index)
         boundary = self.seen[0].item(0, index) + cycles
@@ -414,7 +414,7 @@ class _Stamper:
         cold = self.cold
         if cold is not None and not cold.moves(left, self.course.placement):
             cold = None
-        # Where no window can follow, the run is over, and it does not matter when tasks are ready.
+        # If no window can follow, the run is over and needs no simulated migration.
         if cold is not None and earliest + self.window_cycles <= self.cycles:
             self._begin(cold, left, boundary, close_ns)
         else:
@@ -422,14 +422,14 @@ class _Stamper:
             self._move(earliest, begins_window=cold is not None or not self.looks)
 
     def _window_of(self, cycle: int) -> int:
-        """Return the number of windows that have ended by a cycle: that of its own, if any."""
+        """Return the number of windows that end before a cycle: the index of its own window."""
         window: int = self.closed.item(0)
         while window and self.firsts.item(0, window - 1) + self.window_cycles > cycle:
             window -= 1
         return window
 
     def _decide(self, index: int, boundary: int, close_ns: int) -> None:
-        """Ask the controller, and send the probes that it wants."""
+        """Pass the newest metrics to the controller, and stamp the probes that it wants."""
         watch, controller = self.watch, self.controller
         if self.evidence is not None:
             first = boundary - self.every
@@ -450,16 +450,16 @@ class _Stamper:
         if self.course.by_guard and not self.lacks_shadow:
             first = self._takes_effect(boundary, close_ns)
             watch.want(self.course.wanted, first)
-            # A cycle that is released at the very close has been stamped before.
+            # A cycle released exactly at the close is stamped already.
             self._stamp(min(first, self.stamped), self.stamped)
 
     def _go_on(self, boundary: int) -> None:
-        """Stamp the cycles up to the next decision with the placement that stays."""
+        """Stamp the cycles up to the next decision with the unchanged placement."""
         start, self.stamped = self.stamped, self._reach(boundary + self.every)
         self._stamp(start, self.stamped)
 
     def _move(self, following: int, *, begins_window: bool = True) -> None:
-        """Go on under the placement that has been ordered, from a cycle on."""
+        """Apply the ordered placement from the cycle `following` on."""
         if self.watch is not None:
             self.watch.moved(following)
         self._place(following, begins_window=begins_window)
@@ -467,7 +467,7 @@ class _Stamper:
         self.rule_stamped[:] = self.stamped
 
     def _place(self, following: int, *, begins_window: bool) -> None:
-        """Count decisions, and windows if one begins, from the first cycle under a placement."""
+        """Restart the intervals of decisions, and on request of windows, at a cycle."""
         cell = self.cell
         if begins_window:
             cell["window_first"] = following
@@ -480,25 +480,25 @@ class _Stamper:
         self.stamped = self._reach(following + self.every)
 
     def _begin(self, cold: ColdMigration, left: str, boundary: int, close_ns: int) -> None:
-        """Begin a cold migration, which ends with `step`."""
+        """Begin a cold migration; `step` completes it."""
         arrival_ns = close_ns + self.delay_ns
         cold.begin(self.arrays, left, self.course.placement, boundary, arrival_ns)
         cell = self.cell
-        # No window closes, and nothing is decided, before the migration is over.
+        # No window closes, and no decision is due, before the migration is over.
         cell["window_first"] = cell["close_cycle"] = cell["look_cycle"] = self.cycles + 1
         cell["close_pending"] = cell["look_pending"] = 0
         cell["migrating"] = 1
         self._stamp(self.stamped, self.cycles, left)
 
     def step(self) -> None:
-        """Take the step that is due: of a cold migration, or of the guard."""
+        """Process the current event: of a cold migration, or of the guard."""
         if kind_of(int(self.arrays.tables.clock[0]["step_key"])) == EventKind.GUARD:
             self._fire()
         else:
             self._carry_on()
 
     def _fire(self) -> None:
-        """Move to a fallback, if there is one; the window that is open is cut short."""
+        """Move to the guard's fallback, if any; the open window is discarded."""
         tables, watch = self.arrays.tables, self.watch
         if watch is None:
             return
@@ -513,14 +513,14 @@ class _Stamper:
         self.cell["migrating"] = 0
         self._place(first, begins_window=True)
         if first + self.window_cycles > self.cycles:
-            # No window can follow, so that the run ended with the last close.
+            # No window can follow: the run ended with the last close.
             return
         self.controller.looked = LookedAt(self.closed.item(0), first - 1, 0)
         self.controller.adopt(fallback, left=active)
         self._stamp(first, self.stamped)
 
     def _carry_on(self) -> None:
-        """Carry a cold migration on; when its last task is ready, the order takes effect."""
+        """Advance a cold migration; apply its order when the last task is ready."""
         cold = self.cold
         if cold is None or not cold.step(self.arrays):
             return
@@ -530,7 +530,7 @@ class _Stamper:
         self._move(self.stamped)
 
     def _takes_effect(self, boundary: int, close_ns: int) -> int:
-        """First cycle that an order given at a close stamps; those before are out already."""
+        """Return the first cycle that an order can stamp; earlier cycles are released already."""
         first, arrived_ns = boundary + self.lead, close_ns + self.delay_ns
         if first >= self.cycles or arrived_ns <= self.release_ns.item(first):
             return first
@@ -545,7 +545,7 @@ class _Stamper:
 def _evidence(
     problem: Problem, realisation: Realisation, arrays: CellArrays
 ) -> Callable[[int, int, int], Evidence]:
-    """Return the function that cuts a window's evidence out of the logs."""
+    """Return the function that extracts a window's evidence from the logs."""
     flows = flow_rows(problem.pipeline)
 
     def cut(first: int, last: int, close_ns: int) -> Evidence:
@@ -563,7 +563,7 @@ def meta_of(
     windows: int,
     guard: bool,
 ) -> dict[str, Any]:
-    """Return what the record of a simulated run says of it."""
+    """Return the metadata of a simulated run."""
     return {
         "kind": "simulated",
         "cell": controller.problem.name,

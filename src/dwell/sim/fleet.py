@@ -1,4 +1,4 @@
-"""A fleet in the simulator: cells that share nodes, played together, each with its controller."""
+"""Simulation of fleets: cells that share nodes, each with its own controller."""
 
 from __future__ import annotations
 
@@ -45,31 +45,32 @@ def simulate_fleet(
     jobs: bool = False,
     progress: Progress | None = None,
 ) -> FleetRun:
-    """Draw a realisation for every cell of a fleet, and play them together.
+    """Sample a realisation for every cell of a fleet and simulate the cells together.
 
     Parameters
     ----------
     seed : int
-        Seed of all random streams; the first cell of a file draws what it draws alone.
+        Seed of all random streams; the first copy of a cell has the same streams as the cell alone.
     windows : int
-        Length of the run in windows of the cell whose windows are longest.
+        Length of the run in windows of the cell with the longest windows.
     seconds : float, optional
-        Length of the run, in place of `windows`.
+        Length of the run; replaces `windows`.
     policy, estimator : str, optional
-        Of every cell; what the fleet's file says where None.
+        Policy and estimator of every cell [default: the fleet file's].
     coordination, phases : optional
-        As in the fleet's file; what that says where None.
+        As in the fleet file [default: the fleet file's].
     guard : bool
         Whether the cells' guards act.
     jobs : bool
-        Whether every job's instants are kept.
+        Whether to record the instants of all jobs.
     progress : callable, optional
-        Told how much of how much is done: levels of the ledger's table of loads, then windows.
+        Receives the completed and the total number of steps: first of levels in the ledger's table
+        of loads, then of windows.
 
     Raises
     ------
     ProblemError, PolicyError, TraceError, SimulationError
-        If something named is unknown, or a run cannot be drawn.
+        If a name is unknown, or a realisation cannot be sampled.
     """
     fleet = fleet.changed(
         policy=policy, estimator=estimator, coordination=coordination, phases=phases
@@ -95,12 +96,9 @@ def simulate_fleet(
 
 
 def duration_of(fleet: Fleet, windows: int, seconds: float | None = None) -> int:
-    """Return the length of a run, nanoseconds: seconds where given, else in windows.
+    """Return the length of a run in nanoseconds, from `seconds` if given, else from `windows`.
 
-    Raises
-    ------
-    ProblemError
-        If it is shorter than a window of some cell.
+    Raises ProblemError if `seconds` is shorter than the longest window, or too long for the clock.
     """
     if seconds is None:
         return fleet.duration_ns(windows)
@@ -114,7 +112,7 @@ def duration_of(fleet: Fleet, windows: int, seconds: float | None = None) -> int
 def _meta_of(
     fleet: Fleet, cell: FleetCell, played: PlayedRealisation, *, seed: int, guard: bool
 ) -> dict[str, Any]:
-    """Return what the record of a cell says: also by which streams `draw` repeats its draws."""
+    """Return the metadata of a cell's run, with the random streams and the shared disturbances."""
     meta = meta_of(
         played.controller,
         scenario=cell.entry.scenario,
@@ -139,7 +137,7 @@ def play_fleet(
     jobs: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, PlayedRealisation]:
-    """Play the cells of a fleet as it is (see `simulate_fleet`), and return them by name."""
+    """Simulate the cells of an unchanged fleet (see `simulate_fleet`); return them by name."""
     names = [cell.name for cell in fleet.cells]
     problems = dict(zip(names, phased(fleet, seed), strict=True))
     realisations = drawn(fleet, problems, seed, duration_ns)
@@ -154,18 +152,18 @@ def play_fleet(
             controller = Controller(problem, chosen, named, asks)
             yield PlayedCell(problem, realisation, controller, guard and controller.guarded)
 
-    # The kernel knows the rules of policies, and nothing of a fleet's.
+    # The kernel implements the rules of policies, but no coordination.
     by_window = fleet.coordination != "none"
     play = partial(
         play_cells, shared=fleet.shared, jobs=jobs, by_window=by_window, progress=progress
     )
-    # As in a cell alone, shadows are drawn for probes where the first are wanted.
+    # Simulate again with shadows only if a guard wants probes, as in `simulate_realisation`.
     played = play([*cells()]) or play([*cells()], shadow=True) or []
     return dict(zip(names, played, strict=True))
 
 
 def waiting_in_fleet(fleet: Fleet, *, seed: int, duration_ns: int) -> Waiting:
-    """Return where the cycles of a fleet that missed have waited."""
+    """Return the waiting times of the missed cycles of a fleet, by resource and link."""
     whole = Waiting()
     for one in play_fleet(fleet, seed=seed, duration_ns=duration_ns, jobs=True).values():
         whole += waiting_of(one.problem, one.realisation, one.arrays)
@@ -173,23 +171,23 @@ def waiting_in_fleet(fleet: Fleet, *, seed: int, duration_ns: int) -> Waiting:
 
 
 def phased(fleet: Fleet, seed: int) -> Iterator[Problem]:
-    """Yield the problem of every cell, with its phase, and the warm-up of the whole fleet."""
+    """Yield the problem of every cell, with its phase and the fleet's common warm-up."""
     warmup_ns = fleet.warmup_ns
     for cell, phase_ms in zip(fleet.cells, phases_ms(fleet, seed).values(), strict=True):
         yield _phased(cell.problem, cell.problem.folder, phase_ms, warmup_ns)
 
 
-# A study of capacity has the same cell in many sizes, and each new problem is checked as a whole.
+# Cached because a capacity study uses one cell in many sizes, and a new problem is slow to check.
 @lru_cache(MOST_CELLS)
 def _phased(problem: Problem, folder: str | None, phase_ms: float, warmup_ns: int) -> Problem:
-    # Problems that differ by their folder alone are equal.
+    # The folder is a separate key: problems that differ only in the folder are equal.
     windows = -(-warmup_ns // problem.window_ns)
     pipeline = replace(problem.pipeline, phase_ms=phase_ms)
     return replace(problem, pipeline=pipeline, warmup_windows=windows, folder=folder)
 
 
 def phases_ms(fleet: Fleet, seed: int) -> dict[str, float]:
-    """Return the phase of every cell; one that says its own keeps it."""
+    """Return the phase of every cell in ms: its own if it has one, else the fleet's."""
     cells = fleet.cells
     found = {}
     for i, cell in enumerate(cells):
@@ -215,15 +213,15 @@ def _phase_ms(phases: Phases, cell: FleetCell, place: int, count: int, seed: int
 
 
 def priced_cells(fleet: Fleet, problems: Iterable[Problem]) -> list[PricedCell]:
-    """Return the cells of a fleet, undisturbed, as its ledger prices them."""
+    """Return the cells of a fleet for the ledger."""
     pairs = zip(fleet.cells, problems, strict=True)
     return [PricedCell(cell.name, problem, cell.streams) for cell, problem in pairs]
 
 
 def tabled_cells(fleet: Fleet, seed: int) -> list[PricedCell]:
-    """Return the cells as the table of loads has them: evenly spread where phases are drawn.
+    """Return the cells for the table of loads.
 
-    So one table serves all seeds.
+    Random phases are replaced by even ones, which makes one table valid for all seeds.
     """
     spread = fleet.changed(phases="even") if fleet.phases == "random" else fleet
     return priced_cells(spread, phased(spread, seed))
@@ -232,7 +230,7 @@ def tabled_cells(fleet: Fleet, seed: int) -> list[PricedCell]:
 def drawn(
     fleet: Fleet, problems: Mapping[str, Problem], seed: int, duration_ns: int
 ) -> dict[str, Realisation]:
-    """Draw every cell; what happens to a shared node is the same for all."""
+    """Sample the realisation of every cell; disturbances of shared nodes are common to all."""
     found = {}
     for cell in fleet.cells:
         problem = problems[cell.name]
@@ -244,7 +242,7 @@ def drawn(
 def draw_cell(
     fleet: Fleet, cell: FleetCell, problem: Problem, seed: int, duration_ns: int
 ) -> Realisation:
-    """Draw a cell for a duration: whole windows, the last of which may end beyond it."""
+    """Sample a cell for a duration, rounded up to complete windows."""
     return draw(
         problem,
         scenario=cell.entry.scenario,
@@ -257,7 +255,7 @@ def draw_cell(
 
 
 def cycles_within(problem: Problem, duration_ns: int) -> int:
-    """Return how many cycles of a cell are released within a duration."""
+    """Return the number of cycles that a cell releases within a duration."""
     first_ns = round(problem.pipeline.first_release_ms * NS_PER_MS)
     return -((first_ns - duration_ns) // problem.pipeline.period_ns)
 
@@ -268,7 +266,7 @@ def coordinations(
     seed: int,
     progress: Progress | None = None,
 ) -> Iterator[Coordination | None]:
-    """Yield what each cell asks before it moves; None where it asks nobody."""
+    """Yield the coordination of each cell's moves; None without coordination."""
     if fleet.coordination == "ledger":
         ledger = FleetLedger(
             priced_cells(fleet, problems.values()),

@@ -14,24 +14,15 @@ from dwell.sim.tables import PlayedRealisation
 def shared_load(
     played: Mapping[str, PlayedRealisation], shared: Collection[str]
 ) -> dict[str, NDArray[np.generic]]:
-    """Return the load of shared nodes in windows as long as the shortest of the cells'.
+    """Return the load of shared nodes in equal windows, as long as the shortest window of a cell.
 
-    Windows begin with the run, whatever the cells' own do, and last as long as all cells are there.
-    What a resource had done is known where any cell's window begins or ends, and is interpolated
-    between.
+    The windows are independent of the cells' windows: they begin at time 0 and end before the first
+    cell ends. The work done by each resource is known at the start and end of the cells' windows
+    and interpolated in between.
 
-    Parameters
-    ----------
-    played : mapping of str to PlayedRealisation
-        By the cells' names.
-    shared : collection of str
-        Nodes.
-
-    Returns
-    -------
-    dict of str to array, shape (windows,)
-        ``window``, ``start_ns``, and for every shared resource ``u_RESOURCE``, its utilisation,
-        and ``own_RESOURCE_CELL``, the share of it that a cell has had, its shadow's included.
+    The result has ``window``, ``start_ns``, and for every shared resource ``u_RESOURCE``, its
+    utilisation, and ``own_RESOURCE_CELL``, the share that a cell and its shadow used; all arrays
+    have the shape (windows,).
     """
     problem = min((one.problem for one in played.values()), key=lambda one: one.window_ms)
     window_ns = problem.window_ms * 1e6
@@ -62,7 +53,7 @@ def shared_load(
 
 
 def _snapshots(of: PlayedRealisation) -> tuple[Floats, Floats]:
-    """Return instants, and the core-nanoseconds done by then, shape (instants, 4, resources)."""
+    """Return instants and the core-nanoseconds done until then, shape (instants, 4, resources)."""
     count = len(of.first)
     at = np.concatenate([of.realisation.release_ns[of.first], of.close_ns]).astype(np.float64)
     tables = of.arrays.tables
@@ -70,6 +61,6 @@ def _snapshots(of: PlayedRealisation) -> tuple[Floats, Floats]:
 
 
 def _share(edges_ns: Floats, at: Floats, done: Floats, whole_ns: float) -> Floats:
-    """Return the share of what a resource can do that was done between edges."""
+    """Return the used share of a resource's capacity between successive edges."""
     order = np.argsort(at, kind="stable")
     return np.diff(np.interp(edges_ns, at[order], done[order], left=0.0)) / whole_ns

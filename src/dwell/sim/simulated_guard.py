@@ -1,4 +1,4 @@
-"""The guard in the simulator: when it is woken, what it is told then, and the probes it wants."""
+"""The guard in the simulator: its wake-ups, its observations and its probes."""
 
 from __future__ import annotations
 
@@ -20,18 +20,12 @@ from dwell.model.instants import EVIDENCE_NS, HORIZON_NS, NEVER_NS
 
 
 class SimulatedGuard:
-    """Tells a cell's guard what the kernel's tables say, whenever the kernel wakes it.
+    """Passes observations from the kernel's tables to a cell's guard when the kernel wakes it.
 
-    The kernel wakes it at a given instant, if no cycle from a given one on has been heard to
-    complete by then, or else once the cycle after the newest completed one is g periods old. That
-    is never later than the guard would fire; it may be earlier, as the kernel knows of no rest.
-
-    Parameters
-    ----------
-    problem : Problem
-        With fallbacks.
-    arrays : CellArrays
-        The simulation about to be played.
+    The kernel wakes the guard at a set instant if the completion of no cycle from a set cycle on
+    has been received until then; otherwise, when the cycle after the newest completed one is g
+    periods old. The guard never fires before it wakes. It may wake too early, because the kernel
+    does not model its rest. The problem must have fallbacks.
     """
 
     def __init__(self, problem: Problem, realisation: Realisation, arrays: CellArrays) -> None:
@@ -39,13 +33,14 @@ class SimulatedGuard:
         self.release_ns, self.cycles = realisation.release_ns, realisation.cycles
         self.names = tuple(problem.candidates)
         self.guard = CellGuard(problem)
-        # First cycle under orders, None under the guard's own move; and that of the last order.
+        # First cycle of the controller's placements, None after a move of the guard; and first
+        # cycle of the last order or move.
         self._ordered: int | None = 0
         self._moved = 0
-        # The guard has been told of the releases of so many cycles, and of all until this instant.
+        # Number of released cycles that the guard knows, and the instant of its last update.
         self._told, self._told_ns = 0, -1
-        # Candidate that each cycle is sent through as a probe, -1 for none. The probation has been
-        # told of those before a cycle, and of all until an instant.
+        # Candidate that each cycle probes, -1 for none; number of cycles whose probes the probation
+        # knows, and the instant of its last update.
         self._probes = np.full(self.cycles, -1, np.int16)
         self._probed, self._probed_ns = 0, -1
         self._cell["patience_ns"] = min(self.guard.patience_ns, HORIZON_NS)
@@ -59,7 +54,7 @@ class SimulatedGuard:
     # --------------------------------------------------------------------------- waking
 
     def wake(self, now: int) -> str | None:
-        """Return the fallback that the cell has to move to now; None where it stays."""
+        """Return the fallback to move to now; None if the placement stays."""
         self._tell(now)
         own_node = self._outages[self.problem.stamper_node]
         if not any(down <= now < up for down, up in own_node):
@@ -74,7 +69,7 @@ class SimulatedGuard:
         return None
 
     def _fall(self, now: int, fallback: str) -> None:
-        """Move to a fallback; an order that has not stamped a cycle yet is void."""
+        """Move to a fallback; an order that has not stamped a cycle yet is cancelled."""
         if self._ordered is not None:
             heard = self._heard_ns(self._ordered, self._told)[0] <= now
             self.guard.probation.healthy(int(np.count_nonzero(heard)))
@@ -84,11 +79,11 @@ class SimulatedGuard:
         self._arm(now)
 
     def _arm(self, now: int) -> None:
-        """Be woken when the guard may fire next, if nothing completes until then."""
+        """Set the next wake-up: when the guard may fire next if nothing completes until then."""
         guard = self.guard
         instants = [self._due_ns(guard.waits_for), self._due_ns(self._moved)]
         if guard.due_ns is not None and guard.due_ns <= now:
-            # It would have moved if it could.
+            # The guard is due but no fallback works: wake when a node, link or worker is back.
             parts = {self.problem.stamper_node}
             parts.update(*(guard.presence.parts[name] for name in guard.options))
             instants += [up for part in parts for _, up in self._outages[part]]
@@ -96,37 +91,38 @@ class SimulatedGuard:
         self._wake_at(min((at for at in instants if at > now), default=LAST_NS))
 
     def _due_ns(self, cycle: int) -> int:
-        """Instant at which a cycle is g periods old."""
+        """Return the instant at which a cycle is g periods old."""
         if cycle >= self.cycles:
             return LAST_NS
         return min(int(self.release_ns[cycle]) + self.guard.patience_ns, LAST_NS)
 
     def _wake_at(self, at_ns: int) -> None:
-        """Be woken at an instant, and not before."""
+        """Replace the next wake-up."""
         self._cell["wakes_ns"] = at_ns
         if at_ns < LAST_NS:
             post_event(self.arrays, at_ns, EventKind.GUARD)
 
     def moved(self, first: int) -> None:
-        """Take note of an order that takes effect at a cycle."""
+        """Record an order that takes effect at a cycle."""
         if self._ordered is None:
-            # If the guard moves before that cycle, it is a relapse all the same.
+            # A move of the guard before that cycle is a relapse, too.
             self.guard.probation.left()
             self._probes[first:] = -1
             self._ordered = first
         self._moved = first
         cell = self._cell
         cell["waited"] = min(cell["waited"], first)
-        # Other fallbacks may be open to the new placement than to the one before.
+        # The new placement may have other fallbacks.
         if self._due_ns(first) < cell["wakes_ns"]:
             self._wake_at(self._due_ns(first))
 
     # -------------------------------------------------------------------------- telling
 
     def _tell(self, now: int) -> None:
-        """Tell the guard what has happened until now, completions heard at this instant too.
+        """Update the guard with all events until now, including completions received right now.
 
-        Of the orders since it was told, the first may have left a fallback, and the last holds.
+        Only the first and the last new order matter: the first may leave a fallback, and the last
+        is in force.
         """
         placed = self.arrays.tables.stamps[0, self._told : self._released(now)]
         before = self.names.index(self.guard.placement)
@@ -142,9 +138,9 @@ class SimulatedGuard:
                 self.guard.restart()
 
     def _tell_until(self, now: int) -> None:
-        """Tell the guard what matters of a time without orders.
+        """Update the guard with the relevant events of an interval without orders.
 
-        Within it the order of what has happened changes nothing, nor does telling it twice.
+        In such an interval the order and the repetition of events have no effect.
         """
         guard, stamps = self.guard, self.arrays.tables.stamps
         stop = self._released(now)
@@ -167,10 +163,10 @@ class SimulatedGuard:
         self._told, self._told_ns = stop, now
 
     def _first_to_tell(self, stop: int, now: int) -> int:
-        """Return the first cycle that matters of those before one.
+        """Return the first cycle before `stop` that the guard still needs.
 
-        None does that is followed by a cycle, or a shadow, through the same candidate that has been
-        heard to complete, nor one that is too old.
+        It needs no cycle that is too old, and none that precedes a completed cycle or shadow of the
+        same candidate.
         """
         oldest = self._released(now - max(EVIDENCE_NS, self.guard.patience_ns))
         stamps = self.arrays.tables.stamps[:, oldest:stop]
@@ -185,14 +181,14 @@ class SimulatedGuard:
         return first
 
     def _released(self, now: int) -> int:
-        """Return how many cycles were released before an instant."""
+        """Return the number of cycles released before an instant."""
         return int(np.searchsorted(self.release_ns[: self.cycles], now))
 
     def _heard_ns(self, first: int, stop: int) -> NDArray[np.int64]:
-        """Return when the completions of cycles and shadows are heard; `NEVER_NS` if never.
+        """Return when the guard receives the completions of cycles and shadows, or `NEVER_NS`.
 
-        A shadow has completed when all sinks have their inputs; one that it shares with its cycle
-        must have completed.
+        A shadow is complete when all sinks have their inputs and every sink that it shares with its
+        cycle has completed.
         """
         tables, cycles = self.arrays.tables, slice(first, stop)
         latency_ns = tables.latency_ns[:, cycles]
@@ -203,7 +199,7 @@ class SimulatedGuard:
     # --------------------------------------------------------------------------- probes
 
     def proven(self, now: int) -> str | None:
-        """Return the candidate that probes have proven by now."""
+        """Return the wanted candidate if its probes have proven it by now."""
         wanted = self.guard.probation.wanted
         if wanted is None:
             return None
@@ -211,13 +207,13 @@ class SimulatedGuard:
         return wanted if self.guard.probation.proven(wanted, now) else None
 
     def _tell_probes(self, now: int) -> None:
-        """Tell the probation what has happened to probes until now, in the order of time."""
+        """Update the probation with all releases and completions of probes until now, by time."""
         probation, told, stop = self.guard.probation, self._probed, self._released(now)
         first = max(told - MOST_OPEN, 0)
         cycles = np.arange(first, stop)
         release_ns, heard_ns = self.release_ns[first:stop], self._heard_ns(first, stop)[1]
         new = (heard_ns <= now) & ((heard_ns > self._probed_ns) | (cycles >= told))
-        # At one instant completions come first, but for those of cycles released then.
+        # At equal times completions precede releases, unless the completed cycle is released then.
         after = np.where(heard_ns == release_ns, 2, 0)
         sent = zip(release_ns[told - first :].tolist(), repeat(1), range(told, stop))
         completed = zip(
@@ -231,14 +227,14 @@ class SimulatedGuard:
         self._probed, self._probed_ns = max(told, stop), now
 
     def want(self, name: str | None, first: int) -> None:
-        """Send every cycle from `first` on through the wanted candidate, too."""
+        """Send probes through the wanted candidate from the cycle `first` on."""
         if name != self.guard.probation.wanted:
             self.guard.probation.want(name, first)
             self._probes[first:] = -1 if name is None else self.names.index(name)
             self._probed = first
 
     def stamp(self, start: int, stop: int) -> None:
-        """Stamp the probes among some cycles; the others keep their shadows."""
+        """Stamp the probes among cycles; other cycles keep their shadows."""
         if self._probed:
             probes = self._probes[start:stop]
             stamps = self.arrays.tables.stamps[1, start : start + len(probes)]
@@ -248,7 +244,7 @@ class SimulatedGuard:
 
     @cached_property
     def _outages(self) -> dict[str, list[tuple[int, int]]]:
-        """Outages of nodes, links and workers: from when, until when."""
+        """Outages of nodes, links and workers, as (start, end) in ns."""
         nodes = NodeChanges.of(self.realisation.node_changes)
         links = LinkSegments.of(self.realisation.link_segments)
         found = {}
@@ -269,14 +265,9 @@ def _row(names: tuple[str, ...], name: str) -> int:
 
 
 def _outages(changes: NDArray[np.int64], start_ns: int) -> list[tuple[int, int]]:
-    """Return from when until when something is away.
+    """Return outages as (start, end) in ns; each end includes the restart time `start_ns`.
 
-    Parameters
-    ----------
-    changes : int64 array, shape (changes, 2)
-        Instants, ascending, and whether it is down from then on.
-    start_ns : int
-        Time that it takes to be back.
+    The rows of `changes` contain an instant, ascending, and whether the part is down from then on.
     """
     turns_ns = changes[np.diff(changes[:, 1], prepend=0) != 0, 0].tolist()
     outages: list[tuple[int, int]] = []

@@ -1,4 +1,4 @@
-"""Fleets of which no cell moves: one call of the kernel, whatever their size."""
+"""Fleets with fixed placements, simulated by one call of the kernel."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from dwell.sim.waiting import Waiting, waiting_of
 
 
 class StaticRun(NamedTuple):
-    """What a fleet came to after the warm-up.
+    """Results of a fleet after the warm-up.
 
     Parameters
     ----------
     missed : list of bool array, shape (cycles,)
-        Of every cell: whether each of its cycles missed.
+        Whether each cycle missed, by cell.
     used : mapping of str to float
         Utilisation of the shared resources.
     """
@@ -36,15 +36,9 @@ class StaticRun(NamedTuple):
 
 
 class StaticFleet:
-    """Plays a fleet in several sizes under one seed; a cell of several sizes is drawn once.
+    """Simulates a fleet in several sizes under one seed; samples each cell once for all sizes.
 
-    It gives what `simulate_fleet` does under static policies.
-
-    Parameters
-    ----------
-    seed : int
-    duration_ns : int
-        Length of the run.
+    The results equal those of `simulate_fleet` under static policies.
     """
 
     def __init__(self, *, seed: int, duration_ns: int) -> None:
@@ -55,13 +49,7 @@ class StaticFleet:
         return f"<StaticFleet: seed {self.seed}>"
 
     def play(self, fleet: Fleet) -> StaticRun:
-        """Play a fleet, and return what it came to.
-
-        Raises
-        ------
-        SimulationError
-            If some cell may move.
-        """
+        """Simulate a fleet; raise SimulationError if a cell may move."""
         missed: list[NDArray[np.bool_]] = []
         used: dict[str, float] = {}
         for problem, _, cell in self._play(fleet):
@@ -80,7 +68,7 @@ class StaticFleet:
         return StaticRun(missed, used)
 
     def waiting(self, fleet: Fleet) -> Waiting:
-        """Return where the cycles that missed have waited, of all cells."""
+        """Return the waiting times of the missed cycles of all cells."""
         whole = Waiting()
         for problem, real, arrays in self._play(fleet, jobs=True):
             whole += waiting_of(problem, real, arrays)
@@ -117,7 +105,7 @@ class StaticFleet:
 
 
 def _released_at(fleet: Fleet, problem: Problem, real: Realisation) -> Realisation:
-    """Return a realisation without traces with another phase; jobs and messages take the same."""
+    """Return a realisation with another phase and the same jobs and messages; allows no traces."""
     drawing = Drawing(
         problem,
         real.scenario,

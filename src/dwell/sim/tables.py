@@ -1,4 +1,4 @@
-"""Tables of a Run from what the kernels left in their arrays."""
+"""Tables of a Run, made from the arrays of the kernel."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ T = TypeVar("T", bound=np.generic)
 
 @dataclass(eq=False)
 class PlayedRealisation:
-    """A realisation that has been played to its end.
+    """A completely simulated realisation.
 
     Parameters
     ----------
     problem, realisation, controller, arrays
-        As they were used.
+        As after the simulation.
     metrics : list of tuple
-        L95 (ms), violation rate and cost of every window as the controller saw them, None where
-        its node was down; empty where the kernel decided, or decisions come more often than windows
-        close.
+        L95 (ms), violation rate and cost of every window as the controller saw them; None while
+        its node was down. The list is empty if the kernel decided, or if decisions are more
+        frequent than windows.
     host_down : function of int
-        Whether the controller's node is down at an instant, ns.
+        Whether the controller's node is down at an instant (ns).
     """
 
     problem: Problem
@@ -52,18 +52,18 @@ class PlayedRealisation:
 
     @property
     def looks(self) -> bool:
-        """Whether decisions come more often than windows close."""
+        """Whether decisions are more frequent than windows."""
         return self.problem.decide_cycles < self.problem.window_cycles
 
     @cached_property
     def looked(self) -> Rows:
-        """The cycles that every decision has looked at."""
+        """Range and metrics of the cycles that each decision evaluated."""
         tables = self.arrays.tables
         return tables.looked[0, : tables.cells[0]["look"]] if self.looks else self.seen
 
     @cached_property
     def seen(self) -> Rows:
-        """Every closed window as it could be known then."""
+        """Metrics of every window as known at its close."""
         tables = self.arrays.tables
         return tables.seen[0, : tables.cells[0]["window"]]
 
@@ -74,21 +74,21 @@ class PlayedRealisation:
 
     @property
     def shares(self) -> Floats:
-        """Busy, own, shadow and others' share of every resource, shape (windows, 4, resources)."""
+        """Busy, own, shadow and other cells' shares, shape (windows, 4, resources)."""
         return self.arrays.tables.shares[0, : len(self.seen)]
 
     @property
     def by_kernel(self) -> bool:
-        """Whether the kernel decided, and not the controller."""
+        """Whether the kernel decided instead of the controller."""
         return len(self.arrays.tables.rule) > 0
 
     @property
     def features(self) -> tuple[Feature, ...]:
-        """Features of the run that not every run has, beside those of its estimator."""
+        """Optional features of the run, without those of its estimator."""
         return ("shadows",) if len(self.arrays.tables.cells) > 1 else ()
 
     def by_window(self, cycles: NDArray[T]) -> NDArray[T]:
-        """Values of cycles as rows of windows, (windows, W); a view where none is left out."""
+        """Return values of cycles by window, shape (windows, W); a view if `whole`."""
         if self.whole:
             return cycles[: self.counted].reshape(-1, self.problem.window_cycles)
         rows: NDArray[T] = sliding_window_view(cycles, self.problem.window_cycles)[self.first]
@@ -108,8 +108,8 @@ class PlayedRealisation:
     def released(self) -> int:
         """Number of cycles released before the run ended.
 
-        Fewer than were drawn if an order takes time: the cycles between a close and the first
-        cycle of the new placement belong to no window, and the last window may be incomplete.
+        Fewer cycles are released than sampled if orders take time: cycles between a close and the
+        first cycle of the new placement belong to no window, and the last window may be incomplete.
         """
         return int(self.arrays.tables.cells[0]["released"])
 
@@ -122,7 +122,7 @@ class PlayedRealisation:
 
     @property
     def close_ns(self) -> Ints:
-        """Instant of every close, shape (windows,)."""
+        """Instant at which each window closes, shape (windows,)."""
         release_ns, beyond = self.realisation.release_ns, self.first + self.problem.window_cycles
         return window_close_ns(self.problem, release_ns[beyond - 1], release_ns[beyond])
 
@@ -132,7 +132,7 @@ class PlayedRealisation:
         latency_ns = self.arrays.tables.latency_ns[0, : self.released]
         missed: NDArray[np.bool_] = latency_ns > self.problem.pipeline.deadline_ns
         if not self.realisation.is_cut(self.problem):
-            # The run has ended before the windows of the last cycles could close.
+            # The windows of the last cycles never closed.
             missed[self.counted :] = False
         age_ns = self.close_ns[:, None] - self.by_window(self.realisation.release_ns)
         late = self.by_window(latency_ns) > age_ns
@@ -147,14 +147,9 @@ class PlayedRealisation:
 def make_tables(
     played: PlayedRealisation, *, jobs: bool = False
 ) -> tuple[dict[str, Callable[[], pl.DataFrame]], dict[str, Callable[[], TableArrays]]]:
-    """Functions that make each table when it is first asked for; `jobs` asks for that of jobs.
+    """Return functions that make the tables: as frames, and (except ``jobs``) as arrays.
 
-    Returns
-    -------
-    frames : dict of str to function
-        One a table.
-    arrays : dict of str to function
-        Columns of the tables that need not be frames to be computed with.
+    The frames include the table of jobs if `jobs` is true.
     """
     problem, controller = played.problem, played.controller
     arrays: dict[str, Callable[[], TableArrays]] = {
@@ -234,13 +229,13 @@ def _windows(played: PlayedRealisation, seen: dict[str, Floats]) -> TableArrays:
 
 
 def _shadow_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray[np.generic]]]:
-    """Cost of shadow jobs in each window: cycles sent twice, bytes, share of resources."""
+    """Return the cost of shadows in each window: cycles sent twice, bytes, share of resources."""
     if not played.features:
         return {}
 
     def sent_bytes() -> Ints:
         sent = played.by_window(played.arrays.tables.shadow_bytes)
-        # What 64 bits do not hold is as good as that.
+        # Limit sums that 64 bits may not hold.
         held = sent.sum(axis=1, dtype=np.float64) < HORIZON_NS
         return np.where(held, sent.sum(axis=1), HORIZON_NS)
 
@@ -257,7 +252,7 @@ def _shadow_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray
 
 
 def _seen(played: PlayedRealisation) -> dict[str, Floats]:
-    """Metrics of windows as they could be known, NaN where the controller's node was down."""
+    """Return the metrics of windows at their closes; NaN while the controller's node was down."""
     tables, window_cycles = played.arrays.tables, played.problem.window_cycles
     if played.looks or played.by_kernel:
         seen = {
@@ -275,9 +270,9 @@ def _seen(played: PlayedRealisation) -> dict[str, Floats]:
 
 
 def _costs(played: PlayedRealisation, seen: dict[str, Floats]) -> Floats:
-    """J of windows, with the switching term of every move that took effect in one of them.
+    """Return J of the windows, with the switching terms of the moves that took effect in them.
 
-    It is NaN where the controller's node was down at the close, and so are the metrics then.
+    If the controller's node was down at a close, J is NaN, and so are the metrics in `seen`.
     """
     problem, resources = played.problem, played.controller.resources
     used = {name: played.shares[:, 0, i] for i, name in enumerate(resources)}
@@ -294,12 +289,12 @@ def _costs(played: PlayedRealisation, seen: dict[str, Floats]) -> Floats:
 
 
 def _decisions(controller: Controller) -> TableArrays:
-    """Decisions of the controller, their names found among those that there may be."""
+    """Return the decisions of the controller, with candidates and reasons as `Names`."""
     columns, rows = controller.decision_columns, controller.decisions
     columns_of_rows = zip(*rows, strict=True) if rows else [()] * (len(columns) + 1)
     decided: dict[str, object] = dict(zip((*columns, "refused"), columns_of_rows, strict=True))
     if controller.coordination is None:
-        # Every decision is carried out.
+        # Without coordination no decision is refused.
         del decided["refused"]
     known = dict.fromkeys(("incumbent", "placement"), tuple(controller.problem.candidates))
     known["reason"] = REASONS
@@ -307,13 +302,13 @@ def _decisions(controller: Controller) -> TableArrays:
         column: partial(Names.of, cast("Sequence[str]", decided[column]), those)
         for column, those in known.items()
     }
-    # Also where nothing was decided.
+    # The type must be right without decisions, too.
     migrated = np.asarray(decided["migrated"], np.bool_)
     return TableArrays({**decided, **names, "migrated": migrated})
 
 
 def _decided_by_kernel(played: PlayedRealisation) -> TableArrays:
-    """Decisions that the kernel has made."""
+    """Return the decisions of the kernel."""
     controller, tables = played.controller, played.arrays.tables
     names, looked = tuple(played.problem.candidates), played.looked
     count, last = len(looked), looked["first_cycle"] + looked["cycles"] - 1
@@ -337,7 +332,7 @@ def _decided_by_kernel(played: PlayedRealisation) -> TableArrays:
             "seen_violation_rate": looked["missed"] / looked["cycles"],
             **dict(zip((f"u_{one}" for one in controller.resources), used, strict=False)),
         }
-    # It decides by estimates without errors alone.
+    # The kernel's estimates have no errors.
     errors = ("est_l95_error_ms", "est_violation_error")
     columns |= {f"{error}_{name}": np.zeros(count) for error in errors for name in names}
     priced = [column for column in controller.decision_columns if column not in columns]
@@ -355,7 +350,7 @@ def _jobs(played: PlayedRealisation) -> pl.DataFrame:
     nodes = tuple(problem.fabric.nodes)
     cells = len(tables.cells)
     log, outcome, _ = played.arrays.logs()
-    # Sites of a shadow follow those of its cell in the same order.
+    # The sites of a shadow follow the sites of its cell, in the same order.
     site_node = np.array([nodes.index(node) for _, node in played.realisation.sites] * cells)
     site = tables.site_of - played.arrays.part.site_0
     node = site_node[site[np.maximum(tables.stamps[:, : log.shape[1]], 0).astype(np.int64)]]

@@ -1,4 +1,4 @@
-"""Versions of the software that a run's numbers come from."""
+"""Versions of the software that computes a run."""
 
 from __future__ import annotations
 
@@ -11,12 +11,9 @@ from dwell.version import __version__
 
 
 def versions() -> dict[str, str]:
-    """Return the versions by their names; the kernel's are its sources' digest and its compiler.
+    """Return versions by name; that of the kernel is the digest of its sources and its compiler.
 
-    Raises
-    ------
-    KernelError
-        If the compiled kernel cannot be used.
+    Raises KernelError if the compiled kernel cannot be used.
     """
     return {
         "dwell": __version__,
@@ -27,5 +24,5 @@ def versions() -> dict[str, str]:
 
 
 def kernel_digest() -> str:
-    """Return 16 hexadecimal digits of the kernel's sources: they give the same by any compiler."""
+    """Return 16 hexadecimal digits of the digest of the kernel's sources."""
     return library.digest()[:16]

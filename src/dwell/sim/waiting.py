@@ -1,4 +1,4 @@
-"""Waiting: where the cycles of a cell that missed have waited, for resources and links."""
+"""Waiting times of missed cycles, for resources and for links."""
 
 from __future__ import annotations
 
@@ -13,20 +13,15 @@ from dwell.kernels.realisation import LinkSegments, Realisation
 from dwell.model import Problem
 from dwell.model.number_arrays import Ints
 
-#: Nanoseconds by what was waited for: ("resource", "E.gpu"), or ("link", "R1->E").
+#: Waiting time in nanoseconds by ("resource", "E.gpu") or ("link", "R1->E").
 Waiting: TypeAlias = Counter[tuple[str, str]]
 
 
 def waiting_of(problem: Problem, real: Realisation, arrays: CellArrays) -> Waiting:
-    """Sum up what the cycles after the warm-up that missed have waited.
+    """Sum the waiting times of the missed cycles after the warm-up; needs the log of all jobs.
 
-    For a resource it is the time from readiness to completion beyond what the job takes alone; for
-    a link the time before the message is sent, and the time for sending it again.
-
-    Parameters
-    ----------
-    arrays : CellArrays
-        As played, with the log of all jobs.
+    The wait for a resource is the time from readiness to completion minus the execution time. The
+    wait for a link is the time until the message is sent, plus the time of repeated attempts.
     """
     tables, pipeline = arrays.tables, problem.pipeline
     first, last = problem.warmup_windows * problem.window_cycles, real.cycles
@@ -69,7 +64,7 @@ def _sum(waited_ns: Ints, known: NDArray[np.bool_]) -> int:
 def _unhindered(
     real: Realisation, hop: tuple[str, str, str], payload_bytes: int, cycles: Ints, sent: Ints
 ) -> Ints:
-    """Return what messages take that find their link free, and are not lost."""
+    """Return the transfer times (ns) of messages on a free link without loss."""
     row = real.hops.index(hop)
     taken = real.delay_ns[row, cycles].astype(np.float64)
     pieces = LinkSegments.of(real.link_segments)
