@@ -164,7 +164,7 @@ def checkout(tmp_path: Path) -> Path:
     shutil.copy(ROOT / "src" / "dwell" / "kernels" / "library.cpp", kernels)
     for name in ("pyproject.toml", "hatch_build.py", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, folder)
-    (folder / "examples").mkdir()
+    shutil.copytree(ROOT / "examples", folder / "examples")
     return folder
 
 
