@@ -115,7 +115,7 @@ def out_of_order(applied: Sequence[Seen]) -> list[str]:
 def unsafe(seen: Sequence[Seen], limit_ms: float) -> list[str]:
     """Return gaps between commands in which ``hold`` or ``zero`` was not called in time.
 
-    A dead or frozen sink cannot call them; `too_old` of `strike` is the only check for such a sink.
+    A dead or frozen sink cannot call them; only `strike.too_old` checks its commands.
     """
     silences = []
     commands = [place for place, one in enumerate(seen) if one.what == APPLY]

@@ -144,7 +144,7 @@ class Harness(Started):
         self.wait_for("the whole cell at home", self.at_home, 60.0)
 
     def _end_all(self) -> None:
-        """End all processes, including frozen ones and ones that lost their parent."""
+        """End all processes, including frozen processes and processes without a parent."""
         self._feed()
         if self._hog is not None:
             self._hog.stop()
