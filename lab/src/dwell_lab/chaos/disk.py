@@ -55,7 +55,7 @@ class SmallDisk(Started):
         """Make the disk full: reduce its size to the used space, then fill the last pages."""
         used = os.statvfs(self.folder)
         size = max((used.f_blocks - used.f_bfree) * used.f_frsize, PAGE_BYTES)
-        # If the files have grown meanwhile, the new size is too small, and mount refuses it.
+        # If the files have grown since then, mount refuses the new size: try a larger size.
         for spare in (0, 1, 4, 16, 64):
             with suppress(LiveError):
                 self._resize(size + spare * PAGE_BYTES)

@@ -62,7 +62,7 @@ class Judge:
     Parameters
     ----------
     renews : bool
-        Whether a fault may have destroyed the stamper's saved state, so that a new run may begin.
+        Whether a fault may have destroyed the stamper's saved state: then a new run may begin.
     held : dict of int to bool
         Whether the controller, and not the guard, chose the placement of a term; from the
         stamper's answers.

@@ -1,7 +1,8 @@
 """Wiretap: records a cell's messages from the wire, in a process outside the cell.
 
-The process uses separate sessions, sends nothing and decodes nothing. A record contains the instant
-on the true clock, the key, the message and its header; messages to stages have only the header.
+The process uses separate sessions, and only receives and stores. A record contains the instant on
+the true clock, the key, the message and its header. For messages to stages the record omits the
+payload.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Names of testbeds: one running testbed per name; what a dead testbed left is removed.
+"""Names of testbeds: one running testbed per name, and removal of a dead testbed's leftovers.
 
 A folder that is lost at reboot contains two files per name. ``NAME.lock`` is locked while its owner
 lives. ``NAME.json`` lists the namespaces that the owner will create, and is written before they
@@ -36,8 +36,8 @@ def claims_folder() -> Path:
 class Claim(Started):
     """Context manager that holds the right to create the hosts and groups of one name.
 
-    Enter it before the hosts and groups are created. It removes those of a dead testbed with the
-    same name. The creator of hosts and groups removes them; otherwise the next claim does.
+    Enter it before the hosts and groups are created. It removes the hosts and groups that a dead
+    testbed with the same name left. A running testbed removes its own hosts and groups.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def _same(handle: int, path: Path) -> bool:
 
 
 def _cgroups() -> Cgroups | None:
-    """Return the control groups; None without any (the doctor and `Groups` report that)."""
+    """Return the control groups, or None; the doctor and `Groups` report that they are missing."""
     with suppress(LiveError):
         return find_cgroups()
     return None

@@ -17,8 +17,8 @@ from dwell_lab.testbed.speeds import Usual
 from dwell_lab.testbed.task_costs import TaskCost
 
 #: Mean size of a group of simultaneous wakes: a message wakes a thread that waits for sockets, a
-#: reader and a worker. In a scheduler trace of the example, the time from any instant to the next
-#: wake or sleep equals that of independent wakes at 0.40 (E) to 0.52 (R1) of the measured rate.
+#: reader and a worker. In a scheduler trace of the example, the times between an instant and the
+#: next wake or sleep match independent wakes at 0.40 (E) to 0.52 (R1) of the measured rate.
 TOGETHER = 2.2
 
 
@@ -61,7 +61,7 @@ def beside_jobs(measured: Sequence[Measured], behind: Mapping[str, float]) -> di
 
 
 def _cores(of: Sequence[tuple[float, float]]) -> float | None:
-    """Return the CPU time during jobs divided by their duration; None without jobs."""
+    """Return the CPU time during jobs divided by their duration; None if no job ran."""
     took_s = sum(took for _, took in of)
     return sum(taken for taken, _ in of) / took_s if took_s > 0 else None
 

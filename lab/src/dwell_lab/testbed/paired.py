@@ -55,7 +55,7 @@ def paired(
     for site in parts:
         beside.setdefault(cpus.get(site[1], site[1]), set()).add(site)
     columns: dict[SiteName, list[Floats]] = {site: [] for site in parts}
-    # Next row of each donor run that is used in order.
+    # Next row of each donor run that is used in order, by CPU.
     begins: dict[tuple[str, Hashable], int] = {}
     for block in blocks.values():
         rows = len(next(iter(block.values())))
@@ -81,8 +81,8 @@ def paired(
 def _as_slow(ours: Sequence[Floats], theirs: Sequence[Floats]) -> NDArray[np.intp]:
     """Return for each row of one run the index of the row with the same rank in another run.
 
-    The rank is by the sum of the tasks' times, so that short tasks, which are mostly noise, have
-    little weight.
+    The rank is by the sum of the tasks' times: short tasks, which are mostly noise, have little
+    weight in it.
     """
     own, other = (np.sum(columns, axis=0) for columns in (ours, theirs))
     place = np.empty(len(own))

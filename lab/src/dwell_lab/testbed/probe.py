@@ -24,7 +24,7 @@ WORK_EVERY, WORK_TURNS = 5, 2_000
 
 
 class Lateness(NamedTuple):
-    """Largest lateness of a probe, and the mean CPU time of its work; None without work."""
+    """Largest lateness of a probe, and the mean CPU time of its work (None if it did no work)."""
 
     max_ms: float
     work_ms: float | None

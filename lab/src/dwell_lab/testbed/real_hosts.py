@@ -125,7 +125,7 @@ class RealHosts(Testbed):
     def inside(self, node: str, words: Sequence[str]) -> Sequence[str]:
         """Return a command for `RemoteProcess` that runs words on a node's host.
 
-        The host's interpreter and folder replace those of this computer.
+        In the words, the host's interpreter and folder replace this computer's.
         """
         return self._words(node, [self._translated(node, word) for word in words])
 

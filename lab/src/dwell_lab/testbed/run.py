@@ -38,7 +38,7 @@ LAST_S = 0.5
 def length_s(problem: Problem, windows: int) -> float:
     """Return the duration of a run with some windows, including the warm-up, in seconds.
 
-    Every migration delays the next window, so that a run with migrations has fewer windows.
+    Every migration delays the next window: a run with migrations has fewer windows.
     """
     cycles_ms = problem.cycles_of(windows) * problem.pipeline.period_ms
     return (cycles_ms + problem.controller.close_grace_ms) / 1e3 + LAST_S

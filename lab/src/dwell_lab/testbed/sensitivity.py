@@ -1,9 +1,10 @@
 """Sensitivity: the effect of the CPU's speed on a stage, relative to a probe's piece of work.
 
-When other processes use shared resources (the second thread of a core, caches, memory), a CPU slows
-down by a different factor for every piece of code: a sum may take twice as long, image processing
-three times. Both times change together from minute to minute. The slope of their logarithms is the
-percentage by which a stage takes longer when the piece of work takes one percent longer.
+Other processes slow a CPU down when they use shared resources (the second thread of a core, caches,
+memory). The factor differs for every piece of code: a sum may take twice as long, image processing
+three times. The times of the probe and of a stage change together from minute to minute. The slope
+of their logarithms is the percentage by which a stage takes longer when the piece of work takes one
+percent longer.
 
 A single window is too noisy: the error of a probe over 2 s exceeds the changes of the CPU's speed,
 and noise in the probe biases the slope towards zero. A point therefore contains the medians of five

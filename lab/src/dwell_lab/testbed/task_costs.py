@@ -9,10 +9,10 @@ node, so the execution times include these costs:
   of the other workers.
 - The part of the overhead that delays messages (`dwell_lab.testbed.message_costs`) delays the
   cycle.
-- A job also includes the time between its last input and its start, and a sink's job the time
-  between its end and the hand-over of the command, both without the effect of the quota.
-- If the CPU time of a node is counted between a release and the start of its source, or between two
-  jobs of a cycle on the node, the job includes this time, because it waits for it.
+- A job also includes the time between its last input and its start. A sink's job also includes the
+  time until the hand-over of the command. Both exclude delays by the quota.
+- Some runs count the CPU time of a node between a release and the start of its source, or between
+  two jobs of a cycle on the node. The job includes this time, because it waits for it.
 """
 
 from __future__ import annotations
