@@ -113,7 +113,7 @@ class Result:
     heard : dict of str to int
         Number of checked messages, by kind.
     means : dict of str to str
-        How each kind of fault was produced with this user's rights.
+        How faults that need special rights or machines were produced, by kind.
     """
 
     seed: int

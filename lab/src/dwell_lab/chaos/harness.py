@@ -383,9 +383,10 @@ class Harness(Started):
         return away_from_home(self.problem, self.home, applied, self.status)
 
     def healthy(self) -> str:
-        """Return which healthy cycles are missing before a next fault is no relapse for the guard.
+        """Return the count of healthy cycles while it is too small; else an empty text.
 
-        11 windows without a lost cycle are enough, or `HEALTH_S` if that is shorter.
+        After 11 healthy windows the guard does not count the next fault as a relapse. If windows
+        are long, cycles worth `HEALTH_S` are enough.
         """
         ten = 11 * self.problem.window_cycles
         needed = min(ten, round(HEALTH_S * 1e9 / self.period_ns))

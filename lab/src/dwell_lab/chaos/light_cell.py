@@ -12,8 +12,8 @@ MAX_AGE_MS = 120
 MIN_DWELL = 2
 WINDOW_CYCLES = 3
 #: Execution times by home (the candidate that the controller prefers), task and node. The stages
-#: are light enough for one CPU, and for a quota of half a CPU; mainly the delays of the links,
-#: which need no CPU, separate the placements.
+#: are light enough for one CPU, and for a quota of half a CPU; the delays of the links, which
+#: need no CPU, separate the placements.
 EXEC_MS = {
     "SO": {"perception": {"R1": 4.0, "E": 2.0}, "planning": {"R2": 8.0, "E": 2.0}},
     "LOC": {"perception": {"R1": 2.0, "E": 6.0}, "planning": {"R2": 2.0, "E": 5.0}},

@@ -34,7 +34,7 @@ NODES = ("R1", "E", "R2")
 
 
 def _where() -> str:
-    """Return the name of this process from its command line: ``task@node``, with suffixes."""
+    """Return this process's name from its command line: ``planning@E.1``, ``sink.control@R2``."""
     return sys.argv[sys.argv.index("--who") + 1]
 
 
