@@ -1,5 +1,5 @@
-"""Chaos: what befalls a live cell on purpose, and who watches whether it keeps its promises.
+"""Chaos: faults injected into a live cell, and checks that the cell keeps its promises.
 
-The watchers are no part of the cell: a process that listens on the wire (`wiretap`), and
-the log of the actuator (`actuations`).
+The checks are independent of the cell. They use a process that records the messages on the wire
+(`wiretap`), and the log of the actuator (`actuations`).
 """

@@ -1,4 +1,4 @@
-"""Actuations: the calls of the actuator, by its own log (see `stages.Witness`)."""
+"""Actuations: the calls of the actuator, read from its log (see `stages.Witness`)."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ class Seen:
     what : int
         `APPLY`, `HOLD`, `ZERO`, or `START` of its process.
     placement : str
-        Candidate of the light cell that the command came through, by its own account.
+        Candidate of the light cell whose nodes the command names; ``?`` if there is none.
     cycle : int
-        Cycle by the runtime.
+        Cycle number that the runtime passed.
     said : int
-        Cycle by the command itself.
+        Cycle number in the command.
     released_ns : int
-        Release as the source saw it.
+        Release that the source read.
     at_ns : int
-        On the true clock.
+        Instant of the call on the true clock.
     """
 
     what: int
@@ -44,20 +44,20 @@ class Seen:
 
     @classmethod
     def of(cls, what: int, perception: int, planning: int, pid: int, *numbers: int) -> Self:
-        """Read a record of the actuator (see `stages.RECORD`)."""
+        """Return the call of a record of the actuator (see `stages.RECORD`)."""
         where = _PLACEMENTS.get((NODES[perception], NODES[planning]), "?")
         return cls(what, where, pid, *numbers)
 
 
 class Actuations:
-    """Calls that the actuator has written down, as far as they have been read."""
+    """Reader of the actuator's log; `all` contains the calls read so far."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.all = path, list[Seen]()
         self._read = 0
 
     def look(self) -> None:
-        """Read the new calls."""
+        """Read the new complete records."""
         if not self.path.exists():
             return
         with self.path.open("rb") as file:
@@ -70,11 +70,11 @@ class Actuations:
 
     @property
     def applied(self) -> list[Seen]:
-        """Commands applied."""
+        """Applied commands read so far."""
         return [seen for seen in self.all if seen.what == APPLY]
 
     def healthy(self, home: str | None = None) -> int:
-        """Cycles since the last one that was lost, or took another placement than `home`."""
+        """Return the number of actuated cycles since the last lost one, or one away from `home`."""
         self.look()
         count, following = 0, None
         for seen in reversed(self.all):
@@ -87,12 +87,12 @@ class Actuations:
         return count
 
     def last(self) -> Seen | None:
-        """Return the last command that was applied."""
+        """Return the last applied command, if any."""
         self.look()
         return next((seen for seen in reversed(self.all) if seen.what == APPLY), None)
 
     def since(self, at_ns: int) -> list[Seen]:
-        """Calls of the actuator from an instant on."""
+        """Return the calls of the actuator since an instant of the true clock."""
         self.look()
         calls = []
         for seen in reversed(self.all):
@@ -103,7 +103,7 @@ class Actuations:
 
 
 def out_of_order(applied: Sequence[Seen]) -> list[str]:
-    """Return commands that came twice, out of order, or with another cycle's number."""
+    """Return commands that are repeated, out of order, or carry another cycle's number."""
     violations = [
         f"cycle {later.cycle} actuated after {before.cycle}"
         for before, later in pairwise(applied)
@@ -113,10 +113,9 @@ def out_of_order(applied: Sequence[Seen]) -> list[str]:
 
 
 def unsafe(seen: Sequence[Seen], limit_ms: float) -> list[str]:
-    """Return silences in which the actuator was not told in time that no command comes.
+    """Return gaps between commands in which ``hold`` or ``zero`` was not called in time.
 
-    A sink that is dead or frozen itself tells it nothing; of that no more is asked than that it
-    never applies what has become old.
+    A dead or frozen sink cannot call them; only `strike.too_old` checks its commands.
     """
     silences = []
     commands = [place for place, one in enumerate(seen) if one.what == APPLY]

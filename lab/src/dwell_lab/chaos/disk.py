@@ -1,4 +1,4 @@
-"""Disks that are full, or slow because somebody else writes to them, too."""
+"""Disks that are full, or slow because other processes write to them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from dwell.errors import LiveError
 from dwell.live.local.child import Started, run_command
 
 NAME = "dwell-chaos"
-#: Of a small disk while it is not full.
+#: Size of a small disk while it is not full.
 ROOMY_BYTES = 512 << 20
 PAGE_BYTES = 4096
 HOG_BYTES = 4 << 20
@@ -31,14 +31,14 @@ def may_mount() -> bool:
 
 
 class SmallDisk(Started):
-    """A file system of its own in place of a folder, which can be made full; a context manager.
+    """Context manager that mounts a tmpfs on a folder; `fill` and `clear` set its free space.
 
-    When it is taken away, what was on it is in the folder.
+    At the end the files remain in the folder.
 
     Raises
     ------
     LiveError
-        If it cannot be mounted.
+        If the tmpfs cannot be mounted.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -52,23 +52,23 @@ class SmallDisk(Started):
         self._stack.callback(self._unmount)
 
     def fill(self) -> None:
-        """Leave no room: not by filling it, but by making it as small as what is on it."""
+        """Make the disk full: reduce its size to the used space, then fill the last pages."""
         used = os.statvfs(self.folder)
         size = max((used.f_blocks - used.f_bfree) * used.f_frsize, PAGE_BYTES)
-        # What grows in between is beyond the size, which is then refused.
+        # If the files have grown since then, mount refuses the new size: try a larger size.
         for spare in (0, 1, 4, 16, 64):
             with suppress(LiveError):
                 self._resize(size + spare * PAGE_BYTES)
                 break
         else:
             raise LiveError(f"{self.folder}: cannot be made full")
-        # The rest of the last pages is room, too.
+        # The last pages may still have free space.
         with suppress(OSError), (self.folder / "filler").open("wb", buffering=0) as file:
             while True:
                 file.write(bytes(PAGE_BYTES))
 
     def clear(self) -> None:
-        """Make room again."""
+        """Restore the free space."""
         self._resize(ROOMY_BYTES)
         (self.folder / "filler").unlink(missing_ok=True)
 
@@ -76,7 +76,7 @@ class SmallDisk(Started):
         run_command("mount", "-o", f"remount,size={size}", str(self.folder))
 
     def _unmount(self) -> None:
-        """Take it away; its files stay."""
+        """Unmount the disk; its files stay in the folder."""
         kept = self.folder.with_name(f"{self.folder.name}.kept")
         shutil.copytree(self.folder, kept, dirs_exist_ok=True)
         run_command("umount", "--lazy", str(self.folder))
@@ -85,7 +85,7 @@ class SmallDisk(Started):
 
 
 def unmount_leftovers(folder: Path) -> None:
-    """Take away the small disks that somebody who was killed has left below a folder."""
+    """Unmount the small disks below a folder that a killed process left mounted."""
     with suppress(OSError):
         mounts = Path("/proc/self/mounts").read_text(encoding="utf-8").splitlines()
         ours = f"{folder.resolve()}/"
@@ -95,12 +95,12 @@ def unmount_leftovers(folder: Path) -> None:
 
 
 def limit_file_size(pid: int, longest: int | None) -> None:
-    """Let a process write no file beyond a length, as on a disk that is full; None: any.
+    """Limit the length of a process's files, as if its disk were full; None removes the limit.
 
     Raises
     ------
     LiveError
-        If it is not ours, or has ended.
+        If the process belongs to another user, or has ended.
     """
     try:
         _, hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)
@@ -111,17 +111,17 @@ def limit_file_size(pid: int, longest: int | None) -> None:
 
 
 class DiskHog(Started):
-    """Writes to a folder's disk as fast as it takes it, beside everybody else; a context manager.
+    """Context manager that writes to a folder's disk at full speed, in several processes.
 
-    A disk that is slow by itself cannot be had without a device of its own. What is slowed down is
-    whoever waits for this disk; by how much is measured.
+    It replaces a slow disk, which would need a separate device. All processes that wait for this
+    disk become slower; a probe measures how much.
 
     Attributes
     ----------
     usual_ms : float
-        How long a page took to be on the disk before.
+        Median time to write and sync a page before the writers start.
     waits_ms : list of float
-        And while it wrote.
+        Times to write and sync a page while they write.
     """
 
     def __init__(self, folder: Path, writers: int = 4) -> None:
@@ -144,11 +144,11 @@ class DiskHog(Started):
         self._stack.callback(probe.join, timeout=30.0)
 
     def stop(self) -> None:
-        """End, and remove what it has written."""
+        """Stop the writers, and remove their files."""
         self._stopped.set()
         for writer in self._writers:
             writer.kill()
-            writer.communicate()  # closes its standard input, too
+            writer.communicate()  # also closes its standard input
         super().stop()
         for path in self._folder.glob("hog-*"):
             path.unlink(missing_ok=True)
@@ -171,7 +171,7 @@ def _page_ms(file: io.FileIO) -> float:
     return (time.monotonic() - begin) * 1e3
 
 
-# Ends with its parent, at the latest after the next write.
+# Ends after the next write at the latest when its parent ends.
 _HOG = f"""
 import os, select, sys
 file = os.open(sys.argv[1], os.O_WRONLY | os.O_CREAT, 0o600)

@@ -1,4 +1,4 @@
-"""FaultCampaign: faults of a timeline befall a cell, one after the other, and are judged."""
+"""FaultCampaign: injects the faults of a timeline into a cell one by one, and judges the cell."""
 
 from __future__ import annotations
 
@@ -36,21 +36,21 @@ from dwell_lab.chaos.wiretap import ActuatorObserver
 from dwell_lab.testbed.netns_testbed import NetnsTestbed
 
 LIGHT_HOME = "SO"
-#: What is on its way to a tap.
+#: Seconds to wait for messages on their way to a wiretap.
 HEARD_S = 0.15
 
 
 @dataclass(frozen=True, slots=True)
 class Staging:
-    """Where the cells of a campaign run, each in a folder of its own.
+    """Settings for the testbeds of a campaign; each cell gets its own folder.
 
     Parameters
     ----------
     cell : Path, optional
-        Cell file; the light cell if left out.
+        Cell file; the light cell if omitted.
     hosts : bool
-        Whether every node gets a host of its own of a testbed, which only root can give; else all
-        are on this computer's loopback.
+        Whether every node runs on its own host of a network testbed, which needs root; otherwise
+        all nodes use this computer's loopback.
     """
 
     cell: Path | None
@@ -59,7 +59,7 @@ class Staging:
     hosts: bool = False
 
     def testbed(self, number: int) -> tuple[LocalTestbed, str | None]:
-        """Return where a cell runs, by its number in the campaign, and its home."""
+        """Return the testbed and the home of a cell, by its number in the campaign."""
         folder = (self.out / f"cell-{number}").resolve()
         folder.mkdir(parents=True, exist_ok=True)
         home = LIGHT_HOME if self.cell is None else None
@@ -91,7 +91,7 @@ class Staging:
 
 
 def _witnessed(problem: Problem, folder: Path) -> tuple[Problem, dict[str, str]]:
-    """Return a cell whose actuators are written down before they are called."""
+    """Return a cell that logs each call of its actuator, and the environment that this needs."""
     actuators = dict(problem.live.actuators)
     if len(actuators) != 1:
         raise LiveError("chaos needs a cell with one sink, whose actuator live.actuators names")
@@ -107,13 +107,13 @@ class Result:
     Parameters
     ----------
     stalled : int
-        Faults in which a bound was missed, or a silence was too long, while the machine stalled.
+        Number of faults with violations that a stall of the machine excuses.
     wrong : list of str
-        Violations, each with the seed and the fault.
+        Violations, each with its fault and the command that repeats it.
     heard : dict of str to int
-        Messages, by their kind, that were held against the cell file.
+        Number of checked messages, by kind.
     means : dict of str to str
-        How faults that need special rights were brought about.
+        How faults that need special rights or machines were produced, by kind.
     """
 
     seed: int
@@ -126,7 +126,7 @@ class Result:
     means: dict[str, str] = field(default_factory=dict)
 
     def document(self) -> dict[str, Any]:
-        """Return it ready for JSON."""
+        """Return the result as a document for JSON."""
         bounded = [o for _, o in self.outcomes if o.bound is not None]
         return {
             "seed": self.seed,
@@ -145,14 +145,14 @@ class Result:
 
 
 class FaultCampaign:
-    """See the module.
+    """A campaign of faults.
 
     Parameters
     ----------
     staging : Staging
         Its folder also gets ``faults.jsonl``.
     again : str
-        Command that repeats it; the number of a fault is added.
+        Command that repeats the campaign; messages append ``--only`` and the number of a fault.
     """
 
     def __init__(
@@ -164,7 +164,7 @@ class FaultCampaign:
         self._staging, self._out, self._seed = staging, staging.out, staging.seed
         self._again, self._say = again, say
         self._disks = may_mount()
-        # On `time.monotonic`, once the first cell has come up.
+        # On the clock of `time.monotonic`; set when the first cell has started.
         self._until_s: float | None = None
         self.result = Result(self._seed)
         self.result.means = {
@@ -179,19 +179,19 @@ class FaultCampaign:
     def run(
         self, *, seconds: float | None = None, faults: int | None = None, only: int | None = None
     ) -> Result:
-        """Have faults befall cells, and judge what they do.
+        """Inject faults into cells, and judge the cells.
 
         Parameters
         ----------
         seconds : float, optional
-            No fault begins later than that after the first cell has come up.
+            Time after the start of the first cell within which faults are taken from the timeline.
         only : int, optional
-            Nothing but this fault of the timeline.
+            Number of the only fault to inject.
 
         Raises
         ------
         LiveError
-            If a cell does not come up.
+            If a cell does not start.
         """
         begin_s = time.monotonic()
         number, waiting = 0, None
@@ -222,7 +222,7 @@ class FaultCampaign:
         stalls: StallDetector,
         seconds: float | None,
     ) -> PlannedFault | None:
-        """Have one cell go through faults; returns the next fault where the cell is past help."""
+        """Inject faults into one cell; if the cell does not recover, return the next fault."""
         testbed, home = self._staging.testbed(number)
         with ExitStack() as stack:
             cell = stack.enter_context(Harness(testbed, home=home, disks=self._disks))
@@ -247,7 +247,7 @@ class FaultCampaign:
     def _one(
         self, cell: Harness, observer: ActuatorObserver, one: PlannedFault, stalls: StallDetector
     ) -> bool:
-        """Have a fault befall a cell; returns whether the cell can go on."""
+        """Inject a fault into a cell; return whether the cell is still usable."""
         fault = one.fault
         outcome = Outcome(fault.name, self._seed, one.phase)
         usable, term = True, -1
@@ -305,7 +305,7 @@ class FaultCampaign:
 
 
 def _untrue(cell: Harness, observer: ActuatorObserver) -> list[str]:
-    """Return which looks at the status read `ok` though the actuator lacked commands."""
+    """Return a violation for each status `ok` during which the actuator lacked commands."""
     cell.actuations.look()
     wrong = []
     for at_ns, status in cell.looks:
@@ -316,9 +316,10 @@ def _untrue(cell: Harness, observer: ActuatorObserver) -> list[str]:
 
 
 def _settle(cell: Harness, rests_s: float, outcome: Outcome) -> None:
-    """Wait until a cell is whole and at home, and has been left alone for a while.
+    """Wait until a cell is complete and at home, before and after a pause without faults.
 
-    The guard may move it meanwhile: the bound is one for a single fault, of a cell at home.
+    The bound applies to a single fault of a cell at home, and the guard may move the cell during
+    the pause.
     """
     while True:
         cell.wait_for("the whole cell at home", cell.at_home, 60.0)
@@ -330,7 +331,7 @@ def _settle(cell: Harness, rests_s: float, outcome: Outcome) -> None:
 
 
 def _unread(cell: Harness) -> Sequence[str]:
-    """Return which runs cannot be read."""
+    """Return the error of each run that cannot be read."""
     from dwell.record import open_run
 
     unreadable = []

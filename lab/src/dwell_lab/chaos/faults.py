@@ -1,4 +1,4 @@
-"""Faults: what can befall a cell, whether it promises a bound, and which comes next."""
+"""Faults: the faults that a cell can suffer, their bounds, and random timelines."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ How: TypeAlias = Literal[
     "blank",
 ]
 
-#: What oscillators do, and what nobody's should.
+#: Drift of ordinary oscillators, and a drift that no oscillator should have.
 WITHIN_PPM, BEYOND_PPM = 80.0, 2_000.0
 JUMPS_MS = (200.0, 5_000.0)
-#: How long faults last, seconds: shorter and longer than a session's lease.
+#: Shortest and longest fault, seconds: shorter and longer than a session's lease.
 LASTS_S = 0.5, 2.4
-#: And how long the cell is left alone before the next one.
+#: Shortest and longest pause before a fault, seconds.
 RESTS_S = 0.0, 1.5
 
 
@@ -44,12 +44,12 @@ class Fault:
     Parameters
     ----------
     whom : tuple of str
-        Processes, ``*E`` for all of a node; directions of a link, as ``R1->E``; nodes; ``runs`` for
-        the disk that the runs are kept on.
+        Processes (``*E``: all of node E), directions of a link such as ``R1->E``, nodes, or
+        ``runs`` for the disk of the recorded runs.
     amount : float
-        Jump in ms, drift in parts per million, rate in Mbit/s, frames per period.
+        Jump in ms, drift in parts per million, rate in Mbit/s, or frames per period.
     kind : str
-        Kind that shares its turns; `how` if left out.
+        Kind in `planned`, which takes one fault per kind in each round; `how` if omitted.
     """
 
     name: str
@@ -63,14 +63,14 @@ class Fault:
 
 
 def faults_of(problem: Problem, *, disks: bool = True, stages: bool = True) -> Iterator[Fault]:
-    """Yield every fault of a cell; `bound_of` says what is promised for it.
+    """Yield the faults of a cell; `bound_of` returns their bounds.
 
     Parameters
     ----------
     disks : bool
-        Whether nodes have disks of their own that can be made full.
+        Whether each node has its own disk that can be filled.
     stages : bool
-        Whether stages raise when they are told to, as those of the light cell.
+        Whether the stages can raise on request, as the light cell's can.
     """
     everybody = roles(problem)
     relay = problem.relay_node
@@ -112,7 +112,7 @@ def faults_of(problem: Problem, *, disks: bool = True, stages: bool = True) -> I
 
 
 def _slow_links(problem: Problem) -> Iterator[Fault]:
-    """Yield each direction that images may take, with a quarter of the rate that they need."""
+    """Yield a fault for each link direction with images: a quarter of the rate that they need."""
     pipeline = problem.pipeline
     for link in problem.fabric.links.values():
         crossing = [
@@ -143,16 +143,16 @@ def struck(problem: Problem, fault: Fault) -> list[str]:
         if not who.startswith("*"):
             names.append(who)
             continue
-        # The agent first: it must not bring back what dies next.
+        # The agent first: otherwise it would restart the other processes.
         there = [role.who for role in roles(problem) if role.node == who[1:]]
         names += sorted(there, key=lambda one: not one.startswith("agent"))
     return names
 
 
 def hit_by(problem: Problem, fault: Fault) -> frozenset[str] | None:
-    """Return the parts of placements that a fault takes away (see `parts_of`).
+    """Return the parts of placements that a fault disables (see `parts_of`).
 
-    None where it takes away what no placement does without: the stamper, a sink, or their clocks.
+    None if it hits what every placement needs: the stamper, a sink, or their nodes and clocks.
     """
     everybody = {role.who: role for role in roles(problem)}
     vital = {role.node for role in everybody.values() if role.kind in ("stamper", "sink")}
@@ -185,12 +185,12 @@ def hit_by(problem: Problem, fault: Fault) -> frozenset[str] | None:
 
 
 def bound_of(problem: Problem, fault: Fault, placement: str) -> int | None:
-    """Return how many consecutive cycles a fault may cost; None where nothing is promised.
+    """Return the largest number of consecutive cycles that a fault may cost; None if unbounded.
 
     Parameters
     ----------
     placement : str
-        Candidate that holds when it strikes.
+        Placement when the fault begins.
     """
     hit = hit_by(problem, fault)
     if hit is None:
@@ -202,7 +202,7 @@ def bound_of(problem: Problem, fault: Fault, placement: str) -> int | None:
     struck = [bool(parts_of(problem, name) & hit) for name in others]
     if all(struck):
         return None
-    # What is heard all the same is tried before what works.
+    # The guard still receives messages from these parts, so it tries such fallbacks first.
     return bound * (1 + struck.index(False)) if fault.how in ("slow", "fail") else bound
 
 
@@ -217,7 +217,7 @@ class PlannedFault:
     phase : float
         Fraction of the period at which it begins.
     lasts_s, rests_s : float
-        How long it lasts, and how long nothing happens before it.
+        Duration of the fault, and of the pause before it.
     """
 
     number: int
@@ -228,10 +228,10 @@ class PlannedFault:
 
 
 def planned(seed: int, faults: Sequence[Fault]) -> Iterator[PlannedFault]:
-    """Yield the faults of a seed, without end.
+    """Yield an endless random timeline of faults from a seed.
 
-    Each kind comes once a round, in a random order, and its faults in a random order, too: none
-    comes again before all of its kind have been there.
+    Each round contains one fault of each kind, in random order. Within a kind, a fault repeats
+    only after all the others of its kind.
     """
     kinds: dict[str, list[Fault]] = {}
     for fault in faults:

@@ -1,4 +1,4 @@
-"""Runs a cell, injects faults into it, and tells when it has recovered."""
+"""Harness: runs a cell, injects faults, and detects when the cell has recovered."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ from dwell_lab.chaos.faults import Fault, struck
 from dwell_lab.chaos.stages import APPLY, TOLD
 
 OBSERVED, CLOCK_FILE, FAILING = "observed", "clocks", "failing"
-#: Ten windows without a fault make the next one no relapse; of long ones, no more than this.
+#: Longest healthy time to wait for before a fault; short windows need less (`Harness.healthy`).
 HEALTH_S = 5.0
-#: Periods of which the actuations are looked at, to see whether a cell works.
+#: Number of past periods whose actuations show whether a cell works.
 RECENT_PERIODS = 6
-#: Busy threads beside the processes of a node that starves.
+#: Busy threads that compete with the processes of a starved node.
 STARVING_THREADS = 32
 
 
 def environment_of(folder: Path, exec_ms: Mapping[str, object], **more: object) -> dict[str, str]:
-    """Return the variables that stages and actuator of a cell in a folder need."""
+    """Return the environment variables for the stages and the actuator of a cell."""
     folder = folder.resolve()
     files = {"observed": str(folder / OBSERVED), "failing": str(folder / FAILING)}
     return {TOLD: json.dumps({**files, "exec_ms": exec_ms, **more})}
@@ -51,16 +51,16 @@ def away_from_home(
     applied: Sequence[Seen],
     status: Callable[[], Mapping[str, Any]],
 ) -> str:
-    """Return what keeps a cell from being whole, watched, and where its controller wants it.
+    """Return why a cell is not complete and at home; an empty text if it is.
 
-    It may be the guard that has moved it home: its controller has nothing to order then.
+    With a home, the guard may have moved the cell there: `fallback` is not checked.
 
     Parameters
     ----------
     applied : sequence of Seen
         Commands of the last `RECENT_PERIODS`.
     status : callable
-        Returns the controller's status; nothing where it does not answer.
+        Returns the controller's status; an empty mapping if the controller does not answer.
     """
     if len(applied) < 4:
         return f"{len(applied)} actuations in six periods"
@@ -92,16 +92,16 @@ def _unwell(problem: Problem, processes: Mapping[str, Any]) -> Iterator[str]:
 
 
 class Harness(Started):
-    """See the module; a context manager.
+    """Context manager that runs a cell and injects faults.
 
     Parameters
     ----------
     testbed : LocalTestbed
-        With the variables of `environment_of` in its environment.
+        Its environment contains the variables of `environment_of`.
     home : str, optional
-        Candidate that the controller wants; whatever it decides if left out.
+        Candidate to which the cell must return; if omitted, any that the controller chooses.
     disks : bool
-        Whether nodes, and the runs, get disks of their own, which can be made full.
+        Whether each node and the folder of runs gets a small disk that `fill` faults can fill.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class Harness(Started):
         self.folder.mkdir(parents=True, exist_ok=True)
         self.actuations = Actuations(self.folder / OBSERVED)
         self.starved_cpus: frozenset[int] = frozenset()
-        #: Answers to `status` since they were judged last, with their instants on the true clock.
+        #: Answers to `status` that are not judged yet, with their instants on the true clock.
         self.looks: list[tuple[int, Mapping[str, Any]]] = []
         self._small: dict[str, SmallDisk] = {}
         self._hog: DiskHog | None = None
@@ -129,11 +129,11 @@ class Harness(Started):
 
     @property
     def period_ns(self) -> int:
-        """P."""
+        """The pipeline's period P."""
         return self.problem.pipeline.period_ns
 
     def _start(self) -> None:
-        """Start everything, and wait until the cell is at home."""
+        """Start all processes, and wait until the cell is at home."""
         nodes = list(self.problem.fabric.nodes)
         for name in ("runs", *nodes) if self.disks else ():
             self._small[name] = self._stack.enter_context(SmallDisk(self.folder / name))
@@ -144,7 +144,7 @@ class Harness(Started):
         self.wait_for("the whole cell at home", self.at_home, 60.0)
 
     def _end_all(self) -> None:
-        """End everything, also what is frozen or has no parent any more."""
+        """End all processes, including frozen processes and processes without a parent."""
         self._feed()
         if self._hog is not None:
             self._hog.stop()
@@ -160,7 +160,7 @@ class Harness(Started):
 
     @property
     def runs(self) -> list[Path]:
-        """Folders of the runs."""
+        """Folders of the recorded runs."""
         folder = self.folder / "runs"
         return sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
 
@@ -169,7 +169,7 @@ class Harness(Started):
         return [process.pid for process in found if process is not None]
 
     def pid(self, who: str) -> int:
-        """Process id of one of the cell's processes."""
+        """Return the process id of a process of the cell; raise LiveError if it does not run."""
         if who in self.testbed.processes.running:
             return self.testbed.processes.running[who].pid
         node = who.partition("@")[2].partition(".")[0]
@@ -179,7 +179,7 @@ class Harness(Started):
         return process.pid
 
     def _running(self) -> dict[str, int]:
-        """Return the process ids of all that run, the controller included."""
+        """Return the ids of all running processes, including the controller."""
         ours = self.testbed.processes.running
         everybody = {who for node in self.problem.fabric.nodes for who in self._all_of(node)}
         running = {}
@@ -189,7 +189,7 @@ class Harness(Started):
         return running
 
     def ended(self, fault: Fault) -> list[str]:
-        """Return the processes that have ended since a fault began, and that it has not ended."""
+        """Return a violation for each process that ended after a fault began but was not killed."""
         running = self._running()
         ended = struck(self.problem, fault) if fault.how == "kill" else []
         return [
@@ -199,7 +199,7 @@ class Harness(Started):
         ]
 
     def start_again(self, who: str) -> None:
-        """Start an agent or the controller again, as an init system does."""
+        """Restart an agent or the controller, as an init system does."""
         process = self.testbed.processes.running.pop(who, None)
         if process is not None:
             process.wait(10)
@@ -210,23 +210,23 @@ class Harness(Started):
             self.testbed.processes.start_controller()
 
     def _all_of(self, node: str) -> list[str]:
-        """Return the processes of a node, its controller included."""
+        """Return the processes of a node, including the controller."""
         controller = [f"controller@{node}"] if node == self.problem.controller_node else []
         return [*expected(self.problem, node), *controller]
 
     # ------------------------------------------------------------------------- clocks
 
     def set_clock(self, node: str, *, jump_ms: float = 0.0, drift_ppm: float = 0.0) -> None:
-        """Have a node's clock jump, and drift from now on."""
+        """Make a node's clock jump, and set its drift."""
         self._clocks.set(node, jump_ns=round(jump_ms * 1e6), drift_ppb=round(drift_ppm * 1e3))
 
     # --------------------------------------------------------------------------- CPUs
 
     def starve(self, node: str) -> None:
-        """Have a node's processes share one CPU with busy threads, and keep the others off it.
+        """Move a node's processes to one CPU with busy threads, and the other nodes off that CPU.
 
-        Where nodes have CPUs of their own, the threads are there and nobody is moved. Where there
-        is one CPU only, all nodes starve.
+        If every node has its own CPUs, the busy threads run on them and no process moves. On a
+        machine with only one CPU all nodes starve.
         """
         if self.testbed.own_cpus:
             self._stressed = node
@@ -281,7 +281,7 @@ class Harness(Started):
     # ------------------------------------------------------------------------- faults
 
     def begin(self, fault: Fault, at_ns: int) -> int:
-        """Have a fault begin at an instant of the true clock; returns when it did."""
+        """Begin a fault at an instant of the true clock; return the actual instant."""
         self._living = self._running()
         if fault.how == "cut":
             ways = [way.split("->") for way in fault.whom]
@@ -319,7 +319,7 @@ class Harness(Started):
         return begin_ns
 
     def end(self, fault: Fault) -> str:
-        """End a fault; returns a note about it."""
+        """End a fault; return a note about its effect, or an empty text."""
         match fault.how:
             case "cut":
                 for way in fault.whom:
@@ -353,12 +353,12 @@ class Harness(Started):
     # ------------------------------------------------------------------------- events
 
     def wait_for(self, what: str, event: Callable[[], str], patience_s: float) -> None:
-        """Wait for an event: until it returns nothing that is missing.
+        """Poll `event` until it returns an empty text; other texts name the missing condition.
 
         Raises
         ------
         LiveError
-            With what is missing after `patience_s`.
+            If the event does not happen within `patience_s`; the message contains the last text.
         """
         until = time.monotonic() + patience_s
         while missing := event():
@@ -367,7 +367,7 @@ class Harness(Started):
             time.sleep(0.002)
 
     def status(self) -> Mapping[str, Any]:
-        """Return the controller's status; nothing where it does not answer."""
+        """Return the controller's status, or an empty mapping if it does not answer."""
         try:
             told = self.testbed.sample(0.4)
         except LiveError:
@@ -377,13 +377,17 @@ class Harness(Started):
         return told
 
     def at_home(self) -> str:
-        """Return what keeps the cell from being at home; nothing where it is."""
+        """Return why the cell is not complete and at home; an empty text if it is."""
         seen = self.actuations.since(time.monotonic_ns() - RECENT_PERIODS * self.period_ns)
         applied = [one for one in seen if one.what == APPLY]
         return away_from_home(self.problem, self.home, applied, self.status)
 
     def healthy(self) -> str:
-        """Look whether the guard takes the next fault for no relapse."""
+        """Return the count of healthy cycles while it is too small; else an empty text.
+
+        After 11 healthy windows the guard does not count the next fault as a relapse. If windows
+        are long, cycles worth `HEALTH_S` are enough.
+        """
         ten = 11 * self.problem.window_cycles
         needed = min(ten, round(HEALTH_S * 1e9 / self.period_ns))
         count = self.actuations.healthy(self.home)

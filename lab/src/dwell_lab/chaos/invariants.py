@@ -1,7 +1,7 @@
-"""Invariants: violations of a cell's promises, by its messages on the wire.
+"""Invariants: violations of a cell's promises, found in its messages on the wire.
 
-Nothing of a cell's own code decides anything here: its messages are decoded, and held against the
-cell file.
+The checks decode the messages and compare them with the cell file. They do not call the cell's own
+decisions.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from dwell.policies.registry import estimator_of
 from dwell_lab.chaos.actuations import Seen
 from dwell_lab.chaos.stages import APPLY, HOLD, ZERO
 
-#: Share of its commands that an actuator gets while a status may be `ok`.
+#: Smallest share of the commands that must reach the actuator while the status is `ok`.
 LEAST_APPLIED = 0.9
-#: Stamps and orders that are remembered.
+#: Largest number of stamps, and of orders, in memory.
 MEMORY = 10_000
 
 K = TypeVar("K")
@@ -41,12 +41,12 @@ V = TypeVar("V")
 
 @dataclass(slots=True)
 class Term:
-    """A term, as it was stamped first.
+    """A term, with the placement and the cycle of its first stamp.
 
     Parameters
     ----------
     cycle : int
-        First that was heard to be stamped with it.
+        First cycle received with a stamp of this term.
     """
 
     term: int
@@ -57,15 +57,15 @@ class Term:
 
 @dataclass(slots=True)
 class Judge:
-    """Hears all messages in the order of their arrival, and finds violations.
+    """Reads all messages in the order of their arrival, and finds violations.
 
     Parameters
     ----------
     renews : bool
-        Whether a fault may have taken the stamper's book, so that a later run may begin.
+        Whether a fault may have destroyed the stamper's saved state: then a new run may begin.
     held : dict of int to bool
-        Whether the controller holds the cell where it is in a term, and not the guard, as the
-        stamper was heard to say.
+        Whether the controller, and not the guard, chose the placement of a term; from the
+        stamper's answers.
     """
 
     problem: Problem
@@ -78,7 +78,7 @@ class Judge:
     _orders: dict[tuple[str, int], Order] = field(default_factory=dict)
     _early: dict[tuple[str, int], Accepted] = field(default_factory=dict)
     held: dict[int, bool] = field(default_factory=dict)
-    # Terms that an order has brought about which was heard to be accepted.
+    # Terms that began with an accepted order.
     _moved: set[int] = field(default_factory=set)
     _looked: int = -1
 
@@ -86,7 +86,7 @@ class Judge:
         self.problem = resolved(self.problem, estimator_of(self.problem))
 
     def hear(self, at_ns: int, key: str, payload: bytes, header: bytes) -> Iterable[str]:
-        """Take a message in; returns its violations."""
+        """Process a message; return its violations."""
         word = Keys(self.problem.name).word(key)
         self.counts[word] += 1
         try:
@@ -114,7 +114,7 @@ class Judge:
         return self._last[0]
 
     def _begin_run(self) -> None:
-        """Forget the run before: its numbers and terms may return."""
+        """Clear the state of the previous run; its cycle numbers and terms may occur again."""
         self.terms.clear()
         self.held.clear()
         self.stamped_ns.clear()
@@ -153,7 +153,7 @@ class Judge:
     def _ordered(self, order: Order) -> list[str]:
         who = order.controller, order.number
         _remember(self._orders, who, order)
-        # They come through different connections: an answer may be heard before its order.
+        # Orders and answers use different connections: an answer may arrive before its order.
         answer = self._early.pop(who, None)
         return [] if answer is None else self._weigh(order, answer)
 
@@ -168,7 +168,7 @@ class Judge:
         return self._weigh(self._orders[who], answer)
 
     def _weigh(self, order: Order, answer: Accepted) -> list[str]:
-        """Hold an answer against its order, and against what was stamped before it."""
+        """Compare an answer with its order, and with the stamps before it."""
         if (order.run, order.term) == (0, 0):
             return []
         violations = []
@@ -190,10 +190,10 @@ class Judge:
         return violations
 
     def migrations(self) -> list[str]:
-        """Return the controller's migrations since the last call that came too early.
+        """Return the controller's migrations since the last call that were too early.
 
-        They are `Problem.stay_cycles` apart, so that K windows hold at most K·W over that; the
-        guard's moves do not count.
+        Two migrations must be at least `Problem.stay_cycles` cycles apart: K windows of W cycles
+        contain at most K·W / `stay_cycles`. The guard's moves do not count.
         """
         apart = self.problem.stay_cycles
         violations = []
@@ -214,13 +214,13 @@ class Judge:
         return violations
 
     def moved_by_guard(self, after: int) -> bool:
-        """Whether a term later than one is the guard's."""
+        """Whether the guard began a term later than `after`."""
         return any(term > after and self.held.get(term) is False for term in self.terms)
 
     def ordered_since(self, at_ns: int) -> int | None:
-        """Return the instant of the first stamp from `at_ns` on that an order stands behind.
+        """Return the instant of the first stamp since `at_ns` whose placement was ordered.
 
-        The placement of a run's beginning counts as ordered. None where there was none yet.
+        The first placement of a run counts as ordered. None if there is no such stamp yet.
         """
         instants = [
             self.stamped_ns[cycle]
@@ -232,10 +232,10 @@ class Judge:
     # ------------------------------------------------------------------------ routing
 
     def looked(self, status: Mapping[str, Any], seen: Sequence[Seen]) -> list[str]:
-        """Hold a status that is `ok` against the actuator's calls until then.
+        """Compare a status `ok` with the actuator's calls up to that instant.
 
-        Less than two of the last three windows, with the cycles before each, may have a call of
-        ``hold`` or ``zero``, or fewer than 0.9 of their commands.
+        At most one of the status's recent windows may have a call of ``hold`` or ``zero``, or lack
+        more than 1 - `LEAST_APPLIED` of its commands.
         """
         if status.get("health") != "ok" or "recent" not in status:
             return []
@@ -244,9 +244,9 @@ class Judge:
         return [f"status reads ok: {'; '.join(bad)}"] if len(bad) > 1 else []
 
     def _unserved(self, first: int, last: int, seen: Sequence[Seen]) -> str:
-        """Return how the actuator lacked commands in some cycles."""
+        """Return which commands the actuator lacked in some cycles; an empty text if none."""
         released_ns = [at_ns for cycle, at_ns in self.stamped_ns.items() if first <= cycle <= last]
-        if not released_ns:  # cycles of a run before
+        if not released_ns:  # cycles of an earlier run
             return ""
         passed_ns = max(released_ns) - min(released_ns)
         due = max(passed_ns // self.problem.pipeline.period_ns + 1, len(released_ns))
@@ -288,7 +288,7 @@ class Judge:
         return task in tasks and node in self.problem.pipeline.tasks[task].on
 
     def _done(self, done: Completion) -> Iterable[str]:
-        """Hold where the jobs of a cycle ran against its stamp."""
+        """Compare the nodes on which the jobs of a cycle ran with its stamp."""
         if done.outcome not in (*HANDED_OVER, "behind", "stale"):
             return
         stamp = done.stamp

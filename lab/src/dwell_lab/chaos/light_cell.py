@@ -1,4 +1,4 @@
-"""The cell that faults befall where no other is named: three nodes, light enough for two cores."""
+"""The default cell of a chaos campaign: three nodes, light enough for two cores."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ GUARD_CYCLES = 3
 MAX_AGE_MS = 120
 MIN_DWELL = 2
 WINDOW_CYCLES = 3
-#: By the candidate that a cell's controller wants, its home: what makes the controller want it.
-#: Links, which cost no CPU, tell the placements apart; the stages leave one CPU room enough, and a
-#: quota of half of one.
+#: Execution times by home (the candidate that the controller prefers), task and node. The stages
+#: are light enough for one CPU, and for a quota of half a CPU; the delays of the links, which
+#: need no CPU, separate the placements.
 EXEC_MS = {
     "SO": {"perception": {"R1": 4.0, "E": 2.0}, "planning": {"R2": 8.0, "E": 2.0}},
     "LOC": {"perception": {"R1": 2.0, "E": 6.0}, "planning": {"R2": 2.0, "E": 5.0}},
@@ -22,10 +22,10 @@ DELAY_MS = {
     "SO": {"R1-E": 1, "E-R2": 1, "R1-R2": 8},
     "LOC": {"R1-E": 10, "E-R2": 10, "R1-R2": 1},
 }
-#: Away from home the cell file has stages take so many times as long: the controller goes home, and
-#: stays there, whatever the machine does to the latencies of three cycles.
+#: Factor on the execution times in the cell file on nodes away from home: the controller returns
+#: home and stays there, even if the machine disturbs the latencies of three cycles.
 WARY = 3
-#: Of a campaign: enough for nodes with 0.4 of a CPU, and for a machine shared with others.
+#: Period in a campaign: long enough for nodes with 0.4 of a CPU, and for a shared machine.
 PATIENT_MS = 80
 CANDIDATES = {
     "LOC": {"perception": "R1", "planning": "R2"},
@@ -35,7 +35,7 @@ CANDIDATES = {
 
 
 def exec_ms(home: str) -> dict[str, dict[str, float]]:
-    """Return how long each task takes on each node."""
+    """Return the execution time of each task on each node, in ms."""
     return {"sensing": {"R1": 1.0}, **EXEC_MS[home], "control": {"R2": 0.5}}
 
 
@@ -50,17 +50,17 @@ def _node(node: str, *, quotas: bool) -> dict[str, Any]:
 def document(
     home: str, *, period_ms: int = PERIOD_MS, standby: bool = True, quotas: bool = False
 ) -> dict[str, Any]:
-    """Return the cell file of a cell whose controller wants to be at `home`.
+    """Return the cell file of a cell whose controller prefers the candidate `home`.
 
     Parameters
     ----------
     standby : bool
-        Whether sensing and control have one.
+        Whether tasks with a single node (sensing and control) have a standby.
     quotas : bool
-        Whether nodes have a share of a CPU, as a testbed's have to.
+        Whether nodes have a share of a CPU; the nodes of a network testbed need one.
     """
-    # A window with lost cycles closes after the guard has looked (`close_grace_ms`): an order that
-    # comes of it, and that might be for what has just died, finds another term.
+    # With `close_grace_ms` a window with lost cycles ends only after the guard's check. If the
+    # guard moves the cell, an order from that window, perhaps to a dead process, has an old term.
     tasks: dict[str, Any] = {}
     for task, nodes in exec_ms(home).items():
         spare = {"standby": 1} if standby and len(nodes) == 1 else {}

@@ -1,7 +1,7 @@
-"""Stages that take as long as they are told, and an actuator that writes down what it is called.
+"""Stages with set execution times, and an actuator that logs its calls.
 
-Nothing here knows the protocol: a stage passes on what the source has said of the cycle, and the
-actuator is an observer: it writes down every call, in order, with the instant.
+The stages do not use the protocol: they pass on the cycle number and the release from the source.
+The actuator logs every call, in order, with its instant.
 """
 
 from __future__ import annotations
@@ -18,14 +18,15 @@ from pathlib import Path
 
 from dwell.live.stage import CellActuator, Message, load_actuator
 
-#: Variable with what the processes are told: ``observed`` (file), ``exec_ms`` (by task and node),
-#: ``actuators`` (by task, those that are called behind the witness), ``failing`` (file with the
-#: processes whose stages or actuators raise, while it is there).
+#: Environment variable with the settings of the processes: ``observed`` (log of the actuator),
+#: ``exec_ms`` (by task and node), ``actuators`` (by task; the witness calls them), ``failing``
+#: (file with the processes whose stages or actuators must raise; if absent, none).
 TOLD = "DWELL_CHAOS"
 
-#: Cycle and release as the source saw them; where perception and planning ran (index of node).
+#: Cycle and release that the source read; nodes of perception and planning (indices of `NODES`).
 SAID = struct.Struct("<qqBB")
-#: What was called, and the same; then the cycle that the runtime says, and the instant.
+#: Call, nodes of perception and planning, process id; the runtime's cycle, the command's cycle,
+#: its release, and the instant of the call.
 RECORD = struct.Struct("<BBBxIqqqq")
 APPLY, HOLD, ZERO, START = range(1, 5)
 FRAME_BYTES = 60_000
@@ -33,19 +34,19 @@ NODES = ("R1", "E", "R2")
 
 
 def _where() -> str:
-    """Task and node of this process, from its command line: the stages ask nobody."""
+    """Return this process's name from its command line: ``planning@E.1``, ``sink.control@R2``."""
     return sys.argv[sys.argv.index("--who") + 1]
 
 
 def _fail_where_told(told: Path) -> None:
-    """Raise a RuntimeError where a file names this process."""
+    """Raise a RuntimeError if the file `told` names this process."""
     with suppress(FileNotFoundError):
         if _where() in told.read_text(encoding="utf-8").split():
             raise RuntimeError("told to fail")
 
 
 class _Timed(ABC):
-    """A stage that takes as long as the cell file says, and leaves the CPU to others."""
+    """A stage that sleeps until its time from ``exec_ms`` is over, without using the CPU."""
 
     def __init__(self) -> None:
         task, _, rest = _where().partition("@")
@@ -56,7 +57,7 @@ class _Timed(ABC):
         self._failing = Path(told["failing"])
 
     def process(self, inputs: Mapping[str, Message]) -> Message:
-        """Take the time that it takes; raise where it is told to."""
+        """Return the output after the stage's time; raise if this process must fail."""
         (message,) = inputs.values()
         _fail_where_told(self._failing)
         begin = time.monotonic()
@@ -66,11 +67,11 @@ class _Timed(ABC):
 
     @abstractmethod
     def turn(self, message: Message) -> bytes:
-        """Return the output."""
+        """Return the output's payload."""
 
 
 class Sensing(_Timed):
-    """Says of the cycle what all others pass on, in a message as large as an image."""
+    """The source: sends the cycle number and the release in a message as large as an image."""
 
     def turn(self, message: Message) -> bytes:
         """Return the image."""
@@ -79,38 +80,38 @@ class Sensing(_Timed):
 
 
 class Perception(_Timed):
-    """Adds where it ran."""
+    """Adds its node."""
 
     def turn(self, message: Message) -> bytes:
-        """Return what was said, and the node."""
+        """Return the cycle number, the release and this node."""
         cycle, released_ns, _, _ = SAID.unpack_from(message.payload)
         return SAID.pack(cycle, released_ns, self.node, 0)
 
 
 class Planning(_Timed):
-    """Adds where it ran."""
+    """Adds its node."""
 
     def turn(self, message: Message) -> bytes:
-        """Return what was said, and the node."""
+        """Return the message of perception with this node added."""
         cycle, released_ns, perception, _ = SAID.unpack(message.payload)
         return SAID.pack(cycle, released_ns, perception, self.node)
 
 
 class Control(_Timed):
-    """Passes it on."""
+    """Passes its input on."""
 
     def turn(self, message: Message) -> bytes:
-        """Return what was said."""
+        """Return the input's payload."""
         return bytes(message.payload)
 
 
 class Witness(CellActuator):
-    """The actuator: a record a call, appended in one write, so that no kill tears it.
+    """Actuator that appends one record per call, each in one write, so that a kill cannot split it.
 
     Parameters
     ----------
     behind : CellActuator, optional
-        Called after the record has been written.
+        Actuator to call after the record has been written.
     """
 
     def __init__(self, behind: CellActuator | None = None) -> None:
@@ -123,7 +124,7 @@ class Witness(CellActuator):
         self._write(START)
 
     def apply(self, command: Message) -> None:
-        """Write down the command, and apply it; raise instead where it is told to."""
+        """Log the command, and apply it; raise after the log if this process must fail."""
         if self._behind is None:
             cycle, released_ns, perception, planning = SAID.unpack(command.payload)
             self._write(APPLY, perception, planning, command.cycle, cycle, released_ns)
@@ -134,19 +135,19 @@ class Witness(CellActuator):
         self._behind.apply(command)
 
     def hold(self) -> None:
-        """Write it down, and hold."""
+        """Log the call, and hold."""
         self._write(HOLD)
         if self._behind is not None:
             self._behind.hold()
 
     def zero(self) -> None:
-        """Write it down, and stop."""
+        """Log the call, and command zero."""
         self._write(ZERO)
         if self._behind is not None:
             self._behind.zero()
 
     def stop(self) -> None:
-        """Have what is behind it stop, where it can."""
+        """Stop the actuator behind the witness, if any."""
         if self._behind is not None:
             self._behind.stop()
 
@@ -158,7 +159,7 @@ class Witness(CellActuator):
 
 
 class Witnessed(Witness):
-    """The same before the actuator that the cell file has named."""
+    """A witness in front of the actuator from the cell file."""
 
     def __init__(self) -> None:
         _, _, rest = sys.argv[sys.argv.index("--who") + 1].partition(".")

@@ -1,4 +1,4 @@
-"""Stalls: times in which the machine kept a thread from running that only sleeps."""
+"""Stalls: times in which the machine did not schedule a thread that only sleeps."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from dwell.live.local.child import Started
 
 
 class StallDetector(Started):
-    """Threads, one pinned to each CPU, that note when they were not scheduled: the machine's doing.
+    """Context manager with one thread per CPU that records when it was scheduled too late.
 
-    The cell's processes have the same priority: where a thread that only sleeps comes too late,
-    theirs do, too. A context manager.
+    The cell's processes have the same priority: if such a thread is late, they are late as well.
     """
 
     STEP_S = 0.004
@@ -45,13 +44,7 @@ class StallDetector(Started):
             before_ns = now_ns
 
     def worst_ms(self, since_ns: int, until_ns: int, *, but: Collection[int] = ()) -> float:
-        """Longest stall that touches a time.
-
-        Parameters
-        ----------
-        but : collection of int
-            CPUs that are kept busy on purpose.
-        """
+        """Return the longest stall that overlaps an interval, except on the CPUs in `but`."""
         lengths = [
             b - a for a, b, cpu in self.stalls if b >= since_ns and a <= until_ns and cpu not in but
         ]

@@ -1,4 +1,4 @@
-"""Strike: a fault befalls a cell, ends, and the cell recovers; its cost."""
+"""Strike: injects a fault into a cell, waits for the recovery, and measures the cost."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from dwell_lab.chaos.invariants import Judge
 from dwell_lab.chaos.stages import APPLY, HOLD, ZERO
 from dwell_lab.chaos.stalls import StallDetector
 
-#: Time in which a cell has to have recovered.
+#: Longest time until a cell must have recovered.
 RECOVERED_S = 60.0
-#: Longest time that a fault may take to be brought about, or to pass.
+#: Longest time to wait for a fault's duration, or for cycles after it.
 PATIENCE_S = 30.0
 SOON_NS = 5_000_000
 
@@ -29,28 +29,28 @@ class Outcome:
     Parameters
     ----------
     phase : float
-        Fraction of the period, after a release, at which it began.
+        Fraction of the period, after a release, at which the fault began.
     lost, lost_after : int
-        Most consecutive cycles without an actuation, by their numbers: from the fault to its end,
-        and from there to the recovery. A stamper that starts anew leaves numbers out: -1.
+        Most consecutive cycles without an actuation, by cycle numbers: during the fault, and after
+        its end. `lost` is -1 if the stamper was killed, because its restart skips numbers.
     gap_ms, gap_after_ms : float
-        Longest time between two actuations, likewise.
+        Longest time between two actuations, during the fault and after its end.
     recovery_ms : float
-        From the end of the fault until the cell was whole and at home.
+        Time from the end of the fault to the recovery (see `recovered`).
     silences : int
-        Times that the actuator was told that no command came.
+        Number of calls of ``hold`` and ``zero``.
     moved : str
-        Placements that were actuated, in order, by the commands' own account.
+        Placements of the actuated commands, in order, as the commands name them.
     stall_ms : float
-        Longest time that the machine kept a thread waiting meanwhile.
+        Longest stall of the machine in this time.
     bound : int, optional
-        Consecutive cycles that may be lost.
+        Largest number of consecutive cycles that may be lost.
     begin_ns, end_ns, back_ns : int
-        When it began, ended, and the cell had recovered, on the true clock.
+        Instants of the beginning, the end and the recovery, on the true clock.
     wrong : list of str
         Violations.
     late : list of str
-        Violations that the machine has caused where it stalled.
+        Violations that a stall of the machine can excuse.
     """
 
     fault: str
@@ -84,26 +84,25 @@ def strike(
     bound: int | None,
     outcome: Outcome | None = None,
 ) -> Outcome:
-    """Have a fault befall a cell, end it, and wait until the cell has recovered.
+    """Inject a fault into a cell, end it, and wait until the cell has recovered.
 
     Parameters
     ----------
     cell : Harness
-        At home, and healthy where the fault makes it move.
+        At home, and healthy if the fault makes it move.
     seed : int
-        Seed that `phase` and `lasts` were drawn with.
+        Seed of `phase` and `lasts`.
     lasts : int
-        Periods until what is frozen or cut is so no more.
+        Duration of the fault, in periods.
     bound : int, optional
-        Consecutive cycles that may be lost.
+        Largest number of consecutive cycles that may be lost.
     outcome : Outcome, optional
-        Filled in; a new one if left out. It tells how far it came where something is waited for
-        in vain.
+        Outcome to fill in; a new one if omitted. After an error it contains the steps so far.
 
     Raises
     ------
     LiveError
-        If an event that it waits for does not come.
+        If an expected event does not happen in time.
     """
     found = Outcome(fault.name, seed, phase) if outcome is None else outcome
     found.bound = bound
@@ -120,15 +119,15 @@ def strike(
     finally:
         found.note = cell.end(fault)
     if fault.how == "kill" and bound is None:
-        # Its end is the first cycle again.
+        # The first actuated cycle is the end of the fault.
         since_ns = found.end_ns
         cell.wait_for("a cycle after it", lambda: _few(cell, since_ns, 1), PATIENCE_S)
         found.end_ns = time.monotonic_ns()
     recovered = f"the whole cell at home after '{fault.name}'"
     cell.wait_for(recovered, cell.at_home, RECOVERED_S)
     found.back_ns = time.monotonic_ns()
-    # What is on its way when the cell is back is seen, too. A node with a small quota waits for
-    # processes that still start.
+    # Include the messages that were on their way at the recovery. A node with a small quota can be
+    # slow while other processes start.
     cell.wait_for("five more cycles", lambda: _few(cell, found.back_ns, 5), PATIENCE_S)
     period_ns = cell.period_ns
     found.stall_ms = stalls.worst_ms(found.begin_ns - period_ns, found.back_ns, but=cpus)
@@ -137,7 +136,7 @@ def strike(
 
 
 def beyond(outcome: Outcome) -> list[str]:
-    """Return how a fault has cost more cycles than its bound."""
+    """Return the violations of a fault's bound on lost cycles."""
     if outcome.bound is None:
         return []
     lost = ("by it", outcome.lost), ("after it", outcome.lost_after)
@@ -149,7 +148,10 @@ def beyond(outcome: Outcome) -> list[str]:
 
 
 def _last(cell: Harness, fault: Fault, begin_ns: int, lasts: int, bound: int | None) -> None:
-    """Wait for the event that the fault's end waits for."""
+    """Wait for the duration of a fault and, if it has a bound, for twelve actuations.
+
+    A fault that kills and has no bound ends at once.
+    """
     over_ns = begin_ns + lasts * cell.period_ns
     if bound is not None:
         cell.wait_for(
@@ -172,14 +174,14 @@ def _few(cell: Harness, since_ns: int, count: int) -> str:
 def weigh(
     problem: Problem, faults: Sequence[Fault], seen: Sequence[Seen], outcome: Outcome
 ) -> None:
-    """Fill in what faults at one time have cost, and what was wrong at the actuator.
+    """Fill in the cost of simultaneous faults, and the violations at the actuator.
 
     Parameters
     ----------
     seen : sequence of Seen
-        Calls of the actuator, from ten periods before the first fault on at least.
+        Calls of the actuator, starting at least ten periods before the first fault.
     outcome : Outcome
-        With its instants and the machine's stall.
+        Its instants and `stall_ms` are set.
     """
     begin_ns = outcome.begin_ns
     applied = [one for one in seen if one.what == APPLY]
@@ -208,14 +210,14 @@ def weigh(
 
 
 def too_old(problem: Problem, seen: Sequence[Seen], stamped_ns: Mapping[int, int]) -> list[str]:
-    """Return commands that were applied too long after their stamp was heard.
+    """Return the commands that were applied too long after their stamp was received.
 
     Parameters
     ----------
     stamped_ns : mapping of int to int
-        Instants, by cycle, on the true clock.
+        Instants of the stamps, by cycle, on the true clock.
     """
-    # The gate looks a little before the actuator is called, which may be scheduled out between.
+    # The process may lose the CPU between the gate's check and the call of the actuator.
     limit_ms = problem.max_age_ms + problem.pipeline.period_ms
     return [
         f"cycle {one.cycle} was actuated {age_ms:.0f} ms after it was stamped"
@@ -227,9 +229,9 @@ def too_old(problem: Problem, seen: Sequence[Seen], stamped_ns: Mapping[int, int
 
 
 def recovered(judge: Judge, outcome: Outcome, home: str | None) -> None:
-    """Take the recovery from the wire: the first cycle that an order stands behind.
+    """Set the recovery time from the wire: until the first stamp with an ordered placement.
 
-    None follows where the guard's own move has brought the cell home; that is said beside it.
+    If the guard has moved the cell home, there may be no such cycle; the note says so.
     """
     at_ns = judge.ordered_since(outcome.end_ns)
     if at_ns is not None:
@@ -241,12 +243,12 @@ def recovered(judge: Judge, outcome: Outcome, home: str | None) -> None:
 
 
 def moved_in_vain(judge: Judge, fault: Fault, term: int) -> list[str]:
-    """Return whether the guard has moved since a term for an actuator that raises."""
+    """Return a violation if the guard moved the cell because its actuator raises."""
     if fault.kind == "refuse" and judge.moved_by_guard(term):
         return ["the guard has moved, though each placement ends at that sink"]
     return []
 
 
 def _strikes_sink(fault: Fault) -> bool:
-    """Whether the process that tells the actuator that no command comes is struck itself."""
+    """Whether a fault hits the sink, which calls the actuator's ``hold`` and ``zero``."""
     return fault.how == "starve" or any(who.startswith(("sink.", "*")) for who in fault.whom)

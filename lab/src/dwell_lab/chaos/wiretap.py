@@ -1,7 +1,8 @@
-"""Records a cell's messages from the wire, in a process that is no part of the cell.
+"""Wiretap: records a cell's messages from the wire, in a process outside the cell.
 
-It has sessions of its own, sends nothing, and decodes nothing: a record is the instant on the true
-clock, the key, and the message; of a stage's message, its header.
+The process uses separate sessions, and only receives and stores. A record contains the instant on
+the true clock, the key, the message and its header. For messages to stages the record omits the
+payload.
 """
 
 from __future__ import annotations
@@ -24,12 +25,12 @@ from dwell.live.wire.wiring import SESSIONS, Role, Session, Wiring, WiringEntry
 from dwell_lab.chaos.invariants import Judge
 
 _HEAD = struct.Struct("<QIII")
-#: How long it may take until everything is heard for the first time, seconds.
+#: Longest time until each kind of message has been received once, seconds.
 HEARD_S = 20.0
 
 
 def entry_for(wiring: Wiring, nodes: Sequence[str]) -> WiringEntry:
-    """Return the endpoints of a listener to all processes of some nodes."""
+    """Return the endpoints for a wiretap of all processes on some nodes."""
     connect: dict[Session, list[Any]] = {}
     for entry in wiring.entries.values():
         if entry.role.node in nodes:
@@ -41,14 +42,14 @@ def entry_for(wiring: Wiring, nodes: Sequence[str]) -> WiringEntry:
 
 
 class Wiretap(Child):
-    """The process, as its parent sees it; a context manager.
+    """Context manager that runs a wiretap as a child process.
 
     Parameters
     ----------
     nodes : sequence of str
-        Whose processes are listened to.
+        Nodes whose processes are recorded.
     prefix : sequence of str
-        Words of a command that runs what follows where these nodes are reached.
+        Command prefix that runs the process on a host that reaches these nodes.
     """
 
     def __init__(
@@ -60,7 +61,7 @@ class Wiretap(Child):
 
 
 class Records:
-    """The records that a wiretap has written, as far as they have been read."""
+    """Reader of the records of a wiretap."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._read = path, 0
@@ -87,7 +88,7 @@ class Records:
 
 
 class ActuatorObserver(Started):
-    """Hears a cell by wiretaps on all its nodes, and judges what it hears; a context manager."""
+    """Context manager that runs wiretaps on all nodes of a cell, and judges the messages."""
 
     def __init__(self, testbed: LocalTestbed, cell: Path) -> None:
         super().__init__()
@@ -100,7 +101,7 @@ class ActuatorObserver(Started):
             self._records.append(Records(out))
 
     def _start(self) -> None:
-        """Listen until something has been heard."""
+        """Start the wiretaps, and wait until each of three kinds of message has been received."""
         for tap in self._taps:
             self._stack.enter_context(tap)
         until = time.monotonic() + HEARD_S
@@ -111,7 +112,7 @@ class ActuatorObserver(Started):
             self.look()
 
     def look(self) -> list[str]:
-        """Return the faults of the messages heard since the last call."""
+        """Return the violations in the messages since the last call."""
         news = [one for records in self._records for one in records.news()]
         news.sort(key=lambda one: one[0])
         violations = [wrong for one in news for wrong in self.judge.hear(*one)]
@@ -119,7 +120,7 @@ class ActuatorObserver(Started):
 
 
 def main() -> None:
-    """Listen until the parent ends, or wants this to."""
+    """Record until the parent ends, or requests the end."""
     from dwell.cellfile import load
     from dwell.live.host.security import INSECURE
     from dwell.live.local.linked_transport import without_source

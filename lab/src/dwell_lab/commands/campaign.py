@@ -1,4 +1,4 @@
-"""`dwell testbed campaign`: measure every policy in every scenario, or go on with that."""
+"""`dwell testbed campaign`: measure every policy in every scenario, or continue a campaign."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def _names(text: str | None) -> tuple[str, ...]:
 
 
 def _player(hosts: Path | None, problem: Problem, scenarios: Sequence[str]) -> tuple[Play, str]:
-    """Return what makes a run, and where; refuse what can be played in no run."""
+    """Return the function that makes a run, and its place; raise if a scenario cannot be run."""
     from dwell.live.local.timeline import require_playable_scenario
 
     outages = hosts is None
@@ -155,12 +155,12 @@ def report_campaign(
     static: bool = False,
     as_json: bool,
 ) -> None:
-    """Write the report of a campaign, finished or not (see `write_report`), and print its results.
+    """Write the report of a campaign, also before its end (`write_report`), and print its results.
 
     Raises
     ------
     RunError
-        If the folder is no campaign, or none of its runs is done.
+        If the folder is not a campaign, or has no finished run.
     """
     measured = _write_page(folder, page, figures=figures, static=static)
     _print(measured, folder, page, None, as_json=as_json)

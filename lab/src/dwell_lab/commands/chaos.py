@@ -1,4 +1,4 @@
-"""`dwell testbed chaos`: faults befall a cell, and somebody watches what it promises."""
+"""`dwell testbed chaos`: inject faults into a cell, and check its promises."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dwell.cli.output import json_text, print_json, write_file
 from dwell.errors import ExitCode
 from dwell.live.log import say
 
-#: A folder with this file is a campaign's, and may be replaced by the next.
+#: File that marks the folder of a chaos campaign, which the next campaign may replace.
 MARK = ".dwell-chaos"
 
 

@@ -9,7 +9,7 @@ from dwell.cli.options import require_one_length
 
 
 def seconds_of_runs(cell: Path, windows: int | None, seconds: float | None) -> float:
-    """Return how long each run on a testbed takes; 120 s where neither length is given.
+    """Return the duration of each run on a testbed; 120 s if neither length is given.
 
     Raises
     ------

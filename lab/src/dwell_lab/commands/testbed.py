@@ -1,4 +1,4 @@
-"""`dwell testbed`: cells on hosts, links and CPUs of their own, on one machine."""
+"""`dwell testbed`: cells on emulated hosts with links and CPU quotas, on one machine."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def run(
 
 
 def _sum_up(folder: Path, *, as_json: bool) -> None:
-    """Print what the run showed; it has failed where the machine was under pressure."""
+    """Print the results of a run; exit with an error if the machine was the bottleneck."""
     import dwell
     from dwell_lab.testbed.run import summary
 

@@ -1,4 +1,4 @@
-"""`dwell validate`: what a calibrated cell predicts, beside what its runs measured."""
+"""`dwell validate`: predictions of a calibrated cell next to measurements of its runs."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def validate(
 
 
 def _sidecar(cell: Path) -> tuple[list[str], Usual]:
-    """Return the ids, or names, of the runs that a cell was calibrated from, and its speeds."""
+    """Return the ids or names of a cell's calibration runs, and the speeds of the calibration."""
     from dwell_lab.testbed.speeds import Usual
 
     file = cell.with_name(f"{cell.stem}.calibration.json")
@@ -93,7 +93,7 @@ def _sidecar(cell: Path) -> tuple[list[str], Usual]:
     try:
         document = json.loads(file.read_text(encoding="utf-8"))
         usual = Usual.of(document)
-        # Runs of two campaigns may have the same name; what their stamps carry differs.
+        # Prefer ids: runs of two campaigns may have the same name.
         if document.get("ids"):
             return [str(run_id) for run_id in document["ids"]], usual
         return [Path(str(name)).name for name in document.get("runs", [])], usual
@@ -105,7 +105,7 @@ def _sidecar(cell: Path) -> tuple[list[str], Usual]:
 
 
 def _open(folders: Sequence[Path]) -> dict[str, Run]:
-    """Open the runs by the names of their folders; of two of one name, by their whole paths."""
+    """Open the runs; keys are folder names, or the full path if the name is already used."""
     runs: dict[str, Run] = {}
     faults: list[str] = []
     known: set[Path] = set()

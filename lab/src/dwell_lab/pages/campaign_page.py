@@ -1,4 +1,4 @@
-"""The report of a campaign: what was measured, what it answers, and what can be shown by so few."""
+"""The report of a campaign: its measurements, answers, and the limits of few repetitions."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from dwell.study.family import UNTOLD, untold
 from dwell_lab.validation.campaign_questions import CampaignQuestion, questions
 from dwell_lab.validation.measured_campaign import MeasuredCampaign
 
-#: Points of a distribution over windows.
+#: Number of points of a distribution over windows.
 POINTS = 80
-#: An axis of latencies ends after so many deadlines.
+#: Upper end of an axis of latencies, in deadlines.
 DEADLINES = 4
 SHOWN = {one.column: one for one in MEASURES if one.column not in ("cost", "migrations")}
 WHERE = {"testbed": "the testbed"}
 
 
 def campaign_html(measured: MeasuredCampaign, *, static: bool = False) -> str:
-    """Return a page about a campaign, finished or not; see `dwell.report.page.page_html`."""
+    """Return the page of a campaign, also before its end; see `dwell.report.page.page_html`."""
     return page_html(campaign_page(measured), static=static)
 
 
 def campaign_page(measured: MeasuredCampaign) -> Page:
-    """Return what there is to show of a campaign; see `campaign_html`."""
+    """Return the contents of the page of a campaign."""
     comparison = measured.comparison
     blocks = PolicyBlocks(comparison)
     return Page(
@@ -241,7 +241,7 @@ def _failed(measured: MeasuredCampaign) -> Iterator[Table]:
 
 
 def campaign_text(measured: MeasuredCampaign, *, width: int | None = None) -> str:
-    """Return the results of a campaign as `dwell.report.table.table_text`, the answers last."""
+    """Return the results of a campaign as text (`dwell.report.table.table_text`), answers last."""
     comparison = measured.comparison
     blocks = PolicyBlocks(comparison)
     parts = [blocks.results(compact=True), blocks.counts()]

@@ -1,4 +1,4 @@
-"""What `dwell report` and notebooks show of campaigns and validations."""
+"""Pages of campaigns and validations for `dwell report` and notebooks."""
 
 from __future__ import annotations
 

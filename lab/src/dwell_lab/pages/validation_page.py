@@ -1,4 +1,4 @@
-"""The page of a validation: what the simulator predicted, beside what runs measured."""
+"""The page of a validation: predictions of the simulator next to measurements of runs."""
 
 from __future__ import annotations
 
@@ -52,14 +52,14 @@ GOAL_NAMES = {
     "dominant": "the same dominant placement",
     "sum_of_means": "better than the sum of means",
 }
-#: Points of a distribution, and where its axis ends.
+#: Number of points of a distribution, and upper end of its axis in deadlines.
 POINTS, DEADLINES = 120, 3.0
 MEASURED, PREDICTED = "measured", "predicted"
 BOTH = {
     MEASURED: Style(INK, "circle", DASHES[0]),
     PREDICTED: Style(MUTED, "diamond", DASHES[1]),
 }
-#: Columns of verdicts that a terminal has room for.
+#: Columns of verdicts that fit into a terminal.
 SHORT = {
     *("l95", "l95_predicted", "l95_word", "rate", "rate_predicted", "rate_word"),
     *("use_word", "placed_word", "sum_word"),
@@ -69,12 +69,12 @@ POLICY = Text("policy", "policy", "policy")
 
 
 def validation_html(validation: Validation, *, static: bool = False) -> str:
-    """Return a page about a validation; see `dwell.report.page.page_html`."""
+    """Return the page of a validation; see `dwell.report.page.page_html`."""
     return page_html(validation_page(validation), static=static)
 
 
 def validation_page(validation: Validation, *, sections: int | None = None) -> Page:
-    """Return what there is to show of a validation; its first `sections` only, the answer first."""
+    """Return the contents of the page of a validation; with `sections`, only that many sections."""
     runs = sum(len(group.runs) for group in validation.groups)
     minutes = sum(group.minutes for group in validation.groups)
     return Page(
@@ -87,7 +87,7 @@ def validation_page(validation: Validation, *, sections: int | None = None) -> P
 
 
 def validation_text(validation: Validation, *, width: int | None = None) -> str:
-    """Return a validation as `dwell.report.table.table_text`, the verdicts on goals last."""
+    """Return a validation as text (`dwell.report.table.table_text`), verdicts on goals last."""
     page = validation_page(validation)
     tables = [_verdicts(validation, compact=True), _goals(validation)]
     texts = [table_text(one, width=width) for one in tables]
@@ -131,7 +131,7 @@ def _sections(validation: Validation) -> Iterator[Section]:
 
 
 def _palette(validation: Validation) -> Palette:
-    """Return the colours of placements and policies; runs may have had candidates of their own."""
+    """Return the colours of placements and policies, including candidates that only runs have."""
     shares = (name.removeprefix("share_") for name in _shares(validation))
     names = dict.fromkeys([*validation.problem.candidates, *shares])
     return Palette.of(names, [group.policy for group in validation.groups])
@@ -157,7 +157,7 @@ def _table(
 def _pair(
     column: str, name: str, unit: str, factor: float = 1.0, decimals: int = 1
 ) -> list[Measure]:
-    """Return the columns of a figure: measured, and predicted."""
+    """Return the two columns of a quantity: measured and predicted."""
     measured = Measure(column, name, unit, factor, decimals)
     return [measured, measured._replace(column=f"{column}_predicted", name="predicted")]
 
@@ -239,7 +239,7 @@ def _verdicts(validation: Validation, *, compact: bool = False) -> Table:
 
 
 def worst_use(group: Group) -> tuple[str, Judged]:
-    """Return the node whose utilisation is predicted worst, and what was found there."""
+    """Return the node with the worst prediction of utilisation, and the judgement of it."""
     uses = group.uses
 
     def rank(name: str) -> tuple[int, float]:
@@ -254,7 +254,7 @@ def worst_use(group: Group) -> tuple[str, Judged]:
 
 
 def _over(validation: Validation) -> Figure:
-    """Draw predicted over measured: L95, V_D and U, with what is allowed as a band."""
+    """Draw predicted over measured L95, V_D and U, with the allowed error as a band."""
     import polars as pl
 
     titles = {"l95_ms": "L95 (ms)", "violation_rate": "V_D (%)", "use": "U of every node (%)"}
@@ -447,7 +447,7 @@ def _jobs(validation: Validation) -> Table:
 
 
 def _compared(validation: Validation, slug: str, names: Sequence[str], title: str) -> Table:
-    """Return figures that some group has, measured and predicted."""
+    """Return the columns, measured and predicted, of the figures that at least one group has."""
     names = [name for name in names if any(name in one.figures for one in validation.groups)]
     rows = []
     for group in validation.groups:

@@ -1,8 +1,8 @@
-"""Names of testbeds: each belongs to a living testbed, and remains of dead ones are removed.
+"""Names of testbeds: one running testbed per name, and removal of a dead testbed's leftovers.
 
-Two files in a folder that does not outlast the machine: ``NAME.lock``, locked as long as the owner
-lives, however it ends, and ``NAME.json``, what it was about to make, written before it makes any.
-So whoever takes the name next knows what is there to remove, and that nothing else is.
+A folder that is lost at reboot contains two files per name. ``NAME.lock`` is locked while its owner
+lives. ``NAME.json`` lists the namespaces that the owner will create, and is written before they
+exist. The next owner of the name removes these, and the name's control group, if they remain.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,39}")
 
 
 def claims_folder() -> Path:
-    """Return where names are taken: ``/run/dwell``, or in the user's own folder if not root."""
+    """Return the folder of the names: ``/run/dwell``, or below the user's runtime folder."""
     if os.geteuid() == 0:
         return Path("/run/dwell")
     return Path(os.environ.get("XDG_RUNTIME_DIR") or f"/run/user/{os.geteuid()}", "dwell")
 
 
 class Claim(Started):
-    """The right to make the hosts and groups of one name; a context manager.
+    """Context manager that holds the right to create the hosts and groups of one name.
 
-    Entered before anything is made. What a dead testbed of this very name left is removed; hosts
-    and groups are removed by whoever made them, and by the next claim otherwise.
+    Enter it before the hosts and groups are created. It removes the hosts and groups that a dead
+    testbed with the same name left. A running testbed removes its own hosts and groups.
 
     Parameters
     ----------
@@ -46,12 +46,12 @@ class Claim(Started):
     nodes : sequence of str
         Nodes that will have a network namespace and a group.
     folder : Path, optional
-        Where names are taken.
+        Folder of the names.
 
     Raises
     ------
     LiveError
-        If the name is not one.
+        If the name is invalid.
     """
 
     def __init__(self, name: str, nodes: Sequence[str], *, folder: Path | None = None) -> None:
@@ -68,7 +68,7 @@ class Claim(Started):
         self._handle: int | None = None
 
     def _start(self) -> None:
-        """Take the name, unless it is taken already; where another has it nothing is changed."""
+        """Take the name, once; if another process holds it, raise and change nothing."""
         if self._handle is not None:
             return
         try:
@@ -82,19 +82,19 @@ class Claim(Started):
         write_whole(self._record, record, durable=False)
 
     def stop(self) -> None:
-        """Give the name back, after removing any remains."""
+        """Remove any leftovers, and release the name."""
         if self._handle is None:
             return
         try:
             self._clear()
         finally:
-            self._lock.unlink(missing_ok=True)  # while it is locked: nobody else has it
+            self._lock.unlink(missing_ok=True)  # still locked: no other process holds it
             os.close(self._handle)
             self._handle = None
 
     def _open(self) -> int:
         while True:
-            # Not handed to processes that are started: they may live longer than their testbed.
+            # Child processes do not inherit the lock: they may live longer than their testbed.
             handle = os.open(self._lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -120,7 +120,7 @@ class Claim(Started):
             record = cast("dict[str, list[str]]", json.loads(self._record.read_text()))
         except FileNotFoundError:
             return
-        except ValueError:  # of another version, or by another hand
+        except ValueError:  # from another version, or edited
             raise LiveError(f"{self._record} is not a testbed's record; remove it") from None
         if cgroups := _cgroups():
             remove_group(group_name(self.name), cgroups)
@@ -145,14 +145,14 @@ class Claim(Started):
 
 
 def _same(handle: int, path: Path) -> bool:
-    """Whether a path still names an open file."""
+    """Whether a path still names the file of an open handle."""
     with suppress(FileNotFoundError):
         return os.path.samestat(os.fstat(handle), path.stat())
     return False
 
 
 def _cgroups() -> Cgroups | None:
-    """Find the groups; none where this machine has none, which the doctor and `Groups` tell of."""
+    """Return the control groups, or None; the doctor and `Groups` report that they are missing."""
     with suppress(LiveError):
         return find_cgroups()
     return None

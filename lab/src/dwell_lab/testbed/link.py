@@ -1,18 +1,19 @@
-"""The link of two hosts, emulated: a process between the TUN devices that lead to the other one.
+"""Emulated link of two hosts: a process between their TUN devices.
 
-What differs from a real link:
+Differences from a real link:
 
 * The unit is the burst: packets of one flow (addresses, protocol, ports) in one direction that
-  follow each other within a gap. That is a message, as long as messages of one connection are
-  further apart than the gap; of closer ones the first draws the delay of all.
-* Within a flow nothing overtakes, as a TCP connection would put it in order anyway: a message whose
-  delay is drawn shorter arrives right behind the one before it. Flows overtake each other.
-* A bare acknowledgement of TCP is delayed like a message, and overtakes them.
-* It never loses a packet while it is up. Where a loss means that a message is sent again, its burst
-  is held back by whole timeouts. Where it means that the message is gone, the transport of the
-  sender leaves it out (`dwell.live.local.linked_transport`), because TCP would send it again.
-* While it is down packets vanish, and TCP sends them again after it is up: after 0.2 s at the
-  soonest, and twice as long after every further attempt.
+  follow each other within a gap. A burst is one message if the messages of a connection are further
+  apart than the gap; closer messages share the delay of the first.
+* Packets of a flow stay in order, because a TCP connection would restore the order anyway: a
+  message with a shorter delay arrives right after the previous message. Flows can overtake each
+  other.
+* A bare acknowledgement of TCP is delayed like a message, and can overtake messages.
+* A link that is up never loses a packet. If the sender repeats lost messages, a loss delays the
+  burst by multiples of the timeout. If it does not, the sender's transport drops the message
+  (`dwell.live.local.linked_transport`), because TCP would repeat it.
+* A link that is down drops packets. TCP repeats them after the link is up again: 0.2 s later at the
+  earliest, and twice as long after every further attempt.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ from dwell_lab.testbed.forwarder import Passed
 
 
 class TunLink(Child):
-    """The link between two hosts, as its parent sees it; a context manager.
+    """Context manager that runs the process of a link between two hosts.
 
-    Its conditions can be changed at any time.
+    The conditions can be changed at any time.
 
     Parameters
     ----------
@@ -38,16 +39,16 @@ class TunLink(Child):
     descriptors : mapping of str to int
         TUN device of each node that leads to the other, without packet information.
     usual : mapping of (source, target) to Conditions
-        At the beginning; a direction that is not there has no delay, loss or limit.
+        Initial conditions; directions without an entry have no delay, loss or limit.
     retransmit_ms : mapping of (source, target) to float
-        Timeout of the directions that send again what was lost; others may have no `loss`.
+        Timeout of the directions that repeat lost messages; other directions cannot have `loss`.
     seed : int
         Seed of delays and losses.
 
     Raises
     ------
     LiveError
-        If a direction or descriptor is not of the nodes, or conditions are none of such a link.
+        If a direction or descriptor does not belong to the nodes, or a condition is invalid.
     """
 
     def __init__(
@@ -78,7 +79,7 @@ class TunLink(Child):
 
     @property
     def scheduling(self) -> Scheduling:
-        """How well it can keep its instants beside busy threads."""
+        """Scheduling of the process: ``usual``, or ``short slices`` (punctual on a busy CPU)."""
         scheduling: Scheduling = self.answered or "usual"
         return scheduling
 
@@ -89,32 +90,31 @@ class TunLink(Child):
         return (first, second), (second, first)
 
     def set(self, source: str, target: str, *, at_ns: int | None = None, **changes: Any) -> int:
-        """Change some conditions of a direction for messages that begin their way from then on.
+        """Change conditions of a direction for all messages sent after an instant.
 
         Parameters
         ----------
         at_ns : int, optional
-            When, by the monotonic clock; at once if left out or past.
+            Instant on the monotonic clock; immediately if omitted or past.
         **changes
-            Fields of `Conditions`. Packets on their way arrive in spite of `down`.
+            Fields of `Conditions`. With `down`, packets on their way still arrive.
 
         Returns
         -------
         int
-            The instant from which they hold, ns of the monotonic clock.
+            The instant of the change, ns on the monotonic clock.
 
         Raises
         ------
         LiveError
-            If there is no such direction or field, a value is out of its bounds or none that this
-            kind of link has, or the process has ended.
+            If the direction, a field or a value is invalid for this link, or the process has ended.
         """
         news = self._change(source, target, changes)
         since_ns: int = self.ask(("set", source, news, at_ns or 0))
         return since_ns
 
     def read(self, *, reset: bool = True) -> dict[tuple[str, str], Passed]:
-        """Return counts of each direction since they were last read.
+        """Return the counts of each direction since the last reset.
 
         Raises
         ------
@@ -129,12 +129,12 @@ class TunLink(Child):
             raise LiveError(f"{self.name} does not go from {source} to {target}")
 
     def _change(self, source: str, target: str, changes: Mapping[str, Any]) -> dict[str, Any]:
-        """Note the conditions of a direction; returns those that are others than before.
+        """Save the conditions of a direction; return the changed fields.
 
         Raises
         ------
         LiveError
-            If no such link has them.
+            If a condition is invalid for this link.
         """
         self._require(source, target)
         way = f"{self.name}, {source} to {target}"
@@ -145,5 +145,5 @@ class TunLink(Child):
             )
         before = self._conditions[source, target]
         self._conditions[source, target] = changed(way, before, changes)
-        # What stays may be a trace, which takes the process a while to read.
+        # Unchanged fields are left out: a trace takes the process a while to read.
         return {name: value for name, value in changes.items() if value != getattr(before, name)}

@@ -1,4 +1,4 @@
-"""Measured: times and loads of tasks, links and nodes in the windows of a run."""
+"""Measured: the times and loads of tasks, links and nodes in the windows of a run."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 SiteName: TypeAlias = tuple[str, str]
 
-#: Least number of jobs from which anything is taken.
+#: Smallest number of jobs for an estimate.
 LEAST_JOBS = 100
-#: Quantile of a waiting time at which a quota has hardly had a part in it.
+#: Quantile of a waiting time at which quotas have almost no effect.
 UNHINDERED = 0.05
 
 
@@ -35,9 +35,9 @@ class DisturbedPlaces:
     Parameters
     ----------
     nodes : frozenset of str
-        With foreign threads, or down.
+        Nodes with any disturbance, such as stress threads or an outage.
     stressed : frozenset of str
-        Nodes that had foreign threads all the time.
+        Nodes that had stress threads all the time.
     """
 
     nodes: frozenset[str]
@@ -46,12 +46,12 @@ class DisturbedPlaces:
 
     @classmethod
     def of(cls, run: Run) -> DisturbedPlaces:
-        """Read a run's record.
+        """Read the disturbed places from a run's record.
 
         Raises
         ------
         RunError
-            If its scenario is not among those of its cell, or the cell cannot be read.
+            If the cell lacks the scenario of the run, or cannot be read.
         """
         scenario = str(run.meta.get("scenario") or "baseline")
         scenarios = run.problem.scenarios
@@ -75,11 +75,11 @@ class Visit:
     Parameters
     ----------
     stage_ms : float64 array, shape (jobs,)
-        Time that the stage needs where nothing hinders it, in the order of cycles.
+        Time of the stage without waiting, in the order of cycles.
     beside_ms : float64 array, shape (jobs,)
-        CPU time that its node took meanwhile for others, by thread of the job, beyond what it takes
-        in the mean of as long: both use up the quota. 0 where nothing counts it, and of a task that
-        an accelerator runs.
+        CPU time of other threads of the node during the job, minus its mean for the job's duration,
+        per thread of the job. It matters because it uses the same quota. 0 if it is not counted, or
+        if an accelerator runs the task.
     cycles, windows : int64 array, shape (jobs,)
     """
 
@@ -91,39 +91,39 @@ class Visit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
-    """Measurements of a run, from its windows that are neither warm-up nor mixed nor excluded.
+    """Measurements of a run, from its usable windows (see `usable`).
 
     Parameters
     ----------
     placement : str
-        Candidate of all its windows; empty where it moved.
+        Candidate of all windows; empty if there are several.
     windows : int
-        Number of the windows used.
+        Number of usable windows.
     visits : dict of (str, str) to Visit
-        By task and node.
+        Jobs by task and node.
     rates : dict of (str, str) to float
-        Cores that each process took, by node and process.
+        Mean number of cores used, by node and process.
     starts : dict of (str, str, bool) to float
-        Jobs a second, by task, node, and whether they are shadows.
+        Jobs per second, by task, node, and whether they are shadows.
     spent_ms : dict of (str, str, bool) to float
-        Mean CPU time of their stage.
+        Mean CPU time of the stage, by the same keys.
     used : dict of str to float
-        Cores that were busy on each node.
+        Mean number of busy cores, by node.
     work_ms : dict of str to float
-        CPU time of a fixed piece of work on every node (`dwell_lab.testbed.speeds`).
+        CPU time of a fixed piece of work, by node (`dwell_lab.testbed.speeds`).
     begins_ms, ends_ms : dict of (str, str) to float
-        From the arrival of the last input, or a release, to the start of the job; of sinks, from
-        the end of the job to that of the cycle. Unhindered, but where something counts what the
-        node took: since a release, and to the end of the cycle.
+        Undelayed time from the last input or the release to the start of the job, and from the end
+        of a sink's job to the end of the cycle. Counted CPU time of the node, if available,
+        replaces it for sources and sinks.
     handovers_ms : dict of (str, str) to float
-        By task and node: CPU time that the node took between a release, or the job before on the
-        same node, and the job; where something counts it.
+        Counted CPU time of the node between a release, or the previous job on the same node, and
+        the job; by task and node.
     beside : dict of str to (float, float)
-        By node: CPU time of other processes while jobs ran, and how long these ran, seconds; of
-        nodes where something counts it.
+        CPU time of other processes during jobs, and the duration of these jobs, s; by node, if it
+        is counted.
     delays_ms : dict of (str, str, str, str) to float64 array
-        By source, target, and the nodes of both: from the end of the job that sent a message to its
-        arrival.
+        Times from the end of the sending job to the arrival of the message; by source, target, and
+        their nodes.
     """
 
     name: str
@@ -145,12 +145,12 @@ class Measured:
 
 
 def look_at(name: str, run: Run, problem: Problem) -> Measured:
-    """Measure a run that kept its jobs.
+    """Return the measurements of a run with recorded jobs.
 
     Raises
     ------
     RunError
-        If it kept no jobs or no CPU times, is of another pipeline, or no window can be used.
+        If jobs or their CPU times are missing, the pipeline differs, or no window is usable.
     """
     import polars as pl
 
@@ -249,7 +249,7 @@ def _require_same(name: str, run: Run, problem: Problem) -> None:
 
 
 def usable(run: Run) -> pl.DataFrame:
-    """Return the windows of a run after the warm-up that are of one placement and undisturbed."""
+    """Return the windows of a run except warm-up, mixed, unproven and excluded windows."""
     import polars as pl
 
     windows = run.windows.filter(~pl.col("warmup") & ~pl.col("mixed"))
@@ -261,7 +261,7 @@ def usable(run: Run) -> pl.DataFrame:
 
 
 def cycles_in(windows: pl.DataFrame, problem: Problem) -> pl.DataFrame:
-    """Return the cycles of windows: `window`, and `cycle` (Int64)."""
+    """Return the cycles of windows, with columns `window` and `cycle` (Int64)."""
     import polars as pl
 
     ranges = pl.int_ranges("first_cycle", pl.col("first_cycle") + problem.window_cycles)
@@ -269,7 +269,7 @@ def cycles_in(windows: pl.DataFrame, problem: Problem) -> pl.DataFrame:
 
 
 def _while_jobs_ran(own: pl.DataFrame, column: str) -> dict[str, tuple[float, float]]:
-    """CPU time that others took while jobs ran, and how long these ran, s, by node."""
+    """Return the CPU time of others during jobs, and the duration of the jobs, s, by node."""
     import polars as pl
 
     if column not in own.columns:
@@ -283,7 +283,7 @@ def _while_jobs_ran(own: pl.DataFrame, column: str) -> dict[str, tuple[float, fl
 
 
 def _accompanied(jobs: pl.DataFrame) -> pl.Series:
-    """Whether another job of the cell, or a shadow, ran on the same node meanwhile."""
+    """Return for each job whether another job or a shadow overlapped it on the same node."""
     import polars as pl
 
     order = jobs.with_row_index().sort("node", "start_ns", "end_ns")
@@ -298,9 +298,9 @@ def _accompanied(jobs: pl.DataFrame) -> pl.Series:
 
 
 def _beside_ms(of: pl.DataFrame) -> Floats:
-    """CPU time that a site's node took beside each of its jobs, beyond the mean, ms.
+    """Return the CPU time of other threads during each job of a site, minus its mean, ms.
 
-    Unknown of a job that another one accompanied: it is that of the job before.
+    A job that overlaps another job takes the value of the previous job.
     """
     import polars as pl
 
@@ -316,7 +316,7 @@ def _beside_ms(of: pl.DataFrame) -> Floats:
 
 
 def _taken_ms(own: pl.DataFrame, column: str) -> dict[SiteName, float]:
-    """Mean CPU time that nodes took around their jobs, where it is known of enough of them."""
+    """Return the mean of a counted CPU time by task and node, if enough jobs have it, ms."""
     import polars as pl
 
     if column not in own.columns:
@@ -331,7 +331,7 @@ def _taken_ms(own: pl.DataFrame, column: str) -> dict[SiteName, float]:
 
 
 def _rates(run: Run, windows: pl.DataFrame, problem: Problem) -> dict[tuple[str, str], float]:
-    """Cores that each process took in the windows; each counts from its release to its close."""
+    """Return the cores that each process used in the windows, from first release to the end."""
     import polars as pl
 
     if not run.has_processes:
@@ -344,7 +344,7 @@ def _rates(run: Run, windows: pl.DataFrame, problem: Problem) -> dict[tuple[str,
 
 
 def _delays(own: pl.DataFrame, problem: Problem) -> dict[tuple[str, str, str, str], Floats]:
-    """Delays of messages, by flow and nodes; of joins it is not known which input came last."""
+    """Return the delays of messages by flow and nodes; tasks with several inputs are left out."""
     import polars as pl
 
     delays: dict[tuple[str, str, str, str], Floats] = {}
@@ -389,7 +389,7 @@ def _ends(own: pl.DataFrame, run: Run, problem: Problem) -> dict[SiteName, float
 
 
 def _unhindered(jobs: pl.DataFrame, wait_ms: pl.Expr) -> dict[SiteName, float]:
-    """Quick waits of jobs, by task and node."""
+    """Return the quantile `UNHINDERED` of the waits of jobs, by task and node."""
     quick_ms = wait_ms.quantile(UNHINDERED, "linear").clip(0.0)
     quick = jobs.group_by("task", "node").agg(quick_ms.alias("ms"))
     return {(task, node): ms for task, node, ms in quick.iter_rows()}

@@ -1,9 +1,9 @@
-"""Costs of the messages between two jobs: CPU time of their workers, time on their link.
+"""Costs of the messages between two jobs: CPU time of their workers, and time on their link.
 
-A worker spends more CPU time on a job than its stage takes: on messages. Not all of that lies on
-the way of the cycle: it also reads what is late, answers, and puts away. How much does is seen
-where nothing hinders it: a message that came quickest took its link's own delay, its transmission,
-and of the CPU time that its sender and its receiver spend on messages what is left of the time.
+A worker spends CPU time on messages in addition to its stage. Only a part of it delays the cycle:
+the worker also reads late messages, answers and cleans up. The fastest undisturbed messages show
+this part. Their time consists of the link's delay, the transmission, and the CPU time of sender and
+receiver that delays them.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from dwell_lab.testbed.measured import LEAST_JOBS, Measured, SiteName
 HopName: TypeAlias = tuple[str, str, str, str]
 Link: TypeAlias = tuple[str, str]
 
-#: Quantile of a message's time at which nothing but itself has had a part in it.
+#: Quantile of the times of messages that selects undelayed messages.
 QUICK = 0.1
-#: Bytes that cost as much CPU as sending or receiving a message at all.
+#: Number of bytes whose CPU cost equals the fixed cost of sending or receiving a message.
 MESSAGE_BYTES = 20_000
 
 
@@ -34,17 +34,17 @@ class OnTheWay(NamedTuple):
     Parameters
     ----------
     hops : dict of (str, str, str, str) to (float, float)
-        CPU time of sender and receiver that lies on a message's way, ms, by source, target, and
-        the nodes of both.
+        CPU time of sender and receiver that delays a message, ms, by source, target, and their
+        nodes.
     asked_ms : mapping of (str, str) to float64 array
-        Delays that the cell asks of links that are emulated.
+        Delays of emulated links according to the cell.
     """
 
     hops: dict[HopName, tuple[float, float]]
     asked_ms: Mapping[Link, Floats]
 
     def known_ms(self, hop: HopName, problem: Problem) -> float:
-        """Transmission of a message, and the CPU time on its way."""
+        """Return a message's transmission time plus the CPU time that delays it."""
         return _transmission_ms(hop, problem) + sum(self.hops.get(hop, (0.0, 0.0)))
 
 
@@ -54,19 +54,19 @@ def hops(
     problem: Problem,
     asked_ms: Mapping[Link, Floats],
 ) -> OnTheWay:
-    """Find the part of the workers' messaging that lies on the way of messages.
+    """Return the part of the workers' messaging time that delays messages.
 
     Parameters
     ----------
     messaging_ms : mapping of (str, str) to float
-        CPU time that a worker takes for a job besides its stage, by task and node.
+        CPU time of a worker per job beyond its stage, by task and node.
     asked_ms : mapping of (str, str) to float64 array
-        Delays that the cell asks of links that are emulated. Of others, whose own delay nobody
-        knows, all of the messaging is taken to lie on the way.
+        Delays of emulated links according to the cell. The delay of other links is unknown: all
+        messaging time is assumed to delay their messages.
     """
     gaps_ms = _gaps(measured, problem, asked_ms)
     whole = {hop: _whole(hop, messaging_ms, problem) for hop in gaps_ms}
-    # On one node there is nothing else between two jobs.
+    # Within a node messaging is the only time between two jobs.
     parts: dict[tuple[str, str], list[float]] = {}
     for hop, gap_ms in gaps_ms.items():
         source, target, node, to = hop
@@ -81,7 +81,7 @@ def hops(
         sides_ms = np.array(whole[hop]) * [np.mean(of) if of else 1.0 for of in known]
         over_ms = float(sides_ms.sum()) - gap_ms
         if over_ms > 0:
-            # The side of which nothing is known spends so much less on the way; or both do.
+            # Subtract the excess from the sides without a known part, or from both sides.
             is_open = np.array([of is None for of in known])
             spends = np.where(is_open, sides_ms, 0.0)
             spends = spends if spends.sum() > over_ms else sides_ms
@@ -94,9 +94,9 @@ def hops(
 def _gaps(
     measured: Sequence[Measured], problem: Problem, asked_ms: Mapping[Link, Floats]
 ) -> dict[HopName, float]:
-    """Time of the quickest messages beyond their link's delay and transmission, ms.
+    """Return the time of the fastest messages beyond the link's delay and transmission, ms.
 
-    On one node it is what the node took meanwhile, where something counts it.
+    Within a node it is the counted CPU time of the node between the jobs, if available.
     """
     gaps: dict[HopName, list[float]] = {}
     for one, hop, delay_ms in _undisturbed(measured):
@@ -106,7 +106,7 @@ def _gaps(
             own_ms = -math.inf if asked is None else float(np.quantile(asked, QUICK))
         gap_ms = float(np.quantile(delay_ms, QUICK)) - own_ms - _transmission_ms(hop, problem)
         if hop[2] == hop[3] and end in one.handovers_ms:
-            # The start of the next job is that job's own.
+            # The start of the next job belongs to that job.
             gap_ms = one.handovers_ms[end] - one.begins_ms.get(end, 0.0)
         gaps.setdefault(hop, []).append(gap_ms)
     return {hop: max(float(np.median(seen)), 0.0) for hop, seen in gaps.items()}
@@ -115,7 +115,7 @@ def _gaps(
 def _whole(
     hop: HopName, messaging_ms: Mapping[SiteName, float], problem: Problem
 ) -> tuple[float, float]:
-    """CPU time that sender and receiver spend on a message, on its way or not, ms."""
+    """Return the total CPU time of sender and receiver for a message, ms."""
     source, target, node, to = hop
     return (
         messaging_ms.get((source, node), 0.0) * share(problem, source, source, target),
@@ -124,9 +124,9 @@ def _whole(
 
 
 def share(problem: Problem, task: str, source: str, target: str) -> float:
-    """Share of a task's messaging that one of its flows is, by messages and by bytes.
+    """Return the share of a flow in a task's messaging, by numbers of messages and bytes.
 
-    A source's stamp, and a sink's command, are flows from and to ``""``.
+    A source's stamp counts as an input, and a sink's command as an output.
     """
     inputs, outputs = problem.pipeline.inputs(task), problem.pipeline.outputs(task)
     messages = max(len(inputs), 1) + max(len(outputs), 1)
@@ -136,7 +136,7 @@ def share(problem: Problem, task: str, source: str, target: str) -> float:
 
 
 def floors(measured: Sequence[Measured], known: OnTheWay, problem: Problem) -> dict[Link, float]:
-    """Time that the messages of every emulated link take beyond the delay asked of it, ms."""
+    """Return the time of messages on every emulated link beyond the delay set for it, ms."""
     over: dict[Link, list[float]] = {}
     for _, hop, delay_ms in _undisturbed(measured):
         asked = known.asked_ms.get(hop[2:])
@@ -149,7 +149,7 @@ def floors(measured: Sequence[Measured], known: OnTheWay, problem: Problem) -> d
 def own_delays(
     measured: Sequence[Measured], known: OnTheWay, problem: Problem
 ) -> dict[Link, Floats]:
-    """Delays of every link as they were measured, ms, for links that nobody emulates."""
+    """Return the measured delays of every link, ms; for links that are not emulated."""
     delays: dict[Link, list[Floats]] = {}
     for _, hop, delay_ms in _undisturbed(measured):
         if "->".join(hop[2:]) in problem.fabric.links:

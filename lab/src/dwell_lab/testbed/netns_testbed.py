@@ -1,7 +1,7 @@
-"""Testbed on this machine: network namespaces as hosts, links, CPUs, and the cell on them.
+"""Testbed on this machine: a cell on network namespaces as hosts, with links and CPU quotas.
 
-Nothing here moves a stage: it plays what a scenario does to nodes and links, and what a controller
-makes of it is the controller's.
+The testbed applies the disturbances of a scenario to nodes and links. Only the controller moves
+stages.
 """
 
 from __future__ import annotations
@@ -39,13 +39,7 @@ LINK_FILE = "links"
 
 
 def require_playable(problem: Problem) -> None:
-    """Refuse a cell with something that a testbed does not have.
-
-    Raises
-    ------
-    LiveError
-        With every fault.
-    """
+    """Raise a LiveError that lists all features of a cell that a testbed does not support."""
     faults = [
         f"nodes.{node.name}.bursts: drawn foreign work is not played"
         for node in problem.fabric.nodes.values()
@@ -61,36 +55,36 @@ def require_playable(problem: Problem) -> None:
 
 
 class NetnsTestbed(LocalTestbed):
-    """A cell on hosts of its own on this machine; a context manager.
+    """Context manager that runs a cell on emulated hosts of this machine.
 
     Parameters
     ----------
     problem : Problem
-        Where its nodes are is put into it.
+        The cell; the attribute `problem` becomes a copy with the addresses of the hosts.
     folder : Path
-        For cell file, states, logs and runs.
+        Folder for the cell file, states, logs and runs.
     name : str
-        Name of this testbed, among others on this machine.
+        Name of this testbed, unique on this machine.
     seed : int
         Seed of delays and losses.
     more : sequence of str
         Further arguments of the controller.
     environment : mapping of str to str, optional
-        Variables that all processes get as well.
+        Additional environment variables of all processes.
     clocks : Path, optional
-        File of a `ClockFile`, which says what is wrong with the nodes' clocks.
+        File of a `ClockFile` with the errors of the nodes' clocks.
 
     Attributes
     ----------
     links : dict of frozenset of str to TunLink
-        By pair of nodes.
+        Links by pair of nodes.
     watcher : Watcher
-        Tells how the cell is.
+        Process that requests the status of the cell.
 
     Raises
     ------
     LiveError
-        If the cell cannot be played, or this machine has too few CPUs for its nodes.
+        If the testbed does not support the cell, or this machine has too few CPUs for its nodes.
     """
 
     own_cpus = True
@@ -124,30 +118,30 @@ class NetnsTestbed(LocalTestbed):
     # --------------------------------------------------------------------- up and down
 
     def claim(self) -> None:
-        """Take the name, and clear away what a dead testbed of this name left.
+        """Take the name, and remove the leftovers of a dead testbed of this name.
 
         Raises
         ------
         LiveError
-            If a testbed of this name runs, or something else is in the way.
+            If a testbed of this name runs, or other namespaces or groups use the name.
         """
         self._stack.enter_context(self._claim)
 
     def _start(self) -> None:
-        """Make hosts, links and groups, start everything, and begin a run."""
+        """Create hosts, links and groups, start all processes, and begin a run."""
         self.claim()
         self._stack.callback(remove_orphans)
         self._make()
         for node in self.nodes:
             self.processes.start_agent(node)
-        # Interpreters that start would take most of a minute of what a small robot has.
+        # Under a small robot's quota, starting the interpreters would take most of a minute.
         with self._groups.unlimited():
             self._come_up()
         self.begun_ns = self.begin()
 
     def _make(self) -> None:
         enter = self._stack.enter_context
-        # The agents of a cell all talk to each other.
+        # Every agent of a cell communicates with every other.
         nodes, pairs = list(self.nodes), list(combinations(self.nodes, 2))
         self._hosts = enter(Hosts(self.name, nodes, pairs))
         self._groups = enter(Groups(self.name, {**self.shares, PROBES: Share()}))
@@ -164,7 +158,7 @@ class NetnsTestbed(LocalTestbed):
         self._stack.callback(self._stop_stress)
         environment = {
             "DWELL_WORLD": str(self.folder / "world"),
-            # Its hosts' addresses lead nowhere but to each other.
+            # The hosts can reach only each other.
             INSECURE: "1",
             **self._environment,
         }
@@ -183,18 +177,18 @@ class NetnsTestbed(LocalTestbed):
 
     @property
     def probing(self) -> list[str]:
-        """First words of a command that runs as weighty as the nodes do, and belongs to none."""
+        """Command prefix that runs a process outside all nodes, with a node's CPU weight."""
         return self._groups.inside(PROBES, [])
 
     def beside(self, node: str) -> list[str]:
-        """Return a command's first words that have it run on a node's host, outside its group."""
+        """Return a command prefix that runs a process on a node's host, outside its group."""
         return self._hosts.inside(node, [])
 
     def _inside(self, node: str, words: Sequence[str]) -> Sequence[str]:
         return self._groups.inside(node, self._hosts.inside(node, words))
 
     def _link(self, pair: tuple[str, str], number: int) -> TunLink:
-        """Return the link of a pair; a direction that the cell does not have has no delay."""
+        """Return the link of a pair of nodes; directions that the cell lacks have no delay."""
         usual: dict[tuple[str, str], Conditions] = {}
         retransmit_ms: dict[tuple[str, str], float] = {}
         for link in self._usual.values():
@@ -220,7 +214,7 @@ class NetnsTestbed(LocalTestbed):
             self.stress.pop(node).stop()
 
     def stop(self) -> None:
-        """End everything, and leave nothing behind; safe to call twice."""
+        """End all processes, and remove hosts, links and groups; may be called twice."""
         with undisturbed():
             super().stop()
 
@@ -236,7 +230,7 @@ class NetnsTestbed(LocalTestbed):
         was_down = node in self._down
         if state.down and not was_down:
             self._down.add(node)
-            # All at once, as a loss of power does.
+            # Kill all processes at once, like a loss of power.
             self._groups.kill(node)
             self.processes.forget(node)
             with suppress(LiveError):
@@ -260,7 +254,7 @@ class NetnsTestbed(LocalTestbed):
         way.set(link.source, link.target, **fields_of(now))
 
     def cut(self, source: str, target: str, at_ns: int) -> int:
-        """Cut a direction of a link; returns when that was."""
+        """Cut a direction of a link; return the instant of the cut."""
         way = self.links[frozenset((source, target))]
         return way.set(source, target, at_ns=at_ns, down=True)
 
@@ -271,17 +265,17 @@ class NetnsTestbed(LocalTestbed):
     # ---------------------------------------------------------------------------- facts
 
     def taps(self) -> Mapping[tuple[str, ...], Sequence[str]]:
-        """Return how to run a command beside the processes of each node: words to put first."""
+        """Return the command prefix for each node that runs a process on its host."""
         return {(node,): self.beside(node) for node in self.problem.fabric.nodes}
 
     @property
     def used_ns(self) -> dict[str, Callable[[], int]]:
-        """Readers of the CPU time that a node has taken so far, by node."""
+        """Functions that return the CPU time of a node so far, by node."""
         return {node: partial(self._groups.used_ns, node) for node in self.nodes}
 
     @property
     def switches(self) -> dict[str, Callable[[], dict[int, int]]]:
-        """Readers of how often each thread of a node has gone to sleep so far, by node."""
+        """Functions that return how often each thread of a node has slept so far, by node."""
         return {node: partial(self._groups.switches, node) for node in self.nodes}
 
     @property
@@ -290,7 +284,7 @@ class NetnsTestbed(LocalTestbed):
         return sorted({cpu for share in self.shares.values() for cpu in share.cpus})
 
     def facts(self) -> dict[str, Any]:
-        """Return facts on the testbed for the record of a run, ready for JSON."""
+        """Return a description of the testbed for the record of a run, as a JSON document."""
         return {
             "name": self.name,
             "kernel": os.uname().release,

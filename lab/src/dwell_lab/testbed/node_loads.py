@@ -1,7 +1,7 @@
-"""Node loads: what nodes do besides jobs, and how busy nodes slow their jobs down.
+"""Node loads: the background load of nodes, and the slowdown of jobs on stressed nodes.
 
-Everything that a node does and that is in no task's cost (agents, stampers, sinks, the controller,
-workers without jobs and the messaging that delays nothing) is its background.
+The background contains all CPU time of a node outside the costs of tasks: agents, stampers, sinks,
+the controller, workers without jobs, and messaging that does not delay the cycle.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from dwell_lab.testbed.measured import LEAST_JOBS, Measured, SiteName
 from dwell_lab.testbed.speeds import Usual
 from dwell_lab.testbed.task_costs import TaskCost
 
-#: Wakes that come together: a message wakes a thread that waits for sockets, one that reads, and a
-#: worker's. In a trace of the scheduler under the example, the time from any instant until a thread
-#: wakes or sleeps is as long as with 0.40 (E) to 0.52 (R1) times as many that come alone.
+#: Mean size of a group of simultaneous wakes: a message wakes a thread that waits for sockets, a
+#: reader and a worker. In a scheduler trace of the example, the times between an instant and the
+#: next wake or sleep match independent wakes at 0.40 (E) to 0.52 (R1) of the measured rate.
 TOGETHER = 2.2
 
 
 def backgrounds(
     measured: Sequence[Measured], costs: Mapping[SiteName, TaskCost], problem: Problem
 ) -> dict[str, float]:
-    """Cores of every node that neither its jobs nor foreign threads took.
+    """Return the background of every node in cores, from runs without disturbance of the node.
 
-    Of a node with a quota its control group says what was taken in all; elsewhere, where others
-    may have the same CPUs, only the cell's own processes are counted.
+    For a node with a quota the total is from its control group. Otherwise other processes may use
+    the same CPUs, so the total contains only the cell's processes.
     """
     result = {}
     for node, of in problem.fabric.nodes.items():
@@ -49,7 +49,7 @@ def backgrounds(
 
 
 def beside_jobs(measured: Sequence[Measured], behind: Mapping[str, float]) -> dict[str, float]:
-    """Cores of every node's background that were taken while its jobs ran, where it is known."""
+    """Return the cores of every node's background during its jobs, if they are measured."""
     result = {}
     for node, cores in behind.items():
         of = [
@@ -61,13 +61,13 @@ def beside_jobs(measured: Sequence[Measured], behind: Mapping[str, float]) -> di
 
 
 def _cores(of: Sequence[tuple[float, float]]) -> float | None:
-    """CPU time taken while jobs ran, over how long these ran; None where none did."""
+    """Return the CPU time during jobs divided by their duration; None if no job ran."""
     took_s = sum(took for _, took in of)
     return sum(taken for taken, _ in of) / took_s if took_s > 0 else None
 
 
 def wakes(measured: Sequence[Measured], problem: Problem) -> dict[str, float]:
-    """How often in a second threads of a node wake, where the kernel looks at ticks otherwise."""
+    """Return the groups of wakes per second, for nodes whose quota is checked at ticks."""
     result = {}
     for name, node in problem.fabric.nodes.items():
         counted = [one.run.meta.get("wakes_hz") or {} for one in measured]
@@ -80,7 +80,7 @@ def wakes(measured: Sequence[Measured], problem: Problem) -> dict[str, float]:
 def interferences(
     measured: Sequence[Measured], costs: Mapping[SiteName, TaskCost], usual: Usual
 ) -> dict[str, float]:
-    """How many times as much core time stages took on nodes that were stressed all the time."""
+    """Return the factor on core time of stages, for nodes that were stressed all the time."""
     sums: dict[str, list[float]] = {}
     for one in measured:
         for site, visit in one.visits.items():
@@ -103,7 +103,7 @@ def _cores_ms(
     costs: Mapping[SiteName, TaskCost],
     problem: Problem,
 ) -> float:
-    """Core time, ms, of a job as a simulator will charge it."""
+    """Return the core time of a job in the simulator, ms."""
     execution = problem.pipeline.tasks[key[0]].on[key[1]]
     if execution.accelerator is not None:
         return 0.0

@@ -1,4 +1,4 @@
-"""Packets on an emulated link: which flow each is of, and whether it carries data."""
+"""Packets on an emulated link: the flow of a packet, and whether it carries data."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 ICMP, TCP, UDP = 1, 6, 17
 FIN_SYN_RST = 0x07
-# Don't-fragment left out: more fragments, and where in the packet this one begins.
+# Flag "more fragments" and offset of the fragment; without the flag "don't fragment".
 FRAGMENT = 0x3FFF
 MULTICAST = 224
 LEAST_BYTES = 20
@@ -19,9 +19,10 @@ class Kind(NamedTuple):
     Parameters
     ----------
     flow : bytes
-        Same for all packets of one 5-tuple. Bare acknowledgements of TCP are a flow of their own.
+        Equal for all packets of a 5-tuple, except that bare TCP acknowledgements form a separate
+        flow.
     data : bool
-        Whether it may be a part of a message, and is no bare acknowledgement.
+        Whether the packet may be part of a message; false for bare acknowledgements.
     """
 
     flow: bytes
@@ -29,15 +30,15 @@ class Kind(NamedTuple):
 
 
 def kind_of(packet: bytes) -> Kind | None:
-    """Return a packet's kind; None for packets of no cell: the kernel's own, on every interface.
+    """Return a packet's kind; None for the kernel's own packets on every interface.
 
-    That is all of IPv6 (router solicitations, neighbours, listeners), multicast, broadcast, and
-    what is neither TCP, UDP nor ICMP.
+    These are IPv6 packets (router solicitations, neighbours, listeners), multicast, broadcast, and
+    all protocols except TCP, UDP and ICMP.
 
     Parameters
     ----------
     packet : bytes
-        As a TUN device without packet information gives it.
+        Packet from a TUN device without packet information.
     """
     if len(packet) < LEAST_BYTES or packet[0] >> 4 != 4:
         return None

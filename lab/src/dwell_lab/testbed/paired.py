@@ -1,10 +1,11 @@
-"""Paired: execution times as rows in which the tasks of a CPU keep what they had in common.
+"""Paired: execution times in rows that preserve the correlation between tasks of one CPU.
 
-Where others share the machine, its CPUs are fast at times and slow at others, for all that runs on
-them. A row holds one cycle of a run, every task on every node. A task that was not there in that
-run, because its cycles were placed elsewhere, takes its times from a run in which it was: from a
-cycle that was as slow, among those of its run, for the tasks of its CPU that were there in both.
-Where there was none, from the cycles in their order. Tasks that were not there stay together.
+The speed of a shared machine's CPUs varies, and affects all tasks on a CPU. A row contains one
+cycle of a run, with every task on every node. If a run has no jobs of a task on a node, because
+its placements used other nodes, the times are taken from a donor run that has them. The donor's
+cycle has the same rank, by the times of the tasks on this CPU that both runs have. If the runs
+share no task on the CPU, the donor's cycles are used in their order. Missing tasks are taken from
+a donor together.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ class Part(NamedTuple):
     Parameters
     ----------
     cycles : int64 array, shape (jobs,)
-        Ascending.
+        Cycle numbers, ascending.
     times_ms : float64 array, shape (jobs,)
     """
 
@@ -37,14 +38,14 @@ class Part(NamedTuple):
 def paired(
     parts: Mapping[SiteName, Mapping[str, Part]], cpus: Mapping[str, Hashable] = FrozenDict()
 ) -> dict[SiteName, Floats]:
-    """Return a column of times for every task on every node, all of one length.
+    """Return a column of times for every task on every node, all of equal length.
 
     Parameters
     ----------
     parts : mapping of (str, str) to mapping of str to Part
-        By task and node, and by run; at least one run each.
+        Times by task and node, then by run; at least one run each.
     cpus : mapping of str to hashable
-        CPUs of a node; those of a node that is not there are its own.
+        CPUs by node; nodes with equal CPUs share them, and a node without an entry shares none.
     """
     runs = list(dict.fromkeys(run for of in parts.values() for run in of))
     blocks = {
@@ -54,14 +55,14 @@ def paired(
     for site in parts:
         beside.setdefault(cpus.get(site[1], site[1]), set()).add(site)
     columns: dict[SiteName, list[Floats]] = {site: [] for site in parts}
-    # Where each run's rows go on when they stand in for another's.
+    # Next row of each donor run that is used in order, by CPU.
     begins: dict[tuple[str, Hashable], int] = {}
     for block in blocks.values():
         rows = len(next(iter(block.values())))
         for place, sites in beside.items():
             have = {site: block[site] for site in sites & block.keys()}
             while missing := sites - have.keys():
-                # The run that has most of the missing tasks, and then of those that are there.
+                # The donor has most of the missing tasks, then most of the present tasks.
                 wanted = missing, have.keys()
                 donor = max(blocks, key=lambda run: [len(w & blocks[run].keys()) for w in wanted])
                 of = blocks[donor]
@@ -78,10 +79,10 @@ def paired(
 
 
 def _as_slow(ours: Sequence[Floats], theirs: Sequence[Floats]) -> NDArray[np.intp]:
-    """Return for every row of some tasks that of another run that has the same place in it.
+    """Return for each row of one run the index of the row with the same rank in another run.
 
-    A row's place among all is by how long its tasks took together: short ones, whose noise is as
-    large as what slows them, have little say.
+    The rank is by the sum of the tasks' times: short tasks, which are mostly noise, have little
+    weight in it.
     """
     own, other = (np.sum(columns, axis=0) for columns in (ours, theirs))
     place = np.empty(len(own))
@@ -91,7 +92,7 @@ def _as_slow(ours: Sequence[Floats], theirs: Sequence[Floats]) -> NDArray[np.int
 
 
 def _block(of: Mapping[SiteName, Part]) -> dict[SiteName, Floats]:
-    """Return one run's times with a row for every cycle; a job that is missing is as the last."""
+    """Return a run's times with one row per cycle; a missing job repeats the job before it."""
     cycles = np.unique(np.concatenate([part.cycles for part in of.values()]))
     found = {}
     for site, part in of.items():

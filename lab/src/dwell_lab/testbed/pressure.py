@@ -1,24 +1,24 @@
-"""Pressure: whether the machine has been the bottleneck of a testbed in a window, by a fixed rule.
+"""Pressure: a fixed rule for whether the machine was the bottleneck of a testbed in a window.
 
-A window counts if the machine gave every node what its quota says, when it asked. PSI cannot tell:
-processes of one node that wait for each other, or for what their own quota grants, wait for a CPU
-like any others, so that it is high wherever a node is stressed. It is recorded, and so is how fast
-the CPUs were (``work_ms``); neither decides anything. What decides, for the CPUs that nodes use
-(`Rule` has the numbers):
+A window counts if the machine granted every node its quota on demand. PSI cannot decide this:
+it also counts processes that wait for other processes of their node, or for their own quota, and so
+is high whenever a node is stressed. PSI and the speed of the CPUs (``work_ms``) are recorded, but
+decide nothing. The criteria, for the CPUs of nodes (`Rule` has the numbers):
 
 ``full``
-    The CPU was never idle for a fifth of a second, in more than a tenth of the window. Nodes alone
-    cannot fill one: some of every CPU is granted to nobody (see `allotment`).
+    The CPU was hardly idle during stretches of 0.2 s that make up over a tenth of the window. Nodes
+    alone cannot fill a CPU, because a part of every CPU is never allotted (see `allotment`).
 ``stolen``
-    The hypervisor gave it to others.
+    The hypervisor gave the CPU to other machines.
 ``stalled``
-    A probe on it, which belongs to no node, ran late by more than nodes and their quotas explain.
+    A probe on the CPU, outside all nodes, was later than nodes and their quotas can explain.
 ``starved``
-    A node that was stressed all the time, and so wanted all it could get, got less than its quota.
+    A node that was stressed all the time, and thus used all CPU time it could, got less than its
+    quota.
 ``late links``
-    Too many packets left their link later than they were due.
+    Too many packets left their link late.
 
-The rule was fixed before any campaign, and knows nothing of what a run has shown of its policy.
+The rule was fixed before any campaign, and does not depend on the results of a policy.
 """
 
 from __future__ import annotations
@@ -36,26 +36,26 @@ from dwell.calibration.machine_conditions import STOLEN_MOST
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """From when on a window is excluded, and a run has failed.
+    """Limits that decide which windows are excluded, and which runs have failed.
 
     Parameters
     ----------
     idle_least : float
-        Share of a stretch of time below which a CPU counts as full in it.
+        Idle share of a stretch below which a CPU counts as full.
     stretch_s : float
-        Length of the stretches.
+        Length of a stretch.
     full_most : float
-        Share of a window's stretches in which a CPU may be full.
+        Largest share of a window in which a CPU may be full.
     stolen_most : float
-        Share of a window's time that may be stolen from a CPU.
+        Largest share of a window that may be stolen from a CPU.
     stall_ms : float
-        Lateness that a probe may have.
+        Largest lateness of a probe.
     quota_least : float
-        Share of its quota that a node gets that wants all of it.
+        Smallest share of its quota that a stressed node must get.
     late_ms, late_most : float
-        Packets that leave a link later than that may be such a share.
+        Lateness from which a packet is late, and largest share of late packets.
     excluded_most : float
-        Share of the windows after the warm-up that may be excluded before a run has failed.
+        Largest share of excluded windows after the warm-up; a run with more has failed.
     """
 
     idle_least: float = 0.05
@@ -71,26 +71,26 @@ class Rule:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """Counters of the machine at an instant, and lateness since the sample before.
+    """Counters of the machine at an instant, and lateness since the previous sample.
 
     Parameters
     ----------
     at_ns : int
-        On the clock of the run.
+        Instant on the clock of the run.
     idle_s, stolen_s : mapping of int to float
-        Since the machine was started, by CPU.
+        Idle and stolen time since the machine's start, by CPU.
     used_s : mapping of str to float
-        CPU time of each node.
+        CPU time of each node so far.
     waited_s : float or None
-        PSI: time in which something waited for a CPU; None where the kernel does not say.
+        PSI: time in which some task waited for a CPU; None if the kernel does not report it.
     probe_ms : mapping of int to float
-        Longest lateness of each CPU's probe since the sample before.
+        Largest lateness of each CPU's probe since the previous sample.
     work_ms : mapping of int to float
-        CPU time that a fixed piece of work has taken on each CPU since the sample before.
+        Mean CPU time of the probe's fixed work since the previous sample, by CPU.
     packets, late : mapping of str to int
-        By link: those that have left, and of them those that were late, since the sample before.
+        Numbers of packets, and of late packets, since the previous sample, by link.
     late_ms : mapping of str to float
-        By link: longest lateness of a packet since the sample before.
+        Largest lateness of a packet since the previous sample, by link.
     """
 
     at_ns: int
@@ -107,14 +107,14 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """A window in time.
+    """The time span of a window.
 
     Parameters
     ----------
     begin_ns, end_ns : int
-        On the clock of the samples.
+        Instants on the clock of the samples.
     stressed : mapping of str to float
-        Capacity in cores of the nodes that had foreign threads all the time.
+        Capacity in cores of the nodes that were stressed throughout the window.
     """
 
     number: int
@@ -130,9 +130,9 @@ def judged(samples: Sequence[Sample], spans: Sequence[Span], rule: Rule) -> dict
     Returns
     -------
     dict
-        Ready for JSON. ``rule``; ``windows``, a row each: ``window``, ``broken`` (what the rule
-        says of it), and what was measured; ``excluded``, numbers of those after the warm-up of
-        which the rule says anything; ``share`` of them; ``failed``; ``why``.
+        Document for JSON with ``rule``; ``windows``, one row per window with its number,
+        ``broken`` (broken parts of the rule) and the measurements; ``excluded``, the numbers of the
+        windows after the warm-up that break the rule; their ``share``; ``failed``; ``why``.
     """
     instants = [sample.at_ns for sample in samples]
     rows = [_row(_covering(samples, instants, span), span, rule) for span in spans]
@@ -151,18 +151,18 @@ def judged(samples: Sequence[Sample], spans: Sequence[Span], rule: Rule) -> dict
 
 
 def _why(rows: Iterable[Mapping[str, Any]]) -> str:
-    """Return how often each part of the rule was broken, most frequent first."""
+    """Return the number of windows that break each part of the rule, most frequent first."""
     counts = Counter(fault for row in rows for fault in row["broken"])
     return ", ".join(f"{fault} in {count}" for fault, count in counts.most_common())
 
 
 def _row(inside: Sequence[Sample], span: Span, rule: Rule) -> dict[str, Any]:
-    """Return the measurements of a window, and which parts of the rule they break."""
+    """Return the measurements of a window, and the parts of the rule that they break."""
     if len(inside) < 2:
         return {"window": span.number, "broken": ["not measured"]}
     first, last = inside[0], inside[-1]
     lasted_s = (last.at_ns - first.at_ns) / 1e9
-    # What a sample says was late has been so since the one before.
+    # The lateness in a sample belongs to the time since the previous sample.
     since = inside[1:]
     full = {str(cpu): _full(inside, cpu, rule) for cpu in first.idle_s}
     stolen = {
@@ -217,7 +217,7 @@ def _rounded(values: Mapping[str, float]) -> dict[str, float]:
 
 
 def _covering(samples: Sequence[Sample], instants: Sequence[int], span: Span) -> Sequence[Sample]:
-    """Return the samples of a window, from the last before it to the first after it."""
+    """Return the samples of a window, with the last sample before it and the first after it."""
     if not samples or instants[-1] <= span.begin_ns or instants[0] >= span.end_ns:
         return ()
     begin = max(bisect_right(instants, span.begin_ns) - 1, 0)

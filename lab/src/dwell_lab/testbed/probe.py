@@ -1,10 +1,9 @@
-"""Probe: how late a process that wants little of a CPU gets it, and how fast it is then.
+"""Probe: measures the lateness of a process that needs little CPU time, and the CPU's speed.
 
-It sleeps 5 ms, and notes how much later than that it runs again: at normal priority, in a group as
-weighty as the nodes' and without a quota. Nodes that use what their quotas grant make it late by
-less than one period of a quota; a machine that stands still, or has more to do than it can, makes
-it later. Every 25 ms it does a fixed piece of work: what that takes of the CPU's time says how fast
-the CPU is, on a machine that others share.
+The probe sleeps 5 ms at a time, and records how late it wakes. It has normal priority, and its
+control group has a node's weight but no quota. Nodes within their quotas delay it by less than a
+quota's period; a stalled or overloaded machine delays it more. After every fifth sleep (25 ms) it
+does a fixed piece of work, whose CPU time shows the speed of a shared machine's CPU.
 """
 
 from __future__ import annotations
@@ -20,24 +19,24 @@ from typing import NamedTuple
 from dwell.live.local.child import Child, Parent
 
 SLEEP_NS = 5_000_000
-#: Wakes between two pieces of work, and turns of its loop: about 0.1 ms.
+#: Wakes per piece of work, and turns of its loop (about 0.1 ms).
 WORK_EVERY, WORK_TURNS = 5, 2_000
 
 
 class Lateness(NamedTuple):
-    """Longest lateness of a probe, and the mean CPU time of its work; None where it did none."""
+    """Largest lateness of a probe, and the mean CPU time of its work (None if it did no work)."""
 
     max_ms: float
     work_ms: float | None
 
 
 class Probe(Child):
-    """Measures on one CPU until it is stopped; a context manager.
+    """Context manager that runs a probe on one CPU.
 
     Parameters
     ----------
     prefix : sequence of str
-        First words of its command.
+        Command prefix of its process.
     """
 
     def __init__(self, cpu: int, prefix: Sequence[str] = ()) -> None:
@@ -45,19 +44,13 @@ class Probe(Child):
         super().__init__("dwell_lab.testbed.probe", f"probe of CPU {cpu}", cpu, prefix=prefix)
 
     def read(self) -> Lateness:
-        """Return how late it was since this was last asked.
-
-        Raises
-        ------
-        LiveError
-            If it does not run.
-        """
+        """Return the measurements since the last call; raise a LiveError if it does not run."""
         longest_ns, works, work_ns = self.ask(None)
         return Lateness(longest_ns / 1e6, work_ns / works / 1e6 if works else None)
 
 
 def main() -> None:
-    """Sleep, and note how long, until the parent ends."""
+    """Measure until the parent ends."""
     parent = Parent()
     with contextlib.suppress(EOFError):
         os.sched_setaffinity(0, [parent.receive()])
@@ -85,10 +78,10 @@ def _measure(parent: Parent) -> None:
 
 
 def _work_ns() -> int:
-    """Do the piece of work; returns the CPU time that it took.
+    """Do the piece of work; return its CPU time.
 
-    Its numbers are small ones, which Python keeps: others are allocated, and where a process's heap
-    stands at the edge of a pool, that takes twice as long, for as long as the process lives.
+    It uses only small numbers, which Python caches. Other numbers are allocated; in a process whose
+    heap is at the edge of a pool, this would always take twice as long.
     """
     begun_ns, value = time.thread_time_ns(), 1
     for _ in range(WORK_TURNS):

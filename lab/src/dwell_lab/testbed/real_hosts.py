@@ -1,8 +1,8 @@
 """Real hosts: a cell on the computers of an inventory, run as on a testbed.
 
-Everything that is put on a host is in one folder of this testbed's name there, which is removed
-before the next run. Links are what they are; only what the inventory has commands for can be
-disturbed. Nothing is known of the hosts' pressure: no window is excluded.
+All files on a host are in one folder with the testbed's name, which is removed before the next run.
+Links are real; the inventory's commands disturb them. The pressure on the hosts is unknown, so no
+window is excluded.
 """
 
 from __future__ import annotations
@@ -38,31 +38,31 @@ from dwell_lab.testbed.inventory import Inventory
 from dwell_lab.testbed.remote import SHELL_ID, RemoteProcess, script_of
 
 NAME = re.compile(r"[A-Za-z0-9_-]{1,32}")
-#: For a command that is to end by itself.
+#: Timeout of a command that ends by itself, seconds.
 COMMAND_S = 60.0
 STOP_S = 10.0
-#: Less than any loss that is asked for, more than roundings.
+#: Bound below which a loss is a rounding error.
 LEAST_LOSS = 1e-9
 
 
 class RealHosts(Testbed):
-    """A cell on real hosts; a context manager.
+    """Context manager that runs a cell on real hosts.
 
     Parameters
     ----------
     problem : Problem
-        Where its nodes are is put into it.
+        The cell; the attribute `problem` becomes a copy with the addresses of the hosts.
     folder : Path
-        For cell file and logs on this computer.
+        Folder on this computer for the cell file and logs.
     name : str
-        Name of this testbed, among others on those hosts.
+        Name of this testbed, unique on those hosts.
     more : sequence of str
         Further arguments of the controller.
 
     Raises
     ------
     LiveError
-        If the name is none.
+        If the name is invalid.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class RealHosts(Testbed):
         )
 
     def _start(self) -> None:
-        """Put the cell file everywhere, start everything, and begin a run."""
+        """Copy the cell file to all hosts, start all processes, and begin a run."""
         self.processes.write()
         self._stack.callback(self._undisturb)
         self._stack.callback(self.processes.stop)
@@ -104,11 +104,11 @@ class RealHosts(Testbed):
         self._client = self._stack.enter_context(OperatorClient(self.problem))
         self._come_up()
         self.begin()
-        # The stamper's clock is another one: this one's, since the run was seen to begin.
+        # The stamper's clock differs: use this computer's, read when `begin` returns.
         self.begun_ns = clock_of(self.problem)()
 
     def stop(self) -> None:
-        """End everything, and take disturbances back; runs stay there until the next start."""
+        """End processes and disturbances; the hosts keep the runs until the next start."""
         with undisturbed():
             super().stop()
 
@@ -123,9 +123,9 @@ class RealHosts(Testbed):
         return f"{self.inventory.hosts[node].folder}/dwell-{self.name}-{node}"
 
     def inside(self, node: str, words: Sequence[str]) -> Sequence[str]:
-        """Return a command that runs words on a node's host, as a `RemoteProcess`.
+        """Return a command for `RemoteProcess` that runs words on a node's host.
 
-        The interpreter, and the folder on this computer, become those there.
+        In the words, the host's interpreter and folder replace this computer's.
         """
         return self._words(node, [self._translated(node, word) for word in words])
 
@@ -152,7 +152,7 @@ class RealHosts(Testbed):
         Raises
         ------
         LiveError
-            If that fails, or takes too long.
+            If the line fails, or exceeds `COMMAND_S`.
         """
         command = [*self.inventory.hosts[node].run, line]
         try:
@@ -187,13 +187,7 @@ class RealHosts(Testbed):
         self.shell(node, f"rm -f {mark}.book; kill -KILL $({number})")
 
     def fetch_runs(self) -> None:
-        """Copy the runs that the controller has written to this computer.
-
-        Raises
-        ------
-        LiveError
-            If it has written nothing.
-        """
+        """Copy the controller's runs to this computer; raise a LiveError if there are none."""
         node = self.problem.controller_node
         data = self.shell(node, f"tar -C {shlex.quote(self.there(node))} -cf - runs")
         with tarfile.open(fileobj=io.BytesIO(data)) as archive:
@@ -202,7 +196,7 @@ class RealHosts(Testbed):
     # --------------------------------------------------------------------- disturbances
 
     def _apply_to_node(self, node: str, state: NodeState) -> None:
-        # The steps of a ramp are many more than whole threads.
+        # A ramp has more steps than the number of threads has values.
         if state.threads == self._threads.get(node, 0):
             return
         self._threads[node] = state.threads
@@ -213,7 +207,7 @@ class RealHosts(Testbed):
             self.stress[node] = RemoteProcess(words, process_group=0)
 
     def _apply_to_link(self, name: str, now: Conditions) -> None:
-        """Run a link's command for the disturbance that is on, or for its end."""
+        """Run the inventory's command that begins or ends a link's disturbance."""
         link, commands = self.problem.fabric.links[name], self.inventory.links[name]
         if asked := disturbance_of(link, now):
             self._disturbed.add(name)
@@ -237,13 +231,7 @@ class RealHosts(Testbed):
 
 
 def require_commands(inventory: Inventory, scenario: Iterable[Disturbance]) -> None:
-    """Refuse a scenario with links that an inventory has no commands for.
-
-    Raises
-    ------
-    LiveError
-        With all of it.
-    """
+    """Raise a LiveError that lists a scenario's links without commands in the inventory."""
     links = {item.link for item in scenario if isinstance(item, LinkDisturbance)}
     missing = sorted(links - set(inventory.links))
     if missing:
@@ -254,10 +242,10 @@ def require_commands(inventory: Inventory, scenario: Iterable[Disturbance]) -> N
 
 
 def disturbance_of(link: Link, now: Conditions) -> dict[str, float]:
-    """Return values to fill into a link's command; empty where no disturbance is on.
+    """Return the values for a link's command; empty without a disturbance.
 
-    Its loss is what makes the link's own the one that is asked for, and its rate the link's where
-    that is the lower one.
+    ``loss_percent`` is the additional loss that, with the link's own, gives the requested loss.
+    ``rate_mbps`` is infinite unless the requested rate is below the link's.
     """
     usual = usual_conditions(link)
     added = [pair for pair in zip(now.add_delays_ms, now.shares, strict=True) if pair[1]]
@@ -291,18 +279,18 @@ def run_on_hosts(
     Parameters
     ----------
     seconds : float
-        From the first release on, the warm-up included.
+        Duration from the first release, including the warm-up.
     seed : int
-        Seed of the episodes of disturbances; delays and losses are the links'.
+        Seed of the episodes of disturbances; delays and losses are the real links'.
     out : Path
-        For logs and the run; one of a run before is replaced.
+        Folder for logs and the run; the folder of an earlier run is replaced.
     jobs : bool
-        Whether the run keeps its jobs.
+        Whether the run records its jobs.
 
     Raises
     ------
     DwellError
-        If something cannot be played there, or the cell does not come up.
+        If the hosts do not support the scenario, or the cell does not start.
     """
     problem = problem.under(policy)
     by_name(problem.controller.policy, resolved(problem, estimator_of(problem)))

@@ -1,8 +1,8 @@
-"""A process on another host, as if it ran here: it ends when it is told to, or its owner ends.
+"""Processes on other hosts, which end on `terminate` or when this process ends.
 
-A signal does not cross ssh. So the shell on the other side waits for the end of its standard input,
-which this process closes: when it tells the command to end, and by ending itself, however it does.
-Then the shell tells its command to end, and ends with the same code once that has.
+A signal does not cross ssh. Therefore the remote shell waits for the end of its standard input.
+This process closes that input in `terminate`, and also by ending in any way. The shell then sends
+SIGTERM to its command, waits for it, and returns its exit code.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-#: Word of a command that stands for the process id of the shell on the other side.
+#: Placeholder in a command for the process id of the remote shell.
 SHELL_ID = "$$"
-#: 3 is the other side's standard input; a command in the background has none.
+#: Descriptor 3 is the remote shell's standard input; a command in the background has none.
 SCRIPT = """exec 3<&0
 cd {folder} || exit 1
 {environment}
@@ -31,18 +31,18 @@ exit $code"""
 def script_of(
     words: Sequence[str], folder: str, environment: Mapping[str, str], *, whole: bool = False
 ) -> str:
-    """Return a script with which the shell of another host runs a command.
+    """Return a shell script that runs a command on another host.
 
     Parameters
     ----------
     words : sequence of str
-        The command; `SHELL_ID` among them becomes the shell's process id.
+        The command; the shell's process id replaces `SHELL_ID`.
     folder : str
-        Where it runs.
+        Working directory.
     environment : mapping of str to str
-        Variables that it gets.
+        Environment variables.
     whole : bool
-        Whether those that it starts are told to end, too.
+        Whether SIGTERM is also sent to the command's children.
     """
     pairs = [f"{name}={shlex.quote(value)}" for name, value in environment.items()]
     given = ["setsid", *words] if whole else words
@@ -61,15 +61,16 @@ class RemoteProcess(subprocess.Popen[bytes]):
     Parameters
     ----------
     words : sequence of str
-        Words that run a script over there, as ``ssh host``, and that of `script_of`.
+        Command that runs a script on the host, such as ``ssh host``, then the script of
+        `script_of`.
     **options
-        As of `Popen`.
+        Options of `Popen`.
     """
 
     def __init__(self, words: Sequence[str], **options: Any) -> None:
         super().__init__(words, **{**options, "stdin": subprocess.PIPE})
 
     def terminate(self) -> None:
-        """Tell the command to end."""
+        """Close the standard input, which ends the command."""
         if self.stdin is not None:
             self.stdin.close()

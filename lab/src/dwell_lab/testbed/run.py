@@ -1,4 +1,4 @@
-"""One run on a testbed: everything checked, made, played, sealed, and taken down again."""
+"""One run on a testbed: checks, creates, runs, records and removes everything."""
 
 from __future__ import annotations
 
@@ -29,29 +29,23 @@ from dwell_lab.testbed.netns_testbed import NetnsTestbed
 from dwell_lab.testbed.pressure import Rule, Span, judged
 from dwell_lab.testbed.sampling import Sampler
 
-#: From when on a window is excluded, and a run has failed.
+#: Limits that decide which windows are excluded, and which runs have failed.
 RULE = Rule()
 #: Time for a controller's last window, beyond its grace.
 LAST_S = 0.5
 
 
 def length_s(problem: Problem, windows: int) -> float:
-    """Return how long a cell runs for so many windows, the warm-up among them, seconds.
+    """Return the duration of a run with some windows, including the warm-up, in seconds.
 
-    Every move makes the window after it begin later: a run with moves has some windows less.
+    Every migration delays the next window: a run with migrations has fewer windows.
     """
     cycles_ms = problem.cycles_of(windows) * problem.pipeline.period_ms
     return (cycles_ms + problem.controller.close_grace_ms) / 1e3 + LAST_S
 
 
 def require_machine(problem: Problem) -> None:
-    """Refuse a cell that this machine cannot run.
-
-    Raises
-    ------
-    LiveError
-        With everything that is missing, and what to do about it.
-    """
+    """Raise a LiveError if this machine cannot run a cell; it lists all causes and remedies."""
     missing = [one for one in examine([problem]) if one.needed and not one.ok]
     if missing:
         reasons = "; ".join(f"{one.name}: {one.found}; {one.remedy}" for one in missing)
@@ -70,37 +64,38 @@ def run_once(
     jobs: bool = False,
     tell: Callable[[str], None] = lambda line: None,
 ) -> Path:
-    """Run a cell on a testbed of its own, and return the folder of its run.
+    """Run a cell on a new testbed, and return the folder of its run.
 
-    Interrupted, it takes everything down, and seals what there is of the run.
+    On an interrupt it removes the testbed, and completes the record of the partial run.
 
     Parameters
     ----------
     policy : str or None
-        A policy or a candidate; the cell's own where None.
+        A policy or a candidate; None: the cell's policy.
     seconds : float
-        From the first release on, the warm-up included.
+        Duration from the first release, including the warm-up.
     seed : int
-        Seed of the realisation that is played, and of delays and losses.
+        Seed of the scenario's realisation, and of delays and losses.
     out : Path
-        For states, logs and the run; one of a run before is replaced.
+        Folder for states, logs and the run; the folder of an earlier run is replaced.
     name : str
-        Name of the testbed, among others on this machine.
+        Name of the testbed, unique on this machine.
     jobs : bool
-        Whether the run keeps its jobs.
+        Whether the run records its jobs.
     tell : callable
-        Takes a line on what happens.
+        Receives progress as lines of text.
 
     Returns
     -------
     Path
-        Also where the machine was under too much pressure: its meta say ``failed``.
+        Folder of the run. If the machine was the bottleneck, ``pressure`` of its metadata contains
+        ``failed``.
 
     Raises
     ------
     DwellError
-        Before anything has been changed, if the cell, the scenario or the policy cannot be played
-        here; later, if the cell does not come up, or has written no run.
+        Before any change, if the cell, the scenario or the policy cannot run here; later, if the
+        cell does not start, or has written no run.
     """
     if policy is not None:
         problem = problem.under(policy)
@@ -116,7 +111,7 @@ def run_once(
     try:
         with interruptible():
             try:
-                # A folder that is replaced may be that of a testbed that runs.
+                # Claim first: a running testbed may use the folder that `make_folder` replaces.
                 testbed.claim()
                 make_folder(out, MARK, "a testbed's")
                 tell("starting the cell")
@@ -126,7 +121,7 @@ def run_once(
             finally:
                 testbed.stop()
     except KeyboardInterrupt:
-        # Before it was played, what is there may be a run of long ago.
+        # Without a sampler the run has not begun; the folder may contain an old run.
         folder = longest_run(out / "runs") if samplers else None
         if folder is not None:
             _seal(folder, testbed, played, samplers, interrupted=True)
@@ -162,7 +157,7 @@ def _seal(
     *,
     interrupted: bool,
 ) -> None:
-    """Note in the run what was played, the testbed, and the machine's pressure."""
+    """Add the disturbances, the testbed and the machine's pressure to the record of a run."""
     more: dict[str, Any] = {"testbed": testbed.facts()}
     if interrupted:
         more["interrupted"] = True
@@ -176,7 +171,7 @@ def _seal(
 
 
 def spans_of(run: Run, played: Played) -> list[Span]:
-    """Return a run's windows in time, with the nodes that were stressed all through them."""
+    """Return the time spans of a run's windows, with the nodes that were stressed throughout."""
     span = begun(run)
     if span is None:
         return []
@@ -197,7 +192,7 @@ def spans_of(run: Run, played: Played) -> list[Span]:
 
 
 def _stressed(played: Played, begin_ns: int, end_ns: int) -> dict[str, float]:
-    """Return the capacity of nodes with as many foreign threads as cores all the time."""
+    """Return the capacity of nodes that always had at least one stress thread per core."""
     return {
         name: node.capacity
         for name, node in played.problem.fabric.nodes.items()
@@ -206,7 +201,7 @@ def _stressed(played: Played, begin_ns: int, end_ns: int) -> dict[str, float]:
 
 
 def summary(run: Run) -> dict[str, Any]:
-    """Return a few numbers on a run after its warm-up."""
+    """Return summary numbers of a run after its warm-up."""
     windows = run.windows.filter(~run.windows["warmup"])
     pressure = run.meta.get("pressure") or {}
     excluded = set(pressure.get("excluded", ()))

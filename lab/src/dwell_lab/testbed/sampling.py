@@ -27,22 +27,22 @@ TOTALS = ("bursts", "delay_ns", "squares", "held", "vanished")
 
 
 class Sampler(Started):
-    """Takes samples in a thread of its own until it is stopped; a context manager.
+    """Context manager that takes samples in a separate thread.
 
     Parameters
     ----------
     cpus : collection of int
         CPUs that nodes use.
     used_ns : mapping of str to callable
-        CPU time that a node has taken so far, by node.
+        Functions that return the CPU time of a node so far, by node.
     switches : mapping of str to callable
-        How often each thread of a node has gone to sleep so far, by node.
+        Functions that return how often each thread of a node has slept so far, by node.
     links : mapping of str to TunLink
-        By name. Their counters are read, and begin anew.
+        Links by name. Every sample reads and resets their counters.
     clock : callable
-        The run's, ns.
+        The run's clock, ns.
     prefix : sequence of str
-        First words of the probes' commands.
+        Command prefix of the probes.
     """
 
     def __init__(
@@ -57,12 +57,12 @@ class Sampler(Started):
     ) -> None:
         self.samples: list[Sample] = []
         super().__init__()
-        #: What kept it from going on, if anything did.
+        #: The error that ended the sampling, if any.
         self.trouble = ""
         self._totals: defaultdict[tuple[str, str], Passed] = defaultdict(Passed)
         self._switches = dict(switches)
         self._begun: dict[str, tuple[Mapping[int, int], float]] = {}
-        #: How often a node's threads have woken, per second, over all of them; once it has stopped.
+        #: Wakes per second of all threads of a node; available after `stop`.
         self.wakes_hz: dict[str, float] = {}
         self._cpus, self._used_ns, self._links = sorted(cpus), dict(used_ns), dict(links)
         self._clock = clock
@@ -73,7 +73,7 @@ class Sampler(Started):
     def _start(self) -> None:
         for probe in self._probes:
             self._stack.enter_context(probe)
-        # A look reads a file per thread, a hundred of them: there is one here and one at the end.
+        # Counting reads about a hundred files, one per thread; so only at the start and the end.
         for node, read in self._switches.items():
             self._begun[node] = read(), time.monotonic()
         thread = threading.Thread(target=self._run, name="sampler", daemon=True)
@@ -81,7 +81,7 @@ class Sampler(Started):
         self._stack.callback(thread.join)
 
     def stop(self) -> None:
-        """Take no more samples."""
+        """Stop sampling, and compute `wakes_hz`."""
         self._stopped.set()
         super().stop()
         for node, (before, begun_s) in self._begun.items():
@@ -95,7 +95,7 @@ class Sampler(Started):
                 self.samples.append(self._sample())
                 due_s = max(due_s + EVERY_S, time.monotonic())
         except (LiveError, OSError) as error:
-            # What is not measured any more is excluded; the run itself goes on.
+            # The run continues; windows without samples are excluded.
             self.trouble = str(error)
 
     def _sample(self) -> Sample:
@@ -131,7 +131,7 @@ class Sampler(Started):
         )
 
     def links(self) -> dict[str, Any]:
-        """Return statistics of the delays drawn for each direction, ready for JSON."""
+        """Return statistics of the sampled delays by direction, as a JSON document."""
         statistics = {}
         for (source, target), total in self._totals.items():
             delay_ms = {
@@ -148,16 +148,16 @@ class Sampler(Started):
 
 
 def rate_hz(before: Mapping[int, int], after: Mapping[int, int], lasted_s: float) -> float:
-    """Return how often in a second something happened that is counted for each thread.
+    """Return the sum of the rates of counters by thread, per second.
 
-    Threads that are not there at both looks do not count.
+    Only threads in both readings count.
     """
     both = after.keys() & before.keys()
     return sum(after[thread] - before[thread] for thread in both) / max(lasted_s, 1e-9)
 
 
 def cpu_times(cpus: Collection[int]) -> tuple[dict[int, float], dict[int, float]]:
-    """Return for how long CPUs have been idle and stolen since the machine was started, seconds."""
+    """Return the idle and the stolen seconds of CPUs since the machine's start."""
     tick_s = 1.0 / os.sysconf("SC_CLK_TCK")
     wanted = {f"cpu{cpu}": cpu for cpu in cpus}
     idle_s, stolen_s = {}, {}

@@ -1,15 +1,15 @@
-"""Sensitivity: how much longer a stage takes where a probe's piece of work does.
+"""Sensitivity: the effect of the CPU's speed on a stage, relative to a probe's piece of work.
 
-A CPU that is slower because somebody else uses what it shares with them (the other thread of its
-core, caches, memory) is so in another measure for every piece of code: twice as slow for a sum may
-be three times as slow for pictures. Both change from minute to minute, and together: the slope of
-the logarithm of one on that of the other says by how many percent a stage takes longer where the
-piece of work takes one percent longer.
+Other processes slow a CPU down when they use shared resources (the second thread of a core, caches,
+memory). The factor differs for every piece of code: a sum may take twice as long, image processing
+three times. The times of the probe and of a stage change together from minute to minute. The slope
+of their logarithms is the percentage by which a stage takes longer when the piece of work takes one
+percent longer.
 
-A window alone is too noisy: what a probe finds in 2 s is off by more than CPUs change meanwhile, at
-times by a multiple, and a slope on what is noisy comes out too flat. So a point is the medians of
-five windows in a row, and the slope the median of those of all pairs, of all runs together (Theil
-and Sen).
+A single window is too noisy: the error of a probe over 2 s exceeds the changes of the CPU's speed,
+and noise in the probe biases the slope towards zero. A point therefore contains the medians of five
+consecutive windows, and the slope is the median slope of all pairs of points of all runs (Theil and
+Sen).
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from dwell.model.number_arrays import Floats
 from dwell_lab.testbed.measured import Measured, SiteName, Visit
 from dwell_lab.testbed.speeds import Usual, window_work_ms
 
-#: Jobs that a window's mean needs; windows in a row that are one point; points that a slope needs.
+#: Fewest jobs for a window's mean; consecutive windows per point; fewest points for a slope.
 LEAST_JOBS, TOGETHER, LEAST_POINTS = 10, 5, 8
-#: How wide the 95 % interval of a slope may be: of nothing that changes, nothing follows.
+#: Largest width of a slope's 95 % interval; it is wider if the speed hardly changes.
 WIDEST = 0.6
-#: A stage that takes longer where a probe takes less has been measured badly.
+#: Bounds of an exponent: a negative slope is a measurement error.
 LOWEST, HIGHEST = 0.0, 2.0
 
 
 def usual_of(measured: Sequence[Measured]) -> Usual:
-    """Return how fast the CPUs were in some runs, for the nodes of which every run knows it."""
+    """Return the mean CPU speeds of some runs, for the nodes that are measured in every run."""
     nodes = set.intersection(*(set(one.work_ms) for one in measured)) if measured else set()
     return Usual(
         {node: float(np.mean([one.work_ms[node] for one in measured])) for node in sorted(nodes)},
@@ -40,7 +40,7 @@ def usual_of(measured: Sequence[Measured]) -> Usual:
 
 
 def sensitivities(measured: Sequence[Measured]) -> dict[SiteName, float]:
-    """Return exponents by task and node, where nodes that nothing disturbs show them."""
+    """Return the exponents by task and node that undisturbed nodes show with enough precision."""
     from scipy.stats import theilslopes
 
     points: dict[SiteName, list[tuple[Floats, Floats]]] = {}
@@ -62,7 +62,7 @@ def sensitivities(measured: Sequence[Measured]) -> dict[SiteName, float]:
 
 
 def _points(visit: Visit, probed: dict[int, float]) -> tuple[Floats, Floats]:
-    """Logarithms of the times of a probe's work and of a stage: medians of a few windows each."""
+    """Return log times of the probe's work and of a stage; one median per `TOGETHER` windows."""
     numbers, place, jobs = np.unique(visit.windows, return_inverse=True, return_counts=True)
     stage_ms = np.bincount(place, visit.stage_ms) / jobs
     kept = [

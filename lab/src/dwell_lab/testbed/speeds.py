@@ -1,10 +1,9 @@
-"""Speeds: how fast the CPUs of a testbed's nodes were in a run, and a cell on slower ones.
+"""Speeds: the CPU speeds of a testbed's nodes in a run, and cells on slower CPUs.
 
-A machine that others share is now faster and now slower: what the same work takes of a CPU's time
-changes by a fifth within the hour. The probes of a run do a fixed piece of work all the time
-(`dwell_lab.testbed.probe`), and know nothing of the cell. A calibrated cell says how fast the CPUs
-were that it was measured on, and how much each stage depends on that; a run that is compared with
-it is predicted on CPUs as fast as its own.
+The speed of a shared machine varies: the CPU time of the same work changes by a fifth within an
+hour. The probes of a run repeat a fixed piece of work, independent of the cell
+(`dwell_lab.testbed.probe`). A calibrated cell contains the CPU speeds of its calibration, and the
+sensitivity of each stage to them. The prediction for a run uses the CPU speeds of that run.
 """
 
 from __future__ import annotations
@@ -26,15 +25,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Usual:
-    """How fast the CPUs were that a cell was measured on, and how much stages depend on it.
+    """CPU speeds during the calibration of a cell, and the sensitivity of its stages to them.
 
     Parameters
     ----------
     work_ms : mapping of str to float
         CPU time of a probe's piece of work, by node.
     sensitivity : mapping of (str, str) to float
-        By task and node: where the piece of work takes x times as long, the stage takes
-        x**sensitivity times as long. 1 of those that are not there.
+        Exponents by task and node: if the piece of work takes x times as long, the stage takes
+        x**sensitivity times as long. The default is 1.
     """
 
     work_ms: Mapping[str, float] = FrozenDict()
@@ -42,13 +41,7 @@ class Usual:
 
     @classmethod
     def of(cls, told: Mapping[str, Any]) -> Usual:
-        """Read a calibration's report.
-
-        Parameters
-        ----------
-        told : mapping
-            ``work_ms`` by node and ``sensitivity`` by ``task@node``, where they are there.
-        """
+        """Read a calibration's report: ``work_ms`` by node, ``sensitivity`` by ``task@node``."""
         return cls(
             {str(node): float(ms) for node, ms in told.get("work_ms", {}).items()},
             {
@@ -59,7 +52,7 @@ class Usual:
         )
 
     def factors(self, took_ms: Mapping[str, float]) -> dict[str, float]:
-        """Return how many times as long a probe's piece of work took, by node."""
+        """Return the time of a probe's work relative to the calibration, by node."""
         return {
             node: took_ms[node] / usual_ms
             for node, usual_ms in self.work_ms.items()
@@ -67,25 +60,22 @@ class Usual:
         }
 
     def factor(self, took_ms: Mapping[str, float], task: str, node: str) -> float:
-        """Return how many times as long a stage took as it usually does."""
+        """Return the time of a stage relative to the calibration."""
         factor = self.factors(took_ms).get(node, 1.0)
         return float(factor ** self.sensitivity.get((task, node), 1.0))
 
 
 def work_ms(run: Run) -> dict[str, float]:
-    """CPU time of a probe's piece of work on every node's CPUs, the median of windows that count.
+    """Return the median CPU time of a probe's work over the counted windows, by node.
 
-    Parameters
-    ----------
-    run : Run
-        Where its meta say no ``testbed``, or not what its probes did, nothing is known.
+    Empty if the metadata of the run lack ``testbed`` or ``pressure``.
     """
     windows = window_work_ms(run)
     return {node: median(of.values()) for node, of in windows.items() if of}
 
 
 def window_work_ms(run: Run) -> dict[str, dict[int, float]]:
-    """CPU time of a probe's piece of work on every node's CPUs, by window of those that count."""
+    """Return the CPU time of a probe's work, by node and window, for the windows that count."""
     pressure, testbed = run.meta.get("pressure"), run.meta.get("testbed")
     if not isinstance(pressure, Mapping) or not isinstance(testbed, Mapping):
         return {}
@@ -108,13 +98,7 @@ def window_work_ms(run: Run) -> dict[str, dict[int, float]]:
 
 
 def at_speed_of(run: Run, problem: Problem, usual: Usual) -> Problem:
-    """Return a cell on CPUs as fast as they were in a run.
-
-    Parameters
-    ----------
-    usual : Usual
-        Where the cell was measured.
-    """
+    """Return a cell on CPUs with the speeds of a run; `usual` has the calibration's speeds."""
     return slowed(problem, usual.factors(work_ms(run)), usual.sensitivity)
 
 
@@ -123,15 +107,15 @@ def slowed(
     factors: Mapping[str, float],
     sensitivity: Mapping[tuple[str, str], float] = FrozenDict(),
 ) -> Problem:
-    """Return a cell on CPUs on which everything takes so many times as long.
+    """Return a cell on CPUs that are slower by some factors.
 
     Parameters
     ----------
     factors : mapping of str to float
-        By node. What was measured takes longer (execution times that are replayed, backgrounds,
-        what others take); what was not stays as it is.
+        Factors by node. They apply to measured values (replayed execution times, backgrounds);
+        other values stay the same.
     sensitivity : mapping of (str, str) to float
-        By task and node; see `Usual`.
+        Exponents by task and node; see `Usual`.
     """
     if not factors:
         return problem
@@ -175,11 +159,11 @@ def _tables(
     factors: Mapping[str, float],
     sensitivity: Mapping[tuple[str, str], float],
 ) -> dict[int, TraceTable]:
-    """Tables that nodes' execution times are replayed from, with longer ones, by their identity."""
+    """Return the tables of replayed execution times with longer times, by ``id`` of the table."""
     longer: dict[int, tuple[TraceTable, dict[str, float]]] = {}
     for task in problem.pipeline.tasks.values():
         for node, of in task.on.items():
-            # An accelerator is not slower where CPUs are.
+            # A slower CPU does not slow the accelerator.
             if isinstance(of.exec_ms, Trace) and node in factors and of.accelerator is None:
                 table = of.exec_ms.table
                 factor = factors[node] ** sensitivity.get((task.name, node), 1.0)

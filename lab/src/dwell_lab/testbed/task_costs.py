@@ -1,16 +1,18 @@
-"""Task costs: time that every task takes of every node, its share of messaging included.
+"""Task costs: the time of every task on every node, including its share of messaging.
 
-A job costs its node more CPU than its stage takes: its worker reads and writes messages, and at
-both ends of the pipeline a stamp and a command are handed over. A simulator that knows nothing of
-messages on one node, and of what they cost, is told so by way of the execution times:
+A job costs its node more CPU time than its stage: the worker reads and writes messages, and both
+ends of the pipeline hand over a stamp or a command. The simulator has no model of messages within a
+node, so the execution times include these costs:
 
-- a worker's CPU time is idle · wall + Σ (stage + overhead) over its jobs. Runs in which it has jobs
-  and runs in which it has none tell the two apart; a worker that always has jobs idles like others;
-- of the overhead, what delays messages (`dwell_lab.testbed.message_costs`) delays the cycle;
-- a job takes, besides, what passes between its last input and its start, and a sink's what passes
-  between its end and the command's hand-over, as where the quota does not interfere;
-- where something counts what a node takes between a release and its source's start, or between two
-  jobs of a cycle that both run on it, the job takes that: whoever takes it, the job waits for it.
+- A worker's CPU time is idle · wall + Σ (stage + overhead) over its jobs. The fit of idle and
+  overhead uses runs with jobs and runs without. For a worker that always has jobs, idle is the mean
+  of the other workers.
+- The part of the overhead that delays messages (`dwell_lab.testbed.message_costs`) delays the
+  cycle.
+- A job also includes the time between its last input and its start. A sink's job also includes the
+  time until the hand-over of the command. Both exclude delays by the quota.
+- Some runs count the CPU time of a node between a release and the start of its source, or between
+  two jobs of a cycle on the node. The job includes this time, because it waits for it.
 """
 
 from __future__ import annotations
@@ -27,10 +29,10 @@ from dwell_lab.testbed.message_costs import OnTheWay, share
 from dwell_lab.testbed.paired import Part
 from dwell_lab.testbed.speeds import Usual
 
-#: How many times as long as usual messaging takes where a stage takes longer: in the runs of the
-#: example as many as that, window by window; a job that finds nothing to do has its messages still.
+#: Bounds on the factor by which messaging is longer when a stage is longer than its mean. In the
+#: windows of the example's runs both factors are equal; a job without work still has its messages.
 SLOWER = 0.5, 2.0
-#: Sides of a hop, in its times and, behind source and target, in its name.
+#: Indices of the sides in a hop's times and, after source and target, in its name.
 SENDER, RECEIVER = range(2)
 
 
@@ -41,12 +43,12 @@ class TaskCost:
     Parameters
     ----------
     samples : dict of str to Part
-        Time that an undisturbed job takes of the node, its share of messaging included, by run.
+        Node time of undisturbed jobs, including their share of messaging, by run.
     stage_ms, messaging_ms : float
-        Means of the stage alone, and of its worker's messaging what lies on the way.
+        Means of the stage alone, and of the worker's messaging that delays the cycle.
     before_ms, after_ms : float
-        Means of what other threads do before the stage (input or release, messaging) and after it
-        (messaging, the end of the cycle).
+        Mean times before the stage (input or release, messaging) and after it (messaging, end of
+        the cycle).
     """
 
     samples: dict[str, Part]
@@ -57,7 +59,7 @@ class TaskCost:
 
     @property
     def samples_ms(self) -> Floats:
-        """Samples of all runs, one after the other."""
+        """Samples of all runs, concatenated."""
         return np.concatenate([part.times_ms for part in self.samples.values()])
 
 
@@ -68,23 +70,23 @@ def task_costs(
     problem: Problem,
     usual: Usual,
 ) -> dict[SiteName, TaskCost]:
-    """Execution times of every task on every node that was visited undisturbed.
+    """Return the costs of every task on every node with enough undisturbed jobs.
 
     Parameters
     ----------
     messaging_ms : mapping of (str, str) to float
-        CPU time that a worker takes for a job besides its stage (`messaging`).
+        CPU time of a worker per job beyond its stage (`messaging`).
     known : OnTheWay
-        Part of that which lies on the way of messages.
+        The part of this time that delays messages.
     usual : Usual
-        How fast the CPUs were in all runs together: samples are of CPUs as fast as that.
+        Mean CPU speeds of all runs; the samples are scaled to them.
     """
     costs: dict[SiteName, TaskCost] = {}
     for site in sorted({site for one in measured for site in one.visits}):
         of = [one for one in measured if site in one.visits and site[1] not in one.disturbed.nodes]
         if sum(len(one.visits[site].stage_ms) for one in of) < LEAST_JOBS:
             continue
-        # As long as it would have taken at the runs' mean speed.
+        # Scale the times to the runs' mean CPU speed.
         stages_ms = {
             one.name: one.visits[site].stage_ms / usual.factor(one.work_ms, *site) for one in of
         }
@@ -108,7 +110,7 @@ def task_costs(
 
 
 def _with_messaging(stages_ms: Floats, mean_ms: float, around_ms: float) -> Floats:
-    """Add the time around a stage, which is longer where the stage is."""
+    """Add the time around a stage to its times, in proportion to them within `SLOWER`."""
     if mean_ms <= 0:
         return stages_ms + around_ms
     return stages_ms + around_ms * np.clip(stages_ms / mean_ms, *SLOWER)
@@ -117,7 +119,7 @@ def _with_messaging(stages_ms: Floats, mean_ms: float, around_ms: float) -> Floa
 def _on_the_way_ms(
     site: SiteName, messaging_ms: float, known: OnTheWay, problem: Problem
 ) -> tuple[float, float]:
-    """CPU time of a worker on the way of its job's inputs, and outputs; all of it if unknown."""
+    """Return a worker's messaging time that delays inputs, and outputs; all of it if unknown."""
     task, node = site
 
     def part_ms(flow: Flow, side: int) -> float:
@@ -137,7 +139,7 @@ def _on_the_way_ms(
 
 
 def messaging(measured: Sequence[Measured], problem: Problem) -> dict[SiteName, float]:
-    """CPU time, ms, that every worker takes for a job besides its stage's, by task and node."""
+    """Return the CPU time of every worker per job beyond its stage, in ms, by task and node."""
     of: dict[SiteName, list[tuple[float, float]]] = {}
     for one in measured:
         for (node, process), rate in one.rates.items():
@@ -146,7 +148,7 @@ def messaging(measured: Sequence[Measured], problem: Problem) -> dict[SiteName, 
             if not worker or node in one.disturbed.nodes:
                 continue
             jobs = one.starts.get((task, node, False), 0.0)
-            # Cores besides those of the stage, and jobs a millisecond.
+            # Cores used beyond the stage, and jobs per millisecond.
             besides = rate - jobs * one.spent_ms.get((task, node, False), 0.0) / 1e3
             of.setdefault((task, node), []).append((jobs / 1e3, besides))
     idle: list[float] = []

@@ -1,6 +1,6 @@
-"""Watcher: a small process on the controller's host, through which others ask how the cell is.
+"""Watcher: a small process on the controller's host that requests the status of the cell.
 
-Whoever makes the testbed is on none of its hosts, and no link leads there.
+The process that creates the testbed runs outside its hosts, and has no link to them.
 """
 
 from __future__ import annotations
@@ -12,38 +12,32 @@ from typing import Any
 
 from dwell.live.local.child import Child, Parent
 
-#: Beyond the patience of a question, for the process itself.
+#: Additional timeout for the watcher's own answer.
 SLACK_S = 5.0
 
 
 class Watcher(Child):
-    """Asks a cell's controller, as its parent sees it; a context manager.
+    """Context manager that runs a watcher as a child process.
 
     Parameters
     ----------
     cell : Path
         Cell file.
     prefix : sequence of str
-        Words of a command that runs what follows on the controller's host.
+        Command prefix that runs the process on the controller's host.
     """
 
     def __init__(self, cell: Path, prefix: Sequence[str] = ()) -> None:
         super().__init__("dwell_lab.testbed.watcher", f"watcher of {cell}", cell, prefix=prefix)
 
     def status(self, patience_s: float) -> Mapping[str, Any]:
-        """Return how the cell is.
-
-        Raises
-        ------
-        LiveError
-            If nobody answers.
-        """
+        """Return the status of the cell; raise a LiveError without an answer."""
         status: Mapping[str, Any] = self.ask(patience_s, patience_s + SLACK_S)
         return status
 
 
 def main() -> None:
-    """Answer until the parent ends, or wants this to."""
+    """Answer until the parent ends, or requests the end."""
     from dwell.cellfile import load
     from dwell.live.host.operator_client import OperatorClient
     from dwell.live.host.security import INSECURE
@@ -52,7 +46,7 @@ def main() -> None:
     with ExitStack() as stack:
 
         def begin(cell: Path) -> Callable[[float], Mapping[str, Any]]:
-            # The testbed's hosts lead nowhere but to each other.
+            # The testbed's hosts can reach only each other.
             client = OperatorClient(load(cell), {**without_keys(), INSECURE: "1"})
             stack.enter_context(client)
             return lambda patience_s: client.ask("status", patience_s=patience_s)
