@@ -115,7 +115,7 @@ def out_of_order(applied: Sequence[Seen]) -> list[str]:
 def unsafe(seen: Sequence[Seen], limit_ms: float) -> list[str]:
     """Return gaps between commands in which ``hold`` or ``zero`` was not called in time.
 
-    A dead or frozen sink cannot call them; only `strike.too_old` checks its commands.
+    A dead or frozen sink cannot call them; other checks cover the age and order of its commands.
     """
     silences = []
     commands = [place for place, one in enumerate(seen) if one.what == APPLY]
