@@ -1,4 +1,4 @@
-"""The Controller: what both engines hand closed windows to, and take orders from."""
+"""The Controller: both engines pass it their windows and carry out its orders."""
 
 from __future__ import annotations
 
@@ -45,16 +45,16 @@ from dwell.policies.user_policy import as_proposer
 
 
 class LookedAt(NamedTuple):
-    """The cycles that a decision looks at.
+    """The cycles that a decision is based on.
 
     Parameters
     ----------
     window : int
-        Window of the last of them; of a move of the guard's the one that it begins.
+        Window of the last cycle. For a move of the guard, the window that the move begins.
     last_cycle : int
-        The last of them.
+        The last cycle.
     cycles : int
-        Their number; 0 for a move of the guard's.
+        Number of cycles; 0 for a move of the guard.
     """
 
     window: int
@@ -64,25 +64,25 @@ class LookedAt(NamedTuple):
 
 @dataclass(slots=True)
 class ClosedWindow:
-    """A window as an engine hands it over.
+    """A window at its end, as an engine passes it to the controller.
 
     Parameters
     ----------
     latency_ns, release_ns : int64 array, shape (W,)
-        Latency as known at the close (`NEVER_NS` where unfinished) and release of its cycles.
+        Latency of each cycle at the end of the window (`NEVER_NS` if unfinished), and its release.
     close_ns : int
-        Instant of the close.
+        End of the window.
     open_ns : int
-        Release of its first cycle.
+        Release of the first cycle.
     core_ns : float64 array, shape (3, resources)
-        Core-nanoseconds in the window: of all work, of the cell's own jobs, of its shadow jobs;
-        of an accelerator, of its places. NaN where they were not measured.
+        Busy core-nanoseconds in the window (for an accelerator, place-nanoseconds): all work, the
+        cell's own jobs, its shadow jobs. NaN if not measured.
     looked : LookedAt
-        Its number, and its cycles as the record counts them.
+        Number of the window, and its cycles as the record counts them.
     evidence : callable, optional
-        Makes the window's `Evidence`, for estimators that learn from it.
+        Makes the window's `Evidence` for estimators that learn.
     recent : ClosedWindow, optional
-        Its cycles since the last decision, which estimators get; the window itself if None.
+        The window's cycles since the last decision, for the estimator; None for the whole window.
     """
 
     latency_ns: Ints
@@ -100,23 +100,23 @@ class ClosedWindow:
 
 @dataclass(slots=True)
 class Proposal:
-    """What is decided on a window, until it is known what comes of it.
+    """A decision on a window before it is carried out, rejected or held.
 
     Parameters
     ----------
     seen : tuple of float
-        L95 (ms) and violation rate of the window, and its cost.
+        L95 (ms), violation rate and cost of the window.
     looked : LookedAt
     decision : Decision
-        The policy's.
+        Decision of the policy, or of the fleet if that differs.
     priced : tuple
         Metrics of the cycles and of the candidates, for the row of ``decisions``.
     after : object
-        What the policy is once this counts (`dwell.policies.protocol.Proposer.commit`).
+        State of the policy after the decision (`dwell.policies.protocol.Proposer.commit`).
     verdict : Verdict, optional
-        What the fleet says of it.
+        The fleet's verdict on the decision.
     wished : str
-        What the policy has decided for, where `decision` is the fleet's in its place.
+        Candidate of the policy if the fleet has chosen another one, else empty.
     """
 
     seen: tuple[float, float, float]
@@ -132,41 +132,40 @@ class Proposal:
 
 
 class Controller:
-    """Windows in, orders out: aggregation, estimator and policy in one object.
+    """Aggregates windows, estimates the candidates, and decides by the policy.
 
-    A window is decided on by `propose`, which changes nothing but what the estimator has learnt
-    (and what an object of a user's does to itself, where no fallback of the guard's holds). What
-    becomes of the proposal is told once, when it is known:
+    `propose` decides on a window. It changes the state of the estimator, but never of a policy of
+    Dwell. A user's policy may change its own state, except in a fleet and on a fallback of the
+    guard. The engine then calls one of three methods, once per proposal:
 
     ==========  ======================================  ========================================
-    told by     when                                    the policy is
+    method      use                                     state of the policy
     ==========  ======================================  ========================================
-    `commit`    it is carried out                       as after its decision
-    `reject`    people or the stamper do otherwise      as after its decision, then told twice
-                                                        where the cell is: no switching term
-                                                        remains
-    `hold`      it would leave the guard's fallback     as before; told where the cell is, so
-                for what is not proven                  that one window alone pays for the move
+    `commit`    the proposal is carried out             after its decision
+    `reject`    a person or the stamper overrides it    after its decision, then corrected to the
+                                                        actual placement without a switching term
+    `hold`      it would leave the guard's fallback     before its decision; the first window after
+                for an unproven candidate               the guard's move has the switching term
     ==========  ======================================  ========================================
 
     Parameters
     ----------
     policy : policy, str, or None
-        An object with `decide`, a policy's or candidate's name, a policy's with an estimator's
-        (``cusum+corrected``), or None for the cell file's choice. The caller's object is copied,
-        never changed.
+        An object with `decide`; the name of a policy, of a candidate, or of a policy and an
+        estimator (``cusum+corrected``); None for the policy of the cell file. An object is copied
+        and never changed.
     estimator : Estimator, str, or None
-        An object with `estimate`, an estimator's name, or None for the cell file's choice. The
-        caller's object is copied, never changed.
+        An object with `estimate`; the name of an estimator; None for the estimator of the cell
+        file. An object is copied and never changed.
     coordination : Coordination, optional
-        What is asked before the cell moves, where it is one of a fleet.
+        Coordination of the moves of a fleet, for a cell that belongs to one.
 
     Raises
     ------
     PolicyError
-        If the policy is unknown or is no policy, or names another estimator than is given.
+        If the policy is unknown or invalid, or names another estimator than `estimator`.
     ProblemError
-        If the estimator is unknown, or wants more shadows than there are cycles.
+        If the estimator is unknown, or its shadows would exceed the number of cycles.
     """
 
     def __init__(
@@ -181,9 +180,9 @@ class Controller:
         policy = policy or problem.controller.policy
         estimator = estimator or estimator_of(problem, policy)
         problem = resolved(problem, estimator)
-        #: The cell, with the N_min that it has with this estimator.
+        #: The cell, with N_min for this estimator.
         self.problem, self.coordination = problem, coordination
-        #: Names of the policy and the estimator where these are classes of a user's own, else None.
+        #: Class paths of the policy and the estimator if a user wrote them, else None.
         self._own = tuple(one if CLASS_PATH.holds(one) else None for one in (policy, estimator))
         decider = policy_by_name(policy, problem) if isinstance(policy, str) else policy
         with UserCall(decider, "start"):
@@ -194,38 +193,37 @@ class Controller:
             self._estimator = as_started(made, problem, copied=made is estimator)
         if coordination is not None:
             coordination.meet(self._estimator)
-        #: Share of the cycles that the estimator wants sent through each alternative, by the
-        #: candidate that is active.
+        #: By active candidate, the share of cycles with a shadow through each alternative.
         self.shadow_fractions = _shadow_fractions(self._estimator, problem)
         initial = self._policy.initial
         known = isinstance(initial, str) and initial in problem.candidates
-        #: Where the cell is, as far as is known here.
+        #: Placement of the cell, as far as the controller knows.
         self.course = Course(str(initial) if known else problem.initial)
         if coordination is not None:
             coordination.place(self.course.placement)
         #: The incumbent whose windows are compared with its estimates.
         self._watched, self._watchdog = "", Watchdog(problem.window_cycles)
         self._doubts = Doubts(problem.window_cycles)
-        #: What was last seen under each candidate.
+        #: Last measured metrics under each candidate.
         self._seen_under: dict[str, QoS] = {}
-        #: What the next decision looks at, as the engine counts.
+        #: Cycles of the current decision, as the engine counts them.
         self.looked = LookedAt(0, problem.decide_cycles - 1, problem.decide_cycles)
-        #: Rows of ``decisions``: `decision_columns`, then why it was not carried out, or None.
+        #: Rows of ``decisions``: `decision_columns`, then the reason of a refusal, or None.
         self.decisions: list[tuple[object, ...]] = []
         resources = problem.fabric.resources.values()
         #: Names of the cell's resources: its nodes, then their accelerators.
         self.resources = tuple(one.name for one in resources)
         self._has_accelerators = any(one.kind for one in resources)
         self._names = tuple(problem.candidates)
-        #: What a row has where nothing is known of the candidates.
+        #: Values of a row for candidates without a known value.
         self._none: list[float | bool | None] = [None] * len(self._names)
         self._capacity = np.array([one.capacity for one in resources], float)
         self._pricing = Pricing(problem.candidates, problem.objective)
         self._deadline_ns = problem.pipeline.deadline_ns
         self._censor_ms = problem.censor_ms
-        #: By which caps candidates are eligible: the policy's own, where it has any.
+        #: The policy's objective, else the cell's; its caps decide which candidates are eligible.
         self.objective: Objective = self._policy.objective or problem.objective
-        #: Whether it has any.
+        #: Whether the objective has caps.
         self.has_caps = self.objective.caps != Caps()
 
     def __repr__(self) -> str:
@@ -237,17 +235,17 @@ class Controller:
 
     @property
     def policy(self) -> object:
-        """The policy that decides: a copy of what was given."""
+        """The policy: a copy if the caller passed an object."""
         return self._policy.given
 
     @property
     def estimator(self) -> object:
-        """The estimator that is asked: a copy of what was given."""
+        """The estimator: a copy if the caller passed an object."""
         return self._estimator.given
 
     @property
     def features(self) -> tuple[Feature, ...]:
-        """What ``decisions`` has that not every run's has."""
+        """Optional groups of columns that ``decisions`` has in this run."""
         has: dict[Feature, bool] = {
             "support": self.supports,
             "fleet": self.coordination is not None,
@@ -257,13 +255,12 @@ class Controller:
 
     @cached_property
     def decision_columns(self) -> tuple[str, ...]:
-        """Names of the columns of ``decisions``, but the last.
+        """Names of the columns of ``decisions``, except the last.
 
-        J of every candidate (null where the policy prices none), what was estimated of it (L95 in
-        ms, violation rate, their standard errors, utilisation of every resource), whether it is
-        within the caps, by how much it is over them at most (null without caps), and where the
-        estimator says it, how many samples stand behind the estimate and how old (windows) the
-        newest is.
+        Each candidate has columns for J (null if the policy has no prices) and its estimates: L95
+        (ms), violation rate, their standard errors, and the utilisation of every resource. Further
+        columns are whether it is within the caps and the largest excess over a cap (null without
+        caps). Some estimators add the number of samples and the age of the newest one (windows).
         """
         resources = self.problem.fabric.resources.values()
         return tuple(
@@ -274,7 +271,7 @@ class Controller:
         )
 
     def described(self) -> dict[str, object]:
-        """Policy, its parameters and estimator as the record of a run names them."""
+        """Return the policy, its parameters and the estimator for the record of a run."""
         policy = self.policy
         own_policy, own_estimator = self._own
         known = type(policy).__repr__ is not object.__repr__
@@ -292,20 +289,19 @@ class Controller:
 
     @property
     def learns(self) -> bool:
-        """Whether windows have to bring their evidence."""
+        """Whether windows need their evidence."""
         return self._estimator.learns
 
     @property
     def guarded(self) -> bool:
-        """Whether a guard may move the cell: it has fallbacks, and the policy lets it.
+        """Whether a guard may move the cell: it has fallbacks, and the policy is `guarded`.
 
-        A policy whose attribute `guarded` is false is left alone, as is the placement that never
-        moves.
+        A fixed placement is not guarded.
         """
         return bool(self._policy.guarded and self.problem.controller.fallbacks)
 
     def propose(self, window: ClosedWindow) -> Proposal:
-        """Look at a closed window and say what the cycles after it shall be placed on.
+        """Propose the placement of the next cycles, from a window at its end.
 
         Raises
         ------
@@ -321,7 +317,7 @@ class Controller:
         return self.propose_on(*metrics, shares, recent)
 
     def _metrics(self, window: ClosedWindow) -> tuple[float, float, float]:
-        """Return L95 as it could be known (ms), V_D, and L95 as caps are compared with it."""
+        """Return L95 known at the end of the window (ms), V_D, and L95 for caps (ms)."""
         age_ns = window.close_ns - window.release_ns
         missed = int(missed_cycles(window.latency_ns, age_ns, self._deadline_ns))
         l95_ms, uncut_ms = seen_l95_ms(window.latency_ns, age_ns, self._censor_ms)
@@ -333,7 +329,7 @@ class Controller:
         Parameters
         ----------
         names : iterable of str
-            Candidate of the cycle before it, then the candidates of its cycles.
+            Candidate of the cycle before the window, then the candidates of its cycles.
         """
         placed = self.problem.candidates
         moved = sum(hamming(placed[b], placed[a]) for a, b in pairwise(names) if a != b)
@@ -350,17 +346,17 @@ class Controller:
         shares: Floats,
         recent: Floats | None = None,
     ) -> Proposal:
-        """Propose on a window that an engine has measured itself (see `propose`).
+        """Propose from the metrics of a window that the engine has computed (see `propose`).
 
         Parameters
         ----------
         l95_ms, violation_rate, uncut_ms : float
-            L95 as it could be known, V_D, and L95 as caps are compared with it.
+            L95 known at the end of the window, V_D, and L95 for caps.
         shares : float64 array, shape (3, resources) or (4, resources)
-            Busy, own and shadow share of every resource, and that of other cells of a fleet; NaN
-            where they were not measured.
+            Busy, own and shadow share of every resource, and optionally the share of the fleet's
+            other cells; NaN if not measured.
         recent : float64 array, optional
-            The same since the last decision, for the estimator; `shares` where None.
+            The same shares since the last decision, for the estimator; None for `shares`.
         """
         observed = self._observed(l95_ms, violation_rate, uncut_ms, shares)
         if recent is None:
@@ -371,7 +367,7 @@ class Controller:
     def _observed(
         self, l95_ms: float, violation_rate: float, uncut_ms: float, shares: Floats
     ) -> QoS:
-        """Return metrics with what was busy of each resource."""
+        """Return the metrics with the busy share of each resource."""
         used = dict(zip(self.resources, shares[0].tolist(), strict=True))
         if self._has_accelerators:
             used = _measured(used)
@@ -389,18 +385,18 @@ class Controller:
     def propose_by(
         self, observed: QoS, own: Mapping[str, float], recent: QoS | None = None
     ) -> Proposal:
-        """Propose on metrics that are already aggregated (see `propose_on`).
+        """Propose from aggregated metrics (see `propose_on`).
 
         Parameters
         ----------
         own : mapping of str to float
             Share of each resource that is not foreign, since the last decision.
         recent : QoS, optional
-            Metrics with the utilisation since the last decision; `observed` where None.
+            Metrics with the utilisation since the last decision; None for `observed`.
         """
         course = self.course
         incumbent = course.placement
-        # With the switching term of the decision that led to it.
+        # Includes the switching term of the last decision.
         measured = self._pricing.cost(observed, incumbent, course.previous)
         estimates = self._estimates(observed, own, recent or observed)
         with UserCall(self.policy, "decide", self.looked.window):
@@ -426,7 +422,7 @@ class Controller:
             known = self._estimator.estimate(observed=recent, incumbent=incumbent, own=own)
             estimates = dict(known)
         if not self._estimator.learns:
-            # It knows no more of the incumbent than the window shows.
+            # Without learning, the window is the best estimate of the incumbent.
             estimates[incumbent] = observed
         else:
             estimates |= self._doubted(observed, estimates)
@@ -440,10 +436,10 @@ class Controller:
         return FrozenDict(estimates)
 
     def _doubted(self, observed: QoS, estimates: Mapping[str, QoS]) -> Mapping[str, QoS]:
-        """Return what was seen of candidates whose estimates are not what windows show.
+        """Return the last measured metrics of candidates whose estimates contradict their windows.
 
-        The incumbent is compared (see `dwell.control.watchdog`). A cell whose fleet knows what the
-        others do is compared by the fleet: its estimates are those of the cell alone.
+        The watchdog compares the incumbent (see `dwell.control.watchdog`). If the fleet knows the
+        other cells, the fleet compares instead, because these estimates are for the cell alone.
         """
         incumbent, (_, last_cycle, cycles) = self.course.placement, self.looked
         self._seen_under[incumbent] = observed
@@ -476,7 +472,7 @@ class Controller:
     def _consider(
         self, proposal: Proposal, estimates: Mapping[str, QoS], coordination: Coordination
     ) -> None:
-        """Have the fleet look at what the policy has decided."""
+        """Pass the policy's decision to the fleet, and apply its verdict to the proposal."""
         decision, incumbent = proposal.decision, self.course.placement
         by_price = self._policy.by_price
         seen = SeenWindow(*proposal.seen[:2], *proposal.looked[1:])
@@ -497,24 +493,24 @@ class Controller:
             )
 
     def learn(self, evidence: Callable[[], Evidence]) -> None:
-        """Have the estimator learn from a window, if it learns, before it is decided on."""
+        """Pass the evidence of a window to an estimator that learns, before the decision."""
         if self._estimator.learns:
             with UserCall(self.estimator, "learn", self.looked.window):
                 self._estimator.look(evidence())
 
     def utilisation(self, window: ClosedWindow) -> Floats:
-        """Busy, own and shadow share of every resource, shape (3, resources)."""
+        """Return the busy, own and shadow share of every resource, shape (3, resources)."""
         return utilisation(window.core_ns, self._capacity, window.close_ns - window.open_ns)
 
-    # ------------------------------------------------------------- what becomes of a proposal
+    # ------------------------------------------------------------- outcome of a proposal
 
     def settle(self, proposal: Proposal, *, proven: str | None = None) -> str:
-        """Carry a proposal out, unless the guard's fallback would be left for what is not proven.
+        """Carry out a proposal, unless it leaves the guard's fallback for an unproven candidate.
 
         Parameters
         ----------
         proven : str, optional
-            Candidate that enough probes have completed through.
+            Candidate through which enough probes have completed.
 
         Returns
         -------
@@ -528,12 +524,12 @@ class Controller:
         return self.course.placement
 
     def commit(self, proposal: Proposal) -> None:
-        """Take note that a proposal has been carried out."""
+        """Record that a proposal has been carried out."""
         decision = proposal.decision
         if not proposal.wished:
             self._policy.commit(proposal.after)
         elif decision.migrated or self.course.previous != self.course.placement:
-            # The fleet decides in its place, so that it has decided nothing.
+            # The fleet has replaced the policy's decision, which therefore does not count.
             self._adopt(decision.name)
         self._record(proposal)
         if decision.migrated:
@@ -542,18 +538,17 @@ class Controller:
             self.course.stay(decision.dwell)
 
     def reject(self, proposal: Proposal, why: str | None = None) -> None:
-        """Take note that a proposal is not carried out, and why, if that is to be recorded."""
+        """Record that a proposal is not carried out, with an optional reason."""
         self._policy.commit(proposal.after)
         self._record(proposal, why)
         self._find(self.course.placement, proposal.decision.name)
         self.course.find(self.course.placement, by_guard=self.course.by_guard)
 
     def hold(self, proposal: Proposal, why: str | None = None) -> None:
-        """Stay on the guard's fallback: what is proposed has not been proven.
+        """Stay on the guard's fallback, because the proposed candidate is not proven.
 
-        A decision that cannot be carried out has not been made: the policy is as it was, and says
-        at the next close what it wants then. `Course.wanted` names it, and probes are to be sent
-        through it.
+        The policy keeps its state from before the decision, and decides again at the end of the
+        next window. `Course.wanted` names the candidate, for the probes.
         """
         course, wanted = self.course, proposal.decision
         proposal.decision = replace(
@@ -566,33 +561,33 @@ class Controller:
         )
         self._record(proposal, why)
         if course.previous != course.placement:
-            # Nothing has been decided since the guard moved; this window has paid for the move.
+            # First window since the guard's move: it has the switching term, later ones do not.
             self._adopt(course.placement)
         course.hold(wanted.name)
 
     def miss(self) -> None:
-        """Take note of a decision that was not made, because the controller's node was down."""
+        """Record a window without a decision, because the controller's node was down."""
         self.course.miss()
 
     def adopt(self, name: str, *, left: str | None = None) -> None:
-        """Take note that the guard has moved the cell to a fallback (rules 5 and 6 of the guard).
+        """Record that the guard has moved the cell to a fallback (rules 5 and 6 of the guard).
 
-        The fallback is the incumbent with n_d = 0, and the next window, which begins with the first
-        cycle stamped with it, carries the switching term of the move. ``decisions`` has a row for
-        it, with reason ``guard``.
+        The fallback becomes the incumbent with n_d = 0. The next window begins with the first cycle
+        on the fallback, and its cost includes the switching term of the move. ``decisions`` gets a
+        row with reason ``guard``.
 
         Parameters
         ----------
         name : str
             The fallback.
         left : str, optional
-            Placement that held until then; the incumbent where None. They differ where an order
-            was still under way: it is void.
+            Placement before the move; None for the incumbent. The two differ if an order had not
+            taken effect yet; this order is void.
 
         Raises
         ------
         PolicyError
-            If one of them is no candidate.
+            If `name` or `left` is not a candidate.
         """
         left = self.course.placement if left is None else left
         for who in (name, left):
@@ -613,17 +608,17 @@ class Controller:
         self.decisions.append((*fixed, *priced, None))
 
     def resume(self, name: str, *, fallback: bool = False) -> None:
-        """Take note of where the cell is, though nothing here was decided.
+        """Record the placement of the cell after a move that this controller did not decide.
 
-        A person has moved it, or this controller takes over from another one. It counts as a
-        decision to be there: n_d is 0, and nothing has been switched.
+        A person has moved the cell, or this controller takes over from another one. n_d becomes 0,
+        and the cost of the next window has no switching term.
 
         Parameters
         ----------
         name : str
             Candidate.
         fallback : bool
-            Whether that is the guard's own move.
+            Whether the guard has made the move.
         """
         self._find(name, self.course.placement)
         self.course.find(name, by_guard=fallback)
@@ -631,19 +626,19 @@ class Controller:
             self.coordination.place(name)
 
     def _find(self, name: str, believed: str) -> None:
-        """Tell a policy that believes the cell elsewhere where it is."""
+        """Report the placement of the cell to a policy that assumes another one."""
         if name != believed:
-            # The second time there is no move to tell of, so that no switching term remains.
+            # The second report has no move, and thus removes the switching term.
             self._adopt(name)
             self._adopt(name)
 
     def _adopt(self, name: str) -> None:
-        """Report to the policy where the cell is."""
+        """Report the placement of the cell to the policy."""
         with UserCall(self.policy, "adopt", self.looked.window):
             self._policy.adopt(name)
 
     def _record(self, proposal: Proposal, why: str | None = None) -> None:
-        """Write a row of ``decisions``: a move that was not carried out is none."""
+        """Append a row to ``decisions``; a refused move becomes a stay with the refusal."""
         decision, incumbent = proposal.decision, self.course.placement
         name, migrated = decision.name, decision.migrated
         if why is not None and migrated:
@@ -660,14 +655,14 @@ class Controller:
         self.decisions.append((*fixed, *cycles, dwell_cycles, *proposal.priced, *asked, why))
 
     def _looked_at(self, observed: QoS) -> tuple[float | None, ...]:
-        """Return the metrics that a decision looked at, where no window has them."""
+        """Return the metrics of a decision, if a window can have several decisions."""
         if "between" not in self.features:
             return ()
         used = map(observed.utilisation.get, self.resources)
         return observed.l95_ms, observed.violation_rate, *used
 
     def _priced(self, decision: Decision, estimates: Mapping[str, QoS]) -> tuple[object, ...]:
-        """Return what a row of ``decisions`` says of every candidate."""
+        """Return the values of all candidates for a row of ``decisions``."""
         names, costs = self._names, decision.costs
         known = [estimates[name] for name in names]
         errors = [estimate.error or NO_ERROR for estimate in known]
@@ -684,7 +679,7 @@ class Controller:
         )
 
     def _capped(self, known: Iterable[QoS]) -> list[float | bool | None]:
-        """Whether candidates are within the caps, then by how much they are over them."""
+        """Return whether each candidate is within the caps, then the largest excess of each."""
         if not self.has_caps:
             return [*[True for _ in known], *self._none]
         excesses = [excess(estimate, self.objective) for estimate in known]
@@ -692,7 +687,7 @@ class Controller:
 
     @property
     def supports(self) -> bool:
-        """Whether the estimator says how much stands behind its estimates."""
+        """Whether the estimator reports the samples behind its estimates."""
         return self._estimator.supports
 
     def _supported(self) -> list[float]:
@@ -710,7 +705,7 @@ class Controller:
         return [known.samples for known in behind] + [known.age_windows for known in behind]
 
     def _checked(self, decision: Decision | str) -> Decision:
-        """Bring what a policy returned into the form of a decision."""
+        """Return a policy's result as a `Decision`, and raise if it is invalid."""
         candidates = self.problem.candidates
         who = type(self.policy).__name__
         name = decision.name if isinstance(decision, Decision) else decision
@@ -741,14 +736,14 @@ class Controller:
 
 
 def _measured(shares: Mapping[str, float]) -> dict[str, float]:
-    """Leave out what is NaN."""
+    """Return the shares that are not NaN."""
     return {name: share for name, share in shares.items() if not math.isnan(share)}
 
 
 def _without_estimator(
     name: str, estimator: Estimator | str | None, problem: Problem
 ) -> tuple[str, Estimator | str | None]:
-    """Split ``cusum+corrected``; the estimator stays as it is where the name has none."""
+    """Split ``cusum+corrected``; keep `estimator` if the name has none."""
     policy, named = problem.policy_and_estimator(name)
     if named is not None and estimator is not None and estimator != named:
         raise PolicyError(f"policy {name!r} names its estimator; leave the other one out")
@@ -756,12 +751,12 @@ def _without_estimator(
 
 
 def _shadow_fractions(estimator: CellEstimator, problem: Problem) -> FrozenDict[str, float]:
-    """Share of the cycles that an estimator wants sent through each alternative, by candidate.
+    """Return, by active candidate, the share of cycles with a shadow through each alternative.
 
     Raises
     ------
     ProblemError
-        If it is no share, or all alternatives together would get more than all cycles.
+        If a value is not a share, or the shares of all alternatives add up to more than 1.
     """
     who = f"shadow_fraction of {type(estimator.given).__name__}"
     fractions = by_candidate(estimator.shadow_fraction, problem.candidates)

@@ -1,4 +1,4 @@
-"""Coordination: what a cell of a fleet has to ask before it moves."""
+"""Coordination of the moves of a fleet's cells: every decision needs a verdict."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from dwell.control.watchdog import Doubts, SeenWindow
 from dwell.estimators.protocol import CellEstimator
 from dwell.model import Decision, QoS
 
-#: Φ before and after what was looked at, and the round that it is of; what is not known is None.
+#: Φ before and after the move considered, and the round; None for unknown values.
 Asked: TypeAlias = tuple[float | None, float | None, int | None]
 NOT_ASKED: Asked = (None, None, None)
 
 
 class Verdict(NamedTuple):
-    """What a fleet says of a decision.
+    """The verdict of a fleet on a decision.
 
     Parameters
     ----------
     name : str
-        Candidate of the cycles that follow.
+        Candidate of the next cycles.
     why : str, optional
-        Why it is not the one that the policy has decided for.
+        Reason against the policy's candidate.
     asked : tuple
-        Φ before and after the move that was looked at, and the round.
+        Φ before and after the move considered, and the round.
     """
 
     name: str
@@ -36,26 +36,26 @@ class Verdict(NamedTuple):
 
 
 class Wish(NamedTuple):
-    """What a policy has decided at a close.
+    """A decision of a policy, for the verdict of the fleet.
 
     Parameters
     ----------
     decision : Decision
     estimates : mapping of str to QoS
-        Of every candidate.
+        Estimates of all candidates.
     incumbent : str
-        Where the cell is.
+        Placement of the cell.
     estimator : CellEstimator
-        Whose estimates they are.
+        Estimator of the estimates.
     by_price : bool
-        Whether the policy would move to any candidate that is cheap enough, so that another one
-        may be taken in the place of its own.
+        Whether the policy accepts any candidate that is cheap enough; the fleet may then choose
+        another candidate than the policy.
     seen : SeenWindow, optional
-        What the decision looks at.
+        Window of the decision.
     doubts : Doubts, optional
-        Candidates of the cell whose windows were not what was played.
+        Candidates of the cell whose windows contradicted the simulation.
     on_fallback : bool
-        Whether the guard holds the cell on a fallback.
+        Whether the cell is on a fallback of the guard.
     """
 
     decision: Decision
@@ -69,41 +69,41 @@ class Wish(NamedTuple):
 
 
 class Coordination(Protocol):
-    """Says of a decision whether it may be carried out, or what is to be done in its place."""
+    """Accepts decisions of a cell's policy, or replaces them."""
 
     @property
     def knows_others(self) -> bool:
-        """Whether what other cells of the fleet do is known, so that it is no foreign load."""
+        """Whether the load of the fleet's other cells is known, and thus not foreign."""
         return False
 
     def consider(self, wish: Wish) -> Verdict:
-        """Look at what a policy has decided at a close."""
+        """Return the verdict on a decision of the policy."""
         ...
 
     def meet(self, estimator: CellEstimator) -> None:
-        """Have the cell's estimator take notice of the fleet, before the first window."""
+        """Pass facts of the fleet to the cell's estimator before the first window."""
         return
 
     def turns(self, release_ns: NDArray[np.int64]) -> NDArray[np.bool_] | None:
-        """Whether shadows may be sent to shared nodes with each cycle; None where all may."""
+        """Return whether each cycle may send shadows to shared nodes; None if all may."""
         return None
 
     def place(self, name: str) -> None:
-        """Take note of where the cell is, though nothing was asked: the guard, or a person."""
+        """Record the placement of the cell after a move by the guard or a person."""
         return
 
 
 class ByChance(Coordination):
-    """Lets a move pass with a probability: the share of its J that the cell gains.
+    """Accepts a move at random, with the relative saving of J as its probability.
 
-    Where all cells of a fleet see the same advantage at once, some go, and the others look again
-    (Fischer and Vöcking, PODC 2005, DOI 10.1145/1073814.1073868). Controllers need not know of each
-    other for it. The move of a policy without prices passes.
+    If all cells of a fleet see the same advantage at once, only some of them move, and the others
+    decide again later (Fischer and Vöcking, PODC 2005, DOI 10.1145/1073814.1073868). Controllers
+    need no knowledge of each other. Moves of a policy without prices are always accepted.
 
     Parameters
     ----------
     rng : numpy Generator
-        Of one cell.
+        Random numbers of one cell.
     """
 
     def __init__(self, rng: np.random.Generator) -> None:
@@ -113,12 +113,12 @@ class ByChance(Coordination):
         return "<ByChance>"
 
     def consider(self, wish: Wish) -> Verdict:
-        """Refuse a move in some of the cases."""
+        """Accept or refuse a move at random."""
         decision, incumbent = wish.decision, wish.incumbent
         costs = decision.costs
         if not decision.migrated or incumbent not in costs or not costs[incumbent] > 0:
             return Verdict(decision.name)
-        # The price of the move is in what the other candidate costs.
+        # The cost of the other candidate includes the switching term.
         gain = costs[incumbent] - costs[decision.name]
         chance = min(1.0, max(0.0, gain / costs[incumbent]))
         if self._rng.random() < chance:

@@ -1,4 +1,4 @@
-"""Course: where a cell is placed, whose move that was, and where it is wanted."""
+"""The placement of a cell, the author of its last move, and the placement that is wanted."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from dataclasses import dataclass
 
 @dataclass(slots=True)
 class Course:
-    """The placement in force, as whoever holds this knows it.
+    """The placement in force, as far as the process that keeps this object knows it.
 
-    Beside the stamper of a live cell it is the truth; the controller's changes by what the stamper
-    says. In the simulator there is one, since an order that is given is carried out.
+    In a live cell, the stamper's course is authoritative, and the controller's follows the reports
+    of the stamper. The simulator needs only one course, because it carries out every order.
 
     ================  ===========  ===========  =======  ==========  ========
-    what happens      `placement`  `previous`   `dwell`  `by_guard`  `wanted`
+    method            `placement`  `previous`   `dwell`  `by_guard`  `wanted`
     ================  ===========  ===========  =======  ==========  ========
     `stay`            same         `placement`  given    same        none
-    `move`            new          what held    given    no          none
-    `fall`            new          what held    0        yes         none
+    `move`            new          last one     given    no          none
+    `fall`            new          given        0        yes         none
     `find`            new          new          0        given       same
     `miss`            same         `placement`  same     same        same
     `hold`            same         `placement`  same     same        new
@@ -26,20 +26,21 @@ class Course:
     Parameters
     ----------
     placement : str
-        Candidate that holds.
+        Candidate in force.
     run, term : int
-        Run, and its term that the placement holds in.
+        Run, and its term, in which the placement is in force.
     by_guard : bool
-        Whether that is the guard's own move.
+        Whether the guard made the move to the placement.
 
     Attributes
     ----------
     previous : str
-        Candidate before the last decision; a window's cost has the switching term between the two.
+        Candidate before the last decision. The cost of a window includes the switching term from
+        `previous` to `placement`.
     dwell : int
-        Windows since the last move (n_d).
+        Decisions since the last move (n_d).
     wanted : str or None
-        What the guard's fallback would be left for, were it proven.
+        Candidate that will replace the guard's fallback once probes have proven it.
     """
 
     placement: str
@@ -54,40 +55,40 @@ class Course:
         self.previous = self.previous or self.placement
 
     def stay(self, dwell: int) -> None:
-        """Note a window after which nothing moves."""
+        """Record a decision to stay."""
         self.previous, self.dwell, self.wanted = self.placement, dwell, None
 
     def miss(self) -> None:
-        """Note a window that nobody has decided on."""
+        """Record a window without a decision."""
         self.previous = self.placement
 
     def move(self, placement: str, dwell: int = 0) -> None:
-        """Note that an order holds."""
+        """Record that an order has taken effect."""
         self.previous, self.placement = self.placement, placement
         self.by_guard, self.dwell, self.wanted = False, dwell, None
 
     def credit(self, *, by_guard: bool) -> None:
-        """Note whose move it is that holds."""
+        """Record whether the guard made the last move."""
         self.by_guard = by_guard
 
     def fall(self, placement: str, left: str) -> None:
-        """Note that the guard has moved the cell, away from what held until then."""
+        """Record that the guard has moved the cell from `left` to `placement`."""
         self.previous, self.placement = left, placement
         self.by_guard, self.dwell, self.wanted = True, 0, None
 
     def find(self, placement: str, *, by_guard: bool = False) -> None:
-        """Note where the cell is, however it came there: nothing has been switched."""
+        """Record the placement of the cell without a switching term."""
         self.placement = self.previous = placement
         self.by_guard, self.dwell = by_guard, 0
 
     def hold(self, wanted: str) -> None:
-        """Note that the guard's fallback is kept, since what is wanted is not proven."""
+        """Record that the cell stays on the guard's fallback until probes prove `wanted`."""
         self.previous, self.wanted = self.placement, wanted
 
     def enter(self, run: int, term: int) -> None:
-        """Note which term of which run that is."""
+        """Record the run and its term."""
         self.run, self.term = run, term
 
     def leaves_unproven(self, placement: str, proven: str | None) -> bool:
-        """Whether a move would leave the guard's fallback for what no probes have proven."""
+        """Whether a move would leave the guard's fallback for an unproven candidate."""
         return self.by_guard and placement not in (self.placement, proven)

@@ -13,7 +13,7 @@ from dwell.estimators.fleet_prices import CellPrice, FleetPrice, PricedCell
 from dwell.estimators.slow_processes import unseen_error
 from dwell.model.fleet import LIMIT, FleetObjective
 
-#: Standard errors by which V_D differs from the limit before a cell is served, or no longer.
+#: Distance of V_D from the limit in standard errors at which a cell becomes served or not served.
 DEVIATIONS = 2.0
 
 
@@ -53,11 +53,11 @@ class FleetRank:
         return price.costs
 
     def aim(self, cost: float, violation_rate: float) -> float:
-        """Return the cost in a search of a cell that meets no other one."""
+        """Return the cost in a search of a cell without other cells."""
         return cost
 
     def settle(self, price: FleetPrice) -> None:
-        """Take note of the price at the present placements."""
+        """Record the price at the current placements."""
 
     def is_promising(
         self, before: Sequence[float], after: Sequence[float], absent: Collection[int] = ()
@@ -121,8 +121,8 @@ class WorstFirst(FleetRank):
 class MostServed(FleetRank):
     """Compares how many cells are served; then the sum.
 
-    A cell is served if its V_D is below the limit by two standard errors, and not served if above
-    by two. In between it is as it was at the last placements, at first by V_D alone.
+    A cell is served if its V_D is more than two standard errors below the limit, and not served if
+    it is more than two above. In between, the last result applies; the first one uses V_D alone.
     """
 
     worse = "ledger: fewer cells would be served"
@@ -151,7 +151,7 @@ class MostServed(FleetRank):
         return before
 
     def settle(self, price: FleetPrice) -> None:
-        """Take note of which cells are served."""
+        """Record which cells are served."""
         self._served = [*self.served(price)]
 
     def aims(self, price: FleetPrice) -> list[float]:

@@ -1,9 +1,10 @@
-"""Fleet search: moves of several cells that pay together, within few plays of the fleet.
+"""Fleet search: moves of several cells that lower Φ together, with few simulations of the fleet.
 
-A *change* begins when Φ becomes another function: a present is new, a guard moves a cell, a cell
-leaves Φ or returns. From then on the fleet is played at most `PLAYS` times. When every cell has
-decided, the search plays the jump to the placements that are best by the table of loads, then moves
-of one cell and of two. Cells that cannot move yet are searched with the plays that are left.
+A *change* begins when Φ changes for equal placements or a cell moves without the ledger: measured
+conditions are new, a guard moves a cell, a cell leaves Φ or returns. Each change allows at most
+`PLAYS` simulations of the fleet. When every cell has decided, the search simulates the best
+placements by the table of loads, then moves of one and two cells. Cells that cannot move yet are
+searched later with the remaining simulations.
 """
 
 from __future__ import annotations
@@ -18,32 +19,31 @@ from dwell.control.neighbours import Neighbours, Rank, descend
 from dwell.control.table_loads import Loads
 from dwell.estimators.fleet_prices import FleetPrice, FleetPrices
 
-#: Plays of the whole fleet at a change, and those that a search leaves for cells that cannot move
-#: yet.
+#: Simulations of the fleet per change, and the number reserved for cells that cannot move yet.
 PLAYS, KEPT = 12, 5
 
 Names: TypeAlias = tuple[str, ...]
 
 
 class FleetSearch:
-    """Counts the plays of a change, and searches when every cell has decided.
+    """Counts the simulations of a change, and searches when every cell has decided.
 
     Parameters
     ----------
     prices : FleetPrices
-        Plays the fleet.
+        Simulates the fleet.
     loads : Loads
-        The table of loads, as the objective has it in a search.
+        Table of loads with the objective's additions for a search.
     rank : FleetRank
     before : int
-        Plays before the search of a change, for moves of single cells.
+        Largest number of simulations before the search of a change, for moves of single cells.
     """
 
     def __init__(self, prices: FleetPrices, loads: Loads, rank: FleetRank, before: int) -> None:
         self._prices, self._loads, self._rank, self._before = prices, loads, rank, before
         self._neighbours = Neighbours(prices.cells, loads)
         self._dwells = [cell.problem.min_dwell_decisions > 0 for cell in prices.cells]
-        #: By cell, whether it may move; None where it never is part of a search.
+        #: By cell, whether it may move; None if it does not belong to the search.
         self._free: list[bool | None] = [None] * len(prices.cells)
         self._plays, self._spent = 0, False
         #: Cells that have decided since the change; None after the search.
@@ -55,7 +55,7 @@ class FleetSearch:
         return f"<FleetSearch: {self._plays} of {PLAYS} plays>"
 
     def change(self) -> None:
-        """Begin a change; a change before the search of another one is part of it."""
+        """Begin a change; if the search of the last change is still due, the two count as one."""
         if self._decided is None:
             self._decided, self._plays, self._spent = set(), 0, False
 
@@ -75,7 +75,7 @@ class FleetSearch:
             self._free[index] = False
 
     def spend(self) -> None:
-        """Note that a single cell has moved: nothing is played before the search."""
+        """Record a move of a single cell: there are no more simulations before the search."""
         self._spent = True
 
     def is_free(self, index: int) -> bool:
@@ -94,18 +94,18 @@ class FleetSearch:
 
     @property
     def _most(self) -> int:
-        """Plays of a change outside its search."""
+        """Largest number of simulations of a change outside its search."""
         if self.is_open:
             return 0 if self._spent else self._before
         return PLAYS
 
     @property
     def has_plays(self) -> bool:
-        """Whether the fleet may be played outside a search."""
+        """Whether a simulation outside the search is left."""
         return self._plays < self._most
 
     def play(self, placements: Names) -> FleetPrice | None:
-        """Play the fleet outside a search; None if the plays for it are used up."""
+        """Simulate the fleet outside a search; None if no simulation is left."""
         return self._play(placements, self._most)
 
     def _play(self, placements: Names, most: int) -> FleetPrice | None:
@@ -118,7 +118,7 @@ class FleetSearch:
     def jump(
         self, here: Names, alone: Sequence[Mapping[str, float]], owed: Sequence[Mapping[str, float]]
     ) -> Names:
-        """Return the placements that are best by the table (for parameters see `best`)."""
+        """Return the best placements by the table (for parameters see `best`)."""
         return cheapest(self._loads, _costs(alone, owed), here)
 
     def best(
@@ -133,13 +133,13 @@ class FleetSearch:
         Parameters
         ----------
         here : tuple of str
-            Present placements.
+            Current placements.
         alone : sequence of mapping of str to float
-            By cell, the cost in a search of each candidate without any other cell.
+            By cell, the cost of each candidate in a search, without other cells.
         owed : sequence of mapping of str to float
-            By cell, each candidate that it may take, and what the move owes.
+            By cell, the cost of a move to each permitted candidate.
         rank : callable
-            Rank of a price and of what the moves to it owe.
+            Rank from a price of the fleet and the cost of the moves.
         """
         self._decided = None
         self._held = {i for i, free in enumerate(self._free) if free is False}

@@ -1,11 +1,10 @@
-"""The guard beside the stamper: it leaves a placement that has fallen silent, and never returns.
+"""The guard: it leaves a placement whose cycles stop completing, and never returns by itself.
 
-Everything here is arithmetic on instants that the caller brings: there is no clock, no thread and
-no message. Instants are whole nanoseconds of one clock, that of the node the guard is on, and never
-go back.
+This module computes with instants that the caller passes in; it has no clock, thread or message.
+Instants are integer nanoseconds of the clock of the guard's node, and never decrease.
 
-The same machine runs beside the stamper of a live cell and in the simulator: `CellGuard` is told
-what happens, and asked whether to move.
+A live cell's stamper and the simulator use the same `CellGuard`: they report events to it and
+call `CellGuard.look` to learn whether to move.
 """
 
 from __future__ import annotations
@@ -20,26 +19,26 @@ from dwell.model.bounds import require
 from dwell.model.controller_settings import GUARD_CYCLES, PROBE_CYCLES
 from dwell.model.instants import EVIDENCE_NS
 
-#: However often a cell relapses, no more than this many times as many.
+#: Largest number of doublings of the number of probes and of the length of a rest.
 MOST_DOUBLINGS = 5
-#: Windows' worth of completed cycles that make a cell healthy (see `Probation`).
+#: Completed cycles, in windows, after which a cell counts as healthy (see `Probation`).
 HEALTH_WINDOWS = 10
-#: Probes whose completion may still count, the newest of them.
+#: Largest number of open probes; older probes no longer count.
 MOST_OPEN = 1_024
 
 
-#: Whether a candidate may be moved to.
+#: Whether the guard may move to a candidate.
 Whole: TypeAlias = Callable[[str], bool] | Mapping[str, bool]
 
 
 class _Silence:
-    """Wait for the cycle after the newest completed one.
+    """The wait for the cycle after the newest completed one.
 
     Parameters
     ----------
     kept : int
-        How many cycles older than the patience are kept, the newest of them; there is no bound on
-        how many are released meanwhile.
+        Largest number of waiting cycles that are older than the patience. Younger cycles have no
+        bound.
     """
 
     __slots__ = ("kept", "newest", "patience_ns", "released", "waiting")
@@ -50,7 +49,7 @@ class _Silence:
         self.released = self.newest = -1
 
     def release(self, cycle: int, at_ns: int) -> None:
-        """Wait for a cycle, from its release on; numbers that do not grow are ignored."""
+        """Wait for a cycle from its release on; ignore numbers that do not increase."""
         if cycle <= self.released:
             return
         self.released = cycle
@@ -60,23 +59,23 @@ class _Silence:
             waiting.popleft()
 
     def complete(self, cycle: int) -> None:
-        """Wait no longer for a cycle, nor for those before it; unknown ones are ignored."""
+        """Stop waiting for a completed cycle and all before it; ignore unknown cycles."""
         if self.newest < cycle <= self.released:
             self.newest = cycle
             self.skip(cycle)
 
     def skip(self, cycle: int) -> None:
-        """Wait no longer for a cycle, nor for those before it, though it has not completed."""
+        """Stop waiting for a cycle and all before it, even if it has not completed."""
         while self.waiting and self.waiting[0][0] <= cycle:
             self.waiting.popleft()
 
     def forget(self) -> None:
-        """Wait only for cycles that are released from now on."""
+        """Stop waiting for all cycles released so far."""
         self.waiting.clear()
 
     @property
     def due_ns(self) -> int | None:
-        """Instant at which the patience ends; None where no cycle is waited for."""
+        """Instant at which the patience ends; None if no cycle is waiting."""
         return self.waiting[0][1] + self.patience_ns if self.waiting else None
 
     def over(self, now_ns: int) -> bool:
@@ -86,10 +85,9 @@ class _Silence:
 
 
 class FallbackRound:
-    """Which fallback is tried next: each once, those that have failed last.
+    """The order in which fallbacks are tried: each once, failed ones last.
 
-    A *round* lasts from the placement under which nothing completes any more until a cycle has
-    completed, or an order has come.
+    A *round* begins when cycles stop completing, and ends with the next completed cycle or order.
 
     Parameters
     ----------
@@ -101,7 +99,7 @@ class FallbackRound:
 
     def __init__(self, fallbacks: Iterable[str]) -> None:
         self.fallbacks = tuple(dict.fromkeys(fallbacks))
-        # In the order of their failures; and what the guard has moved to.
+        # Failed fallbacks in the order of their failures, and the fallbacks tried so far.
         self._failed: dict[str, None] = {}
         self._tried: set[str] = set()
 
@@ -111,11 +109,11 @@ class FallbackRound:
 
     @property
     def begun(self) -> bool:
-        """Whether any has been tried."""
+        """Whether the guard has tried a fallback."""
         return bool(self._tried)
 
     def options(self, placement: str, carrier: str | None = None) -> list[str]:
-        """Return the other fallbacks that have not been tried, the next one first.
+        """Return the other untried fallbacks, next first.
 
         Parameters
         ----------
@@ -128,84 +126,87 @@ class FallbackRound:
         return [name for name in order if name != placement and name not in self._tried]
 
     def moved(self, left: str, to: str) -> None:
-        """Note a move of the guard away from what has failed."""
+        """Record a move of the guard away from a failed placement."""
         if left in self.fallbacks:
             self._failed.pop(left, None)
             self._failed[left] = None
         self._tried.add(to)
 
     def again(self) -> None:
-        """Begin another round: all may be tried again, in the order of their failures."""
+        """Begin another round: each fallback may be tried again, failed ones last."""
         self._tried.clear()
 
     def over(self) -> None:
-        """Note that a cycle has completed, or that an order has come."""
+        """End the round after a completed cycle or an order."""
         self._failed.clear()
         self._tried.clear()
 
 
 class Guard:
-    """Says when the cell must leave its placement by itself, and for which fallback.
+    """Decides when the cell must leave its placement without an order, and for which fallback.
 
-    It *fires* when the cycle after the newest completed one is older than g periods. Precisely:
+    The guard *fires* when the cycle after the newest completed cycle is g periods old. In detail:
 
-    * The *newest completed* cycle is the one with the highest number of which a completion has
-      been heard, not the one heard last. A completion that comes after that of a later cycle
-      changes nothing, and a cycle that is lost between two completed ones is nothing.
-    * The *cycle after* it is the first one released with a higher number, so that gaps in the
-      numbers (the stamper has started again) are no silence. Before anything has completed it is
-      the first cycle released.
-    * It *is older than* g periods from g periods after its release on, that instant included. A
-      completion heard at that very instant comes first.
-    * A move, whoever makes it, begins anew: only cycles released under the placement that holds
-      now are waited for, so that a new placement has g periods to complete its first cycle. A
-      late completion of a cycle of the placement before changes nothing.
-    * Completions of cycles that were never released here are ignored.
+    * The *newest completed* cycle has the highest number of all completed cycles, in whatever order
+      their completions arrive. A late completion of an older cycle and a cycle lost between two
+      completed cycles change nothing.
+    * The *cycle after* it is the first released cycle with a higher number, because the numbers
+      have gaps when the stamper restarts. Before the first completion it is the first released
+      cycle.
+    * The guard fires from g periods after the release of that cycle on, including that instant. A
+      completion at that instant counts first.
+    * Every move restarts the wait. The guard waits only for cycles released after the move, and a
+      new placement has g periods to complete its first cycle. Late completions of earlier cycles
+      change nothing.
+    * The guard ignores completions of cycles that were never released here.
 
     The guard is *on a fallback* from its own move until the next order. A fallback *carries* the
-    cell once one of its cycles has completed. One that does not within g periods has failed, and
-    the next is tried at once: first what carried the cell before an order left it, until the
-    cycle has completed that is `probe_cycles` after that; then the others, best first; then those
-    that have failed since the last completed cycle or order, in the order of their failures. Each
-    is tried once a round.
+    cell once one of its cycles has completed. If none completes within g periods, the fallback has
+    failed, and the guard tries the next one at once. It tries each fallback once per round, in this
+    order:
 
-    A fallback that carries earns a *rest*: of the first `probe_cycles` cycles after the move those
-    that come after the first completed one are not waited for. When each fallback that is there has
-    been tried and nothing has completed, the guard rests for as many cycles as well; another
-    round begins when it would fire again, and what was not there is tried as soon as it is. Every
-    further rest before an order doubles them, up to 32 times, so that a cell none of whose
-    fallbacks can carry it is not thrown about. Afterwards cycles are waited for as under any
-    placement: the controller may be content with the fallback, or gone. A fallback that the
-    controller ordered is watched at once.
+    1. the fallback that carried the cell before an order left it, until a cycle has completed that
+       was released more than `probe_cycles` cycles after the last one under that fallback;
+    2. the other fallbacks, best first;
+    3. fallbacks that have failed since the last completed cycle or order, earliest failure first.
 
-    **Bound.** While the guard does not rest, and f fallbacks are there of which one can carry the
-    cell, at most (f + 1)(g + 1) consecutive cycles bring no actuation: for each placement before
-    that one the first that is lost, those released within the g periods after its release, and the
-    one that may be released at the instant of the move. So it is g + 1 after a single fault from
-    which on the first fallback that is tried works. (2g + 1 if an order to another placement that
-    the fault broke takes effect within these g periods.) Without a fault it does not fire while
-    every cycle completes, and is heard, within g periods of its release, nor, where single cycles
-    are lost, while the others are heard within g - 1.
+    After its move the guard *rests* for `probe_cycles` cycles: once a first cycle has completed,
+    it does not wait for the remaining ones. It also rests when it has tried every available
+    fallback and no cycle has completed. The next round then begins when the guard would fire again,
+    but a fallback that becomes available is tried at once. Every further rest before an order is
+    twice as long, up to 32 times `probe_cycles`; this limits the moves of a cell that no fallback
+    can carry. After a rest the guard waits for cycles as under any placement, because the
+    controller may keep the fallback or may be down. A fallback ordered by the controller gets no
+    rest.
+
+    **Bound.** Assume that the guard does not rest, and that f fallbacks are available, at least one
+    of which can carry the cell. Then at most (f + 1)(g + 1) consecutive cycles bring no actuation.
+    Each placement that fails costs its first lost cycle, the cycles released in the g periods after
+    it, and a cycle that may be released at the instant of the move. After a single fault the bound
+    is g + 1 if the first fallback works. (It is 2g + 1 if, within these g periods, an order takes
+    effect to another placement that the fault broke.) Without a fault, the guard does not fire
+    while every completion arrives within g periods of the release. If single cycles are lost, it
+    does not fire while the other completions arrive within g - 1 periods.
 
     Parameters
     ----------
     fallbacks : iterable of str
-        Candidates, best first; none: it never fires.
+        Candidates, best first. A guard without fallbacks never fires.
     guard_cycles : int
         g, at least 2.
     period_ns : int
         P.
     probe_cycles : int
-        Cycles that it rests for, at least 1: as many as would prove a placement.
+        Length of the first rest in cycles, at least 1; also the probes that prove a placement.
     placement : str
-        Candidate that the first cycles are stamped with.
+        Candidate of the first cycles.
 
     Attributes
     ----------
     course : Course
-        Where the cell is, and whose move that was.
+        Placement of the cell, and whether the guard moved it there.
     newest : int
-        Highest cycle completed, -1 for none.
+        Highest completed cycle, -1 for none.
     """
 
     __slots__ = (
@@ -238,11 +239,11 @@ class Guard:
         self.course = Course(placement)
         self._silence = _Silence(guard_cycles * period_ns)
         self._round = FallbackRound(fallbacks)
-        # Last cycle before the last move; and before an order left the fallback that carried.
+        # Last cycle before the last move, and last cycle before an order left the fallback.
         self._since = self._returned = -1
         self._carrier: str | None = None
-        # Rests since the last order; cycles left of this one, and the last that it has waited for
-        # all the same; when each fallback had been tried.
+        # Rests since the last order; remaining cycles of this rest; last cycle of the rest that
+        # the guard waited for; instant at which every available fallback had been tried.
         self._rests = self._rest = 0
         self._rest_last = -1
         self._spent_ns: int | None = None
@@ -254,12 +255,12 @@ class Guard:
 
     @property
     def placement(self) -> str:
-        """Candidate that holds."""
+        """Candidate in force."""
         return self.course.placement
 
     @property
     def on_fallback(self) -> bool:
-        """Whether it is the guard's own move that holds."""
+        """Whether the guard itself made the last move."""
         return self.course.by_guard
 
     @property
@@ -284,12 +285,12 @@ class Guard:
 
     @property
     def resting(self) -> bool:
-        """Whether it rests, or will when a cycle has completed, so soon after its own move."""
+        """Whether the guard rests, or will rest as soon as a cycle completes."""
         return self._rest > 0
 
     @property
     def waits_for(self) -> int:
-        """Cycle that it waits for, or will: none before it makes it fire."""
+        """Earliest cycle, released or to come, that can make the guard fire."""
         silence = self._silence
         if silence.waiting:
             return silence.waiting[0][0]
@@ -298,12 +299,12 @@ class Guard:
 
     @property
     def options(self) -> list[str]:
-        """Fallbacks that it may try, the next one first."""
+        """Fallbacks that the guard may try, next first."""
         recent = self.newest <= self._returned + self.probe_cycles
         return self._round.options(self.placement, self._carrier if recent else None)
 
     def released(self, cycle: int, at_ns: int) -> None:
-        """Note a cycle that has been stamped and released."""
+        """Record the release of a stamped cycle."""
         silence = self._silence
         if not self._rest or cycle <= silence.released:
             silence.release(cycle, at_ns)
@@ -316,23 +317,20 @@ class Guard:
             silence.released = cycle
 
     def passed(self, cycles: int) -> None:
-        """Note how many cycles have been released before one that has completed.
-
-        Of these nothing else has to be noted.
-        """
+        """Record cycles released before a completed one, in place of `released` for each."""
         self._rest = max(self._rest - cycles, 0)
 
     def completed(self, cycle: int, at_ns: int) -> None:
-        """Note that the completion of a cycle (by every sink) has been heard."""
+        """Record the completion of a cycle by every sink."""
         self._silence.complete(cycle)
         if self.carries:
             self._silence.skip(self._rest_last)
 
     @property
     def due_ns(self) -> int | None:
-        """Next instant at which it would fire if nothing completed; None where it would not.
+        """Next instant at which the guard fires if no cycle completes; None if it cannot fire.
 
-        It lies in the past where the guard has fired and a fallback was not there.
+        The instant is past if the guard has fired and no fallback was available.
         """
         if not any(name != self.placement for name in self.fallbacks):
             return None
@@ -341,21 +339,21 @@ class Guard:
         return self._silence.due_ns
 
     def check(self, now_ns: int, whole: Whole, heard: Whole | None = None) -> str | None:
-        """Look whether to move, and where to; the rest after a round begins here, too.
+        """Return the fallback to move to now, if any; begin a rest at the end of a round.
 
         Parameters
         ----------
         whole : callable of str to bool, or mapping
-            Whether all nodes, links and workers of a candidate were heard lately, and not all of
-            its last cycles failed; see `Presence` and `Failures`.
+            Whether all nodes, links and workers of a candidate have sent a recent sign of life and
+            its last cycles have not all failed (see `Presence` and `Failures`).
         heard : callable of str to bool, or mapping, optional
-            Whether they were heard; asked where no fallback that may be tried is whole.
+            Whether they have sent a recent sign of life; used if no untried fallback is `whole`.
 
         Returns
         -------
         str or None
-            The fallback to try; `adopt` it. None where there is no reason to move, or no such
-            fallback: the guard stays armed, so ask again when one may be there.
+            Fallback to pass to `adopt`. None if the guard need not move or no fallback is
+            available; in the latter case call again when one may have become available.
         """
         due_ns = self.due_ns
         if due_ns is None or now_ns < due_ns:
@@ -377,17 +375,17 @@ class Guard:
 
     @property
     def _fails(self) -> bool:
-        """Whether it is on a fallback that is being tried, and has not carried the cell yet."""
+        """Whether the guard is trying a fallback that has not carried the cell yet."""
         return self.on_fallback and self._spent_ns is None and not self.carries
 
     def adopt(self, candidate: str, fallback: bool = False) -> None:
-        """Take note of a move: cycles released from now on have another placement.
+        """Record a move: the cycles released from now on have the placement `candidate`.
 
         Parameters
         ----------
         fallback : bool
-            Whether the guard itself makes it (`check` said so), and no order. An order for the
-            placement that holds already is a move, too: it makes a fallback the controller's.
+            Whether the guard makes the move (after `check`) and not an order. An order for the
+            placement in force is also a move: it ends the state *on a fallback*.
         """
         if fallback:
             self._rests += not self._fails
@@ -405,26 +403,26 @@ class Guard:
         self._spent_ns, self._since = None, self._silence.released
 
     def _begin_rest(self) -> None:
-        """Wait for nothing that is out, and rest longer with each rest before an order."""
+        """Forget all released cycles, and rest twice as long with each rest since an order."""
         rests = self._rests
         self._rest = self.probe_cycles << min(rests - 1, MOST_DOUBLINGS) if rests else 0
         self._rest_last = -1
         self._silence.forget()
 
     def restart(self) -> None:
-        """Begin anew: nothing released so far is waited for (the guard's own node was away)."""
+        """Forget all released cycles after an outage of the guard's own node."""
         self._silence.forget()
 
 
 def _patience_ns(problem: Problem) -> int:
-    """Longest wait of a cell for a cycle: g periods."""
+    """Return the longest wait of a cell for a cycle: g periods."""
     return problem.controller.guard_cycles * problem.pipeline.period_ns
 
 
 def parts_of(problem: Problem, candidate: str) -> frozenset[str]:
-    """Return the names of all that must be there for a candidate to be whole.
+    """Return the names of all parts that a candidate needs.
 
-    Nodes by their name, links as ``R1->E``, workers as ``perception@E``.
+    Nodes have their name; links have the form ``R1->E``, workers ``perception@E``.
     """
     pipeline, placement = problem.pipeline, problem.candidates[candidate]
     crossed = {(placement[flow.source], placement[flow.target]) for flow in pipeline.flows}
@@ -438,14 +436,14 @@ def parts_of(problem: Problem, candidate: str) -> frozenset[str]:
 
 
 class Presence:
-    """Last sign of life of every node, link and worker, and the candidates that are whole.
+    """Last sign of life of every node, link and worker, and the candidates with all parts alive.
 
     Parameters
     ----------
     parts : mapping of str to collection of str
         Parts of each candidate; see `parts_of`.
     within_ns : int
-        Age beyond which a sign of life counts no more.
+        Age from which on a sign of life no longer counts.
     """
 
     __slots__ = ("_heard_ns", "parts", "within_ns")
@@ -460,30 +458,30 @@ class Presence:
 
     @classmethod
     def of(cls, problem: Problem) -> Presence:
-        """Make that of all candidates of a cell: heard within g - 1 periods.
+        """Return the presence of a cell, with a largest age of g - 1 periods.
 
-        What a fault has ended may have been heard up to a period after the release of the first
-        cycle that it cost. The guard looks g periods after that release: of what it takes for
-        whole, the last sign of life has to be younger than that.
+        The last sign of life of a failed part may arrive up to one period after the release of the
+        first lost cycle. The guard checks g periods after that release, so a part counts as alive
+        only if its last sign of life is younger than g - 1 periods.
         """
         period_ns = problem.pipeline.period_ns
         parts = {name: parts_of(problem, name) for name in problem.candidates}
         return cls(parts, max(problem.controller.guard_cycles - 1, 1) * period_ns)
 
     def heard(self, part: str, at_ns: int) -> None:
-        """Note a sign of life."""
+        """Record a sign of life."""
         self._heard_ns[part] = max(at_ns, self._heard_ns.get(part, at_ns))
 
     def gone(self, part: str) -> None:
-        """Forget a part that has said itself that it cannot do its work."""
+        """Forget a part that has reported its own failure."""
         self._heard_ns.pop(part, None)
 
     def restart(self) -> None:
-        """Forget everything: nobody has been heard yet."""
+        """Forget all signs of life."""
         self._heard_ns.clear()
 
     def missing(self, candidate: str, now_ns: int) -> frozenset[str]:
-        """Return the parts of a candidate that were not heard lately."""
+        """Return the parts of a candidate without a recent sign of life."""
         since_ns = now_ns - self.within_ns
         heard_ns = self._heard_ns
         return frozenset(
@@ -491,20 +489,20 @@ class Presence:
         )
 
     def whole(self, candidate: str, now_ns: int) -> bool:
-        """Whether all parts of a candidate were heard lately."""
+        """Whether all parts of a candidate have sent a recent sign of life."""
         return not self.missing(candidate, now_ns)
 
 
 class Failures:
-    """The last cycles and shadows through every candidate that nobody has heard complete.
+    """Cycles and shadows that have failed since the last completion, by candidate.
 
     Parameters
     ----------
     candidates : iterable of str
     in_a_row : int
-        k: as many failures make a candidate fail.
+        k: number of failures in a row after which a candidate fails.
     patience_ns : int
-        Time from a release after which a cycle that is not heard to complete has failed.
+        Time after its release at which a cycle without a completion has failed.
     """
 
     __slots__ = ("_through", "in_a_row")
@@ -518,20 +516,20 @@ class Failures:
 
     @classmethod
     def of(cls, problem: Problem) -> Failures:
-        """Make that of a cell: g + 1 in a row, each g periods old."""
+        """Return the failures of a cell, with k = g + 1 and a patience of g periods."""
         in_a_row = problem.controller.failures_in_a_row
         return cls(problem.candidates, in_a_row, _patience_ns(problem))
 
     def released(self, candidate: str, cycle: int, at_ns: int) -> None:
-        """Note that a cycle, or its shadow, has been sent through a candidate."""
+        """Record the release of a cycle or its shadow through a candidate."""
         self._through[candidate].release(cycle, at_ns)
 
     def completed(self, candidate: str, cycle: int) -> None:
-        """Note that a completion has been heard; unknown ones are ignored."""
+        """Record a completion; ignore unknown cycles."""
         self._through[candidate].complete(cycle)
 
     def failing(self, candidate: str, now_ns: int) -> bool:
-        """Whether the last k have all failed, none of them more than `EVIDENCE_NS` ago."""
+        """Whether the last k cycles have all failed and were released within `EVIDENCE_NS`."""
         silence = self._through[candidate]
         failed_ns = [at for _, at in silence.waiting if at <= now_ns - silence.patience_ns]
         if len(failed_ns) < self.in_a_row:
@@ -547,23 +545,22 @@ class Failures:
 class Probation:
     """Permission for an order to leave the fallback: h probes through the wanted placement.
 
-    A *probe* is the shadow of a cycle through the placement that is wanted. While somebody wants to
-    leave, every cycle brings one. Once h of them have completed since the wish began, the placement
-    is *proven*, for as long as the wish lasts. By the measure of the guard itself: where the
-    probe after the newest completed one becomes older than g periods, the count begins anew, for
-    there the guard would have fired.
+    A *probe* is the shadow of a cycle through the wanted placement. Every cycle has a probe while
+    the policy or a person wants to leave the fallback. Once h probes have completed, the placement
+    is *proven* as long as it stays wanted. If the probe after the newest completed one becomes g
+    periods old, counting restarts, because the guard would have fired.
 
-    h is `probe_cycles` at first. It doubles at every *relapse*: the guard fires before a whole
-    *stretch of health* has completed since the fallback was left. It halves, not below
-    `probe_cycles`, with every stretch of health that completes under orders. It never exceeds 32
-    times `probe_cycles`.
+    At first h equals `probe_cycles`. It doubles at every *relapse*: the guard fires before
+    `health_cycles` cycles have completed since an order left the fallback. It halves, down to
+    `probe_cycles`, with every `health_cycles` cycles that complete under orders. It never exceeds
+    32 times `probe_cycles`.
 
     Parameters
     ----------
     probe_cycles : int
-        The least h, at least 1.
+        Smallest h, at least 1.
     health_cycles : int
-        Completed cycles that make a stretch of health.
+        Completed cycles after which the cell counts as healthy.
     patience_ns : int
         g periods.
 
@@ -572,7 +569,7 @@ class Probation:
     needed : int
         h.
     wanted : str or None
-        Placement that probes are sent through.
+        Placement of the probes.
     """
 
     __slots__ = (
@@ -598,14 +595,14 @@ class Probation:
         self.health_cycles = health_cycles
         self.wanted: str | None = None
         self._silence = _Silence(patience_ns)
-        # Probes under this wish that have not completed, in their order.
+        # Probes of the wanted placement that have not completed, oldest first.
         self._open: dict[int, None] = {}
         self._count = self._first = self._health = 0
         self._on_fallback = self._returned = False
 
     @classmethod
     def of(cls, problem: Problem) -> Probation:
-        """Make that of a cell: ten windows completed are a stretch of health."""
+        """Return the probation of a cell, which is healthy after `HEALTH_WINDOWS` windows."""
         return cls(
             problem.controller.probe_cycles,
             health_cycles=HEALTH_WINDOWS * problem.window_cycles,
@@ -616,12 +613,12 @@ class Probation:
         return f"Probation({self._count} of {self.needed} through {self.wanted!r})"
 
     def want(self, candidate: str | None, first: int = 0) -> None:
-        """Set the placement that the fallback shall be left for; another wish begins anew.
+        """Set the wanted placement; a change of it restarts counting.
 
         Parameters
         ----------
         first : int
-            First cycle that is a probe under this wish.
+            First cycle that counts as a probe.
         """
         if candidate != self.wanted:
             self.wanted, self._count, self._first = candidate, 0, first
@@ -629,7 +626,7 @@ class Probation:
             self._silence.forget()
 
     def released(self, cycle: int, at_ns: int) -> None:
-        """Note that a cycle has been sent as a probe through the wanted placement."""
+        """Record the release of a probe through the wanted placement."""
         self._look(at_ns)
         if cycle >= max(self._first, self._silence.released + 1):
             self._silence.release(cycle, at_ns)
@@ -638,10 +635,10 @@ class Probation:
                 del self._open[next(iter(self._open))]
 
     def completed(self, cycle: int, at_ns: int) -> None:
-        """Note that the completion of a probe through the wanted placement has been heard.
+        """Record the completion of a probe through the wanted placement.
 
-        One that comes after that of a later cycle counts, too. One that was sent under a wish
-        before, or that has been heard of already, does not.
+        Completions count in any order, but only once, and only for probes released since the
+        placement became wanted.
         """
         self._look(at_ns, also_now=False)
         if cycle in self._open:
@@ -650,7 +647,7 @@ class Probation:
             self._silence.complete(cycle)
 
     def done(self, now_ns: int) -> int:
-        """Return how many probes count by now, at most h."""
+        """Return the number of completed probes, at most h."""
         self._look(now_ns)
         return min(self._count, self.needed)
 
@@ -659,24 +656,24 @@ class Probation:
         return self.done(now_ns) == self.needed and candidate == self.wanted
 
     def _look(self, now_ns: int, *, also_now: bool = True) -> None:
-        """Begin to count anew where the patience has ended."""
+        """Restart counting if the patience has ended."""
         if self._silence.over(now_ns if also_now else now_ns - 1):
             self._count = 0
 
     def fell(self) -> None:
-        """Note that the guard has moved the cell to a fallback."""
+        """Record that the guard has moved the cell to a fallback."""
         if self._returned:
             self.needed = min(2 * self.needed, self.most)
         self._on_fallback, self._returned, self._health = True, False, 0
         self.want(None)
 
     def left(self) -> None:
-        """Note that an order has left the fallback."""
+        """Record that an order has replaced the fallback."""
         self._on_fallback, self._returned, self._health = False, True, 0
         self.want(None)
 
     def healthy(self, cycles: int = 1) -> None:
-        """Note cycles that have completed; under a fallback they say nothing."""
+        """Record completed cycles; ignore them on a fallback."""
         if self._on_fallback:
             return
         self._health += cycles
@@ -687,22 +684,22 @@ class Probation:
 
 
 class CellGuard(Guard):
-    """The guard of a cell: all that has to be noted of what happens in it.
+    """The guard of a cell, with its signs of life, failures and probation.
 
     Parameters
     ----------
     problem : Problem
     placement : str, optional
-        Candidate that the first cycles are stamped with; by default the initial one.
+        Candidate of the first cycles; the initial one by default.
 
     Attributes
     ----------
     presence : Presence
-        To be told the signs of life.
+        Signs of life; the caller reports them.
     failures : Failures
-        Cycles and shadows that nobody has heard complete.
+        Cycles and shadows without a completion.
     probation : Probation
-        To be told who wants to leave the fallback, and what completes under orders.
+        Probes; the caller reports the wanted placement and the cycles completed under orders.
     """
 
     __slots__ = ("failures", "presence", "probation")
@@ -720,25 +717,25 @@ class CellGuard(Guard):
         self.probation = Probation.of(problem)
 
     def sent(self, cycle: int, at_ns: int, candidate: str) -> None:
-        """Note that a cycle has been released through a candidate."""
+        """Record the release of a cycle through a candidate."""
         self.released(cycle, at_ns)
         self.failures.released(candidate, cycle, at_ns)
 
     def shadow_sent(self, cycle: int, at_ns: int, candidate: str) -> None:
-        """Note that a cycle has also been released through another candidate."""
+        """Record the release of the shadow of a cycle through a candidate."""
         self.failures.released(candidate, cycle, at_ns)
         if candidate == self.probation.wanted:
             self.probation.released(cycle, at_ns)
 
     def arrived(self, cycle: int, at_ns: int, candidate: str) -> None:
-        """Note that the completion of a cycle through a candidate has been heard."""
+        """Record the completion of a cycle through a candidate."""
         self.failures.completed(candidate, cycle)
-        # One that was sent a cycle early, before a move, says nothing of the placement that holds.
+        # Ignore a later cycle that was released through another placement than the current one.
         if candidate == self.placement or cycle <= self._since:
             self.completed(cycle, at_ns)
 
     def shadow_arrived(self, cycle: int, at_ns: int, candidate: str) -> None:
-        """Note that the completion of a shadow through a candidate has been heard."""
+        """Record the completion of a shadow through a candidate."""
         self.failures.completed(candidate, cycle)
         if candidate == self.probation.wanted:
             self.probation.completed(cycle, at_ns)
@@ -755,7 +752,7 @@ class CellGuard(Guard):
         return self.check(now_ns, whole, heard)
 
     def adopt(self, candidate: str, fallback: bool = False) -> None:
-        """Take note of a move (see `Guard.adopt`), and of what it says of the probation."""
+        """Record a move (see `Guard.adopt`), and update the probation."""
         left = self.on_fallback and not fallback
         super().adopt(candidate, fallback)
         if fallback:

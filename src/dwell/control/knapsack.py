@@ -27,9 +27,9 @@ def cheapest(
     Parameters
     ----------
     costs : sequence of mapping of str to float
-        By cell, cost of each candidate that it may take, without any other cell.
+        By cell, cost of each permitted candidate without other cells.
     placements : sequence of str
-        Present placements, which load the resources whose turn it is not.
+        Current placements; they determine the load of the other resources in each turn.
     """
     best = tuple(placements)
     for resource in loads.resources or ("",):
@@ -76,7 +76,7 @@ def _at_some(
     cells: Sequence[Sequence[_Option]], first: int, end: int, levels: int
 ) -> Iterator[tuple[str, ...]]:
     """Yield the cheapest placements at some of the levels."""
-    # By level and by work so far, the least sum of the cells before.
+    # Smallest sum of costs of the cells so far, by level and by their work.
     least, chosen = np.zeros((end - first, levels)), []
     for options in cells:
         best, which = np.full_like(least, np.inf), np.zeros(least.shape, np.int16)

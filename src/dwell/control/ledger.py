@@ -1,24 +1,26 @@
 """Ledger: the placements of a fleet's cells, and the moves that are good for all.
 
-Closes are considered one after another. The *presents* of the cells (see
-`dwell.estimators.presents`) and their placements are frozen from one close to the next. A cell that
-may move is considered if something of it is new: a table of loads proposes candidates, and the
-fleet is played as it is and with the move, on the same draws. The move is made if
+The ledger considers the decisions of the cells one after another. The *presents* of the cells
+(their measured conditions, see `dwell.estimators.presents`) and the placements are constant from
+one decision to the next. If anything has changed for a cell that may move, a table of loads
+proposes candidates, and the kernel simulates the fleet without and with the move on the same
+samples. The cell moves if
 
-* Φ as played falls by more than the mover owes, Δ_min + α_S·S, and
+* the simulated Φ falls by more than the cost of the move, Δ_min + α_S·S, and
 * no cell exceeds a cap that it kept before.
 
 When every cell has decided since a change, the ledger searches moves of several cells (see
 `dwell.control.fleet_search`). The best placements become a *set* of moves if Φ falls by more than
-all movers owe. Each member moves at its next close, and nothing else is played until all have.
+the cost of all moves. Each member moves at its next decision, and the search waits until all have
+moved.
 
-A move counts at once, before any window shows it. Under given presents Φ is a function of the
-placements alone, and every move or set lowers it by more than the least Δ_min: their number is
-finite, whatever the table says, and at most (Φ at first − least Φ) / least Δ_min.
+A move counts at once, before a window with it has ended. Under constant conditions Φ depends only
+on the placements, and every move or set lowers it by more than the smallest Δ_min. Their number is
+therefore finite with any table, and at most (first Φ − smallest Φ) / smallest Δ_min.
 
-A cell whose windows are not what was played for it leaves Φ until they are again (see
-`dwell.control.watchdog`). Its load stays where it is; the proof holds from one such change to the
-next.
+A cell whose windows contradict the simulation leaves Φ until they agree again (see
+`dwell.control.watchdog`). Its load still counts. The bound on the number of moves applies between
+two such changes.
 
 The objective decides which of two prices is better (see `dwell.control.fleet_rank`).
 """
@@ -56,45 +58,45 @@ from dwell.model.progress import Progress
 
 __all__ = ["FleetLedger", "Loads", "PricedCell", "Seat"]
 
-#: So many of a cell's candidates are played at a close, those that the table thinks best of.
+#: Number of a cell's candidates to simulate per decision, best by the table.
 LOOKS = 2
 SET_UNDER_WAY = "ledger: Φ would change, a set is under way"
 
 
 class FleetLedger:
-    """Knows where all cells of a fleet are, and lets them move where that is good for all.
+    """Placements of all cells of a fleet, and permission for moves that help the whole fleet.
 
     Parameters
     ----------
     cells : sequence of PricedCell
     shared : sequence of str
-        Nodes that are one computer for all cells.
+        Nodes that all cells share.
     objective : {"sum", "worst", "served"}
     table : LoadTable, optional
-        Proposes moves; made of `tabled` where None.
+        Table that proposes moves; None to compute it from `tabled`.
     tabled : sequence of PricedCell, optional
-        Cells at the phases that the table is made for; `cells` where None.
+        Cells with the phases for the table; None for `cells`.
     prices : FleetPrices, optional
-        What plays.
+        Simulates the fleet.
     progress : callable, optional
-        Told how many of how many levels of the table have been played.
+        Called with the number of simulated levels of the table, and their total.
     limit : float, optional
         Largest V_D of a cell that is served, with the objective ``served``.
 
     Attributes
     ----------
     placements : list of str
-        Where every cell is.
+        Placement of every cell.
     presents : list of Present
-        What each cell knows of itself.
+        Measured conditions of every cell.
     alone : list of mapping of str to float
-        By cell and candidate, J where no other cell is there, without switching and shared nodes.
+        By cell and candidate, J without other cells, switching and shared nodes.
     loads : Loads
-        The table, added up.
+        Sums over the table.
     round : int
-        Number of the round: of the closes since the fleet was last played.
+        Number of the round; a new round begins after a simulation of the fleet.
     absent : set of int
-        Cells that have left Φ, since their windows are not what was played (see `watch`).
+        Cells that have left Φ, because their windows contradict the simulation (see `watch`).
     """
 
     def __init__(
@@ -121,7 +123,7 @@ class FleetLedger:
         self._at = self.loads.at(self.placements)
         self._declared = [prices_of(problem) for problem in problems]
         self.alone: list[dict[str, float]] = [{} for _ in problems]
-        #: The same, as the objective has it in a search.
+        #: `alone` with the objective's additions for a search.
         self._aims: list[dict[str, float]] = [{} for _ in problems]
         for i, prices_alone in enumerate(self._declared):
             self._note_alone(i, {name: price.qos for name, price in prices_alone.items()})
@@ -129,23 +131,22 @@ class FleetLedger:
         self._revisions = [-1] * len(self.cells)
         self._has_caps = any(problem.objective.caps != Caps() for problem in problems)
         names = sorted(cell.name for cell in cells)
-        #: Place of each cell where they take turns, and how long one is.
+        #: Position of each cell in the order of turns, and the length of a turn.
         self.order = [names.index(cell.name) for cell in cells]
         self.turn_ns = max(round(problem.window_ms * 1e6) for problem in problems)
         self.absent: set[int] = set()
         self._watchdogs = [Watchdog(problem.window_cycles) for problem in problems]
-        #: Candidates of each cell that are doubted at its last close.
+        #: Doubted candidates of each cell at the end of its last window.
         self._doubted: list[set[str]] = [set()] * len(self.cells)
-        #: How often Φ has become another function; and of each cell what it was when it was last
-        #: looked at.
+        #: Number of changes of placements, of doubts and of the cells in Φ.
         self._changes = 0
-        #: How often any cell has moved.
+        #: Number of moves of all cells.
         self._moves = 0
         self._looked = [(-1, -1)] * len(self.cells)
         self._refusals: list[dict[str, str]] = [{} for _ in self.cells]
         self.round = 0
         self._search = FleetSearch(self.prices, self._aimed, self.rank, 1 + LOOKS)
-        #: Moves of a set that have not been made yet, and what their rows say.
+        #: Pending moves of a set, and the Φ and round for their rows.
         self._set: dict[int, str] = {}
         self._asked: Asked = NOT_ASKED
 
@@ -153,13 +154,13 @@ class FleetLedger:
         return f"<FleetLedger of {len(self.cells)} cells: round {self.round}>"
 
     def place(self, index: int, name: str) -> None:
-        """Take note that a cell is elsewhere, if the ledger has not moved it."""
+        """Record the placement of a cell; another one than recorded begins a change."""
         if name != self.placements[index]:
             self._put(index, name)
             self._change()
 
     def keep(self, index: int, name: str) -> None:
-        """Take note that a cell is still on its guard's fallback: its move is not proven yet."""
+        """Record that a cell is still on its guard's fallback, because its move is not proven."""
         if name != self.placements[index]:
             self._put(index, name)
 
@@ -177,10 +178,10 @@ class FleetLedger:
         self._search.change()
 
     def watch(self, index: int, seen: SeenWindow, doubts: Doubts, estimator: CellEstimator) -> bool:
-        """Compare a window with what was played; returns whether that is what was seen.
+        """Compare a window with the simulation, and return whether the cell's model is trusted.
 
-        A cell whose estimator learns leaves Φ when it is not, and comes back when it is again. As
-        long as it is away, its estimator takes all load of shared nodes for foreign.
+        A cell whose estimator learns leaves Φ while its model is not trusted. During this time its
+        estimator treats the load of the other cells on shared nodes as foreign.
         """
         dog, name = self._watchdogs[index], self.placements[index]
         if dog.is_due(seen, self._moves):
@@ -202,11 +203,11 @@ class FleetLedger:
         return dog.trusts
 
     def _begin(self) -> None:
-        """Have what plays know the presents; absent cells do not speak of shared nodes."""
+        """Pass the measured conditions to the simulation; absent cells add none of shared nodes."""
         self.prices.begin(self.presents, self.absent)
 
     def note(self, index: int, estimates: Mapping[str, QoS], estimator: CellEstimator) -> None:
-        """Take note of what a cell knows of itself, where that is new."""
+        """Record the estimates and measured conditions of a cell, if they are new."""
         revision = estimator.revision
         if revision == self._revisions[index]:
             return
@@ -226,7 +227,7 @@ class FleetLedger:
     def consider(
         self, index: int, decision: Decision, *, by_price: bool, on_fallback: bool = False
     ) -> Verdict:
-        """Say where a cell is to be that its policy has decided on (see `Wish`)."""
+        """Return the verdict on a decision of a cell's policy (see `Wish`)."""
         here, is_absent = self.placements[index], index in self.absent
         may_move = by_price and bool(decision.costs) and decision.reason != "dwell"
         in_sets = by_price and not is_absent
@@ -262,7 +263,7 @@ class FleetLedger:
     def _of_one(
         self, index: int, decision: Decision, *, by_price: bool, on_fallback: bool
     ) -> Verdict:
-        """Look at moves of the cell alone."""
+        """Return the verdict on moves of this cell only."""
         wished = decision.name
         state = self._changes, self._revisions[index]
         if self._looked[index] != state:
@@ -270,7 +271,7 @@ class FleetLedger:
             self._refusals[index] = {}
         elif not decision.migrated or wished in self._refusals[index]:
             return self._refused(index, wished)
-        # Other cells are no part of the search, so they get an answer in any case.
+        # Other decisions do not belong to the search; the limit on simulations excludes them.
         is_limited = by_price and not on_fallback
         play = self._search.play if is_limited else self.prices.price
         is_led = is_limited and self._search.is_open and self.objective == "sum"
@@ -312,7 +313,7 @@ class FleetLedger:
         return verdict
 
     def _find_set(self) -> None:
-        """Look for moves of several cells that pay together."""
+        """Search moves of several cells that lower Φ together."""
         here = tuple(self.placements)
         owed = [self._owed(i, self._takes(i)) for i in range(len(self.cells))]
         self._begin()
@@ -334,9 +335,9 @@ class FleetLedger:
             self.round += 1
 
     def _led(self, index: int, names: Sequence[str], wished: str) -> list[str]:
-        """Return those of some candidates that lead to the table's best placements.
+        """Return the cell's candidate in the table's best placements, if it is among `names`.
 
-        The table knows no caps, so the candidate that the policy wishes follows.
+        The policy's candidate follows, because the table ignores caps.
         """
         if not names or not self._search.has_plays:
             return []
@@ -355,7 +356,7 @@ class FleetLedger:
         return {name: self.owed(index, name) for name in names}
 
     def _outside(self, index: int, decision: Decision) -> Verdict:
-        """Let a cell that has left Φ do as it likes, except take more of a shared node."""
+        """Permit any move of a cell outside Φ that adds no task to a shared node."""
         candidates, here = self.cells[index].problem.candidates, self.placements[index]
         before, after = candidates[here], candidates[decision.name]
         if any(node in self.shared and before[task] != node for task, node in after.items()):
@@ -373,7 +374,7 @@ class FleetLedger:
         return Verdict(here, why, (*(asked or (None, None)), self.round))
 
     def _promising(self, index: int) -> list[str]:
-        """Candidates by which the table's Φ falls by more than is owed; best first."""
+        """Return up to `LOOKS` candidates that pay off by the table, best first."""
         found, here = [], self.placements[index]
         at_stake = self.alone[index][here] + self._beyond_table(index)
         for name in self.cells[index].problem.candidates:
@@ -386,9 +387,9 @@ class FleetLedger:
         return [name for *_, name in sorted(found)[:LOOKS]]
 
     def _beyond_table(self, index: int) -> float:
-        """J of a cell as played, less what the table says, where foreign load is on shared nodes.
+        """Return simulated minus tabulated J of a cell; 0 without foreign load on shared nodes.
 
-        The table knows no foreign load beyond the declared: it takes such a node for idle.
+        The table includes only the declared foreign load.
         """
         known = [one for i, one in enumerate(self.presents) if i not in self.absent]
         if not any(one.threads.keys() & self.shared for one in known):
@@ -401,7 +402,7 @@ class FleetLedger:
         return 0.0 if cell is None else cell.cost - says
 
     def _helps_first(self, index: int, name: str) -> bool:
-        """Whether the table expects a better rank before the sum counts."""
+        """Whether the table predicts a better first part of the rank, before the sum."""
         if self.objective == "sum":
             return False
         before = self._aimed.costs(self.placements, self._aims)
@@ -409,7 +410,7 @@ class FleetLedger:
         return self.rank.is_promising(before, after, self.absent)
 
     def owed(self, index: int, name: str) -> float:
-        """What Φ has to fall by at least for a cell to move: Δ_min + α_S·S; 0 where it is."""
+        """Return the cost of a move of a cell, Δ_min + α_S·S; 0 for its current placement."""
         if name == self.placements[index]:
             return 0.0
         problem = self.cells[index].problem
@@ -420,13 +421,13 @@ class FleetLedger:
     def _objection(
         self, there: tuple[str, ...], before: FleetPrice, after: FleetPrice
     ) -> str | None:
-        """Why cells must not move there, by what has been played."""
+        """Return the reason against placements from simulated prices, or None."""
         owed = sum(self.owed(i, name) for i, name in enumerate(there))
         why = self.rank.objection(before, after, owed, self.absent)
         return self._over_cap(before, after) if why is None else why
 
     def _over_cap(self, before: FleetPrice, after: FleetPrice) -> str | None:
-        """Return the first cap that a cell would exceed and did not before."""
+        """Return the first cell that would newly exceed its caps, as a reason, or None."""
         if self._has_caps:
             for i, cell in enumerate(self.cells):
                 if i in self.absent:
@@ -437,12 +438,12 @@ class FleetLedger:
         return None
 
     def _phi(self, played: FleetPrice) -> float:
-        """Φ of the cells that are in it."""
+        """Return Φ without absent cells."""
         return self.rank.phi(played, self.absent)
 
 
 class Seat(Coordination):
-    """A cell's place in a ledger."""
+    """Coordination of one cell by a ledger."""
 
     def __init__(self, ledger: FleetLedger, index: int) -> None:
         self.ledger, self._index = ledger, index
@@ -456,22 +457,22 @@ class Seat(Coordination):
         return self._index not in self.ledger.absent
 
     def meet(self, estimator: CellEstimator) -> None:
-        """Have the estimator take notice of the fleet."""
+        """Pass the shared nodes and the number of cells to the estimator."""
         if len(self.ledger.cells) > 1:
             estimator.share(self.ledger.shared, len(self.ledger.cells))
 
     def turns(self, release_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Whether it is the cell's turn at each cycle: one window after another, by name."""
+        """Return whether each cycle is in the cell's turn; cells take turns of a window by name."""
         ledger = self.ledger
         turn = release_ns // ledger.turn_ns % len(ledger.cells)
         return np.equal(turn, ledger.order[self._index])
 
     def place(self, name: str) -> None:
-        """Take note of where the cell is."""
+        """Record the placement of the cell."""
         self.ledger.place(self._index, name)
 
     def consider(self, wish: Wish) -> Verdict:
-        """Have the ledger look at what the policy has decided."""
+        """Return the ledger's verdict on a decision of the policy."""
         put = self.ledger.keep if wish.on_fallback else self.ledger.place
         put(self._index, wish.incumbent)
         self.ledger.note(self._index, wish.estimates, wish.estimator)

@@ -42,11 +42,11 @@ class _Move(NamedTuple):
 
 
 class Neighbours:
-    """Predicts Φ of placements near others that were played.
+    """Predicts Φ of placements near simulated ones.
 
-    The table of loads does not know which cells meet. Two corrections do: the difference between
-    played and tabulated costs leaves with the cell that has it, and a cell that joins others of
-    its period waits in proportion to how near their phases are.
+    The table of loads ignores which cells meet. Two corrections account for it. When a cell moves,
+    its difference between simulated and tabulated cost disappears. When a cell joins others of its
+    period, its predicted wait increases or decreases with the nearness of their phases.
     """
 
     def __init__(self, cells: Sequence[PricedCell], loads: Loads) -> None:
@@ -59,16 +59,17 @@ class Neighbours:
         costs: Sequence[Mapping[str, float]],
         played: Sequence[float],
     ) -> Iterator[tuple[str, ...]]:
-        """Yield moves of one cell and of two, in turn with more, as many and fewer on shared nodes.
+        """Yield placements after moves of one and two cells, most promising first.
 
-        Moves that cannot pay, even if no cell waited any more, are left out.
+        Moves that add, keep or remove cells on shared nodes take turns. Moves that cannot pay off
+        even without any waiting are left out.
 
         Parameters
         ----------
         costs : sequence of mapping of str to float
-            By cell, cost of each candidate that it may take, without any other cell.
+            By cell, cost of each permitted candidate without other cells.
         played : sequence of float
-            Cost of each cell at these placements, as played.
+            Simulated cost of each cell at these placements.
         """
         loads, at = self._loads, self._loads.at(placements)
         rest = [
@@ -83,7 +84,7 @@ class Neighbours:
         ]
         by_kind: defaultdict[int, list[tuple[float, tuple[str, ...]]]] = defaultdict(list)
         best: defaultdict[int, list[_Move]] = defaultdict(list)
-        # A cell that leaves a shared node relieves the others by no more than they wait.
+        # A cell that leaves a shared node saves the others at most their waiting.
         relief = sum(
             max(cost - costs[i][name], 0.0)
             for i, (cost, name) in enumerate(zip(played, placements, strict=True))
@@ -134,7 +135,7 @@ class Neighbours:
         return _Move(rise, costs[i][name] - played, i, name, joins, after)
 
     def _of_two(self, placements: Sequence[str], at: AtLoad, one: _Move, other: _Move) -> float:
-        """Predicted change of Φ for two moves: what they change together differs by the load."""
+        """Return the predicted change of Φ by two moves; the first changes the second's load."""
         loads, here = self._loads, placements[other.cell]
         alone = loads.rise(at, other.cell, here, other.name)
         together = loads.rise(one.at, other.cell, here, other.name)
@@ -146,7 +147,7 @@ def descend(
     neighbours: Callable[[tuple[str, ...]], Iterable[tuple[str, ...]]],
     rank: Callable[[tuple[str, ...]], Rank | None],
 ) -> tuple[str, ...]:
-    """Take the first neighbour that is better until none is, or none can be ranked any more."""
+    """Move to the first better neighbour until no neighbour is better or `rank` returns None."""
     best, least = start, rank(start)
     if least is None:
         return best

@@ -1,7 +1,7 @@
-"""What our own policies decide by, as plain numbers, for an engine that decides itself.
+"""Parameters of Dwell's policies as plain numbers, for the kernel of the simulator.
 
-The classes of `dwell.policies` and `dwell.estimators.profile` define what is right; the kernel of
-the simulator has a second body of some of them, and these are the numbers that it needs.
+The classes of `dwell.policies` and `dwell.estimators.profile` are the reference. The kernel
+implements some of them a second time, and needs these numbers.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ class PlainRule(NamedTuple):
     numbers : mapping of str to float
         Numbers of the policy, weights, targets and caps of its objective.
     options : mapping of str to float64 array, shape (candidates,)
-        What is expected of each candidate, and whether its toggled task is on a robot.
+        Expected metrics of each candidate, and whether its toggled task is on a robot.
     work : float64 array, shape (candidates, resources)
         Share of each resource that the cell's own work takes.
     switching : float64 array, shape (candidates, candidates)
-        S of a candidate (column) after another (row).
+        S of a move from one candidate (row) to another (column).
     tiers : tuple of str
-        Tier of each resource in J, ``robot``, ``edge`` or ``cloud``; empty where J has none of it.
+        Tier of each resource in J: ``robot``, ``edge`` or ``cloud``; empty if it is not in J.
     """
 
     policy: str
@@ -47,10 +47,10 @@ class PlainRule(NamedTuple):
 
 
 def plain_rule(controller: Controller) -> PlainRule | None:
-    """Return the rule of a controller that has closed no window; None where it has to be asked.
+    """Return the rule of a controller before its first window; None if the kernel has no such rule.
 
-    That is wherever its policy or its estimator is not exactly one of those that are known here, or
-    has an objective or candidates that are not the problem's.
+    The kernel needs one of the policies in `_KNOWN` and the estimator `Profile`, subclasses
+    excluded. The policy must use the candidates of the problem, and its objective, if any.
     """
     problem, policy, profile = controller.problem, controller.policy, controller.estimator
     called, numbers = _KNOWN.get(type(policy), ("", None))
@@ -106,7 +106,7 @@ def _objective(objective: Objective) -> dict[str, float]:
         "target_ms": targets.latency_ms,
         "target_robot": targets.robot,
         "target_edge": targets.edge,
-        # None of it is in J.
+        # 0 if J has no term of the cloud.
         "target_cloud": (targets.cloud or 0.0) if apart else 0.0,
         "cap_ms": caps.latency_ms,
         "cap_utilisation": caps.utilisation,
@@ -146,7 +146,7 @@ def _on_robot(policy: ATP) -> dict[str, float]:
     }
 
 
-#: What a policy is called here, and what makes its numbers.
+#: Name of each policy in the kernel, and the function that returns its numbers.
 _KNOWN: dict[type, tuple[str, Callable[[Any, list[str]], dict[str, float]] | None]] = {
     Static: ("static", lambda policy, names: {}),
     LatencyFirst: ("latency_first", lambda policy, names: {}),

@@ -15,14 +15,14 @@ from dwell.estimators.load_table import LoadTable
 
 
 class AtLoad(NamedTuple):
-    """What placements come to on shared resources.
+    """Loads of shared resources at some placements.
 
     Parameters
     ----------
     loads : mapping of str to float
-        Cores, or places, that are kept busy, by resource.
+        Busy cores, or places, by resource.
     waiting : mapping of (kind, candidate) to int
-        How many cells there are of each that has work there.
+        Number of cells with work on a shared resource.
     """
 
     loads: Mapping[str, float]
@@ -35,7 +35,7 @@ UNSERVED = 1000.0
 
 
 class Loads:
-    """Costs of a fleet's cells at any placements, as a table of loads has them.
+    """Costs of a fleet's cells at any placements, interpolated in a table of loads.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class Loads:
 
     def __init__(self, table: LoadTable, limit: float | None = None) -> None:
         self._kinds, self._work = table.kinds, table.work
-        #: Loads and what J is more there, by kind and candidate.
+        #: Loads, and the increase of J at each load, by kind and candidate.
         self._waits: dict[tuple[int, str], tuple[list[float], list[float]]] = {}
         for group, column in table.columns.items():
             objective = table.cells[group[0]].problem.objective
@@ -56,7 +56,7 @@ class Loads:
                 j = j + [shortfall(one, limit) for one in rate.tolist()]
             self._waits[group] = column.level.tolist(), (j - j[0]).tolist()
         terms = [CellTerms(cell.problem, table.shared).of_one() for cell in table.cells]
-        #: What a busy core, or place, of each shared resource costs the fleet.
+        #: Cost to the fleet per busy core, or place, of each shared resource.
         self._of_one = {
             name: sum(one.get(name, 0.0) for one in terms) / len(terms)
             for name in dict.fromkeys(name for work in self._work for name, _ in work.values())
@@ -72,35 +72,35 @@ class Loads:
 
     @property
     def resources(self) -> tuple[str, ...]:
-        """Resources of shared nodes that any candidate fills most."""
+        """Shared resources that are the most used one of some candidate."""
         return tuple(self._of_one)
 
     def most(self, resource: str) -> float:
-        """Work that all cells together may have for a resource: cores, or places."""
+        """Return the largest possible load of a resource by all cells, in cores or places."""
         return sum(
             max((work for where, work in of.values() if where == resource), default=0.0)
             for of in self._work
         )
 
     def group(self, index: int, name: str) -> tuple[int, str]:
-        """Cells that wait alike: the kind of a cell, and a candidate."""
+        """Return the kind of a cell and a candidate; cells with equal groups wait alike."""
         return self._kinds[index], name
 
     def resource(self, index: int, name: str) -> str | None:
-        """Shared resource that a cell's candidate fills most."""
+        """Return the shared resource that a cell's candidate uses most."""
         return self._work[index].get(name, (None, 0.0))[0]
 
     def work(self, index: int, name: str) -> float:
-        """How much of it."""
+        """Return the work of a cell's candidate on this resource, in cores or places."""
         return self._work[index].get(name, (None, 0.0))[1]
 
     def wait(self, index: int, name: str, load: float) -> float:
-        """What J of a cell's candidate grows by at a load of its shared resource."""
+        """Return the increase of J of a cell's candidate at a load of its shared resource."""
         of = self._waits.get(self.group(index, name))
         return 0.0 if of is None else _between(load, *of)
 
     def at(self, placements: Sequence[str]) -> AtLoad:
-        """Add up what placements come to."""
+        """Return the loads at placements."""
         loads, waiting = dict.fromkeys(self._of_one, 0.0), Counter[tuple[int, str]]()
         for i, name in enumerate(placements):
             if name in self._work[i]:
@@ -110,7 +110,7 @@ class Loads:
         return AtLoad(loads, waiting)
 
     def rise(self, at: AtLoad, index: int, here: str, there: str) -> float:
-        """What Φ rises by, but for J alone, where a cell goes from one candidate to another."""
+        """Return the increase of Φ by a move of a cell, without the cell's own J alone."""
         loads = dict(at.loads)
         for name, sign in ((here, -1.0), (there, 1.0)):
             if name in self._work[index]:
@@ -134,12 +134,12 @@ class Loads:
         return rise
 
     def costs(self, placements: Sequence[str], alone: Sequence[Mapping[str, float]]) -> list[float]:
-        """J of every cell, without switching; then what shared resources cost.
+        """Return J of every cell, without switching, then the cost of shared resources.
 
         Parameters
         ----------
         alone : sequence of mapping of str to float
-            J of every candidate of each cell where no other is there.
+            By cell, J of every candidate without other cells.
         """
         loads = self.at(placements).loads
         costs = [
@@ -163,7 +163,7 @@ def moved(placements: Sequence[str], index: int, name: str) -> tuple[str, ...]:
 
 
 def _between(x: float, xs: Sequence[float], ys: Sequence[float]) -> float:
-    """Interpolate; beyond an end it is as there."""
+    """Interpolate linearly, constant beyond both ends."""
     i = bisect.bisect_right(xs, x)
     if i == 0 or i == len(xs):
         return ys[max(i - 1, 0)]

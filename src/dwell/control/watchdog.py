@@ -1,9 +1,9 @@
-"""Watchdog: whether a cell's windows show what was played for it.
+"""Watchdog: a comparison of a cell's windows with their simulation.
 
-A window disagrees if its V_D or L95 is further from the played one than `AGREES` deviations. A
-deviation has two parts: the standard error of what was played, and by how much windows differ
-there. The compared windows share no cycle. After `WINDOWS` of them that disagree the model of
-the cell is not trusted, until as many agree.
+A window disagrees if its V_D or L95 differs from the simulated value by more than `AGREES`
+deviations. A deviation has two parts: the standard error of the simulated mean, and the spread of
+single windows. The compared windows share no cycle. After `WINDOWS` windows in a row that disagree,
+the model of the cell is not trusted until `WINDOWS` windows in a row agree.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from dwell.model.number_arrays import Floats
 from dwell.model.qos import NO_ERROR
 
 WINDOWS = 2
-#: For how many windows a candidate is doubted first, after its model was not trusted.
+#: Length of the first doubt about a candidate in windows; every further doubt is twice as long.
 DOUBTED = 8
 #: Reasons in the record of a decision.
 NOT_AS_PLAYED = "seen is not what was played"
@@ -26,13 +26,13 @@ WAS_NOT_AS_PLAYED = "windows there were not what was played"
 
 
 class SeenWindow(NamedTuple):
-    """What a decision looks at.
+    """Measured window of a decision.
 
     Parameters
     ----------
     l95_ms, violation_rate : float
     last_cycle, cycles : int
-        The last of its cycles, and their number.
+        Last cycle, and number of cycles.
     """
 
     l95_ms: float
@@ -42,7 +42,7 @@ class SeenWindow(NamedTuple):
 
 
 class Expected(NamedTuple):
-    """What windows come to: means, and the deviation of one window from them."""
+    """Expected means of windows, and the deviation of a single window from them."""
 
     l95_ms: float
     violation_rate: float
@@ -51,18 +51,19 @@ class Expected(NamedTuple):
 
     @classmethod
     def of(cls, windows: Floats, price: Price, window_cycles: int) -> Expected:
-        """Tell it from windows that were played.
+        """Compute the expected values from simulated windows.
 
         Parameters
         ----------
         windows : float64 array, shape (n, 2)
-            L95, milliseconds, and V_D of each.
+            L95 (ms) and V_D of each window.
         price : Price
-            The same candidate as declared: it has many more windows, so it includes rare events.
+            Price of the candidate in the declared cell. It has many more windows, so it includes
+            rare events.
         """
         count = len(windows)
         l95_ms, rate = windows.mean(axis=0).tolist()
-        # Of few values the deviation is itself hardly known.
+        # A deviation from few values is uncertain, so enlarge it.
         few = (count + 1) / max(count - 1, 1)
         between = (few * windows.std(axis=0)).tolist()
         error = between[0] / math.sqrt(count), between[1] / math.sqrt(count)
@@ -74,7 +75,7 @@ class Expected(NamedTuple):
 
     @classmethod
     def of_estimate(cls, qos: QoS, deviations: tuple[float, float], window_cycles: int) -> Expected:
-        """Tell it from an estimate, and by how much windows differ."""
+        """Compute the expected values from an estimate and the deviations of single windows."""
         means = qos.l95_ms, qos.violation_rate
         return cls._of(means, qos.error or NO_ERROR, deviations, window_cycles)
 
@@ -87,7 +88,7 @@ class Expected(NamedTuple):
         cycles: int,
     ) -> Expected:
         l95_ms, rate = means
-        # Prices are played until they are known so well.
+        # The simulation of prices stops at these errors.
         l95_error_ms = max(error[0], L95_SHARE * l95_ms)
         rate_error = max(error[1], unseen_error(rate, cycles), RATE)
         l95_deviation_ms = math.hypot(l95_error_ms, deviations[0])
@@ -104,14 +105,14 @@ class Expected(NamedTuple):
 
 
 class Watchdog:
-    """Compares the windows of a cell with what was played for it.
+    """Compares the windows of a cell with their simulation.
 
     Parameters
     ----------
     window_cycles : int
         W.
     after : int
-        Cycle after which windows count.
+        Last cycle before the first window that counts.
     trusts : bool
         Whether the model is trusted at first.
 
@@ -129,12 +130,12 @@ class Watchdog:
         return f"<Watchdog: {'' if self.trusts else 'not '}as played>"
 
     def is_due(self, seen: SeenWindow, moves: int = 0) -> bool:
-        """Whether a window can be compared: a whole one, after all moves.
+        """Whether a window can be compared: it is complete and begins after the last move.
 
         Parameters
         ----------
         moves : int
-            How many moves there were that matter to the cell.
+            Number of moves so far that affect the cell.
         """
         if moves != self._moves:
             self._moves, self._last = moves, seen.last_cycle
@@ -142,7 +143,7 @@ class Watchdog:
         return seen.cycles >= whole and seen.last_cycle - whole >= self._last
 
     def compare(self, seen: SeenWindow, played: Expected) -> bool:
-        """Compare a window that is due; returns whether the model is trusted from now on or not."""
+        """Compare a window that is due, and return whether `trusts` has changed."""
         self._last = seen.last_cycle
         self._against = 0 if played.agrees_with(seen) == self.trusts else self._against + 1
         if self._against < WINDOWS:
@@ -152,7 +153,7 @@ class Watchdog:
 
 
 class Doubts:
-    """Candidates that are doubted.
+    """Candidates whose simulation is doubted for some windows.
 
     Parameters
     ----------
@@ -162,7 +163,7 @@ class Doubts:
 
     def __init__(self, window_cycles: int) -> None:
         self._window_cycles = window_cycles
-        #: Of each candidate the cycle until which it is doubted, and for how many windows.
+        #: By candidate, the last cycle of the doubt, and its length in windows.
         self._until: dict[str, int] = {}
         self._spans: dict[str, int] = {}
 
@@ -170,7 +171,7 @@ class Doubts:
         return f"<Doubts of {', '.join(self._until) or 'nothing'}>"
 
     def change(self, name: str, cycle: int, *, trusts: bool) -> None:
-        """Take note that the model of a candidate is trusted from a close on, or is not."""
+        """Record that the model of a candidate has become trusted or not trusted at a cycle."""
         if trusts:
             self._until.pop(name, None)
             return
@@ -178,9 +179,9 @@ class Doubts:
         self.go_on(name, cycle)
 
     def go_on(self, name: str, cycle: int) -> None:
-        """Take note of a close at which it is still not trusted."""
+        """Record that the model of a candidate is still not trusted at a cycle."""
         self._until[name] = cycle + self._spans[name] * self._window_cycles
 
     def at(self, cycle: int) -> set[str]:
-        """Return the candidates that are doubted at a cycle."""
+        """Return the doubted candidates at a cycle."""
         return {name for name, until in self._until.items() if cycle <= until}

@@ -1,8 +1,7 @@
-"""The metrics that a closed window shows: L95, violation rate, utilisation.
+"""Metrics of a window at its end: L95, violation rate, utilisation.
 
-Everything works on one window, or on the rows of many at once, with the same arithmetic: a window
-that the live runtime closes and one that a study looks back on give the same bits, and so does the
-simulator's kernel (``metrics.h``).
+The functions take one window or many rows, with the same arithmetic. The live runtime, studies and
+the simulator's kernel (``metrics.h``) therefore compute the same bits.
 """
 
 from __future__ import annotations
@@ -19,14 +18,14 @@ from dwell.model.problem import Problem
 
 
 def missed_cycles(latency_ns: Ints, age_ns: Ints, deadline_ns: int) -> Ints | int:
-    """Count the cycles that missed: later than D, or unfinished when their window closed.
+    """Count the cycles that are later than D, or unfinished at the end of their window.
 
     Parameters
     ----------
     latency_ns : int64 array, shape (..., W)
-        Final latency as known; `NEVER_NS` where the cycle has not completed.
+        Final latency as far as known; `NEVER_NS` if the cycle has not completed.
     age_ns : int64 array, shape (..., W)
-        From each cycle's release to the close of its window.
+        Time from each cycle's release to the end of its window.
     deadline_ns : int
         D.
 
@@ -35,7 +34,7 @@ def missed_cycles(latency_ns: Ints, age_ns: Ints, deadline_ns: int) -> Ints | in
     int, or int64 array of shape (...)
     """
     late = latency_ns > np.minimum(age_ns, deadline_ns)
-    # On one window the plain count is several times as fast.
+    # For one window, counting without an axis is several times faster.
     if late.ndim == 1:
         return int(np.count_nonzero(late))
     missed: Ints = np.asarray(np.count_nonzero(late, axis=-1))
@@ -43,7 +42,7 @@ def missed_cycles(latency_ns: Ints, age_ns: Ints, deadline_ns: int) -> Ints | in
 
 
 def seen_l95_ms(latency_ns: Ints, age_ns: Ints, censor_ms: float) -> tuple[Floats, Floats]:
-    """L95 as it could be known when the window closed: an unfinished cycle counts with its age.
+    """Return L95 known at the end of the window: an unfinished cycle counts with its age.
 
     Parameters
     ----------
@@ -55,8 +54,8 @@ def seen_l95_ms(latency_ns: Ints, age_ns: Ints, censor_ms: float) -> tuple[Float
     Returns
     -------
     l95_ms, uncut_ms : float64 array, shape (...)
-        At most `censor_ms`, as J is made of it; and as caps are compared with it: infinite where
-        more cycles are unfinished than L95 leaves out, and it is the age of one of them.
+        L95 for J, at most `censor_ms`, and L95 for caps. The latter is infinite if more cycles are
+        unfinished than L95 leaves out and L95 is the age of an unfinished cycle.
     """
     seen = np.minimum(latency_ns, age_ns)
     count = seen.shape[-1]
@@ -67,7 +66,7 @@ def seen_l95_ms(latency_ns: Ints, age_ns: Ints, censor_ms: float) -> tuple[Float
     unfinished = latency_ns > age_ns
     lost = np.count_nonzero(unfinished, axis=-1) > count - rank
     if np.any(lost):
-        # Of equal values those of unfinished cycles come last.
+        # Among equal values, unfinished cycles rank last.
         at = l95[..., None]
         before = (seen < at) | ((seen == at) & ~unfinished)
         lost = lost & (np.count_nonzero(before, axis=-1) < rank)
@@ -76,19 +75,19 @@ def seen_l95_ms(latency_ns: Ints, age_ns: Ints, censor_ms: float) -> tuple[Float
 
 
 def final_l95_ms(latency_ns: Ints) -> Floats:
-    """L95 of final latencies, shape (..., W), in ms; infinite where too many never completed."""
+    """Return L95 (ms) of final latencies, shape (..., W); infinite if too many never completed."""
     l95 = order_statistic(latency_ns, 95)
     ms: Floats = np.where(l95 >= NEVER_NS, np.inf, l95 / 1e6)
     return ms
 
 
 def utilisation(core_ns: Floats, capacity: Floats, span_ns: Ints | int) -> Floats:
-    """Share of each resource that was busy: of a node's cores, as its system would show it.
+    """Return the busy share of each resource; for a node, the share of its cores.
 
     Parameters
     ----------
     core_ns : float64 array, shape (..., resources)
-        Busy core-nanoseconds in the window; of an accelerator, those of its places.
+        Busy core-nanoseconds in the window; for an accelerator, place-nanoseconds.
     capacity : float64 array, shape (resources,)
         Cores, or places.
     span_ns : int, or int64 array of shape (..., 1)
@@ -98,18 +97,20 @@ def utilisation(core_ns: Floats, capacity: Floats, span_ns: Ints | int) -> Float
 
 
 def moved_shares(problem: Problem) -> Floats:
-    """S of every move, shape (candidates, candidates), from the row's to the column's."""
+    """Return S of every move, shape (candidates, candidates), from row to column."""
     placements = list(problem.candidates.values())
     return np.array([[hamming(there, here) for there in placements] for here in placements])
 
 
 def busiest(used: Mapping[str, Floats], problem: Problem) -> tuple[Floats, Floats, Floats]:
-    """Utilisation of the busiest of each tier, robot, edge and cloud, in every window.
+    """Return the largest utilisation in the robot, edge and cloud tier, in every window.
+
+    A tier without nodes has 0.
 
     Parameters
     ----------
     used : mapping of str to float64 array, shape (windows,)
-        Utilisation of every resource; NaN where it was not measured. A tier without nodes has 0.
+        Utilisation of every resource; NaN if not measured.
     """
     none = np.zeros(len(next(iter(used.values()))))
     robot, edge, cloud = (
@@ -126,12 +127,12 @@ def seen_costs(
     used: Mapping[str, Floats],
     switching: Floats,
 ) -> Floats:
-    """J of windows.
+    """Return J of windows.
 
     Parameters
     ----------
     l95_ms, violation_rate, switching : float64 array, shape (windows,)
-        Switching: the sum of S over the moves that took effect in each window.
+        `switching` is the sum of S over the moves that took effect in each window.
     used : mapping of str to float64 array, shape (windows,)
         Busy share of each resource.
     """
