@@ -137,7 +137,7 @@ class FleetSearch:
         alone : sequence of mapping of str to float
             By cell, the cost of each candidate in a search, without other cells.
         owed : sequence of mapping of str to float
-            By cell, the cost of a move to each permitted candidate.
+            By cell, the least fall of Φ for a move to each permitted candidate.
         rank : callable
             Rank from a price of the fleet and the cost of the moves.
         """

@@ -410,7 +410,7 @@ class FleetLedger:
         return self.rank.is_promising(before, after, self.absent)
 
     def owed(self, index: int, name: str) -> float:
-        """Return the cost of a move of a cell, Δ_min + α_S·S; 0 for its current placement."""
+        """Return the least fall of Φ for a move of a cell, Δ_min + α_S·S; 0 if it stays."""
         if name == self.placements[index]:
             return 0.0
         problem = self.cells[index].problem
