@@ -26,7 +26,7 @@ Kind: TypeAlias = Literal["text", "cell", "policy", "placement", "scenario", "wo
 
 #: Largest width of sentences in text, columns.
 PROSE = 100
-#: Largest number of rows in tables of moves and other events.
+#: Largest number of rows in tables of moves.
 MOST_ROWS = 200
 #: Meaning of the words of verdicts; other words are open.
 WORDS: Mapping[str, Literal["good", "bad"]] = {
