@@ -70,7 +70,7 @@ THE_AIM = Limit(100 * AIM, "the aim, 5 %")
 #: The one sentence that is made of numbers (docs/decisions/0007-reports.md).
 HEADLINE = "V_D under 5 %: {most} in {count} of {of} scenarios; in all: {all}; not shown: {open}."
 KEYS = ("scenario", "policy")
-#: Points of a line of a distribution, evenly spaced on the logarithmic axis.
+#: Approximate largest number of points of a line: bins of the logarithmic axis.
 POINTS = 60
 LEAST_SHARE = 1e-4
 
