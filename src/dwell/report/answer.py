@@ -1,7 +1,7 @@
-"""Short representations of results: their answer as text, and as HTML of a notebook.
+"""Short representations of results: the answer as text, and as HTML for a notebook.
 
-The answer is the first section of the page that a report of them is. Pictures need the extra
-`report`; without it a notebook shows the tables.
+The answer is the first section of the report's page. Pictures need the extra `report`; without it
+a notebook shows the tables.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from dwell.report.page import TEMPLATES, Block, Fact, Page, Section
 from dwell.report.table import Table, table_text
 from dwell.report.topology import topology
 
-#: What fits a screen.
+#: Size of a screen, in characters.
 LINES, COLUMNS = 24, 80
-#: Numbers over a picture.
+#: Largest number of facts above a picture.
 NUMBERS = 5
 _shown = itertools.count()
 
 
 def summary_of(shown: object) -> str:
-    """Return the answer as text; what does not fit a screen is left out, and said to be."""
+    """Return the answer as at most `LINES` lines of text; a last line counts the omitted lines."""
     page = _answer(shown)
     lines = [*textwrap.wrap(page.title, COLUMNS), *textwrap.wrap(page.subtitle, COLUMNS)]
     if page.facts:
@@ -47,7 +47,10 @@ def summary_of(shown: object) -> str:
 
 
 def html_of(shown: object) -> str:
-    """Return the answer as HTML for a notebook: numbers and a picture, or tables without one."""
+    """Return the answer as HTML for a notebook: facts with a picture, or with tables.
+
+    A cell has both a picture and tables.
+    """
     page = _answer(shown)
     parts = [f"<b>{escape(page.title)}</b><div>{escape(page.subtitle)}</div>"]
     if page.facts:
@@ -59,7 +62,7 @@ def html_of(shown: object) -> str:
 
 
 def _answer(shown: object) -> Page:
-    """Return the page of an object, its first section only."""
+    """Return the page of a result with its first section only."""
     if isinstance(shown, Problem):
         return _cell(shown)
     from dwell.record import Run
@@ -95,15 +98,15 @@ def _cell(problem: Problem) -> Page:
     try:
         blocks = [topology(problem), placements_table(problem)]
     except ModuleNotFoundError:
-        # Figures are data frames, which a robot's installation has none of.
+        # Figures need data frames; an installation on a robot lacks Polars.
         blocks = [placements_table(problem)]
     return Page(f"Cell {problem.name}", str(pipeline), [Section("", blocks)], facts)
 
 
 def _drawn(page: Page) -> Iterator[str]:
-    """Yield the page's first picture, where the extra that draws is installed."""
+    """Yield the first picture of a page, if the extra `report` is installed."""
     for figure in itertools.islice(page.figures, 1):
-        # What a figure calls its parts must be its own in the whole notebook.
+        # The ids in a figure must be unique in the notebook.
         own = replace(figure, slug=f"shown-{next(_shown)}")
         try:
             picture = svg(own)
@@ -133,7 +136,7 @@ def _table(table: Table) -> str:
 
 @cache
 def _style() -> str:
-    """Return the style of what is shown: a page's colours, by the notebook's theme."""
+    """Return the style sheet of answers: the colours of a page, by the notebook's theme."""
     css = (TEMPLATES / "page.css").read_text(encoding="utf-8")
     light, dark = (
         re.sub(r"\s+", " ", colours) for colours in re.findall(r":root \{\s*([^}]*)\}", css)

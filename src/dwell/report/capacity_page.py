@@ -1,4 +1,4 @@
-"""The page of a capacity: how many robots there may be, V_D by their number, what would help."""
+"""Page of a capacity: largest number of robots, V_D by number of robots, effects of changes."""
 
 from __future__ import annotations
 
@@ -20,13 +20,7 @@ RATE = Measure("violation_rate", "V_D of the worst cell", "%", 100.0, decimals=2
 
 
 def capacity_page(name: str, found: Capacity, what_ifs: Sequence[WhatIf] = ()) -> Page:
-    """Return what there is to show of a capacity.
-
-    Parameters
-    ----------
-    name : str
-        The fleet's.
-    """
+    """Return the page of a capacity; `name` is the name of the fleet."""
     low, high = found.interval
     facts = [Fact("robots", written(found), f"[{low}, {high}]")]
     if found.limit_on == "excess":
@@ -55,7 +49,7 @@ def written(found: Capacity) -> str:
 
 
 def answer(found: Capacity) -> str:
-    """Return how many robots at which V_D: ``0 at ≤ 5 %; 9 at ≤ 10.3 % (one alone: 5.3 %)``."""
+    """Return numbers of robots by V_D: ``0 at ≤ 5 %; 9 [8, 9] at ≤ 10.3 % (one alone: 5.3 %)``."""
     interval = "[{}, {}]".format(*found.interval)
     if found.limit_on == "violation_rate":
         return f"{written(found)} {interval}"
@@ -67,7 +61,7 @@ def answer(found: Capacity) -> str:
 
 
 def _assumed(found: Capacity) -> Definitions:
-    """Return what was assumed, and what each number is."""
+    """Return the assumptions, and the meaning of each number."""
     excess = " beyond that of one cell alone" if found.limit_on == "excess" else ""
     entries = {
         "robots": "the largest number such that neither it nor a smaller one is over the limit; in "
@@ -138,7 +132,7 @@ def _numbers(found: Capacity) -> Table:
 
 
 def errors(found: Capacity) -> str:
-    """Return how far V_D may be off by the draws of phases, and by the cycles played."""
+    """Return the errors of V_D from sampled phases and from simulated cycles, as text."""
     point = found.point(found.robots)
     by_phases, by_cycles = point.phases_error * 100, point.cycles_error * 100
     return f"at {point.robots}: phases ± {by_phases:.2f}, cycles ± {by_cycles:.2f} points of V_D"

@@ -1,7 +1,7 @@
-"""Charts: what several pages draw, from data frames, as Vega-Lite.
+"""Charts of several pages, drawn from data frames with Vega-Lite.
 
-Every chart names its limit (a deadline, the aim of 5 %), shows intervals where there are any, and
-says under the pointer what a mark stands for.
+Every chart names its limit (a deadline, the aim of 5 %), shows intervals if they are known, and
+describes each mark under the pointer.
 """
 
 from __future__ import annotations
@@ -21,27 +21,28 @@ if TYPE_CHECKING:
 
     from dwell.report.formatting import Measure
 
-#: Names of the parts of a latency, and their colours by these.
+#: Names of the parts of a latency, and their colours by name.
 PARTS_SHOWN = {"compute": "computing", "queue": "waiting", "network": "network"}
 PART_COLOURS = {PARTS_SHOWN[part]: colour for part, colour in PARTS.items()}
-#: Factor between numbers above which an axis is logarithmic.
+#: Ratio of the largest to the smallest number above which an axis is logarithmic.
 WIDE = 30.0
-#: Least width of a panel, room beside panels of named rows and of numbers, and between, pixels.
+#: Least width of a panel; room for names of rows, for an axis of numbers, and between panels;
+#: pixels.
 PANEL_PX, NAMES_PX, AXIS_PX, GAP_PX = 170, 150, 60, 16
 ROW_PX = 17
-#: Values of a parameter that have grid lines, at most.
+#: Largest number of values of a parameter for which grid lines are drawn.
 MOST_LINES = 20
-#: Width of a legend's symbol with what is beside it, and of a letter.
+#: Width of a symbol of a legend with its margins, and of a letter.
 SYMBOL_PX, LETTER_PX = 34, 6.2
-#: Share of cycles below which a distribution is not drawn.
+#: Smallest share of cycles on the axis of a distribution.
 LEAST_SHARE = 1e-4
-#: Tests of rows: whether a reader has chosen their policy, and whether their interval is known.
+#: Vega tests of a row: its policy is chosen by the reader; its interval is known.
 CHOSEN = "indexof(policies, datum.policy) >= 0"
 BOUNDED = "isValid(datum.low) && isValid(datum.high)"
 
 
 class Limit(NamedTuple):
-    """A line on an axis, in the unit that is shown, and its name; none where it is infinite."""
+    """Value of a line on an axis, in the shown unit, and its name; no line if infinite."""
 
     value: float
     name: str
@@ -51,7 +52,7 @@ NO_LIMIT = Limit(math.inf, "")
 
 
 def quantity(field: str, title: str | None, **more: Any) -> Spec:
-    """Return the encoding of a number; ``scale`` and other properties as Vega-Lite has them."""
+    """Return the encoding of a number; `more` are properties of Vega-Lite, such as ``scale``."""
     return {"field": field, "type": "quantitative", "title": title, **more}
 
 
@@ -61,12 +62,12 @@ def name_of(field: str, **more: Any) -> Spec:
 
 
 def names(*fields: str) -> list[Spec]:
-    """Return how several names are shown under the pointer."""
+    """Return the encodings of several names for a tooltip."""
     return [name_of(field, title=field) for field in fields]
 
 
 def coloured(field: str, colours: Mapping[str, str], **more: Any) -> Spec:
-    """Return the encoding of a name as one of several colours."""
+    """Return the encoding of a name as a colour; `colours` maps names to colours."""
     return name_of(field, scale={"domain": list(colours), "range": list(colours.values())}, **more)
 
 
@@ -80,17 +81,9 @@ def layer(
 ) -> Spec:
     """Return a layer of a chart.
 
-    Parameters
-    ----------
-    encoding : mapping of str to Spec or str
-        Encoding of this layer alone, a text for a bare field; what layers share stands in their
-        group.
-    rows : str
-        Name of its data, where these are not the chart's.
-    where : sequence of str
-        Tests that rows must pass, as Vega expressions.
-    **style : Any
-        Properties of the mark.
+    `encoding` is the layer's own; a text in it names a field. `rows` names other data than the
+    chart's, `where` lists tests of rows as Vega expressions, and `style` has properties of the
+    mark.
     """
     fields = {
         channel: {"field": one} if isinstance(one, str) else one
@@ -105,19 +98,15 @@ def layer(
 
 
 def disc(encoding: Mapping[str, Any], size: float, **more: Any) -> Spec:
-    """Return a layer of filled points; further arguments as `layer` has them."""
+    """Return a layer of filled points; `more` are further arguments of `layer`."""
     return layer("point", encoding, **{"filled": True, "size": size, "opacity": 1, **more})
 
 
 def styled(styles: Mapping[str, Style], width: float = 0.0) -> dict[str, Spec]:
     """Return the encodings of colour, dashes and marker of named series.
 
-    Parameters
-    ----------
-    styles : mapping of str to Style
-        By the names that the data have in the column ``policy``.
-    width : float
-        Width of their legend, pixels; no legend where it is 0.
+    The names are values of the column ``policy``. `width` is the width of the legend in pixels; 0
+    leaves the legend out.
     """
     each = SYMBOL_PX + LETTER_PX * max(map(len, styles), default=0)
     shown = {"columns": max(1, int(width / each)), "symbolSize": 60} if width else None
@@ -133,13 +122,13 @@ def styled(styles: Mapping[str, Style], width: float = 0.0) -> dict[str, Spec]:
 
 
 def limit_rule(axis: str, limit: float, name: str, **style: Any) -> list[Spec]:
-    """Return the line of a limit on an axis, and its name; nothing where it is infinite."""
+    """Return the layer with the line of a limit on an axis; no layer if it is infinite."""
     if not math.isfinite(limit):
         return []
     style = {"color": INK, "strokeDash": [4, 3], "strokeWidth": 1, "tooltip": name, **style}
     other, end = ("y", "height") if axis == "x" else ("x", "width")
     along = {other: {"value": 0}, f"{other}2": {"value": end}}
-    # Data of its own: one line, and not one for every row of the chart's.
+    # Separate data of one row: the chart's data would draw the line once per row.
     rule = layer("rule", {axis: {"datum": limit}, **along}, **style)
     return [{"data": {"values": [{}]}, **rule}]
 
@@ -147,16 +136,10 @@ def limit_rule(axis: str, limit: float, name: str, **style: Any) -> list[Spec]:
 def square(
     side: float, across: Spec, up: Spec, limit: Limit, beneath: Spec, marks: Mapping[str, Any]
 ) -> Spec:
-    """Return a square panel of the same quantity on both axes.
+    """Return a square panel with the same quantity, and the same limit, on both axes.
 
-    Parameters
-    ----------
-    limit : Limit
-        Of both axes.
-    beneath : Spec
-        Layer below the marks, with its data.
-    marks : mapping of str to object
-        A group of layers over the chart's rows, without the two encodings.
+    `beneath` is a layer below the marks, with its data; `marks` is a group of layers over the
+    chart's rows, without the encodings of the two axes.
     """
     rules = [rule for axis in ("x", "y") for rule in limit_rule(axis, *limit)]
     encoding = {"x": across, "y": up, **marks["encoding"]}
@@ -165,13 +148,13 @@ def square(
 
 
 def is_wide(values: Sequence[float]) -> bool:
-    """Whether numbers are so far apart that an axis has to be logarithmic."""
+    """Whether positive numbers differ by more than the factor `WIDE`: use a logarithmic axis."""
     known = [value for value in values if math.isfinite(value) and value > 0]
     return len(known) > 1 and max(known) / min(known) > WIDE
 
 
 def thinned(count: int, points: int = 200) -> np.ndarray[Any, np.dtype[np.int64]]:
-    """Return which of `count` sorted values to draw: the nearer to the tail, the more of them."""
+    """Return the indices of `count` sorted values to draw, denser towards the end."""
     if not count:
         return np.zeros(0, np.int64)
     from_end = np.unique(np.rint(np.geomspace(1, count, min(count, points))).astype(np.int64))
@@ -181,21 +164,17 @@ def thinned(count: int, points: int = 200) -> np.ndarray[Any, np.dtype[np.int64]
 def intervals(
     frame: pl.DataFrame, measure: Measure, styles: Mapping[str, Style], limit: Limit = NO_LIMIT
 ) -> Draw:
-    """Draw a measure of policies, a panel a scenario: means with intervals, and every seed.
+    """Draw a measure of policies, one panel per scenario: means with intervals, and every seed.
 
-    Parameters
-    ----------
-    frame : DataFrame
-        ``scenario``, ``policy``, ``mean``, ``low``, ``high``, ``seed``, ``value``, in the
-        measure's shown unit: a row a policy without a seed, and a row a seed without a mean.
-    styles : mapping of str to Style
-        By policy, in the order of the rows.
+    `frame` has the columns ``scenario``, ``policy``, ``mean``, ``low``, ``high``, ``seed`` and
+    ``value``, in the shown unit of the measure. Each policy has one row with a mean, and one row
+    with a value per seed. `styles` lists the policies in the order of the rows of the chart.
     """
     shown = [frame[name].drop_nulls().to_list() for name in ("value", "mean", "low")]
     scale: Spec = {"nice": True}
-    # Of a utilisation nobody asks how often it is another one.
+    # Utilisations have a linear axis: readers compare their differences, not their ratios.
     if is_wide([*shown[0], *shown[1]]) and not measure.column.startswith("u_"):
-        # An interval may reach below what any run has shown.
+        # An interval may extend below the values of all runs.
         zero = min(itertools.chain(*shown)) <= 0
         scale = {"type": "symlog", "constant": 1} if zero else {"type": "log"}
     ticks = {"tickCount": 4, "labelOverlap": "greedy", "labelSeparation": 4}
@@ -228,18 +207,11 @@ def stacked(
     heading: str,
     limit: Limit = NO_LIMIT,
 ) -> Draw:
-    """Draw parts of a whole as bars, a row a policy and a panel a scenario.
+    """Draw stacked bars, one row per policy and one panel per scenario.
 
-    Parameters
-    ----------
-    frame : DataFrame
-        ``scenario``, ``policy``, ``part``, ``value``.
-    policies : sequence of str
-        In the order of the rows.
-    parts : mapping of str to str
-        Colours, in the order of the bars.
-    heading : str
-        Heading of the axis, with its unit.
+    `frame` has the columns ``scenario``, ``policy``, ``part`` and ``value``. `policies` has the
+    order of the rows, and `parts` the colours in the order of the bars. `heading` is the heading
+    of the axis, with its unit.
     """
     encoding = {
         "x": quantity("value", heading, stack="zero", axis={"tickCount": 4}),
@@ -252,7 +224,7 @@ def stacked(
 
 
 def in_order(bars: Spec, parts: Mapping[str, str]) -> Spec:
-    """Return bars that have their parts in the order of these."""
+    """Return a layer of bars with their parts stacked in the order of `parts`."""
     place = {"calculate": f"indexof({list(parts)!r}, datum.part)", "as": "place"}
     order = {"field": "place", "type": "quantitative"}
     return {
@@ -263,12 +235,10 @@ def in_order(bars: Spec, parts: Mapping[str, str]) -> Spec:
 
 
 def distributions(frame: pl.DataFrame, styles: Mapping[str, Style], deadline_ms: float) -> Draw:
-    """Draw the share of cycles that took longer than a latency, a panel a scenario.
+    """Draw the share of cycles that took longer than a latency, one panel per scenario.
 
-    Parameters
-    ----------
-    frame : DataFrame
-        ``scenario``, ``policy``, ``latency_ms``, ``longer``: share of the cycles, above 0.
+    `frame` has the columns ``scenario``, ``policy``, ``latency_ms`` and ``longer``, a share above
+    0.
     """
     up = quantity(
         "longer",
@@ -290,14 +260,10 @@ def cumulative(
     headings: tuple[str, str],
     limit: Limit = NO_LIMIT,
 ) -> Draw:
-    """Draw empirical distributions, a line a policy and a panel a scenario.
+    """Draw empirical distributions, one line per policy and one panel per scenario.
 
-    Parameters
-    ----------
-    frame : DataFrame
-        ``scenario``, ``policy``, ``value``, ``share`` at or below it.
-    headings : (str, str)
-        Headings of the axes: values, shares.
+    `frame` has the columns ``scenario``, ``policy``, ``value`` and ``share``, the share at or
+    below the value. `headings` are the headings of values and shares.
     """
     across = quantity("value", headings[0], axis={"tickCount": 4})
     up = quantity("share", headings[1], axis={"format": "~%", "tickCount": 4})
@@ -315,7 +281,7 @@ def _steps(
     what: str,
     tallest_px: int,
 ) -> Draw:
-    """Draw distributions, a step at each value; `what` a line stands for."""
+    """Draw distributions with a step at each value; `what` is the tooltip's title of a line."""
     about = [
         name_of("policy", title=what),
         quantity(across["field"], across["title"]),
@@ -339,18 +305,12 @@ def curves(
     limit: Limit = NO_LIMIT,
     remark: str = "",
 ) -> Draw:
-    """Draw a measure over a parameter, a line a policy and a panel a scenario.
+    """Draw a measure over a parameter, one line per policy and one panel per scenario.
 
-    Parameters
-    ----------
-    frame : DataFrame
-        ``scenario``, ``policy``, ``at`` (the parameter's values, texts or numbers), ``mean``,
-        ``low``, ``high`` in the measure's shown unit; with ``panel``, a text, there is a panel for
-        each of its values in each scenario.
-    heading : str
-        Heading of the parameter.
-    remark : str
-        Stands above the panels, on paper too.
+    `frame` has the columns ``scenario``, ``policy``, ``at`` (values of the parameter, texts or
+    numbers), ``mean``, ``low`` and ``high``, in the shown unit of the measure. With a column
+    ``panel`` each pair of scenario and panel has a panel. `heading` is the heading of the
+    parameter; `remark` is a title above the panels.
     """
     numeric = frame["at"].dtype.is_numeric()
     values = frame["at"].unique(maintain_order=True).to_list()
@@ -359,7 +319,7 @@ def curves(
     axis["grid"] = numeric and len(values) <= MOST_LINES
     across: Spec = {**at, "axis": axis, "sort": None}
     if numeric:
-        # Values at even distances, as numbers of robots are, stand at even distances.
+        # Evenly spaced values, such as numbers of robots, have a linear axis.
         wide = min(values) > 0 and is_wide(values) and np.ptp(np.diff(values)) > 0
         scale = "log" if wide else "linear"
         across |= {
@@ -401,20 +361,11 @@ def _panels(
     seeds: bool = False,
     remark: str = "",
 ) -> Draw:
-    """Draw layers, a panel for each value of ``scenario`` and, where it is given, of ``panel``.
+    """Draw layers in panels by the columns ``scenario`` and ``panel`` of the frame.
 
-    A heading names what differs between panels.
-
-    Parameters
-    ----------
-    layers : callable
-        Takes the width of the whole, pixels.
-    tallest_px : int, optional
-        Height of a panel at most; if left out it has a row for each policy.
-    most : int
-        Panels beside each other.
-    seeds : bool
-        Whether a reader can choose a seed, beside policies.
+    The heading of a panel has the values that differ between panels. `layers` takes the width of
+    the chart in pixels. `tallest_px` is the largest height of a panel; without it a panel has one
+    row per policy. A row has at most `most` panels. `seeds` lets a reader choose a seed.
     """
     given = [name for name in ("scenario", "panel") if name in frame.columns]
     values = {name: frame[name].unique(maintain_order=True).to_list() for name in given}
@@ -429,7 +380,7 @@ def _panels(
         room_px = width - (NAMES_PX if tallest_px is None else AXIS_PX)
         fitting = max(1, min(most, len(facets), int((room_px + GAP_PX) // (PANEL_PX + GAP_PX))))
         panels = len(values.get("panel", ()))
-        # Scenarios begin with a row.
+        # If possible, each scenario begins a row, or several scenarios fill it.
         whole_rows = (n for n in range(fitting, 1, -1) if not (panels % n and n % panels))
         columns = next(whole_rows, fitting)
         across_px = max(60, int((room_px - (columns - 1) * GAP_PX) / columns))

@@ -1,4 +1,4 @@
-"""The report of a comparison: which policy meets the aim, and what that is known from."""
+"""Report of a comparison: the policies that meet the aim, and the evidence."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ def comparison_html(
     *comparisons: Comparison,
     static: bool = False,
 ) -> str:
-    """Return a page about one comparison, or about several one after the other.
+    """Return a page about one or more comparisons in sequence.
 
     Parameters
     ----------
     *comparisons : Comparison
-        At least one, of cells with different names.
+        At least one comparison; the names of their cells must differ.
     static : bool
         See `dwell.report.page.page_html`.
     """
@@ -44,7 +44,7 @@ def comparison_html(
 
 
 def comparison_page(*comparisons: Comparison, sections: int | None = None) -> Page:
-    """Return what there is to show of comparisons; the first `sections` only of each."""
+    """Return the page of comparisons; `sections` limits the sections of each comparison."""
     several = len(comparisons) > 1
     parts: list[Section] = []
     policies: dict[str, str] = {}
@@ -101,7 +101,7 @@ def _sections(comparison: Comparison, blocks: PolicyBlocks) -> Iterator[Section]
 
 
 def predictions_table(comparison: Comparison, blocks: PolicyBlocks) -> Table:
-    """Return the paper's predictions beside what the runs say; no rows for another cell."""
+    """Return a table of the paper's predictions and the results; no rows for other cells."""
     policies = [DTP] if DTP in comparison.policies else []
     columns: Columns = [
         Text("policy", "policy", "policy"),
@@ -140,7 +140,7 @@ def _timeline(comparison: Comparison, blocks: PolicyBlocks, scenario: str, polic
 
 
 def _beliefs(comparison: Comparison, blocks: PolicyBlocks) -> Table:
-    """Return estimated beside measured J of every policy that moves."""
+    """Return a table of estimated and measured J for every policy that moves."""
     import polars as pl
 
     means = comparison.costs.group_by("scenario", "policy", "candidate", maintain_order=True).agg(
@@ -173,7 +173,10 @@ def _beliefs(comparison: Comparison, blocks: PolicyBlocks) -> Table:
 
 
 def comparison_text(comparison: Comparison, *, width: int | None = None) -> str:
-    """Return the tables of a comparison as `dwell.report.table.table_text`, the answer last."""
+    """Return a comparison as text: its tables, then the answer.
+
+    See `dwell.report.table.table_text` for `width`.
+    """
     blocks = PolicyBlocks(comparison)
     tables = [blocks.results(compact=True), predictions_table(comparison, blocks), blocks.counts()]
     texts = [table_text(one, width=width) for one in tables if one.rows]

@@ -1,7 +1,7 @@
-"""A figure: data and a Vega-Lite drawing of it, as SVG of a page, and as files for a paper.
+"""Figures: data and a Vega-Lite drawing, as SVG for a page, and as files for a paper.
 
-Colours in drawings are names that a page gives a value to, light or dark; files for a paper have
-them resolved. Drawings are made for a width, so that text keeps its size in both.
+Drawings use CSS variables as colours. A page defines them for its light and dark themes; files for
+a paper have fixed values. A drawing is made for a width, which keeps the size of its text.
 """
 
 from __future__ import annotations
@@ -40,14 +40,8 @@ PRINTED_FONT = "Liberation Sans, Arial, Helvetica, sans-serif"
 class Figure:
     """A figure.
 
-    Parameters
-    ----------
-    slug : str
-        Its name in files and links; different for every figure of a page.
-    frames : mapping of str to DataFrame
-        Data by the names that the drawing has for them.
-    caption : str
-        Plain text.
+    `slug` is its name in files and links, unique in a page. `frames` has the data by their names
+    in the drawing. `caption` is plain text.
     """
 
     slug: str
@@ -68,7 +62,7 @@ class Figure:
 
 
 def _rows(frame: pl.DataFrame) -> list[dict[str, Any]]:
-    """Return rows; numbers that JSON does not have are null, and digits that nobody sees go."""
+    """Return the rows for JSON: six digits per number, null for infinity and NaN."""
     return [
         {name: _plain(value) for name, value in row.items()} for row in frame.iter_rows(named=True)
     ]
@@ -85,12 +79,12 @@ def svg(figure: Figure) -> str:
     import vl_convert
 
     text = vl_convert.vegalite_to_svg(figure.spec())
-    # Links within the page are taken for those of a site of Vega's.
+    # vl-convert resolves links within the page against a site of Vega; restore them.
     text = text.replace("https://vega.github.io/vega-datasets/#", "#")
-    # Sizes are the page's; what a page has many of must not be huge.
+    # Two decimals and no ARIA attributes keep a page with many figures small.
     text = re.sub(r"(?<=\d\.\d\d)\d+", "", text)
     text = re.sub(r' (?:role|aria-\w+)="[^"]*"', "", text)
-    # Names within a drawing go on from the one drawn before it: every figure has its own.
+    # vl-convert numbers ids across drawings; ids by slug do not depend on earlier drawings.
     names = list(dict.fromkeys(re.findall(r'id="(\w+)"', text)))
     for place, name in enumerate(names):
         text = re.sub(rf"\b{name}\b", f"{figure.slug}-{place}", text)
@@ -106,25 +100,25 @@ def svg(figure: Figure) -> str:
 
 
 def printed_svg(figure: Figure, width_pt: float = COLUMN_PT) -> str:
-    """Return a figure as an SVG document of a paper's column: black on white, text at 7 pt."""
+    """Return a figure as an SVG document for a column of a paper, with text of 7 pt."""
     import vl_convert
 
     text = str(vl_convert.vegalite_to_svg(_printed(figure, width_pt)))
-    # Drawn in points, a unit each.
+    # One unit of the drawing is one point.
     return re.sub(
         r'width="([\d.]+)" height="([\d.]+)"', r'width="\1pt" height="\2pt"', text, count=1
     )
 
 
 def pdf(figure: Figure, width_pt: float = COLUMN_PT) -> bytes:
-    """Return a figure as PDF of a paper's column: black on white, text at 7 pt."""
+    """Return a figure as PDF for a column of a paper, with text of 7 pt."""
     import vl_convert
 
     return bytes(vl_convert.vegalite_to_pdf(_printed(figure, width_pt)))
 
 
 def _printed(figure: Figure, width_pt: float) -> Spec:
-    """Return the drawing that is as wide as it shall be: axes take what they take."""
+    """Return the drawing whose total width, with axes, is `width_pt`, within 1 pt if possible."""
     import vl_convert
 
     asked = width_pt
@@ -141,7 +135,7 @@ def _printed(figure: Figure, width_pt: float) -> Spec:
 
 
 def _resolved(drawing: Spec) -> Spec:
-    """Return a drawing with the colours and letters of paper."""
+    """Return a drawing with the colours and the font of printed figures."""
     text = json.dumps(drawing)
     for name, value in {**PRINTED, FONT: PRINTED_FONT}.items():
         text = text.replace(name, value)
@@ -157,7 +151,7 @@ def javascript() -> str:
     """
     from importlib.metadata import version
 
-    # Without a home (RuntimeError), or where it cannot be written, every process makes the script.
+    # Without a home directory (RuntimeError) or a writable cache, every process makes the script.
     with suppress(OSError, RuntimeError):
         caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         kept = Path(caches, "dwell", f"vega-{version('vl-convert-python')}.js")
@@ -172,7 +166,7 @@ def javascript() -> str:
 def _made_javascript() -> str:
     import vl_convert
 
-    # Without a snippet it is the whole bundle; the types of the package ask for one.
+    # Without a snippet the function returns the complete bundle; its type stub requires a snippet.
     return str(vl_convert.javascript_bundle())  # type: ignore[call-arg]
 
 
@@ -181,7 +175,7 @@ def _style(letters: float) -> Spec:
     text = {"labelFontSize": letters, "titleFontSize": letters, "labelFont": FONT}
     text |= {"titleFont": FONT, "titleFontWeight": "normal"}
     return {
-        # Every mark would say what it is, twice its own length.
+        # The description of a mark would be twice as long as the mark.
         "aria": False,
         "font": FONT,
         "view": {"stroke": None, "fill": None},

@@ -1,4 +1,4 @@
-"""Figures and tables of a page as files for a paper: PDF, SVG, LaTeX, and CSV of what they show."""
+"""Figures and tables of a page as files for a paper: PDF, SVG, LaTeX, and CSV of their data."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from dwell.report.table import Table, Text
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-#: Width of both columns of a paper, points, and columns of a table above which it has that.
+#: Width of both columns of a paper in points; a table with more columns than this is that wide.
 BOTH_PT, MOST_COLUMNS = 516, 6
-#: What LaTeX writes otherwise.
+#: LaTeX for special characters.
 ESCAPES = {
     "\\": r"\textbackslash{}",
     **{sign: f"\\{sign}" for sign in "&%$#_{}"},
@@ -37,13 +37,10 @@ ESCAPES = {
 
 
 def figure_files(page: Page) -> Iterator[tuple[str, bytes | str]]:
-    """Yield every figure and table of a page as files.
+    """Yield name and content of the files of every figure and table of a page.
 
-    Yields
-    ------
-    (str, bytes or str)
-        A file's name and what it holds: of a figure ``SLUG.pdf``, ``SLUG.svg`` and a CSV for each
-        of its tables of data; of a table ``SLUG.csv`` and ``SLUG.tex``.
+    A figure has ``SLUG.pdf``, ``SLUG.svg`` and one CSV file per data frame; a table has
+    ``SLUG.csv`` and ``SLUG.tex``.
     """
     import polars as pl
 
@@ -76,9 +73,9 @@ def _file_name(slug: str) -> str:
 
 
 def table_tex(table: Table) -> str:
-    """Return a table as LaTeX, 7-point text: one column of a paper wide, or both where it is wide.
+    """Return a table as LaTeX in 7-point text, one column of a paper wide, or two for many columns.
 
-    It needs the packages booktabs and xcolor.
+    The LaTeX needs the packages booktabs and xcolor.
     """
     wide = len(table.columns) > MOST_COLUMNS
     align = "".join("l" if isinstance(column, Text) else "r" for column in table.columns)
@@ -105,7 +102,7 @@ def _environment() -> Environment:
 
 
 def _tex(text: str) -> str:
-    """Return a text as LaTeX writes it; symbols with an index are set in mathematics."""
+    """Return a text as LaTeX, with indexed symbols in math mode."""
 
     def written(sign: re.Match[str]) -> str:
         letter, index = sign.groups()

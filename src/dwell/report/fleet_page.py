@@ -1,4 +1,4 @@
-"""The page of a fleet: every cell, the worst first, who was where, and what rounds changed."""
+"""Page of a fleet: the cells, their placements over time, and the effects of rounds."""
 
 from __future__ import annotations
 
@@ -24,33 +24,25 @@ if TYPE_CHECKING:
     from dwell.record import FleetRun
 
 MOVES = Measure("moves", "moves", decimals=0)
-#: Room beside the panels of cells, and between them, pixels.
+#: Room next to the panels of cells, and between them, pixels.
 BESIDE_PX, GAP_PX = 120, 18
 ROUNDS_PX = 190
-#: Cells whose table is open.
+#: Largest number of cells for which the table of cells is open.
 UNFOLDED = 24
-#: Where a cell goes that stays.
+#: Target of a move in figures if the cell stays.
 STAYS = "no move"
 
 
 def fleet_page(run: FleetRun, *, links: Mapping[str, str] | None = None) -> Page:
-    """Return what there is to show of a fleet's run.
+    """Return the page of a run of a fleet; `SimulationError` without windows after the warm-up.
 
-    Parameters
-    ----------
-    links : mapping of str to str, optional
-        Where the pages of cells are, by their names.
-
-    Raises
-    ------
-    SimulationError
-        If no window is after the warm-up.
+    `links` has the addresses of the pages of cells, by the name of the cell.
     """
     return _FleetPage(run, links or {}).page()
 
 
 class _FleetPage:
-    """Parts of a fleet's page, made from its runs."""
+    """The parts of the page of a fleet."""
 
     def __init__(self, run: FleetRun, links: Mapping[str, str]) -> None:
         self.run, self.links = run, links
@@ -65,7 +57,7 @@ class _FleetPage:
         )
         used = set(run.windows["placement"].cast(str))
         self.palette = Palette.of(candidates)
-        #: Colours of the candidates that any cell was on.
+        #: Colours of the placements that at least one cell used.
         self.used = {name: hue for name, hue in self.palette.placements.items() if name in used}
 
     def page(self) -> Page:
@@ -127,7 +119,7 @@ class _FleetPage:
         )
 
     def _disturbed(self) -> list[Disturbed]:
-        """Return what befell cells, and of how many where it was not all of them."""
+        """Return the disturbances of cells, with the number of cells unless all have them."""
         count = Counter[Disturbed]()
         for entry in self.run.fleet.entries:
             for one in disturbed(entry.cell.scenario(entry.scenario), entry.cell.fabric):
@@ -293,7 +285,7 @@ class _FleetPage:
 
 
 def _dots(cells: Sequence[str], headings: Sequence[str], width: float) -> Spec:
-    """Return the drawing of several measures of cells, a row a cell."""
+    """Return the drawing of several measures of cells, with one row per cell."""
     where = {
         "x": quantity("value", None, axis={"tickCount": 4}),
         "y": name_of("cell", sort=list(cells), axis={"labelOverlap": True}),

@@ -1,4 +1,4 @@
-"""Tables of a cell, its scenarios and its contenders, with which a report ends."""
+"""Last part of a report: the cell, its placements and scenarios, and the policies."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from dwell.report.page import Block, Definitions
 from dwell.report.palette import FAMILIES, Palette, contended
 from dwell.report.table import Columns, Table, Text
 
-#: By what stands in brackets behind a policy.
+#: Sentences by the name in brackets after a policy.
 BELIEFS = {
     **{name: estimator.sentence for name, estimator in ESTIMATORS.items()},
     "hindsight": "is told, one window late, what every placement would have cost: what the rule "
     "does with estimates that are right.",
 }
-#: By what stands with a hyphen behind a policy.
+#: Sentences by the name after a policy and a hyphen.
 VARIANTS = {
     "thresholds": "by the thresholds alone, without a cost.",
     "tuned": "with settings that were chosen on seeds that nothing else is done on.",
@@ -36,7 +36,7 @@ VARIANTS = {
 def method_blocks(
     problem: Problem, scenarios: Sequence[str], policies: Iterable[str], prefix: str = ""
 ) -> list[Block]:
-    """Return what a cell is, where its placements put tasks, what happens to it, who decides."""
+    """Return the descriptions of a cell, its placements, its scenarios and the policies."""
     return [
         Definitions(cell_definitions(problem)),
         placements_table(problem, prefix),
@@ -46,7 +46,7 @@ def method_blocks(
 
 
 def cell_definitions(problem: Problem) -> dict[str, str]:
-    """Return what a cell is, and what its controller does, by headings."""
+    """Return the settings of a cell and its controller, by heading."""
     estimator = estimator_of(problem)
     problem = resolved(problem, estimator)
     pipeline, controller = problem.pipeline, problem.controller
@@ -76,7 +76,7 @@ def cell_definitions(problem: Problem) -> dict[str, str]:
 
 
 def placements_table(problem: Problem, prefix: str = "") -> Table:
-    """Return where each candidate puts the tasks that can move."""
+    """Return a table of the nodes of movable tasks in each candidate."""
     movable = [name for name, task in problem.pipeline.tasks.items() if not task.anchored]
     rows = [
         {"placement": name, **{task: placement[task] for task in movable}}
@@ -91,7 +91,7 @@ def placements_table(problem: Problem, prefix: str = "") -> Table:
 
 
 def scenarios_table(problem: Problem, names: Sequence[str], prefix: str = "") -> Table:
-    """Return what the scenarios add to a cell, a row a disturbance."""
+    """Return a table of the scenarios, with one row per disturbance."""
     rows = []
     for name in names:
         for item in problem.scenario(name):
@@ -135,7 +135,7 @@ def _disturbance(item: NodeDisturbance | LinkDisturbance) -> dict[str, str]:
 
 
 def _process(process: Process) -> str:
-    """Return a process as its kind and its parameters, milliseconds."""
+    """Return the kind of a process and its parameters in milliseconds, as text."""
     if isinstance(process, Trace):
         return f"{process.expectation:.3g} ms in the mean, replayed from {process.table.file}"
     numbers = ", ".join(
@@ -151,7 +151,7 @@ def _accelerators(node: Node) -> str:
 
 
 def _cost(problem: Problem) -> str:
-    """Return J with the numbers of this cell."""
+    """Return the formula of J with the weights and targets of a cell."""
     weights, targets = problem.objective.weights, problem.objective.targets
     terms = [
         f"{weights.latency:g} · L95 / {targets.latency_ms:.4g} ms",
@@ -177,12 +177,9 @@ def _caps(problem: Problem) -> str:
 
 
 def describe_contenders(problem: Problem, names: Iterable[str]) -> dict[str, str]:
-    """Return every policy and every estimator once: a sentence each, by the name that is shown.
+    """Return a sentence per policy, variant and estimator, by the shown name.
 
-    Parameters
-    ----------
-    names : iterable of str
-        As in tables; those that nothing is known of are left out.
+    `names` are names of policies in tables; the result leaves out unknown names.
     """
     names = tuple(names)
     sentences: dict[str, str] = {}
@@ -203,7 +200,7 @@ def describe_contenders(problem: Problem, names: Iterable[str]) -> dict[str, str
 
 
 def numbered(seeds: Sequence[int]) -> str:
-    """``seeds 1 to 20``, or a list of them where they are no range; ``seed 1``."""
+    """Return seeds as text: a range, ``seeds 1 to 20``, or a list, ``seeds 1, 5``."""
     if len(seeds) > 2 and list(seeds) == list(range(seeds[0], seeds[-1] + 1)):
         return f"seeds {seeds[0]} to {seeds[-1]}"
     return f"{'seed' if len(seeds) == 1 else 'seeds'} {', '.join(map(str, seeds))}"

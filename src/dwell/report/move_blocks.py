@@ -1,4 +1,4 @@
-"""Predicted moves in a page: a figure and a table of what was estimated, and what was then seen."""
+"""Figure and table of predicted moves: estimates, and the measurements that followed."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from dwell.report.table import MOST_ROWS, Columns, Row, Table, Text
 if TYPE_CHECKING:
     import polars as pl
 
-#: What is predicted of a move: its column, its standard error's, its name, unit and factor.
+#: Predicted metrics: column, column of the standard error, name, unit and factor.
 PREDICTED = (
     ("l95_ms", "l95_error_ms", "L95", "ms", 1.0),
     ("violation_rate", "violation_error", "V_D", "%", 100.0),
 )
-#: Room beside the two panels, and the largest side of one, pixels.
+#: Width left for axes and legend next to the two panels, and largest side of a panel, pixels.
 BESIDE_PX, SIDE_PX = 230, 300
 #: Share of the range that is free at each end of an axis.
 MARGIN = 0.06
@@ -33,18 +33,10 @@ def move_blocks(
     about: Sequence[Text] = (),
     group: Text | None = None,
 ) -> list[Figure | Table]:
-    """Return a figure and a table of predicted moves; nothing where there are none.
+    """Return a figure and a table of predicted moves, or an empty list without moves.
 
-    Parameters
-    ----------
-    moves : DataFrame
-        As of `dwell.study.predicted_moves.predicted_moves`, with the columns of `about`.
-    palette : Palette
-        Colours of the candidates.
-    about : sequence of Text
-        First columns of the table.
-    group : Text, optional
-        Column of whose values each has a heading in the table.
+    `moves` is a frame of `dwell.study.predicted_moves.predicted_moves` with the columns of
+    `about`, the first columns of the table. The table has a heading for each value of `group`.
     """
     if moves.is_empty():
         return []
@@ -136,7 +128,7 @@ def _scatter(
 
 
 def _range(frame: pl.DataFrame, column: str, error: str) -> tuple[float, float]:
-    """Return the ends of both axes: of all values with their bars, and some room."""
+    """Return the ends of both axes: the range of values and error bars, with a margin."""
     ends = [
         value + sign * (off or 0.0)
         for when in ("predicted", "seen")

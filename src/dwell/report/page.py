@@ -1,7 +1,7 @@
-"""A page: sections of figures and tables, as one file without anything from outside.
+"""Pages of figures and tables, each one HTML file that loads nothing from elsewhere.
 
-Figures stand in the page as static SVG, and, unless the page is static, as Vega-Lite that a script
-of the page draws again: with numbers under the pointer, and a choice of policies and seeds.
+A page contains its figures as SVG. Unless the page is static, a script draws them again with
+Vega-Lite: with tooltips, and a choice of policies and seeds.
 """
 
 from __future__ import annotations
@@ -28,16 +28,9 @@ TEMPLATES = Path(__file__).with_name("templates")
 
 
 class Fact(NamedTuple):
-    """A number that answers the page's question.
+    """A number that answers the question of the page.
 
-    Parameters
-    ----------
-    value : str
-        With its unit.
-    error : str
-        Its interval, or what else belongs to it.
-    word : str
-        Word of a verdict, where there is one.
+    `value` includes the unit. `error` is the interval or another remark; `word` is the verdict.
     """
 
     name: str
@@ -47,7 +40,7 @@ class Fact(NamedTuple):
 
 
 class Definitions(NamedTuple):
-    """Terms, and what stands for them; plain text."""
+    """Terms and their meanings, plain text."""
 
     entries: Mapping[str, str]
 
@@ -59,14 +52,8 @@ Block: TypeAlias = "Figure | Table | Definitions"
 class Section:
     """A part of a page.
 
-    Parameters
-    ----------
-    note : str
-        Fixed text under the heading.
-    anchor : str
-        Name for links within the page.
-    folded : bool
-        Whether it is opened by a click.
+    `note` is a text under the heading and `anchor` a name for links within the page. A click opens
+    a `folded` section.
     """
 
     title: str
@@ -80,14 +67,7 @@ class Section:
 class Page:
     """A report, the answer first.
 
-    Parameters
-    ----------
-    subtitle : str
-        Subject of the report.
-    policies : mapping of str to str
-        Colours of the policies that can be chosen, by how they are written.
-    seeds : sequence of int
-        Seeds that can be chosen.
+    A reader can choose among `policies`, a mapping of names to colours, and among `seeds`.
     """
 
     title: str
@@ -99,36 +79,27 @@ class Page:
 
     @property
     def figures(self) -> Iterator[Figure]:
-        """All figures, in their order."""
+        """All figures, in the order of the page."""
         for part in self.sections:
             yield from (block for block in part.blocks if isinstance(block, Figure))
 
     @property
     def tables(self) -> Iterator[Table]:
-        """All tables, in their order."""
+        """All tables, in the order of the page."""
         for part in self.sections:
             yield from (block for block in part.blocks if isinstance(block, Table))
 
 
 def page_html(page: Page, *, static: bool = False) -> str:
-    """Return a page as HTML.
+    """Return a page as HTML; a static page has no scripts and no data for them.
 
-    Parameters
-    ----------
-    static : bool
-        Whether scripts, and the data that they draw, are left out.
-
-    Returns
-    -------
-    str
-        One file: nothing is loaded from elsewhere, and nothing is evaluated as code (its content
-        security policy forbids both).
+    The content security policy of the page forbids loading anything and evaluating text as code.
     """
     scripts: list[str] = []
     specs: dict[str, str] = {}
     if not static:
         scripts = [javascript(), (TEMPLATES / "page.js").read_text(encoding="utf-8")]
-        # A script ends at the first end tag, whatever it stands in.
+        # The first end tag ends a script, even inside a string.
         specs = {
             figure.slug: json.dumps(figure.spec(), separators=(",", ":")).replace("</", "<\\/")
             for figure in page.figures
@@ -152,7 +123,7 @@ def page_html(page: Page, *, static: bool = False) -> str:
 
 @cache
 def environment() -> Environment:
-    """Return the templates, with how texts are marked up."""
+    """Return the environment of the templates, with the filters ``marked`` and ``digest``."""
     import jinja2
 
     found = jinja2.Environment(
@@ -168,15 +139,15 @@ def environment() -> Environment:
 
 
 def _digest(script: str) -> str:
-    """Return how a content security policy names a script that stands in the page."""
+    """Return the SHA-256 digest of an inline script for a content security policy, in base 64."""
     return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
 
 
 def _marked(text: str) -> str:
-    """Escape a text; set `code` and symbols with an index."""
+    """Return a text as HTML: escaped, with `code` and indexed symbols marked up."""
     from jinja2.filters import do_mark_safe
 
     html = re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text, quote=False))
     html = SYMBOL.sub(r"\1<sub>\2</sub>", html)
-    # A number stays on one line with its unit.
+    # A no-break space keeps a number and its unit on one line.
     return do_mark_safe(re.sub(r"(?<=\d) (?=(?:%|ms|s)(?!\w))", "\u00a0", html))

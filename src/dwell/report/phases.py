@@ -1,4 +1,4 @@
-"""Phases: the stretches of a run in which the same disturbances were on, and what each showed."""
+"""Phases of a run, the stretches with the same active disturbances, and their results."""
 
 from __future__ import annotations
 
@@ -22,18 +22,12 @@ if TYPE_CHECKING:
     from dwell.report.run_header import RunHeader
 
 CALM = "baseline"
-#: Runs with more phases are not told phase by phase.
+#: Largest number of phases in a table; runs with more phases have no table.
 MOST = 16
 
 
 class Phase(NamedTuple):
-    """A stretch of time.
-
-    Parameters
-    ----------
-    name : str
-        ``baseline``, or the kinds of what was on.
-    """
+    """A stretch of time, named ``baseline`` or by the kinds of its disturbances."""
 
     name: str
     begin_s: float
@@ -41,7 +35,7 @@ class Phase(NamedTuple):
 
 
 def phases(events: Sequence[Disturbed], end_s: float) -> list[Phase]:
-    """Return the phases of a run from its beginning on."""
+    """Return the phases of a run in order, from 0 to `end_s`."""
     edges = {0.0, end_s}
     for event in events:
         edges.update(edge for edge in (event.begin_s, event.end_s) if 0 < edge < end_s)
@@ -57,20 +51,13 @@ def phases(events: Sequence[Disturbed], end_s: float) -> list[Phase]:
 
 
 class PhaseRow(NamedTuple):
-    """One phase.
+    """Results of a phase.
 
-    Parameters
-    ----------
-    violation_rate, l95_ms : float
-        By final latencies; L95 is infinite where more than 5 % never finished.
-    lost : int
-        Cycles that never finished.
-    shares : mapping of str to float
-        Shares of the cycles, by placement; the largest first.
-    migrations, guard_moves : int
-        By when the first cycle on the new placement was released.
-    rms_mm, rms_px : float
-        Tracking error; NaN where it is not known.
+    `violation_rate` and `l95_ms` use final latencies; L95 is infinite if more than 5 % of the
+    cycles never finished. `lost` counts those cycles. `shares` has the share of the cycles by
+    placement, the largest first. A move counts in the phase that releases the first cycle on the
+    new placement; `migrations` leaves out moves of the guard. `rms_mm` and `rms_px` are the
+    tracking error, NaN if unknown.
     """
 
     name: str
@@ -88,7 +75,7 @@ class PhaseRow(NamedTuple):
 
 
 def phase_rows(run: Run, header: RunHeader) -> list[PhaseRow]:
-    """Return the phases of a run that have cycles; none where there are too many of them."""
+    """Return the phases of a run that have cycles; an empty list for more than `MOST` phases."""
     import polars as pl
 
     cycles = run.cycles[: run.last_window_end]
@@ -131,7 +118,7 @@ def phase_rows(run: Run, header: RunHeader) -> list[PhaseRow]:
 
 
 def phase_table(rows: Sequence[PhaseRow], palette: Palette) -> Table:
-    """Return the phases of a run, one a row; its error only where that is known."""
+    """Return a table with one row per phase; it has the tracking error if a phase knows it."""
     used = {name for row in rows for name in row.shares}
     names = [name for name in palette.placements if name in used]
     columns: Columns = [
@@ -160,7 +147,7 @@ def phase_table(rows: Sequence[PhaseRow], palette: Palette) -> Table:
 
 
 def _moves(cycles: pl.DataFrame) -> list[tuple[float, str]]:
-    """When the first cycle on another placement was released, and on which."""
+    """Return release (seconds) and placement of the first cycle after each change."""
     import polars as pl
 
     placed = cycles.select("release_ns", pl.col("placement").cast(pl.String))
@@ -169,14 +156,14 @@ def _moves(cycles: pl.DataFrame) -> list[tuple[float, str]]:
 
 
 def _guarded(run: Run, moved_s: Sequence[tuple[float, str]]) -> list[float]:
-    """Return the instants of the guard's moves."""
+    """Return the releases of the first cycles after the guard's moves, seconds."""
     first = dict(zip(run.windows["window"], run.windows["first_cycle"], strict=True))
     released_ns = dict(zip(run.cycles["cycle"], run.cycles["release_ns"], strict=True))
     found = []
     for move in moves(run):
         if not move.by_guard:
             continue
-        # After the last window there is none that follows.
+        # The last window has no next window, hence no upper bound.
         until_ns = released_ns.get(first.get(move.window + 1, -1), math.inf)
         before_s = [at_s for at_s, name in moved_s if name == move.target]
         mine = [at_s for at_s in before_s if at_s * 1e9 <= until_ns + 1]

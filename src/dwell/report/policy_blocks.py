@@ -1,4 +1,4 @@
-"""Figures and tables of runs by scenario and policy: of comparisons, studies and campaigns."""
+"""Figures and tables of comparisons, studies and campaigns, by scenario and policy."""
 
 from __future__ import annotations
 
@@ -70,20 +70,15 @@ THE_AIM = Limit(100 * AIM, "the aim, 5 %")
 #: The one sentence that is made of numbers (docs/decisions/0007-reports.md).
 HEADLINE = "V_D under 5 %: {most} in {count} of {of} scenarios; in all: {all}; not shown: {open}."
 KEYS = ("scenario", "policy")
-#: Lines of a distribution have so many points at most.
+#: Approximate largest number of points of a line: bins of the logarithmic axis.
 POINTS = 60
 LEAST_SHARE = 1e-4
 
 
 class PolicyBlocks:
-    """Runs by scenario and policy, and how they are shown.
+    """Figures and tables of the runs of a comparison, a study or a campaign.
 
-    Parameters
-    ----------
-    found : StudyRuns
-        The runs of a comparison, a study or a campaign.
-    prefix : str
-        Begins the names of figures and tables, where a page has several of these.
+    The names of figures and tables begin with `prefix`, which keeps them unique in a page.
     """
 
     def __init__(self, found: StudyRuns, prefix: str = "") -> None:
@@ -91,7 +86,7 @@ class PolicyBlocks:
         self.problem, self.runs, self.latencies = found.problem, found.runs, found.latencies
         self.prefix = prefix
         self.deadline = Limit(found.problem.pipeline.deadline_ms, "deadline")
-        # References are no contenders, and have runs.
+        # From the runs: references have runs, too, although they do not compete.
         self.scenarios, self.policies = (
             [str(name) for name in self.runs[column].unique(maintain_order=True)]
             for column in ("scenario", "policy")
@@ -99,20 +94,20 @@ class PolicyBlocks:
         self.palette = Palette.of(
             self.problem.candidates, self.policies, estimator_of(self.problem)
         )
-        #: By what the policies are called in figures.
+        #: Styles by the names of policies in figures.
         self.styles = {shown_contender(name): self.palette.policies[name] for name in self.policies}
 
     @property
     def colours(self) -> dict[str, str]:
-        """Colours by what the policies are called in figures."""
+        """Colours by the names of policies in figures."""
         return {name: style.colour for name, style in self.styles.items()}
 
     def answer(self) -> list[Block]:
-        """Return what a page begins with: V_D of all, and who is under the aim."""
+        """Return the first blocks of a page: V_D of all policies, and counts under the aim."""
         return [self.rate(), self.counts()]
 
     def method(self, **about: str) -> list[Block]:
-        """Return what the cell, the scenarios and the policies are, and what else is to be said."""
+        """Return descriptions of cell, scenarios, policies and versions, and the terms `about`."""
         found = self.found
         versions = ", ".join(f"{name} {text}" for name, text in found.versions.items())
         return [
@@ -138,7 +133,7 @@ class PolicyBlocks:
         return Figure(f"{self.prefix}{measure.column}", title, {"rows": frame}, draw, caption)
 
     def rate(self) -> Figure:
-        """Draw V_D beside the aim."""
+        """Draw V_D with the aim of 5 %."""
         return self.measure(
             RATE,
             limit=THE_AIM,
@@ -150,7 +145,7 @@ class PolicyBlocks:
         )
 
     def tail(self) -> Figure:
-        """Draw L95 beside the deadline."""
+        """Draw L95 with the deadline."""
         return self.measure(
             L95,
             limit=self.deadline,
@@ -184,7 +179,7 @@ class PolicyBlocks:
         )
 
     def placed(self) -> list[Figure]:
-        """Draw where the policies that move spent their windows; nothing where none moves."""
+        """Draw the shares of windows by placement, if at least one policy can move."""
         candidates = self.problem.candidates
         moving = [name for name in self.policies if name not in candidates]
         columns = {f"share_{name}": name for name in candidates}
@@ -197,7 +192,7 @@ class PolicyBlocks:
         return [Figure(f"{self.prefix}shares", title, {"rows": frame}, draw)]
 
     def split(self) -> Figure:
-        """Draw where the time of finished cycles goes."""
+        """Draw the parts of the mean latency of finished cycles."""
         columns = {f"{part}_ms": (shown, 1.0) for part, shown in PARTS_SHOWN.items()}
         frame = self._parts(columns, self.policies)
         heading = "mean latency of finished cycles (ms)"
@@ -230,23 +225,23 @@ class PolicyBlocks:
     # -------------------------------------------------------------------------------- tables
 
     def standing(self, scenario: str, policy: str) -> str:
-        """Return whether V_D is shown to be under 5 %: a word of docs/background/statistics.md."""
+        """Return the verdict on V_D under 5 % (docs/background/statistics.md); "" without runs."""
         mine = self.runs.filter(scenario=scenario, policy=policy)
         if mine.is_empty():
             return ""
         return under(mine["violation_rate"].to_list(), AIM, windows=windows_behind(mine))
 
     def standings(self) -> dict[str, Counter[str]]:
-        """Return, by policy, in how many scenarios which word is said of V_D."""
+        """Return the number of scenarios per verdict on V_D, by policy."""
         return {
             policy: Counter(self.standing(scenario, policy) for scenario in self.scenarios)
             for policy in self.policies
         }
 
     def headline(self) -> str:
-        """Return who is under the aim in most scenarios, who in all, and of whom it is not shown.
+        """Return a sentence on the policies under the aim in most and in all scenarios.
 
-        Each list of policies is `none` where there is no such policy.
+        It also lists the policies without a verdict. An empty list is `none`.
         """
         counts, of = self.standings(), len(self.scenarios)
         best = max(words["under"] for words in counts.values())
@@ -270,7 +265,7 @@ class PolicyBlocks:
         )
 
     def counts(self) -> Table:
-        """Return in how many scenarios V_D of each policy is under the aim, or over it."""
+        """Return a table of the numbers of scenarios per verdict on V_D, by policy."""
         rows = [
             {"policy": policy, **{word: words[word] for word in ("under", "over", "not shown")}}
             for policy, words in self.standings().items()
@@ -289,12 +284,10 @@ class PolicyBlocks:
         )
 
     def results(self, *, compact: bool = False) -> Table:
-        """Return what every policy shows in every scenario.
+        """Return a table of the metrics of every policy in every scenario.
 
-        Parameters
-        ----------
-        compact : bool
-            Whether for a terminal: utilisations without intervals, others with the larger half.
+        For a terminal, `compact` leaves out the intervals of utilisations and shows the larger
+        half of the others.
         """
         shares = [
             Measure(f"share_{name}", name, "%", 100.0, 0)
@@ -305,7 +298,7 @@ class PolicyBlocks:
         rows = [
             {**row, "is": self.standing(row["scenario"], row["policy"])} for row in table.to_dicts()
         ]
-        # Of shares of windows there is no room for intervals.
+        # The table has no room for the intervals of shares.
         bare = [*shares, *(MEASURES[3:5] if compact else ())]
         for row in rows:
             for measure in bare:
@@ -358,7 +351,7 @@ class PolicyBlocks:
 
 
 def named(frame: pl.DataFrame, columns: Sequence[str] = KEYS) -> pl.DataFrame:
-    """Return rows in which scenarios and policies have the names that figures show."""
+    """Return rows with the names of scenarios and policies in figures."""
     import polars as pl
 
     shown = {"scenario": shown_scenario, "policy": shown_contender}
@@ -369,12 +362,9 @@ def named(frame: pl.DataFrame, columns: Sequence[str] = KEYS) -> pl.DataFrame:
 
 
 def scaled(frame: pl.DataFrame, measure: Measure) -> pl.DataFrame:
-    """Return ``mean``, ``low`` and ``high`` of a measure in its shown unit, beside the other keys.
+    """Return a frame of `dwell.study.over_seeds` with columns ``mean``, ``low`` and ``high``.
 
-    Parameters
-    ----------
-    frame : DataFrame
-        Table that `dwell.study.over_seeds` returns.
+    The columns have a measure in its shown unit.
     """
     import polars as pl
 

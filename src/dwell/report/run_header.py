@@ -20,19 +20,11 @@ from dwell.study.drawn_disturbances import disturbances_of
 class RunHeader(NamedTuple):
     """Header of a run.
 
-    Parameters
-    ----------
-    kind : str
-        ``simulated`` or ``live``.
-    scenario, policy, estimator, seed : str
-        As text; a dash where there is none.
-    disturbed : tuple of Disturbed
-        What was done to nodes and links: as it was played, where the run says so, and as its
-        scenario has it elsewhere.
-    shadows : str
-        Share of cycles that each alternative gets as shadows, by placement; a dash for none.
-    recovered : mapping of str to object
-        Losses of a live run's journal.
+    `kind` is ``simulated`` or ``live``. A dash replaces an unknown scenario, policy, estimator,
+    seed or share of shadows. `shadows` has the share of cycles in which each alternative runs as a
+    shadow, by placement. `disturbed` has the recorded disturbances of nodes and links, else the
+    disturbances sampled again from scenario and seed. `recovered` has the losses of a live run's
+    journal.
     """
 
     problem: Problem
@@ -49,13 +41,7 @@ class RunHeader(NamedTuple):
 
     @classmethod
     def of(cls, run: Run) -> RunHeader:
-        """Read the header of a run.
-
-        Raises
-        ------
-        RunError
-            If its record lacks the problem it was made from, or that cannot be read.
-        """
+        """Read the header of a run; `RunError` if its problem or disturbances cannot be read."""
         meta = run.meta
         try:
             problem, disturbances = run.problem, disturbances_of(run)
@@ -84,7 +70,7 @@ class RunHeader(NamedTuple):
 
     @property
     def deadline_ms(self) -> float:
-        """D."""
+        """Deadline D of the pipeline."""
         return self.problem.pipeline.deadline_ms
 
     @property
@@ -99,14 +85,10 @@ class RunHeader(NamedTuple):
 
 
 class Tracking(NamedTuple):
-    """Root mean squares of the error of a run's loop, over short stretches of equal length.
+    """Root mean square of the tracking error of a run, by stretches of `step_s` seconds.
 
-    Parameters
-    ----------
-    begin_s : float
-        From the first release of the run to the first stretch.
-    mm, px : float64 array, shape (stretches,)
-        NaN where the error is not known.
+    `begin_s` is the time from the first release to the first stretch. `mm` and `px` have the shape
+    (stretches,), with NaN for an unknown error.
     """
 
     begin_s: float
@@ -116,13 +98,7 @@ class Tracking(NamedTuple):
 
     @classmethod
     def of(cls, meta: Mapping[str, Any]) -> Tracking | None:
-        """Read the error from a run's record; None where it has none.
-
-        Raises
-        ------
-        RunError
-            If it cannot be read.
-        """
+        """Read the error from the record of a run, None without one; `RunError` if malformed."""
         kept = meta.get("tracking")
         if kept is None:
             return None
@@ -136,7 +112,7 @@ class Tracking(NamedTuple):
         return tracking
 
     def rms(self, begin_s: float, end_s: float) -> tuple[float, float]:
-        """Return the root mean squares in mm and px between two instants; NaN where unknown."""
+        """Return the root mean squares in mm and px between two instants; NaN if unknown."""
         middle_s = self.begin_s + (np.arange(len(self.mm)) + 0.5) * self.step_s
         inside = (begin_s <= middle_s) & (middle_s < end_s)
         return _rms(self.mm[inside]), _rms(self.px[inside])

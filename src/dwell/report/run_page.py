@@ -1,4 +1,4 @@
-"""The report of a single run: what happened, when, and why it was decided so."""
+"""Report of a single run: its metrics over time, its worst windows, and its decisions."""
 
 from __future__ import annotations
 
@@ -66,11 +66,11 @@ if TYPE_CHECKING:
     from dwell.record import Run
 
 WORST = 10
-#: Numbers of a placement that never moves.
+#: Metrics of a placement that never moves.
 KEPT = ("violation_rate", "l95_ms", "cost")
-#: Most labels of a figure's cycles.
+#: Largest number of labels of cycles in a figure.
 LABELS = 25
-#: Share of a deadline that clocks may be off by, where a window's latencies are proven.
+#: Largest error of the clocks in a proven window, as a share of the deadline.
 PROVEN_SHARE = 0.2
 
 
@@ -88,14 +88,14 @@ def run_html(run: Run, *, static: bool = False) -> str:
 
 
 def run_page(run: Run, *, sections: int | None = None) -> Page:
-    """Return what there is to show of a run; its first `sections` only, the answer first."""
+    """Return the page of a run, the answer first; `sections` limits its sections."""
     header = RunHeader.of(run)
     counted = count_in(run, header.problem.window_cycles)
     return _RunPage(run, header, counted, sections).page()
 
 
 class _RunPage:
-    """Parts of a run's page, made from the run."""
+    """The parts of the page of a run."""
 
     def __init__(self, run: Run, header: RunHeader, counted: Counted, sections: int | None) -> None:
         self.run = run
@@ -129,7 +129,7 @@ class _RunPage:
         )
 
     def _policy(self) -> str:
-        """Return the policy's name; a placement's where it never moves."""
+        """Return the name of the policy, or of the placement if the policy is static."""
         if self.header.policy_name == "Static":
             return str(self.counted.windows["placement"][0])
         return shown_policy(self.header.policy_name)
@@ -179,7 +179,7 @@ class _RunPage:
     # ------------------------------------------------------------------------------ in time
 
     def _timeline(self) -> Figure:
-        # Cycles of windows are further sections.
+        # The targets of links are in later sections.
         worst = [] if self.most == 1 else self.worst["window"].to_list()
         links = {number: f"#window-{number}" for number in worst}
         return run_timeline(
@@ -207,7 +207,7 @@ class _RunPage:
             yield phase_table(rows, self.palette)
 
     def _never_moving(self, placements: Mapping[str, Mapping[str, float]]) -> Table:
-        """Return what each placement would have done without moves."""
+        """Return a table of the metrics of each placement without moves, and of this run."""
         rows: list[Mapping[str, object]] = [
             {"placement": name, **numbers} for name, numbers in placements.items()
         ]
@@ -250,7 +250,7 @@ class _RunPage:
         return Table("worst", "", columns, rows, caption=caption, palette=self.palette)
 
     def _cycles(self, window: Mapping[str, object]) -> Figure:
-        """Draw where the time of every cycle of a window went."""
+        """Draw the parts of the latency of every cycle of a window."""
         import polars as pl
 
         first = int(str(window["first_cycle"]))
@@ -270,7 +270,7 @@ class _RunPage:
             value_name="time_ms",
         )
         lost = frame.filter(pl.col("latency_ms").is_null()).select("cycle", "outcome")
-        # Vega measures every label before it drops some that overlap.
+        # Few labels save time: Vega measures every label before it drops overlapping labels.
         shown = cycles["cycle"].to_list()[:: -(-len(cycles) // LABELS)]
         axis = {"values": shown, "labelOverlap": True, "labelAngle": 0}
         across = {"field": "cycle", "type": "ordinal", "title": "cycle", "axis": axis}
@@ -451,7 +451,7 @@ class _RunPage:
     # ------------------------------------------------------------------------------- record
 
     def _known(self) -> Table:
-        """Return what of a live run was not heard, not proven or not kept."""
+        """Return a table of the gaps of a live run: clock errors, lost cycles, journal damage."""
         windows, cycles = self.run.windows, self.run.cycles
         recovered = self.header.recovered
         bound_ms = _number(windows["bound_ms"].max())
@@ -501,7 +501,7 @@ class _RunPage:
 
 
 def _begins(run: Run, header: RunHeader) -> NDArray[np.float64]:
-    """When every window began, seconds; a live run's cycles do not come by their numbers."""
+    """Return the beginning of every window in seconds; live runs use the recorded releases."""
     if not header.live:
         return begins_by_number(run.windows, header.problem.pipeline.period_ms)
     released = dict(zip(run.cycles["cycle"], run.cycles["release_ns"], strict=True))
@@ -517,7 +517,7 @@ def _counts(
     what: str,
     decimals: int,
 ) -> Table:
-    """Return a table of names, their meanings, and how often each stands in a column."""
+    """Return a table of names, their meanings, and their counts and shares in a column."""
     counts, (name, meaning) = Counter(found.cast(str)), columns
     rows = [
         {
@@ -533,7 +533,7 @@ def _counts(
 
 
 def _moving(header: RunHeader, name: str) -> str:
-    """Return where a candidate puts the tasks that are not on one node in all of them."""
+    """Return the nodes of a candidate's tasks, for the tasks on which candidates differ."""
     first = next(iter(header.problem.candidates.values()))
     return ", ".join(
         f"{task} on {node}"

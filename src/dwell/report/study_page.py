@@ -41,7 +41,7 @@ def study_html(study: StudyRuns, *, static: bool = False) -> str:
 
 
 def study_page(study: StudyRuns, *, sections: int | None = None) -> Page:
-    """Return what there is to show of a study; its first `sections` only, the answer first."""
+    """Return the page of a study, the answer first; `sections` limits its sections."""
     blocks = PolicyBlocks(study)
     points = study.runs.select(study.parameters).unique().height if study.parameters else 1
     return Page(
@@ -86,19 +86,18 @@ def _measures(study: StudyRuns) -> list[Measure]:
 
 @dataclass(frozen=True, slots=True)
 class _View:
-    """What is shown over an axis of parameters.
+    """The results of a study along one axis of parameters.
 
     Parameters
     ----------
     place : int
-        Place of the axis in the study.
+        Index of the axis in the study.
     at : str
-        Column of the parameter along it.
+        Column of the parameter along the axis.
     panels : tuple of str
-        Column of the parameter that has a panel and a row for each value; none where there is no
-        other axis.
+        Column of the parameter with one panel and one row per value; empty without a second axis.
     averaged : tuple of str
-        Columns that are averaged over.
+        Columns of the parameters that means are taken over.
     """
 
     study: StudyRuns
@@ -114,13 +113,13 @@ class _View:
 
     @property
     def shown_averaged(self) -> str:
-        """Names of what is averaged over."""
+        """Names of the parameters that means are taken over."""
         return ", ".join(map(self.study.shown_parameter, self.averaged))
 
     def means(self, measure: Measure) -> pl.DataFrame:
-        """Return a measure by scenario, policy, panel and value: means over seeds.
+        """Return the means of a measure over seeds, by scenario, policy, panel and value.
 
-        Of what is averaged over, every seed has its mean first.
+        The runs of each seed are averaged first.
         """
         import polars as pl
 
@@ -132,7 +131,7 @@ class _View:
 
 
 def _by_axis(study: StudyRuns, blocks: PolicyBlocks, place: int) -> Iterator[Section]:
-    """Yield what is shown over an axis: small multiples over another one, means over the rest."""
+    """Yield the sections of an axis: panels by the first other axis, means over the rest."""
     axes = list(study.axes)
     at, *together = axes.pop(place)
     first = [axis[0] for axis in axes]
@@ -186,7 +185,7 @@ def _curve(means: pl.DataFrame, blocks: PolicyBlocks, view: _View, measure: Meas
 
 
 def _pivot(means: pl.DataFrame, blocks: PolicyBlocks, view: _View, measure: Measure) -> Table:
-    """Return a measure: a row a scenario, policy and panel, a column a value of the parameter."""
+    """Return a table of a measure: rows by scenario, policy and panel, columns by value."""
     values = [str(value) for value in means[view.at].unique(maintain_order=True)]
     texts = {
         **{name: view.study.shown_parameter(name) for name in view.panels},
@@ -214,7 +213,7 @@ def _pivot(means: pl.DataFrame, blocks: PolicyBlocks, view: _View, measure: Meas
 
 
 def _points(study: StudyRuns, blocks: PolicyBlocks) -> Table:
-    """Return every point, scenario and policy."""
+    """Return a table with one row per point, scenario and policy."""
     measures = _measures(study)
     keys = (*study.parameters, "scenario", "policy")
     table = over_seeds(study.runs, keys, [one.column for one in measures])

@@ -24,11 +24,11 @@ Row: TypeAlias = "Mapping[str, Any]"
 Columns: TypeAlias = "list[Text | Measure]"
 Kind: TypeAlias = Literal["text", "cell", "policy", "placement", "scenario", "word"]
 
-#: Width of sentences in text.
+#: Largest width of sentences in text, columns.
 PROSE = 100
-#: Rows of a table of what a run may have any number of.
+#: Largest number of rows in tables of moves.
 MOST_ROWS = 200
-#: What the words of verdicts mean for who waits for them; all others are open.
+#: Meaning of the words of verdicts; other words are open.
 WORDS: Mapping[str, Literal["good", "bad"]] = {
     "under": "good",
     "over": "bad",
@@ -46,17 +46,9 @@ WORDS: Mapping[str, Literal["good", "bad"]] = {
 class Text(NamedTuple):
     """A column of texts.
 
-    Parameters
-    ----------
-    column : str
-        Key of the rows.
-    name : str
-        Heading.
-    kind : {"text", "cell", "policy", "placement", "scenario", "word"}
-        A cell's name stays on one line. Other names are written as they are everywhere and have
-        their colour; words of verdicts are marked (see `WORDS`).
-    link : str
-        Where a cell leads to, a format of the row: ``#window-{window}``.
+    `column` is the key of the rows and `name` the heading. The name of a cell stays on one line;
+    policies and placements have their colour, and words of verdicts a mark (see `WORDS`). `link`
+    is the target of a link, formatted with the row: ``#window-{window}``.
     """
 
     column: str
@@ -66,20 +58,11 @@ class Text(NamedTuple):
 
 
 class Cell(NamedTuple):
-    """A cell as it is written.
+    """A cell of a table as text.
 
-    Parameters
-    ----------
-    error : str
-        Error of the number, as text.
-    kind : str
-        ``num``, or the kind of a `Text`; of a word what it means.
-    sort : float or str
-        By which rows are sorted.
-    colour : str
-        Colour of the mark before a name.
-    marker : str
-        Shape of that mark, as in figures.
+    `error` is the interval of a number. `kind` is a class of the page's style: ``num``, ``name``,
+    ``cell``, ``text``, or ``word`` with its meaning. `sort` is the key for sorting rows. `colour`
+    and `marker` describe the mark before a name.
     """
 
     text: str
@@ -95,23 +78,10 @@ class Cell(NamedTuple):
 class Table:
     """A table.
 
-    Parameters
-    ----------
-    slug : str
-        Its name in files and links.
-    columns : sequence of Text or Measure
-        Numbers have an interval where a row has the ends of one (``NAME_low``, ``NAME_high``).
-    rows : sequence of mapping of str to value
-        By the names of columns; None, NaN or nothing where nothing is known.
-    group : Text, optional
-        Rows of equal values in this column, which follow each other, stand under one heading.
-    caption : str
-        Plain text.
-    palette : Palette, optional
-        Colours of policies and placements.
-    compact : bool
-        Whether ``±`` stands before the larger half of an interval however much they differ: for
-        terminals.
+    `slug` is its name in files and links. A row maps names of columns to values; an unknown value
+    is None, NaN or missing. A number has an interval if the row has ``NAME_low`` and
+    ``NAME_high``. Consecutive rows with equal values in the column `group` share a heading.
+    `compact` writes every interval as ``±`` and its larger half, for terminals.
     """
 
     slug: str
@@ -131,7 +101,7 @@ class Table:
         )
 
     def groups(self) -> Iterator[tuple[str, list[list[Cell]]]]:
-        """Yield every group's heading, empty without groups, and the cells of its rows."""
+        """Yield the heading of every group (empty without groups) and the cells of its rows."""
         group, columns = self.group, [self._sized(column) for column in self.columns]
         for heading, rows in itertools.groupby(
             self.rows, lambda row: "" if group is None else self._text(group, row).text
@@ -191,7 +161,7 @@ def _sortable(value: float) -> float | str:
 
 
 def interval_row(values: Mapping[str, Interval]) -> dict[str, float | None]:
-    """Return intervals as the columns of a row; ends that are not known are left out."""
+    """Return intervals as the columns of a row, without unknown ends."""
     found: dict[str, float | None] = {}
     for name, known in values.items():
         found[name] = known.value
@@ -201,12 +171,10 @@ def interval_row(values: Mapping[str, Interval]) -> dict[str, float | None]:
 
 
 def table_text(table: Table, *, width: int | None = None) -> str:
-    """Return a table as text: its title, a line a row, its caption.
+    """Return a table as text: title, rows and caption.
 
-    Parameters
-    ----------
-    width : int, optional
-        Columns of the terminal: cells fold where they are too few. As wide as it takes where None.
+    `width` is the width of the terminal in columns; long cells fold. None does not limit the
+    width of rows.
     """
     from rich.console import Console
     from rich.table import Table as Grid
@@ -246,5 +214,5 @@ def table_text(table: Table, *, width: int | None = None) -> str:
 
 
 def wrapped(text: str, width: int | None = None) -> list[str]:
-    """Return a sentence as lines of at most `PROSE` columns, and of the terminal's where given."""
+    """Return a text as lines of at most `PROSE` columns, or `width` if that is less."""
     return textwrap.wrap(text, min(width or PROSE, PROSE), break_on_hyphens=False)

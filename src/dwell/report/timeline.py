@@ -1,4 +1,4 @@
-"""Runs through time: what they showed by window, where they were placed, what was disturbed."""
+"""Timelines of runs: metrics by window, placements, moves and disturbances."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from dwell.record import FleetRun
     from dwell.report.run_header import Tracking
 
-#: Marks of a panel at most, each a window; of longer runs there are fewer, each of several windows.
+#: Largest number of windows with one mark each; marks in longer runs, each of several windows.
 MOST_MARKS, MOST_BINS = 600, 120
-#: What a mark of several windows shows: ends of the names of its columns, and the quantiles.
+#: Quantiles in a mark of several windows, by the ends of the names of its columns.
 QUANTILES = {"median": 0.5, "min": 0.0, "q1": 0.25, "q3": 0.75, "max": 1.0}
 A_WINDOW = "A mark is a window, in the colour of the placement that was active. "
 A_BIN = (
@@ -34,15 +34,15 @@ A_BIN = (
     "them had; of U, a line and bands. "
 )
 PANEL_PX, USE_PX = 86, 56
-#: Height of a cell's row, and of all of them at most.
+#: Height of the row of a cell, and largest height of all rows, pixels.
 ROW_PX, ROWS_PX = 17, 640
 DASHES: tuple[list[int], ...] = ([], [6, 3], [2, 2], [6, 2, 2, 2])
-#: Scales that every panel has for itself.
+#: Scales that panels do not share.
 OWN = ("color", "strokeDash")
 L95 = "L95 seen (ms)"
 WARMUP, UNPROVEN = "warm-up", "clocks unproven"
 AT = quantity("time", "at (s)", format=".1f")
-#: Layers of every panel.
+#: Layer of every panel: shades for warm-up, unproven clocks and disturbances.
 SHADES = layer(
     "rect",
     {
@@ -56,7 +56,7 @@ SHADES = layer(
 
 
 def begins_by_number(windows: pl.DataFrame, period_ms: float) -> NDArray[np.float64]:
-    """Return when every window began, seconds, by the number of its first cycle."""
+    """Return the beginning of every window in seconds, from the number of its first cycle."""
     begins: NDArray[np.float64] = windows["first_cycle"].to_numpy() * (period_ms / 1e3)
     return begins
 
@@ -74,21 +74,12 @@ def run_timeline(
     title: str = "",
     caption: str = "",
 ) -> Figure:
-    """Draw violation rate, L95, J, utilisation and, where it is known, the tracking error.
+    """Draw violation rate, L95, J, utilisation and, if it is known, the tracking error.
 
-    J of the placement that is active is the measured one; of the others, what the policy estimated
-    at the window's close.
-
-    Parameters
-    ----------
-    begin_s : float64 array, shape (windows,)
-        When each window began, seconds.
-    disturbed : iterable of Disturbed
-        Disturbances, cut at the ends of the run.
-    links : mapping of int to str, optional
-        Where windows lead to, by their numbers.
-    caption : str
-        Stands behind what a mark is; where it is empty, nothing says that a mark is a window.
+    J of the active placement is measured; J of the others is the policy's estimate. `begin_s` has
+    the beginning of each window. The figure cuts disturbances at the ends of the run. `links` maps
+    numbers of windows to targets of links. The caption begins with a sentence on the marks; with
+    an empty `caption` only marks of several windows have that sentence.
     """
     import polars as pl
 
@@ -139,7 +130,7 @@ def run_timeline(
 
 
 def rows_px(cells: int) -> float:
-    """Return the height of a panel with a row a cell, pixels."""
+    """Return the height in pixels of a panel with one row per cell."""
     return min(cells * ROW_PX, ROWS_PX)
 
 
@@ -152,14 +143,9 @@ def fleet_timeline(
     disturbed: Iterable[Disturbed],
     caption: str,
 ) -> Figure:
-    """Draw where the cells of a fleet are, their violation rates, and the load of shared nodes.
+    """Draw the placements of the cells of a fleet, their violation rates, and shared load.
 
-    Parameters
-    ----------
-    cells : sequence of str
-        In the order of the rows.
-    colours : mapping of str to str
-        Of the candidates that any cell was on.
+    `cells` has the order of the rows, and `colours` the colours of all placements that were used.
     """
     import polars as pl
 
@@ -183,7 +169,7 @@ def fleet_timeline(
             }
         )
         placed.append(_stays(frame))
-        # A window that follows a move begins a little later than others do.
+        # A window after a move begins a little later than a multiple of the step.
         bins = ((pl.col("begin") / step_s).round() // each).alias("bin")
         rates.append(frame.group_by(bins).agg(pl.col("cell").first(), pl.col("v_d").mean()))
         cycle_s = problems[name].pipeline.period_ms / 1e3
@@ -193,7 +179,7 @@ def fleet_timeline(
     load_s = (run.load["start_ns"] / 1e9 + step_s / 2).to_numpy()
     frames = {
         "placed": pl.concat(placed),
-        # As long as all cells are there.
+        # Until the first cell ends.
         "rates": _spread(pl.concat(rates), each * step_s).filter(
             pl.col("time") < min(stay["end"][-1] for stay in placed)
         ),
@@ -218,12 +204,9 @@ def fleet_timeline(
 
 
 def _binned(frame: pl.DataFrame, each: int, by: Sequence[str] = ()) -> pl.DataFrame:
-    """Return a row a mark: windows, or `each` of them with the quantiles of every measure.
+    """Return one row per mark: a window, or `each` windows with the quantiles of every measure.
 
-    Parameters
-    ----------
-    frame : DataFrame
-        A row a window, or one for each window and value of `by`.
+    `frame` has one row per window and value of `by`.
     """
     import polars as pl
 
@@ -245,7 +228,7 @@ def _binned(frame: pl.DataFrame, each: int, by: Sequence[str] = ()) -> pl.DataFr
 
 
 def _stays(frame: pl.DataFrame) -> pl.DataFrame:
-    """Return the stays of a cell at its placements, of a row a window."""
+    """Return the stays of a cell at its placements from a frame with one row per window."""
     import polars as pl
 
     stays = frame.group_by(pl.col("placement").rle_id().alias("stay"), maintain_order=True)
@@ -254,7 +237,7 @@ def _stays(frame: pl.DataFrame) -> pl.DataFrame:
 
 
 def _spread(rates: pl.DataFrame, step_s: float) -> pl.DataFrame:
-    """Return mean and ends of V_D over cells, of a row a cell and stretch of time."""
+    """Return mean and range of V_D over cells, from one row per cell and stretch of time."""
     import polars as pl
 
     rate = pl.col("v_d")
@@ -265,7 +248,7 @@ def _spread(rates: pl.DataFrame, step_s: float) -> pl.DataFrame:
 
 
 def resources_in(windows: pl.DataFrame, problem: Problem) -> tuple[str, ...]:
-    """Return the nodes, and the accelerators whose use was measured."""
+    """Return the names of all nodes and of the accelerators with a measured utilisation."""
     return tuple(
         name
         for name, one in problem.fabric.resources.items()
@@ -276,7 +259,7 @@ def resources_in(windows: pl.DataFrame, problem: Problem) -> tuple[str, ...]:
 def _used(
     windows: pl.DataFrame, middle_s: NDArray[np.float64], resources: Sequence[str], each: int
 ) -> pl.DataFrame:
-    """Return the utilisation of resources, a row a resource and mark."""
+    """Return the utilisation in percent, with one row per resource and mark."""
     import polars as pl
 
     frame = pl.DataFrame(
@@ -293,10 +276,7 @@ def _used(
 
 
 def _estimates(timed: pl.DataFrame, candidates: Sequence[str], each: int) -> pl.DataFrame:
-    """Return J of the candidates that were not active, as decisions estimated it.
-
-    Of several windows in a mark, the median.
-    """
+    """Return the estimates of J of inactive candidates; the median for several windows."""
     import polars as pl
 
     priced = timed.filter(pl.col("reason").cast(pl.String) != GUARD)
@@ -321,7 +301,7 @@ def _estimates(timed: pl.DataFrame, candidates: Sequence[str], each: int) -> pl.
 def _timed(
     windows: pl.DataFrame, decisions: pl.DataFrame, begin_s: NDArray[np.float64], cycle_s: float
 ) -> pl.DataFrame:
-    """Return the decisions in the windows, with the `time` after the last cycle looked at."""
+    """Return the decisions with the `time` (seconds) of the end of the last evaluated cycle."""
     import polars as pl
 
     columns = {"window": windows["window"], "first": windows["first_cycle"], "begin": begin_s}
@@ -331,7 +311,7 @@ def _timed(
 
 
 def _moves(timed: pl.DataFrame) -> pl.DataFrame:
-    """Return when moves were decided, of decisions with their times."""
+    """Return the times and reasons of the moves among decisions with times."""
     import polars as pl
 
     return timed.filter("migrated").select(
@@ -348,7 +328,7 @@ def _spans(
     length_s: float,
     end_s: float,
 ) -> pl.DataFrame:
-    """Return what went on: warm-up, unproven clocks, disturbances as far as the run reaches."""
+    """Return the times of warm-up, unproven clocks and disturbances, cut at the run's ends."""
     import polars as pl
 
     rows = []
@@ -374,17 +354,12 @@ def _spans(
 def _over_time(
     panels: Sequence[tuple[float, list[Spec]]], end_s: float, each: int, moves: int
 ) -> Draw:
-    """Draw panels below each other on one axis of time, with what went on and who moved.
+    """Draw panels below each other on one axis of time, with disturbances and moves.
 
-    Parameters
-    ----------
-    panels : sequence of (float, list of Spec)
-        Height, pixels, and layers.
-    each : int
-        Windows of a mark.
+    A panel is its height in pixels and its layers; `each` is the number of windows per mark.
     """
     time: Spec = {"type": "quantitative", "scale": {"domain": [0, end_s], "nice": False}}
-    # On paper there is no caption.
+    # Figures for a paper have no caption, so the axis explains the marks.
     across = "time (s)"
     if each > 1:
         across += f"; a mark: median, quartiles, extremes of {each} windows"
@@ -410,7 +385,7 @@ def _over_time(
 
 
 def _named_spans(width: float, time: Spec) -> Spec:
-    """Return a row for everything that went on, with its name."""
+    """Return a panel with one row per kind of span: warm-up, unproven clocks, disturbances."""
     encoding = {
         "x": {"field": "begin", **time, "axis": None},
         "x2": "end",
@@ -426,7 +401,7 @@ def _named_spans(width: float, time: Spec) -> Spec:
 
 
 def _migrations(count: int) -> Spec:
-    """Return upright lines at migrations, the fainter the more there are."""
+    """Return vertical lines at migrations, fainter for many migrations."""
     encoding = {
         "color": {"condition": {"test": "datum.reason === 'guard'", "value": BAD}, "value": INK},
         "opacity": {"value": min(0.35, 35 / max(count, 1))},
@@ -438,7 +413,7 @@ def _migrations(count: int) -> Spec:
 def _marks(
     field: str, title: str, colours: Mapping[str, str], each: int, *, log: bool = False
 ) -> list[Spec]:
-    """Return the marks of a panel: a window each, or `each` windows."""
+    """Return the marks of a panel, each for `each` windows."""
     scale: Spec = {"type": "log", "nice": False} if log else {"zero": field == "v_d"}
     legend = {"symbolSize": 60, "symbolOpacity": 0.9} if field == "v_d" else None
     shown = field if each == 1 else f"{field}_median"
@@ -452,11 +427,11 @@ def _marks(
     point = {
         "y": quantity(shown, title, scale=scale, axis={"tickCount": 4}),
         "color": colour,
-        # What leads nowhere would lead away from the page.
+        # An empty link would leave the page.
         "href": {"condition": {"test": "datum.link !== null", "field": "link"}},
         "tooltip": about,
     }
-    # On paper many stand side by side.
+    # Points of bins are small: figures for a paper are narrow.
     size = 18 if each == 1 else 8
     marks = [disc(point, size, rows="windows", opacity=0.9)]
     if each == 1:
@@ -479,7 +454,7 @@ def _marks(
 
 
 def _placed(cells: Sequence[str], colours: Mapping[str, str]) -> Spec:
-    """Return the stays of cells at their placements, a row a cell."""
+    """Return the layer of the stays of cells at their placements, one row per cell."""
     encoding = {
         "x": "begin",
         "x2": "end",
@@ -496,7 +471,7 @@ def _placed(cells: Sequence[str], colours: Mapping[str, str]) -> Spec:
 
 
 def _rates() -> list[Spec]:
-    """Return the mean over cells of V_D, and a band from the least to the most."""
+    """Return the layers of the mean of V_D over cells and of its range, a band."""
     about = [AT, *names("worst")]
     about += [quantity(how, f"{how} (%)") for how in ("max", "mean", "min")]
     up = {"y": quantity("mean", "V_D (%)", axis={"tickCount": 4})}
@@ -517,7 +492,7 @@ def _others(colours: Mapping[str, str]) -> Spec:
 
 
 def _use(resources: Sequence[str], each: int) -> list[Spec]:
-    """Return a line a resource; of several windows a mark, with bands of quartiles and extremes."""
+    """Return one line per resource, with bands of quartiles and extremes for several windows."""
     shades = {name: (INK, MUTED)[place % 2] for place, name in enumerate(resources)}
     dashes = [DASHES[place % len(DASHES)] for place in range(len(resources))]
     axis, scale = {"values": [0, 50, 100]}, {"domain": [0, 104]}

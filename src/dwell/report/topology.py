@@ -15,23 +15,23 @@ from dwell.report.palette import INK, MUTED, PAPER, SHADE
 if TYPE_CHECKING:
     from dwell.model import Link
 
-#: Size of a node, and the height of a line in it, pixels.
+#: Width of a node, and height of a line of text in it, pixels.
 NODE_PX, LINE_PX = 150, 15
-#: Nodes stand on an ellipse, the edge and the cloud on top, robots below.
+#: Order of the nodes on an ellipse, clockwise from the top.
 TIERS = ("cloud", "edge", "robot")
 
 
 def topology(problem: Problem) -> Figure:
     """Draw a cell's topology.
 
-    A line stands for the links of both ways, with the delay and the rate of the first that is
-    declared. Tasks in a node may run there; those that one node only can run are in parentheses.
+    A line shows the links of both directions, with the delay and rate of the link that the cell
+    declares first. A node lists the tasks that it can run, anchored tasks in parentheses.
     """
     import polars as pl
 
     nodes = sorted(problem.fabric.nodes.values(), key=lambda node: TIERS.index(node.tier))
     step = 2 * math.pi / len(nodes)
-    # Half a turn of the robots, so that they stand on the lower half.
+    # Angles grow clockwise from the top, where the first node is.
     places = {
         node.name: (math.sin(i * step), math.cos(i * step)) if len(nodes) > 1 else (0.0, 0.0)
         for i, node in enumerate(nodes)
@@ -102,7 +102,7 @@ def topology(problem: Problem) -> Figure:
 
 
 def _tasks(problem: Problem, node: str) -> list[str]:
-    """Return the tasks that a node can run."""
+    """Return the names of the tasks that a node can run, anchored tasks in parentheses."""
     tasks = problem.pipeline.tasks.values()
     return [f"({one.name})" if one.anchored else one.name for one in tasks if node in one.on]
 

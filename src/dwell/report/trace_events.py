@@ -1,8 +1,8 @@
-"""The jobs of a run as a trace that chrome://tracing and Perfetto show.
+"""Jobs of a run as trace events for chrome://tracing and Perfetto.
 
-Nodes are processes and tasks are threads. A job is a slice from its start to its end; while it
-waits for a worker it is an asynchronous slice of its own, because waiting jobs of a task overlap.
-Cycles are asynchronous slices of a process of their own, where migrations stand as instants.
+Nodes are processes and tasks are threads. A job is a slice from its start to its end. Its wait for
+a worker is a separate asynchronous slice, because waiting jobs of a task overlap. Cycles are
+asynchronous slices of a separate process, and migrations are instants of that process.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from dwell.record import Run
 
 NS_PER_US = 1e3
-# Process of the cycles; nodes follow.
+# Process number of the cycles; the numbers of the nodes follow.
 CELL = 0
-# Threads kept for the workers of a task on a node.
+# Thread numbers reserved for the workers of each task.
 LANES = 1000
 
-#: Of the Chrome JSON trace event format; times are microseconds.
+#: An event in the Chrome JSON trace event format; times are microseconds.
 TraceEvent: TypeAlias = "dict[str, Any]"
 
 
@@ -35,12 +35,12 @@ def trace_events(run: Run) -> dict[str, Any]:
     Parameters
     ----------
     run : Run
-        One that kept its jobs.
+        A run that kept its jobs.
 
     Returns
     -------
     dict
-        In the Chrome JSON trace event format, to be written with ``json.dump``.
+        A trace in the Chrome JSON trace event format; write it with ``json.dump``.
 
     Raises
     ------
@@ -76,10 +76,10 @@ def _names(header: RunHeader, jobs: pl.DataFrame) -> Iterator[TraceEvent]:
 
 
 def _job_events(header: RunHeader, jobs: pl.DataFrame) -> Iterator[TraceEvent]:
-    """Jobs as slices, their waiting as asynchronous ones."""
+    """Yield the jobs as slices, and their waits as asynchronous slices."""
     threads = _threads(jobs)
     known = [jobs[column].max() for column in ("ready_ns", "start_ns", "end_ns")]
-    # A job that runs when the run ends is shown up to there.
+    # A job without an end is shown until the last time of any job.
     last_ns = max((value for value in known if isinstance(value, int)), default=0)
     for (node, task), mine in jobs.group_by("node", "task", maintain_order=True):
         pid, thread = _processes(header)[str(node)], threads[str(task)]
@@ -93,7 +93,7 @@ def _job_events(header: RunHeader, jobs: pl.DataFrame) -> Iterator[TraceEvent]:
                 name, key = f"{task} waits", f"{pid}/{task}/{job['cycle']}"
                 yield from _span(name, "waiting", pid, key, (ready_ns, begun_ns), about)
             if start_ns is not None:
-                # Workers of a task run jobs at once, but slices of a thread may not overlap.
+                # Workers of a task run jobs in parallel; slices of a thread must not overlap.
                 lane = heapq.heappop(free)[1] if free and free[0][0] <= start_ns else len(free)
                 heapq.heappush(free, (end_ns, lane))
                 yield {
@@ -109,7 +109,7 @@ def _job_events(header: RunHeader, jobs: pl.DataFrame) -> Iterator[TraceEvent]:
 
 
 def _cycle_events(cycles: pl.DataFrame, jobs: pl.DataFrame) -> Iterator[TraceEvent]:
-    """Cycles from their release to their completion, or to where the last of them was seen."""
+    """Yield the cycles, from release to completion, or to the last event of their jobs."""
     import polars as pl
 
     seen = jobs.group_by("cycle").agg(
@@ -129,7 +129,7 @@ def _cycle_events(cycles: pl.DataFrame, jobs: pl.DataFrame) -> Iterator[TraceEve
 
 
 def _migration_events(run: Run) -> Iterator[TraceEvent]:
-    """Decisions that migrate, at the release of the first cycle that they did not look at."""
+    """Yield the decisions that migrate, each at the release of its `Move.cycle`."""
     released_ns = dict(run.cycles.select("cycle", "release_ns").iter_rows())
     for move in moves(run):
         if move.cycle not in released_ns:
@@ -151,7 +151,7 @@ def _processes(header: RunHeader) -> dict[str, int]:
 
 
 def _threads(jobs: pl.DataFrame) -> dict[str, int]:
-    """First thread of every task; further workers of it take the numbers after."""
+    """Return the first thread of each task; further workers have the numbers after it."""
     tasks = jobs["task"].unique(maintain_order=True).to_list()
     return {task: LANES * i + 1 for i, task in enumerate(tasks)}
 
@@ -163,7 +163,7 @@ def _name(what: str, pid: int, tid: int, name: str) -> TraceEvent:
 def _span(
     name: str, category: str, pid: int, key: str, ns: tuple[int, int], about: TraceEvent
 ) -> Iterator[TraceEvent]:
-    """Begin and end of an asynchronous slice."""
+    """Yield the begin and end events of an asynchronous slice."""
     begin = {
         "name": name,
         "cat": category,
