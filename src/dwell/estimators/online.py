@@ -1,10 +1,10 @@
-"""Online: what the estimators that watch windows have in common.
+"""Online: common base of the estimators that learn from windows.
 
-They keep a *present*: of every part of a cycle the demands, of every node the foreign threads, and
-which nodes are down; all of it as the cell declares it until there is evidence that it is
-otherwise. A candidate that has nothing of what is otherwise is priced as by the profile. The others
-are played by the kernel (see `Playing`): some windows when the present changes, another one when
-more is known of it, and more of those on which a move may depend, until their prices tell.
+They keep the measured conditions (`Present`): demands of every part of a cycle, foreign threads of
+every node, rates of links, and nodes that are down. Conditions are as declared until evidence shows
+a change. An unaffected candidate has its price from the profile. The kernel simulates the others
+(see `Playing`): several steps after a change, one more step for new samples, and further steps for
+candidates on which the next move may depend.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from dwell.model.problem import Problem
 from dwell.model.qos import QoS, unchecked_qos
 from dwell.model.shadow_plan import by_candidate
 
-#: Steps that are played when the present changes, the first of which settles queues.
+#: Simulated steps after a change of conditions; the first fills the queues.
 FIRST_STEPS = 6
-#: How often a close goes on with candidates that it is not sure of, and how many steps each time.
+#: Largest number of rounds per window for unsure candidates, and steps per round.
 ROUNDS, STEPS = 2, 2
-#: How many standard errors a difference of two prices must be from what would decide otherwise.
+#: Standard errors between a price difference and the thresholds of a decision that make it sure.
 BAND = 2.0
 
 
 class _Declared(NamedTuple):
-    """Work, and metrics, of a candidate as declared, as `unchecked_qos` takes them."""
+    """Work and metrics of a candidate under declared conditions, in the form of `unchecked_qos`."""
 
     work: list[tuple[str, float]]
     latency: tuple[float, float]
@@ -49,14 +49,14 @@ class _Declared(NamedTuple):
 
 
 class Online(CellEstimator):
-    """Base of the estimators that watch windows.
+    """Base of the estimators that learn from windows.
 
     Attributes
     ----------
     shadow_fraction : float, or mapping of str to float
-        Share of the cycles sent through each alternative, by the candidate that is active.
+        Share of cycles sent through each alternative, by active candidate.
     seed : int
-        Seed of what is played.
+        Seed of the simulations.
     """
 
     seed = SEED
