@@ -126,7 +126,7 @@ class CellEstimator(ABC):
 
     @property
     def present(self) -> Present | None:
-        """The measured conditions that differ from the declared ones; None if not measured."""
+        """The measured changes of declared conditions; None if the estimator measures none."""
         return None
 
     @abstractmethod
