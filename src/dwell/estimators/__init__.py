@@ -1,6 +1,6 @@
-"""Estimators: the QoS that every candidate would show, active or not."""
+"""Estimators: they predict the QoS of every candidate, active or not."""
 
 import lazy_loader
 
-# What is asked for is imported, and nothing else; the names are in the stub.
+# The names are in the stub; each is imported at its first use.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

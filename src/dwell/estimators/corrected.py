@@ -1,20 +1,17 @@
 """Corrected: the profile, corrected online by what active and shadow jobs reveal.
 
-Every part of a cycle (a task on a node, a flow on a link) is as declared until windows show it to
-be otherwise; then it has the values that were measured of it, by own jobs and by shadow jobs, and
-those of the newest `MEMORY` half-lives at most (see `dwell.estimators.pool` and
-`dwell.estimators.learning`).
+Every part of a cycle (a task on a node, a flow on a link) has its declared values until windows
+show a change. It then has the values measured by the cell's jobs and by shadow jobs, at most from
+the newest `MEMORY` half-lives (see `dwell.estimators.pool` and `dwell.estimators.learning`).
 
-What nobody measured
-    A message that was not measured while another one on its link changed its regime gets the extra
-    delay and the losses of that one; a job that was not, while another one on its node began to
-    need more, needs so much more, too. A node of which nothing was measured is judged by its
-    foreign load.
+Unmeasured parts
+    If a message on a link changes, unmeasured messages on the link get the same extra delay and
+    losses. If a job on a node changes, unmeasured jobs on the node change by the same factor. A
+    node without any measured job is judged by its foreign load.
 
 Age
-    What is not as declared, and was not measured for a windows, is less and less known: the error
-    of a price grows with the square root of a. In the end (after `UNSEEN` half-lives) what was
-    measured of it is forgotten, and it is as declared.
+    The error of a price grows with the square root of the windows since the last measurement.
+    After `UNSEEN` half-lives without one, the part has its declared values again.
 """
 
 from __future__ import annotations
@@ -32,17 +29,17 @@ class Corrected(Learning):
     Parameters
     ----------
     shadow_fraction : float, optional
-        Share of the cycles sent through each alternative; the cell file's where None. 0 learns
-        from the active placement alone.
+        Share of cycles sent through each alternative [default: the cell file's]. With 0 the
+        estimator learns from the active placement alone.
     half_life_windows : float, optional
-        The cell file's where None; see `MEMORY` and `UNSEEN`.
+        Unit of `MEMORY` and `UNSEEN` [default: the cell file's].
     seed : int
-        Seed of what is played.
+        Seed of the simulations.
 
     Attributes
     ----------
     regimes : int
-        Changes of regime seen since the start.
+        Number of changes detected since the start.
 
     Raises
     ------
@@ -50,7 +47,7 @@ class Corrected(Learning):
         If `half_life_windows` is out of its range.
     """
 
-    #: Half-lives; going back to look can cost dearly.
+    #: Half-lives; long, because a return to a placement just to measure it can be expensive.
     MEMORY: ClassVar[float] = 6.0
     UNSEEN: ClassVar[float] = 60.0
 

@@ -1,8 +1,8 @@
-"""Evidence: what the messages of a closed window said about jobs and links.
+"""Evidence: instants of jobs and messages in a finished window.
 
-Every message carries the instants of the jobs and hops it went through, so that a window shows more
-than its metrics: how long each task took on the node it ran on, and each message on its link. The
-simulator and the live runtime hand over the same instants.
+Every message carries the instants of its jobs and hops. A window therefore shows the time of each
+task on its node and of each message on its link. The simulator and the live runtime provide the
+same instants.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from dwell.model.number_arrays import Ints
 
 Rows: TypeAlias = slice | NDArray[np.bool_] | NDArray[np.int64]
 
-#: Stands for an instant that had not come, or was not known, when the window closed.
+#: Value of an instant that was still in the future, or unknown, at the end of the window.
 UNKNOWN = -1
 
 
@@ -26,20 +26,20 @@ UNKNOWN = -1
 class Instants:
     """Instants of the jobs and messages of a window's cycles, nanoseconds; `UNKNOWN` if never.
 
-    What an engine does not know of any job is None.
+    An array is None if the engine does not measure it.
 
     Parameters
     ----------
     ready_ns, end_ns : int64 array, shape (W, tasks)
-        When all inputs of a job were there, and when it had completed.
+        When all inputs of a job had arrived, and when the job had completed.
     arrived_ns : int64 array, shape (W, flows)
-        When the message of a flow was handed to its target; it was sent when its source's job
-        ended. On one node it is handed over at once.
+        When the message of a flow reached its target task. It was sent when the source's job
+        ended; within a node it arrives at once.
     start_ns : int64 array, shape (W, tasks), optional
-        When a worker began with a job.
+        When a worker started a job.
     work_ns : int64 array, shape (W, tasks), optional
-        Core time that a completed job received, over all of its threads; that of one on an
-        accelerator is from its start to its end.
+        Core time of a completed job, summed over its threads; on an accelerator the time from its
+        start to its end.
     """
 
     ready_ns: Ints
@@ -52,7 +52,7 @@ class Instants:
         return f"<Instants of {len(self.end_ns)} cycles>"
 
     def at(self, rows: Rows) -> Instants:
-        """Instants of some of the cycles."""
+        """Return the instants of the selected cycles."""
         return Instants(
             ready_ns=self.ready_ns[rows],
             end_ns=self.end_ns[rows],
@@ -62,7 +62,7 @@ class Instants:
         )
 
     def columns(self, placement: NDArray[np.integer]) -> tuple[NDArray[np.integer], ...]:
-        """Return what `WindowRows.of` takes of cycles, or shadows, under candidates."""
+        """Return the arguments of `WindowRows.of` for cycles or shadows under candidates."""
         nothing = np.full_like(self.ready_ns, UNKNOWN)
         work_ns = nothing if self.work_ns is None else self.work_ns
         start_ns = nothing if self.start_ns is None else self.start_ns
@@ -71,7 +71,7 @@ class Instants:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """One window's instants, as known at its close; tasks and flows in the pipeline's order.
+    """Instants of a window, as known at its end; tasks and flows in the pipeline's order.
 
     Parameters
     ----------
@@ -84,8 +84,8 @@ class Evidence:
         Instants of the jobs and messages that a shadow did not share with the cycle itself. It
         stops before the sinks: its last messages arrive there and are discarded.
     shadows_share : bool
-        Whether shadow jobs share the cores that own jobs leave with foreign threads as equals.
-        Where they stand behind these, how long they take says nothing of how many there are.
+        Whether shadow jobs share the cores that own jobs leave equally with foreign threads. If
+        they have lower priority, their times do not show the number of foreign threads.
     """
 
     close_ns: int
@@ -99,7 +99,7 @@ class Evidence:
 
     @classmethod
     def of(cls, rows: WindowRows, close_ns: int, release_ns: Ints) -> Evidence:
-        """Make the evidence of instants that are in one table."""
+        """Make the evidence from a table of instants."""
         placement, ready, end, arrived, work, start = rows.columns(shadow=False)
         cycles, shadows = Instants(ready, end, arrived, start, work), None
         if rows.has_shadows:
@@ -113,7 +113,7 @@ class Evidence:
 
     @property
     def rows(self) -> WindowRows:
-        """All instants as one table, which is made once."""
+        """All instants as one table, cached."""
         if self._rows is None:
             sent = None
             if self.shadows is not None:

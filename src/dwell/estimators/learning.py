@@ -1,4 +1,4 @@
-"""Learning: estimators that hold of every part what windows have shown of it."""
+"""Learning: estimators that keep measured values of every part of a cycle."""
 
 from __future__ import annotations
 
@@ -22,25 +22,24 @@ from dwell.model.controller_settings import HALF_LIFE_WINDOWS
 from dwell.model.number_arrays import Floats
 from dwell.model.problem import Problem
 
-#: Deviation of the logarithm of a price one window after a part was measured that is not as
-#: declared.
+#: Standard deviation of the logarithm of a price, one window after a changed part was measured.
 WIDENING = 0.03
-#: Share of the time that a rate takes to send a message which is too short for that rate.
+#: A link is faster than its rate if messages take less than this share of their sending time.
 EARLY = 0.9
 
 
 class Learning(Online):
-    """Base of the estimators that hold a pool of every part.
+    """Base of the estimators that keep a pool of values per part.
 
     Parameters
     ----------
     shadow_fraction : float, optional
-        Share of the cycles sent through each alternative; where None the cell file's, and where
-        that is `auto` by the active candidate (`dwell.estimators.shadow_price`).
+        Share of cycles sent through each alternative [default: the cell file's]. If the file sets
+        `auto`, the share depends on the active candidate (`dwell.estimators.shadow_price`).
     half_life_windows : float, optional
-        The cell file's where None.
+        Unit of `MEMORY` and `UNSEEN` [default: the cell file's].
     seed : int
-        Seed of what is played.
+        Seed of the simulations.
 
     Raises
     ------
@@ -48,8 +47,8 @@ class Learning(Online):
         If `half_life_windows` is out of its range.
     """
 
-    #: Half-lives after which a measured value gives way to newer ones, and after which a part that
-    #: was not measured any more is as declared again.
+    #: Half-lives until newer values replace a measured value, and until a part without new
+    #: measurements has its declared values again.
     MEMORY: ClassVar[float]
     UNSEEN: ClassVar[float]
     states_errors = True
@@ -85,9 +84,9 @@ class Learning(Online):
         given = self._given_fraction
         self.shadow_fraction = fraction_of(problem) if given is None else given
         super().start(problem)
-        #: Decisions that have been learnt from.
+        #: Number of decisions learnt from.
         self._window = 0
-        #: Links on which delays have changed, and the decision at which they last did.
+        #: Links with changed delays, each with the decision of the last change.
         self._doubts: dict[str, int] = {}
         self._pools = {
             part: Pool(reference, isinstance(part, Message))
@@ -122,12 +121,12 @@ class Learning(Online):
             self._correct(changed, frozenset(demands))
 
     def _learn(self, demands: Mapping[Part, Floats], cycles: int) -> list[Part]:
-        """Add values to the pools of their parts; return the parts whose regime has changed."""
+        """Add values to the pools of their parts; return the parts that have changed."""
         changed = []
-        # How often any part is compared with its reference in a window of the cell.
+        # Number of comparisons of a part with its reference in one window of the cell.
         tests = len(self._pools) * max(self.problem.window_cycles / cycles, 1.0)
         least = least_deviations(tests)
-        # Most pools are as declared, and nothing has to be decided about them.
+        # Most pools have their declared values and need no decision.
         when = self._window, self.memory, cycles
         parts = self._meter.numbers(demands)
         looks = self._rows.learn(self._meter.found, parts, *when, least)
@@ -150,7 +149,7 @@ class Learning(Online):
     def _links_of_other_rates(
         self, demands: Mapping[Part, Floats], changed: Sequence[Part], evidence: Evidence
     ) -> set[str]:
-        """Set the rates of links whose messages show another one, and return the links."""
+        """Set the rates of links whose messages show a new rate, and return the links."""
         links = set()
         for part in changed:
             if isinstance(part, Message):
@@ -174,13 +173,13 @@ class Learning(Online):
         return links
 
     def _is_faster(self, evidence: Evidence, parts: Sequence[Message], mbps: float) -> bool:
-        """Whether messages of a part took less time than a rate allows."""
+        """Return whether messages of any part were faster than a rate allows."""
         times = self._meter.times(evidence)
         least = [(times[part], sending_ns(self.problem, part, mbps) / 1e6) for part in parts]
         return any(float(np.median(taken)) < EARLY * ms for taken, ms in least)
 
     def _better_rate(self, link: str, parts: Sequence[Message], evidence: Evidence) -> Rate | None:
-        """Return the rate of a link that explains its messages better than the present one."""
+        """Return a rate that explains the messages of a link better than its current rate."""
         references = {part: self._pools[part].reference for part in parts}
         references = {part: one for part, one in references.items() if one.usual < math.inf}
         if not references:
@@ -203,7 +202,7 @@ class Learning(Online):
         return better_rate(extra_ms, now, declared, deviation_ms)
 
     def _correct(self, changed: Sequence[Part], measured: frozenset[Part]) -> None:
-        """Correct what nobody measured by what has changed."""
+        """Correct unmeasured parts by the changes of measured parts."""
 
     def _otherwise_parts(self) -> list[Part]:
         return [self._meter.parts[number] for number in self._rows.others()]
@@ -212,7 +211,7 @@ class Learning(Online):
         return {part: self._pools[part].held for part in self._otherwise_parts()}
 
     def support(self) -> dict[str, Support]:
-        """Support of each candidate's estimate: that of its weakest part."""
+        """Return the support of each candidate's estimate: the support of its weakest part."""
         self._take_in_pending()
         return {
             name: Support(samples, self._windows_since(last))
@@ -220,7 +219,7 @@ class Learning(Online):
         }
 
     def deviation(self) -> dict[str, float]:
-        """Deviation of the logarithm of each candidate's price, by the age of what is known."""
+        """Return the deviation of the logarithm of each price due to the age of measurements."""
         self._take_in_pending()
         return {
             name: max(self._widening(self._pools[part]) for part in parts)
@@ -233,7 +232,7 @@ class Learning(Online):
         return WIDENING * math.sqrt(max(self._windows_since(pool.last), 0))
 
     def _windows_since(self, decision: int) -> float:
-        """Return the age of what was learnt at a decision, in windows."""
+        """Return the number of windows since a decision."""
         return (self._window - decision) / self.problem.decisions_per_window
 
     def _known_error(self, name: str, rate: float) -> tuple[float, float]:

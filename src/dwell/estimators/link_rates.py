@@ -1,8 +1,8 @@
-"""Link rates: a lower rate of a link is distinguished from a longer delay.
+"""Link rates: distinguish a lower rate of a link from a longer delay.
 
 A longer delay is the same for all messages. A lower rate delays a message by its own bytes and by
-the bytes in front of it. So messages of several loads show the rate: at the true rate the extra
-delays of all of them are the same.
+the bytes ahead of it. Messages of different loads therefore show the rate: at the true rate all
+have the same extra delay.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ import numpy as np
 from dwell.kernels.elementary import logarithms
 from dwell.model.number_arrays import Floats
 
-#: Rates that are tried first: the largest, a share of it, and so on.
+#: First rates to try: the largest, ratio of each to the one before, and number of rates.
 FASTEST_MBPS, SHARE, TRIED = 1000.0, 0.6, 18
-#: Then rates up to so much away from the best one, in so many steps each way.
+#: Then relative distances around the best rate, and steps in each direction.
 NEARER, STEPS = (0.4, 0.05, 0.006), 8
-#: A rate above this share of the declared one is the declared one.
+#: A rate above this share of the declared rate counts as the declared rate.
 LOWER = 0.9
-#: Gain of log-likelihood by which a rate explains messages better than a delay.
+#: Smallest gain in log-likelihood for a rate to explain messages better than a delay.
 GAIN = 8.0
 #: Least deviation of a delay, milliseconds.
 LEAST_MS = 0.05

@@ -1,10 +1,10 @@
-"""Online: what the estimators that watch windows have in common.
+"""Online: common base of the estimators that learn from windows.
 
-They keep a *present*: of every part of a cycle the demands, of every node the foreign threads, and
-which nodes are down; all of it as the cell declares it until there is evidence that it is
-otherwise. A candidate that has nothing of what is otherwise is priced as by the profile. The others
-are played by the kernel (see `Playing`): some windows when the present changes, another one when
-more is known of it, and more of those on which a move may depend, until their prices tell.
+They keep the measured conditions (`Present`): demands of every part of a cycle, foreign threads of
+every node, rates of links, and nodes that are down. Conditions are as declared until evidence shows
+a change. An unaffected candidate has its price from the profile. The kernel simulates the others
+(see `Playing`): several steps after a change, one more step for new samples, and further steps for
+candidates on which the next move may depend.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from dwell.model.problem import Problem
 from dwell.model.qos import QoS, unchecked_qos
 from dwell.model.shadow_plan import by_candidate
 
-#: Steps that are played when the present changes, the first of which settles queues.
+#: Simulated steps after a change of conditions; the first fills the queues.
 FIRST_STEPS = 6
-#: How often a close goes on with candidates that it is not sure of, and how many steps each time.
+#: Largest number of rounds per window for unsure candidates, and steps per round.
 ROUNDS, STEPS = 2, 2
-#: How many standard errors a difference of two prices must be from what would decide otherwise.
+#: Standard errors between a price difference and the thresholds of a decision that make it sure.
 BAND = 2.0
 
 
 class _Declared(NamedTuple):
-    """Work, and metrics, of a candidate as declared, as `unchecked_qos` takes them."""
+    """Work and metrics of a candidate under declared conditions, in the form of `unchecked_qos`."""
 
     work: list[tuple[str, float]]
     latency: tuple[float, float]
@@ -49,14 +49,14 @@ class _Declared(NamedTuple):
 
 
 class Online(CellEstimator):
-    """Base of the estimators that watch windows.
+    """Base of the estimators that learn from windows.
 
     Attributes
     ----------
     shadow_fraction : float, or mapping of str to float
-        Share of the cycles sent through each alternative, by the candidate that is active.
+        Share of cycles sent through each alternative, by active candidate.
     seed : int
-        Seed of what is played.
+        Seed of the simulations.
     """
 
     seed = SEED
@@ -77,29 +77,29 @@ class Online(CellEstimator):
             name: ForeignThreads(node, every) for name, node in problem.fabric.nodes.items()
         }
         self._down: frozenset[str] = frozenset()
-        #: Rates of links that are not as declared.
+        #: Measured rates of links that differ from the declared rates.
         self._rates: dict[str, Rate] = {}
         self._shared: frozenset[str] = frozenset()
-        #: Counts presents: changes, and every time that what is known of one has doubled.
+        #: Counts changes of the measured conditions, and each doubling of the windows behind them.
         self.revision = 0
         self._grown = self._until = 1
         self._plays = False
         self._patience_ns = patience_ns(problem)
         self._sent = {name: self._sent_under(name) for name in problem.candidates}
-        #: What is the same at every close, made at the first.
+        #: Constant parts of the estimates, cached at the first estimate.
         self._declared: dict[str, _Declared] = {}
-        #: The window that has been learnt from and not been priced, and not been taken in.
+        #: The last window until `estimate` uses it, and until its demands are learnt.
         self._evidence: Evidence | None = None
         self._pending: Evidence | None = None
-        #: Whether the present is another one, or has newer values of the same.
+        #: Whether the measured conditions have changed, or have new samples.
         self._has_changed = self._has_grown = False
 
     def share(self, nodes: Collection[str], cells: int, *, known: bool = True) -> None:
-        """Take note of nodes whose other jobs are those of a fleet's cells (see `CellEstimator`).
+        """Register nodes that the cells of a fleet share (see `CellEstimator`).
 
-        Jobs there say nothing of waits, since the jobs of other cells are not in the evidence. They
-        say how many foreign threads there are where it is known next to how many threads of the
-        fleet they ran. Cells take turns in sending shadows there.
+        The evidence lacks the jobs of other cells, and jobs on these nodes therefore show no waits.
+        They show the number of foreign threads if the number of the fleet's threads is known. Cells
+        take turns with shadows there: each sends 1 / `cells` of its share.
         """
         shared, self._declared = frozenset(nodes), {}
         self._shared = shared if known else frozenset()
@@ -115,45 +115,45 @@ class Online(CellEstimator):
             self._sent[name] = FrozenDict(of)
 
     def __getstate__(self) -> dict[str, object]:
-        # A copy plays its present anew.
+        # A copy repeats the simulations of its measured conditions.
         return {**self.__dict__, "_has_changed": True}
 
     @abstractmethod
     def _take_in(self, demands: Mapping[Part, Floats], evidence: Evidence) -> None:
-        """Take in the demands that a window has shown."""
+        """Learn from the measured demands of a window."""
 
     @abstractmethod
     def _otherwise(self) -> Mapping[Part, Floats]:
-        """Demands of the parts that are not as declared (see `Present`)."""
+        """Return the demands of parts that differ from the declared demands (see `Present`)."""
 
     def _known_error(self, name: str, rate: float) -> tuple[float, float]:
-        """Standard errors of a candidate's L95 and V_D by the samples behind its present."""
+        """Return the errors of L95 (ms) and V_D of a candidate due to few measured samples."""
         return 0.0, 0.0
 
     def look(self, evidence: Evidence) -> None:
-        """Learn."""
+        """Learn from a window."""
         self.learn(evidence)
 
     def learn(self, evidence: Evidence) -> None:
-        """Take in a window: what it showed of each part, once it is known of its nodes."""
+        """Keep a window; its demands are learnt after the state of its nodes."""
         self._take_in_pending()
         self._evidence = self._pending = evidence
 
     def _take_in_pending(self) -> None:
-        """Take in the demands of the last window, if they have not been; its nodes come first."""
+        """Learn from the demands of the last window, once per window."""
         evidence, self._pending = self._pending, None
         if evidence is not None:
             self._take_in(self._meter.demands(evidence, self._threads), evidence)
 
     @property
     def regimes(self) -> int:
-        """Changes of regime seen since the start."""
+        """Number of changes detected since the start."""
         self._take_in_pending()
         return self._regimes
 
     @property
     def present(self) -> Present:
-        """What is not as the cell declares it."""
+        """The measured conditions that differ from the declared ones."""
         self._take_in_pending()
         threads = {name: one.beyond for name, one in self._foreign.items() if one.beyond}
         rates_mbps = FrozenDict({link: rate.mbps for link, rate in self._rates.items()})
@@ -161,7 +161,7 @@ class Online(CellEstimator):
 
     @property
     def _threads(self) -> dict[str, float]:
-        """Foreign threads that each node is thought to have."""
+        """Estimated number of foreign threads on each node."""
         return {name: foreign.threads for name, foreign in self._foreign.items()}
 
     def estimate(
@@ -192,7 +192,7 @@ class Online(CellEstimator):
         return estimates
 
     def _stated_error(self, name: str) -> tuple[float, float]:
-        """Return standard errors of a candidate's L95 (ms) and V_D, by the play and its samples."""
+        """Return standard errors of L95 (ms) and V_D due to simulated and measured samples."""
         played = self._playing.played(name)
         known = self._known_error(name, played.violation_rate)
         return (
@@ -205,7 +205,7 @@ class Online(CellEstimator):
         return self._playing.deviations(name)
 
     def _priced(self, names: list[str], foreign: Foreign) -> dict[str, QoS]:
-        """Return the metrics of all candidates; `estimate` adds the errors of played ones."""
+        """Return the metrics of all candidates, without errors if simulated."""
         played = {name: self._playing.played(name) for name in names}
         if not self._declared:
             self._declared = {name: self._as_declared(name) for name in self.problem.candidates}
@@ -225,7 +225,7 @@ class Online(CellEstimator):
         return estimates
 
     def _as_declared(self, name: str) -> _Declared:
-        """Return what does not change of the estimate of a candidate that is as declared."""
+        """Return the constant parts of a candidate's estimate under declared conditions."""
         qos, work = self._playing.prices[name].qos, self._playing.prices[name].own
         latency, others = (qos.l95_ms, qos.violation_rate), (qos.cut_from_ms, qos.error)
         return _Declared(self._with_sent(name, work), latency, others)
@@ -236,11 +236,11 @@ class Online(CellEstimator):
         return [(one, share + sent[one]) for one, share in work.items()]
 
     def _unsure(self, names: list[str], estimates: Mapping[str, QoS], incumbent: str) -> list[str]:
-        """Of candidates that are played, those that more has to be played of.
+        """Return the simulated candidates that need more simulation.
 
-        They are those that may be better than the incumbent, but not surely by more than a move is
-        asked for, where the sampling error of the difference in J is more than a third of that; and
-        the incumbent itself beside them.
+        A candidate needs more if its gain in J over the incumbent may be positive but may be below
+        the gain required for a move (both within `BAND` standard errors), and if the standard error
+        of the gain exceeds a third of the smallest improvement. The incumbent then needs more too.
         """
         problem, least = self.problem, self.problem.controller.min_improvement
         objective, here = problem.objective, problem.candidates[incumbent]
@@ -261,7 +261,7 @@ class Online(CellEstimator):
         ]
 
     def _cost(self, qos: QoS) -> float:
-        """J of an estimate, where nothing moves."""
+        """Return J of an estimate without the switching term."""
         used = qos.utilisation
         robot, edge, cloud = (
             max([used[one] for one in of if one in used], default=0.0) for of in self._tiers
@@ -270,7 +270,7 @@ class Online(CellEstimator):
         return price(*metrics, 0.0, self.problem.objective)
 
     def _sampled(self, name: str) -> float:
-        """Standard error of a candidate's J by how few cycles have been played."""
+        """Return the standard error of a candidate's J due to few simulated cycles."""
         played = self._playing.played(name)
         error = (played.l95_error_ms, played.violation_error)
         return cost_error(error, self.problem.objective)
@@ -278,7 +278,7 @@ class Online(CellEstimator):
     def _look_at_nodes(
         self, evidence: Evidence, seen: Foreign, own: Mapping[str, float], incumbent: str
     ) -> None:
-        """Take in what a window showed of foreign threads, and of nodes that are down."""
+        """Update the foreign threads of nodes, and the nodes that are down, from a window."""
         known = self._playing.prices[incumbent]
         for name, foreign in self._foreign.items():
             usual, deviation = known.foreign[name], known.foreign_deviation[name]
@@ -312,7 +312,7 @@ class Online(CellEstimator):
         span_ns = evidence.close_ns - int(evidence.release_ns[0])
         for node, ready in ready_ns.items():
             after = [at_ns for at_ns in ready if at_ns > ended_ns[node]]
-            # Where a job is still at work, the node is not down.
+            # A node with a running job is up.
             idle_ns = evidence.close_ns - max(ended_ns[node], min(after, default=0))
             capacity = self.problem.fabric.nodes[node].capacity
             works = own[node] * capacity * span_ns >= 0.5 * idle_ns
@@ -321,7 +321,7 @@ class Online(CellEstimator):
 
     @property
     def _names(self) -> list[str]:
-        """Candidates that have anything that is not as declared."""
+        """Candidates with a part, node or link that differs from its declaration."""
         otherwise = self._otherwise()
         nodes = {name for name, foreign in self._foreign.items() if foreign.beyond} | self._down
         links = {part.link for part in otherwise if isinstance(part, Message)}
@@ -339,7 +339,7 @@ class Online(CellEstimator):
         ]
 
     def _play(self, names: list[str]) -> None:
-        """Play the candidates that are not as declared, anew where the present has changed."""
+        """Simulate the affected candidates; start again if the measured conditions changed."""
         present = self.present
         self._count_presents()
         if self._has_changed:
@@ -350,7 +350,7 @@ class Online(CellEstimator):
         self._has_changed = self._has_grown = False
 
     def _count_presents(self) -> None:
-        """Count this present as a new one, if it is one."""
+        """Increase `revision` after a change, and when the number of windows has doubled."""
         self._grown += 1
         if self._has_changed:
             self._grown = self._until = 1
@@ -359,14 +359,14 @@ class Online(CellEstimator):
             self._until *= 2
 
     def _sent_under(self, name: str) -> Mapping[str, float]:
-        """Share of each resource that shadow jobs take while the cell is on a candidate."""
+        """Return the share of each resource that shadow jobs take under a candidate."""
         problem, here = self.problem, self.problem.candidates[name]
         pipeline, resources = problem.pipeline, problem.fabric.resources
         fraction = by_candidate(self.shadow_fraction, problem.candidates)[name]
         share = dict.fromkeys(resources, 0.0)
         for there in problem.candidates.values():
             apart = pipeline.diverging(here, there)
-            # In the order of tasks: that of a set, and so the rounding of the sum, may differ.
+            # In the order of tasks: the order of a set, and the rounding of the sum, may differ.
             for task in pipeline.tasks:
                 if there is here or task not in apart or not pipeline.outputs(task):
                     continue

@@ -1,19 +1,18 @@
-"""Profile: static profiling, the estimate from what is known before the run.
+"""Profile: static profiling, the estimate from data known before the run.
 
-Every candidate has the price that it comes to where the cell stays on it and no scenario disturbs
-it (`dwell.estimators.prices`): the means over windows of L95 and V_D as the controller sees them,
-and the work of the cell on every node.
+Every candidate has the price of an undisturbed cell that stays on it (`dwell.estimators.prices`):
+the means over windows of L95 and V_D as the controller sees them, and the cell's work on each node.
 
-What a window adds is the foreign load: utilisation that was seen and is not the cell's own work.
-It is expected to stay where it is, whichever candidate runs. Latencies take no notice of it: a
-stressed robot looks busy here, not slow.
+A window adds the foreign load: measured utilisation minus the cell's own work. The estimator
+assumes the same foreign load under every candidate. Estimated latencies ignore it: a stressed robot
+looks busy here, not slow.
 
-Of a saturated node that others have a part of, the foreign load cannot be seen: what others got is
-only the least that they ask for, and where the cell leaves they may take all of it. Such a node is
-expected to be full under every candidate, but under one that was active before and showed less, if
-the node has been saturated at every close since: then it was the cell that filled it. A kind of a
-node's accelerators is as a node in all this; where a window shows nothing of it, neither do the
-estimates.
+The foreign load of a saturated node is unknown if others use a part of it: they may need more than
+they got, and may take all of the node once the cell leaves. Such a node is expected to be full
+under every candidate, with one exception: a candidate that was active in the last unsaturated
+window, and not since, keeps the utilisation measured then, because the cell itself filled the node
+afterwards. Each kind of accelerator is treated like a node; if a window does not measure it, the
+estimates omit it.
 """
 
 from __future__ import annotations
@@ -34,15 +33,15 @@ from dwell.model.qos import QoS, unchecked_qos
 
 
 class Foreign(NamedTuple):
-    """What others took of resources in a window.
+    """Foreign load of resources in a window.
 
     Parameters
     ----------
     shares : mapping of str to float
-        Share of each resource that was measured.
+        Foreign share of each measured resource.
     full : mapping of str to mapping
-        Resources of which nothing was left and others had a part, with what each showed under the
-        candidates that it was seen under since.
+        Saturated resources that others use too, each with its utilisation by candidate in the last
+        unsaturated window and after it.
     """
 
     shares: Mapping[str, float]
@@ -50,15 +49,15 @@ class Foreign(NamedTuple):
 
 
 class Profile(CellEstimator):
-    """Estimates QoS as that of every candidate alone, undisturbed, played once in the kernel.
+    """Estimates the QoS of each candidate alone and undisturbed, simulated once in the kernel.
 
     Parameters
     ----------
     samples : int, optional
-        Cycles of each candidate that count, rounded up to whole windows; as many as the means need
-        where None (see `dwell.estimators.prices`).
+        Counted cycles per candidate, rounded up to full windows [default: enough for the means,
+        see `dwell.estimators.prices`].
     seed : int
-        Seed of what is played; the same for every run, so that an estimate is a fixed number.
+        Seed of the simulations; the same for every run, which makes an estimate a fixed number.
 
     Attributes
     ----------
@@ -72,7 +71,7 @@ class Profile(CellEstimator):
         Share of each resource that the cell's own work takes, by candidate and resource: a node, or
         a kind of its accelerators, as ``E.gpu``.
     prices : mapping of str to Price
-        All of it, with the standard errors and the number of cycles played.
+        The values above with standard errors and the number of simulated cycles.
 
     Raises
     ------
@@ -97,7 +96,7 @@ class Profile(CellEstimator):
         self._accelerators = frozenset(name for name, one in resources.items() if one.kind)
         table, work = [], []
         for name, price in prices.items():
-            # Once through the checks: what differs from window to window are shares of resources.
+            # Checked once: only the shares of resources differ between windows.
             known = QoS(price.l95_ms, price.violation_rate, {}, price.uncut_l95_ms)
             metrics = known.l95_ms, known.violation_rate, known.cut_from_ms
             table.append((name, *metrics))
@@ -115,8 +114,7 @@ class Profile(CellEstimator):
 
     def start(self, problem: Problem) -> None:
         """Forget every window."""
-        #: What each resource showed, by the candidate it was last seen under, at its last close
-        #: without saturation and at all after it.
+        #: Utilisation of each resource by candidate, in its last unsaturated window and after it.
         self._shown: dict[str, dict[str, float]] = {name: {} for name in self._resources}
 
     def estimate(
@@ -130,7 +128,7 @@ class Profile(CellEstimator):
         }
 
     def see(self, observed: QoS, incumbent: str, own: Mapping[str, float]) -> Foreign:
-        """Tell what others took of every resource in a window, and remember what a full one showed.
+        """Return the foreign load of every resource in a window, and record saturated resources.
 
         Parameters
         ----------
@@ -142,7 +140,7 @@ class Profile(CellEstimator):
         MetricError
             If a node's utilisation is missing.
         """
-        # Conditions and not min() and max(): this runs at the close of every window.
+        # Conditions are faster than min() and max(): this runs at the end of every window.
         used = observed.utilisation
         shares, full = {}, {}
         unmeasured = {one for one in self._accelerators if one not in used or one not in own}
@@ -176,7 +174,7 @@ class Profile(CellEstimator):
         Parameters
         ----------
         work : iterable of (candidate, iterable of (resource, share))
-            What the cell itself takes under each candidate, shadow jobs included.
+            Work of the cell itself under each candidate, shadow jobs included.
         """
         estimated = {}
         for name, takes in work:

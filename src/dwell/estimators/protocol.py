@@ -32,10 +32,10 @@ class Support(NamedTuple):
 
 @runtime_checkable
 class Estimator(Protocol):
-    """Predicts the QoS of every candidate from what a window showed under the incumbent.
+    """Predicts the QoS of every candidate from a window under the incumbent.
 
     Its class may have an attribute ``states_errors``, true if its estimates have standard errors
-    (`QoS.error`). N_min is then 0 where a cell gives none, else 3.
+    (`QoS.error`). If the cell sets no N_min, it is 0 with this attribute and 3 without.
     """
 
     def estimate(
@@ -48,8 +48,8 @@ class Estimator(Protocol):
         observed : QoS
             Metrics of the window.
         incumbent : str
-            The candidate it ran under; its entry is an estimate like the others, which policies
-            are shown if the estimator is a `Learner`: else `observed` takes its place.
+            The candidate that was active. Policies receive its estimate if the estimator is a
+            `Learner`, otherwise `observed`.
         own : mapping of str to float
             Share of each node's cores that the cell's own work took in the window; the rest of
             the observed utilisation is foreign load.
@@ -57,7 +57,7 @@ class Estimator(Protocol):
         Returns
         -------
         mapping of str to QoS
-            One entry for each candidate; with standard errors where they are known.
+            One entry per candidate, with standard errors if they are known.
 
         Raises
         ------
@@ -69,13 +69,13 @@ class Estimator(Protocol):
 
 @runtime_checkable
 class Learner(Protocol):
-    """An estimator that learns from what happened to jobs and messages.
+    """An estimator that learns from the timings of jobs and messages.
 
-    It may have an attribute ``shadow_fraction``, the share of the cycles that it wants sent through
-    each alternative as well (one number, or one for each active candidate), and a method
-    ``support()`` that gives a `Support` for each candidate. It is started before a run. Policies
-    compare its prediction of the incumbent with those of the others, so that an error that all of
-    them share decides nothing.
+    It may have an attribute ``shadow_fraction``, the share of cycles to send through each
+    alternative as well (one number, or one per active candidate), and a method ``support()`` that
+    returns a `Support` per candidate. `start` is called before a run. Policies compare its
+    prediction of the incumbent with its predictions of the others, because an error that all of
+    them share then decides nothing.
     """
 
     def start(self, problem: Problem) -> None:
@@ -83,7 +83,7 @@ class Learner(Protocol):
         ...
 
     def learn(self, evidence: Evidence) -> None:
-        """Take in a window; called before `estimate` for the same window."""
+        """Learn from a window; called before `estimate` for the same window."""
         ...
 
     def estimate(
@@ -94,18 +94,18 @@ class Learner(Protocol):
 
 
 class CellEstimator(ABC):
-    """An estimator as the controller works with it: all that others need not have has a default.
+    """An estimator as the controller uses it, with defaults for all optional methods.
 
     Attributes
     ----------
     learns, supports : bool
-        Whether it is shown what happened to jobs, and says what stands behind its estimates.
+        Whether it learns from the jobs of a window, and whether it has a method `support`.
     states_errors : bool
         Whether its estimates have standard errors (`QoS.error`).
     shadow_fraction : float, or mapping of str to float
-        Share of the cycles that it wants sent through each alternative, by the active candidate.
+        Share of cycles to send through each alternative, by active candidate.
     revision : int
-        Counts what is new of `present`.
+        Number of updates of `present`.
     """
 
     learns: bool = False
@@ -126,7 +126,7 @@ class CellEstimator(ABC):
 
     @property
     def present(self) -> Present | None:
-        """What it knows to be otherwise than declared; None where it says nothing of it."""
+        """The measured changes of declared conditions; None if the estimator measures none."""
         return None
 
     @abstractmethod
@@ -134,7 +134,7 @@ class CellEstimator(ABC):
         """Forget every window."""
 
     def look(self, evidence: Evidence) -> None:
-        """Take in what happened to the jobs of a window, where it learns."""
+        """Learn from the jobs of a window, if the estimator learns."""
         if isinstance(self, Learner):
             self.learn(evidence)
 
@@ -145,22 +145,22 @@ class CellEstimator(ABC):
         """As `Estimator.estimate`."""
 
     def deviations(self, name: str) -> tuple[float, float] | None:
-        """Return standard deviations of one window under a candidate: of L95 (ms), and of V_D.
+        """Return standard deviations of L95 (ms) and V_D in one window under a candidate.
 
-        None where they are not known, so that no window can be compared with the estimate.
+        None if unknown: windows are then not compared with the estimate.
         """
         return None
 
     def support(self) -> Mapping[str, Support]:
-        """Say what stands behind the estimates, where it supports them."""
+        """Return number and age of the samples behind each estimate; empty if unknown."""
         return {}
 
     def share(self, nodes: Collection[str], cells: int, *, known: bool = True) -> None:
-        """Take note of nodes whose other jobs are those of a fleet's cells.
+        """Register nodes that the cells of a fleet share.
 
         Parameters
         ----------
         known : bool
-            Whether their load is accounted for; if not, it counts as foreign.
+            Whether the load of the other cells is accounted for; if not, it counts as foreign.
         """
         return

@@ -1,9 +1,8 @@
 """Estimators by the names that a cell file and the command line use.
 
-Each estimator of ours is declared here, and nowhere else by name. The declarations load without the
-classes: these are imported when an estimator is made. Another package adds one by an entry point of
-the group ``dwell.estimators``; its class is imported only when that estimator is asked for. A class
-of a user's own needs no entry: its name is ``package.module:Class``.
+`REGISTRY` is the only list of the built-in estimators. A class is imported when an estimator is
+made. Another package adds an estimator with an entry point of the group ``dwell.estimators``. A
+user's class needs no entry: its name is ``package.module:Class``.
 """
 
 from __future__ import annotations
@@ -30,18 +29,18 @@ GROUP = "dwell.estimators"
 
 @dataclass(frozen=True, slots=True)
 class EstimatorEntry:
-    """An estimator of ours.
+    """A built-in estimator.
 
     Parameters
     ----------
     path : str
         ``module:Class``; the class takes the problem.
     sentence : str
-        The estimator in a sentence, of which it is the subject, for the legend of a report.
+        Predicate of a sentence whose subject is the estimator, for the legend of a report.
     style : int
-        Which marker and dashes a policy that believes it has in figures, from 0.
+        Index, from 0, of the marker and dashes of policies with this estimator in figures.
     shadows : bool
-        Whether it sends shadow jobs through candidates that do not run.
+        Whether it sends shadow jobs through inactive candidates.
     """
 
     path: str
@@ -108,8 +107,8 @@ def by_name(name: str, problem: Problem) -> Estimator:
     Raises
     ------
     ProblemError
-        If there is none of that name (the message lists the known ones), or the package that
-        declares it, or the class that is named, cannot be imported or made.
+        If the name is unknown (the message lists the known names), or the package or class cannot
+        be imported or made.
     """
     if CLASS_PATH.holds(name):
         own = make_user_class(name, problem, "estimate", "estimator", ProblemError)
@@ -133,8 +132,8 @@ def _class_of(name: str, problem: Problem) -> Any:
 def resolved(problem: Problem, estimator: Estimator | str) -> Problem:
     """Return the problem with the N_min that it has with an estimator.
 
-    Where the cell gives none, N_min is 0 if the estimator's class has a true ``states_errors``: the
-    margin of those errors then prevents moves by chance.
+    If the cell sets no N_min, it is 0 for an estimator class with a true ``states_errors``: the
+    margin of its standard errors already prevents moves by chance.
 
     Raises
     ------
@@ -161,7 +160,7 @@ def name_in_run(meta: Mapping[str, Any]) -> str:
     Raises
     ------
     RunError
-        If it is none of these.
+        If the name is unknown.
     """
     told = str(meta.get("estimator"))
     classes = {entry.path.partition(":")[2]: name for name, entry in REGISTRY.items()}

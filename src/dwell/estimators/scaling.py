@@ -1,26 +1,25 @@
-"""Scaling: what candidates come to by what the active placement was measured to take.
+"""Scaling: estimates of all candidates from measurements of the active placement.
 
-There are no shadow jobs: what the active placement shows of its own parts is all that is known. A
-task that needs more than is declared where it runs now needs so many times as much elsewhere, too.
-A *ratio* that is given says what a task needs on another node, over what it needs on this one, in
-every cycle; a *bound* that is given is the largest delay of a link that is not in use. With these
-in the place of what is declared the candidates are played (see `dwell.estimators.online`).
+There are no shadow jobs. If a task takes longer than declared on its node, Scaling assumes the same
+factor on every other node. A *ratio* is the compute time of a task on another node over its time on
+this node, in every cycle. A *bound* is the largest delay of an unused link. They replace declared
+values when candidates are simulated (see `dwell.estimators.online`).
 
-What is bounded
-    Where all of its ratios and bounds are given, a candidate never counts as less than its
-    *queue-free* window: of every cycle the longest path of its execution times, each alone on a
-    node without stress and quota, and of its messages, each alone on its link. So L95 and V_D are
-    bounds on those, cycle by cycle on the same realisation, where every job of the window has
-    completed and
+Bounds
+    If all ratios and bounds of a candidate are given, its estimates are at least L95 and V_D of its
+    *queue-free* window. The latency of a cycle is then the longest path of execution times, each
+    alone on a node without stress and quota, and of messages, each alone on its link. The estimates
+    are upper bounds of the true queue-free values, cycle by cycle on the same realisation, if every
+    job of the window has completed and
 
     * ratios are true: exec there <= ratio * exec here in every cycle (a task with more threads than
       a node has cores takes threads / cores times as long there, which counts);
-    * bounds hold: no message takes longer on a link that its flow does not use now, repeated
-      attempts included, nor is one lost there;
-    * a link that its flow does use is no worse for the message at the instant at which the
-      candidate would send it. Where it is as it was declared, that is so.
+    * bounds are true: on a link that its flow does not use now every message arrives within the
+      bound, repeated attempts included;
+    * a link that its flow uses now is no worse for the message when the candidate would send it. A
+      link with its declared behaviour meets this condition.
 
-    Of a job that waited or was replaced the work is not known; it counts as the longest that is.
+    The work of a job that waited or was replaced is unknown; it counts as the longest known work.
     L95 is cut at ``problem.censor_ms``.
 """
 
@@ -54,15 +53,15 @@ class Scaling(Learning):
     Parameters
     ----------
     ratios : mapping of (task, node, other node) to float, optional
-        Compute time on the other node over that on the node; what is missing is as declared.
+        Compute time on the other node over the time on the node [default: as declared].
     bounds_ms : mapping of str to float, optional
-        Largest delay of each link (``R1->E``), transmission not included, milliseconds; what is
-        missing is as declared.
+        Largest delay of each link (``R1->E``) without transmission, milliseconds [default: as
+        declared].
 
     Raises
     ------
     ProblemError
-        If a ratio or bound is negative or not finite, or is of something that does not exist.
+        If a ratio or bound is negative or not finite, or names an unknown task, node or link.
     """
 
     MEMORY: ClassVar[float] = 1.0
@@ -89,10 +88,10 @@ class Scaling(Learning):
         self._steps = steps_of(problem.pipeline)
         names = list(problem.pipeline.tasks)
         self._sources = [names.index(flow.source) for flow in problem.pipeline.flows]
-        #: Longest work of each task that is known, on the node that it was on.
+        #: Longest known time of each task, alone on its node, milliseconds.
         self._longest: dict[Site, float] = {}
         self._active: Placement | None = None
-        #: Times of each cycle of the last window, milliseconds: of its jobs alone, of its messages.
+        #: Times of jobs (each alone) and of messages in the last window, milliseconds, by cycle.
         self._jobs, self._messages = np.empty((0, 0)), np.empty((0, 0))
 
     def _take_in(self, demands: Mapping[Part, Floats], evidence: Evidence) -> None:
@@ -106,7 +105,7 @@ class Scaling(Learning):
             self._keep_cycles(evidence, newest)
 
     def _keep_cycles(self, evidence: Evidence, newest: int) -> None:
-        """Keep what cycles took; those of an earlier placement are left out."""
+        """Keep the times of the cycles under the newest placement."""
         active = tuple(self.problem.candidates.values())[newest]
         rows = evidence.placement == newest
         cycles = evidence.cycles.at(rows)
@@ -124,7 +123,7 @@ class Scaling(Learning):
         self._messages = spans_ms(sent_ns, cycles.arrived_ns, limit_ns)
 
     def _filled(self, site: Site, alone_ms: Floats) -> Floats:
-        """Let work that is not known be the longest that is."""
+        """Replace unknown times by the longest known time, or by the declared 95th percentile."""
         known = alone_ms[np.isfinite(alone_ms)]
         if len(known):
             self._longest[site] = float(known.max())
@@ -135,7 +134,7 @@ class Scaling(Learning):
 
     def _correct(self, changed: Sequence[Part], measured: frozenset[Part]) -> None:
         sites = [part for part in changed if isinstance(part, Site)]
-        # The surest one has the last word.
+        # The site with the most samples is last and overrides the others.
         for site in sorted(sites, key=lambda site: (self._pools[site].measured, site)):
             for other, pool in self._pools.items():
                 if isinstance(other, Site) and other.task == site.task and other not in measured:
@@ -160,7 +159,7 @@ class Scaling(Learning):
     def estimate(
         self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
     ) -> dict[str, QoS]:
-        """Estimate every candidate's metrics (see `Estimator`); first by the profile."""
+        """Estimate every candidate's metrics (see `Estimator`)."""
         estimates = super().estimate(observed=observed, incumbent=incumbent, own=own)
         if self._active is not None and len(self._jobs):
             for name, placement in self.problem.candidates.items():
@@ -168,7 +167,7 @@ class Scaling(Learning):
         return estimates
 
     def _at_least(self, qos: QoS, placement: Placement, active: Placement) -> QoS:
-        """Let metrics be no less than those of the window's cycles, each queue-free."""
+        """Raise metrics to at least the metrics of the window's cycles without queues."""
         pipeline = self.problem.pipeline
         executed = [
             self._executed(column, task, active, placement)
@@ -186,7 +185,7 @@ class Scaling(Learning):
         on_the_way = [times for times in sent if times is not None]
         if len(known) < len(executed) or len(on_the_way) < len(sent):
             return qos
-        # To whole nanoseconds, as everything is timed.
+        # Rounded to nanoseconds, like all times.
         latency_ms = np.round(longest_path(self._steps, known, on_the_way), 6)
         missed = int(np.count_nonzero(latency_ms > pipeline.deadline_ms)) / len(latency_ms)
         bound_ms = percentile(latency_ms, 95)
@@ -200,7 +199,7 @@ class Scaling(Learning):
     def _executed(
         self, column: int, task: str, active: Placement, placement: Placement
     ) -> Floats | None:
-        """Bound the time of a task's job in each cycle; None where there is no bound."""
+        """Return a bound on the time of a task's job in each cycle; None without a ratio."""
         here, there, alone_ms = active[task], placement[task], self._jobs[:, column]
         if here == there:
             return alone_ms
@@ -210,7 +209,7 @@ class Scaling(Learning):
     def _sent_ms(
         self, part: Message | None, active: Message | None, taken_ms: Floats
     ) -> Floats | float | None:
-        """Bound the time of a flow's message in each cycle; None where there is no bound."""
+        """Return a bound on the time of a flow's message in each cycle; None if unknown."""
         if part is None:
             return 0.0
         bound_ms = self._bounds.get(part.link)
@@ -219,7 +218,7 @@ class Scaling(Learning):
         if part != active:
             return bound_ms
         known = taken_ms[np.isfinite(taken_ms)]
-        # Of what has not been sent by then it is not known; others took so long at most.
+        # Unknown times get the bound of the link, else the longest known time.
         most = bound_ms if bound_ms is not None else float(known.max()) if len(known) else math.inf
         return np.where(np.isnan(taken_ms), most, taken_ms)
 

@@ -1,8 +1,8 @@
-"""Sent shadows: the shadow jobs of a realisation that is played with all cycles on one candidate.
+"""Sent shadows: the shadow jobs of a realisation whose cycles all run under one candidate.
 
-They run on what own jobs leave, so that most candidates come to the same with them and without.
-Where they do not, by what shadows put on links, accelerators and under quotas that own jobs use,
-the candidate is played with them.
+Shadow jobs use the capacity that own jobs leave, and most candidates have the same price with and
+without them. A candidate is simulated with shadows if they may delay its own jobs: on links, on
+accelerators, or on nodes with a quota.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.shadow_plan import ShadowFraction, ShadowPlan, by_candidate
 
-#: Share of D for which a shadow may hold links of own messages and still hinder nobody.
+#: Share of D for which a shadow may occupy links of own messages and still count as harmless.
 NEGLIGIBLE = 0.002
 
 
 class SentShadows:
-    """What an estimator sends as shadows in a realisation.
+    """Shadow jobs of an estimator in a realisation.
 
     Parameters
     ----------
     fraction : float, or mapping of str to float
-        Share of the cycles that each alternative gets, by the candidate that is active.
+        Share of cycles sent through each alternative, by active candidate.
 
     Attributes
     ----------
     realisation : Realisation
-        What the shadow jobs meet.
+        Sampled conditions of the shadow jobs.
     """
 
     def __init__(
@@ -51,14 +51,14 @@ class SentShadows:
         return f"<SentShadows: {self._plan!r}>"
 
     def stamps(self, index: int) -> NDArray[np.int16] | int:
-        """Return the stamps under a candidate: none, which is -1, where they do not hinder it."""
+        """Return the stamps under a candidate; -1 (no shadows) if shadows cannot delay its jobs."""
         if not self._hindered[index]:
             return -1
         return self._plan.stamps(0, self.realisation.cycles, index)
 
 
 def stamps_of(arrays: Arrays, index: int, shadows: SentShadows | None) -> NDArray[np.int16]:
-    """Return the stamps of tables all of whose cycles run under a candidate."""
+    """Return the stamps of tables if every cycle runs under one candidate."""
     stamps = np.full_like(arrays.tables.stamps, index)
     if shadows is not None:
         stamps[1] = shadows.stamps(index)
@@ -76,10 +76,11 @@ def hindered(problem: Problem) -> frozenset[str]:
 
 
 def _is_hindered(problem: Problem, here: Placement, there: Placement) -> bool:
-    """Whether own jobs may wait where cycles are also sent through another candidate.
+    """Return whether own jobs may wait if cycles are also sent through another candidate.
 
-    They do for a link that own messages use and that keeps messages in order, or that shadow
-    messages hold for longer than is negligible, and for accelerators and quotas of both.
+    They may if shadow messages use an own link that keeps messages in order, if shadow messages
+    occupy own links for longer than `NEGLIGIBLE` allows, or if both candidates use the same
+    accelerator or the same CPU with a quota.
     """
     pipeline, links = problem.pipeline, problem.fabric.links
     apart = pipeline.diverging(here, there)

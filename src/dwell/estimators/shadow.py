@@ -1,10 +1,10 @@
-"""Shadow: online emulation, the estimate from cycles also sent through each alternative.
+"""Shadow: online emulation, which also sends some cycles through each alternative.
 
-A shadow shares with its cycle whatever runs on the same nodes, has jobs and messages of its own for
-the rest, and stops before the sinks, whose commands would reach the actuator. What it shows of a
-part, and what the cycles of a placement that was active showed, is held for `MEMORY` half-lives;
-where it is not as declared, the candidate is played with it (see `dwell.estimators.learning`). Of
-what no cycle and no shadow went through nothing is assumed.
+A shadow shares with its cycle the jobs that run on the same nodes and has its own jobs and messages
+for the rest. It stops before the sinks, because their commands would reach the actuator. Values
+measured by shadows and by active cycles are kept for `MEMORY` half-lives. If they differ from the
+declared values, the candidate is simulated with them (see `dwell.estimators.learning`). Parts that
+no cycle and no shadow used keep their declared values.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from dwell.estimators.learning import Learning
 
 
 class Shadow(Learning):
-    """Estimates QoS of candidates from what shadow jobs and active ones showed of their parts.
+    """Estimates the QoS of candidates from values that shadow jobs and active jobs measured.
 
     Parameters
     ----------
     shadow_fraction : float, optional
-        Share of the cycles sent through each alternative; the cell file's where None.
+        Share of cycles sent through each alternative [default: the cell file's].
     half_life_windows : float, optional
-        The cell file's where None.
+        Unit of `MEMORY` and `UNSEEN` [default: the cell file's].
     seed : int
-        Seed of what is played.
+        Seed of the simulations.
 
     Attributes
     ----------
     regimes : int
-        Changes of regime seen since the start.
+        Number of changes detected since the start.
 
     Raises
     ------

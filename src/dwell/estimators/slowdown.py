@@ -1,8 +1,9 @@
 """Slowdown of a job on the CPU by foreign threads.
 
-The slowdown is over a job alone on its node, as the profile has it. On a `fair` node a job of k
-threads beside s foreign threads runs at min(1, c / (k + s)) of its speed, c being the cores that
-the background leaves; on the others at c / (c + s) of what it has alone.
+The slowdown is relative to a job alone on its node, as in the profile. With s foreign threads a job
+of k threads takes (k + s) / max(k, c) times as long on a `fair` node, at least 1; c is the number
+of cores that the background leaves. With another scheduler it takes (n + s) / n times as long on a
+node of n cores.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Durations of a window, and when what has not ended counts as lost."""
+"""Durations of jobs and messages in a window, and when unfinished ones count as lost."""
 
 from __future__ import annotations
 
@@ -8,15 +8,14 @@ from dwell.model.number_arrays import Floats, Ints
 from dwell.model.problem import Problem
 
 NS_PER_MS = 1e6
-#: Periods after which a job or message that has not ended counts as lost.
+#: Periods after which an unfinished job or message counts as lost.
 PATIENCE = 2
 
 
 def patience_ns(problem: Problem) -> int:
-    """Time after which what has not ended at the close of its window counts as lost.
+    """Return the age from which an unfinished job or message counts as lost at a window's end.
 
-    In windows of one or two cycles nothing is ever that old; there it is what has not ended before
-    the window's last release.
+    The age is `PATIENCE` periods, but at most one period less than the window.
     """
     periods = min(PATIENCE, problem.window_cycles - 1)
     return round(periods * problem.pipeline.period_ms * NS_PER_MS)
@@ -25,15 +24,15 @@ def patience_ns(problem: Problem) -> int:
 def spans_ms(begin_ns: Ints, end_ns: Ints, limit_ns: int) -> Floats:
     """Return the durations between instants, milliseconds.
 
-    They are NaN where something had not begun, or had begun a moment ago, and infinite where it was
-    lost.
+    A duration is infinite if the job or message is lost, and NaN if it has not begun or is
+    unfinished but not lost.
 
     Parameters
     ----------
     begin_ns, end_ns : int64 array, shape (n, columns)
-        -1 for an instant that had not come.
+        -1 for an instant in the future.
     limit_ns : int
-        What began before this, and has not ended, counts as lost.
+        An unfinished job or message that began before this instant counts as lost.
     """
     span: Floats = (end_ns - begin_ns) / NS_PER_MS
     open_ended = np.minimum(begin_ns, end_ns) < 0

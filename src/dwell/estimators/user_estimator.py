@@ -1,4 +1,4 @@
-"""A user's object as the controller works with it."""
+"""Adapter from a user's estimator to the interface of the controller."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dwell.model.qos import QoS
 
 
 class UserEstimator(CellEstimator):
-    """A user's object, and what it does without.
+    """A user's object with defaults for its missing methods.
 
     Parameters
     ----------
@@ -29,35 +29,35 @@ class UserEstimator(CellEstimator):
 
     @property
     def given(self) -> Estimator:
-        """The object that estimates."""
+        """The user's object."""
         return self._given
 
     def start(self, problem: Problem) -> None:
-        """Start it, if it wants to be."""
+        """Start the user's object, if it has a method `start`."""
         start = getattr(self._given, "start", None)
         if start is not None:
             start(problem)
         self.shadow_fraction = getattr(self._given, "shadow_fraction", 0.0)
 
     def look(self, evidence: Evidence) -> None:
-        """Have it learn, if it does."""
+        """Pass a window to the user's object, if it is a `Learner`."""
         if isinstance(self._given, Learner):
             self._given.learn(evidence)
 
     def estimate(
         self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
     ) -> Mapping[str, QoS]:
-        """Have it estimate."""
+        """Return the estimates of the user's object."""
         return self._given.estimate(observed=observed, incumbent=incumbent, own=own)
 
     def support(self) -> Mapping[str, Support]:
-        """Ask it, if it knows."""
+        """Return the support of the user's object; call only if `supports` is true."""
         support: Mapping[str, Support] = self._given.support()  # type: ignore[attr-defined]
         return support
 
 
 def as_started(given: Estimator, problem: Problem, *, copied: bool) -> CellEstimator:
-    """Return an estimator that the controller works with, at the begin of a run.
+    """Return a started estimator with the interface of the controller.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def as_started(given: Estimator, problem: Problem, *, copied: bool) -> CellEstim
     """
     made = copy.deepcopy(given) if copied else given
     own = made if isinstance(made, CellEstimator) else UserEstimator(made)
-    # One of ours starts itself when it is made.
+    # A built-in estimator starts itself when it is made.
     if copied or own is not made:
         own.start(problem)
     return own
