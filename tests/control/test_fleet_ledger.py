@@ -64,6 +64,8 @@ def priced(problem: Problem, here: str, wished: str, costs: Mapping[str, float])
 def settle(ledger: FleetLedger, rounds: int = 50) -> list[tuple[int, str, Verdict]]:
     """Have cells look at their candidates in turns until none moves; return the moves."""
     moves: list[tuple[int, str, Verdict]] = []
+    #: By round, cells served before and after it, the fall of Φ, and the sum of what is owed.
+    changes: dict[int, tuple[int, int, float, float]] = {}
     for _ in range(rounds):
         before = len(moves)
         for i, cell in enumerate(ledger.cells):
@@ -75,16 +77,23 @@ def settle(ledger: FleetLedger, rounds: int = 50) -> list[tuple[int, str, Verdic
             verdict = ledger.consider(i, priced(cell.problem, here, here, costs), by_price=True)
             if verdict.name != here:
                 assert ledger.placements[i] == verdict.name
-                first, last, _ = verdict.asked
+                first, last, number = verdict.asked
                 assert first is not None
                 assert last is not None
+                assert number is not None
                 if ledger.objective == "sum":
                     assert first - last > owed[verdict.name]
                 if isinstance(ledger.rank, MostServed):
                     more = sum(ledger.rank.served(ledger.prices.price(tuple(ledger.placements))))
-                    assert more > served or (more == served and first - last > owed[verdict.name])
+                    # The members of a set move one after another, in one round.
+                    begin, _, _, due = changes.get(number, (served, 0, 0.0, 0.0))
+                    changes[number] = begin, more, first - last, due + owed[verdict.name]
                 moves.append((i, verdict.name, verdict))
         if len(moves) == before:
+            assert all(
+                more > served or (more == served and fall > due)
+                for served, more, fall, due in changes.values()
+            )
             return moves
     raise AssertionError("cells do not come to rest")
 
