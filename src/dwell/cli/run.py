@@ -153,8 +153,10 @@ def _require_same(folder: Path, settings: Mapping[str, Any]) -> None:
     """Raise a RunError where a folder holds another run: other than this one made again."""
     if not (folder / "run.json").is_file():
         return
+    from dwell.study.other_placements import PLACEMENTS
+
     # The software's version and the other placements' results do not make it another run.
-    beside = {"versions": None, "placements": None}
+    beside = {"versions": None, PLACEMENTS: None}
     kept = read_document(folder / "run.json")
     if {**kept, **beside} != {**json.loads(json.dumps(settings)), **beside}:
         raise RunError(

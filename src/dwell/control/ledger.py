@@ -117,7 +117,9 @@ class FleetLedger:
         self.prices = prices or FleetPrices(cells, shared)
         self.loads = Loads(self.table)
         self.rank = fleet_rank(objective, cells, limit)
-        self._aimed = Loads(self.table, self.rank.limit)
+        self._aimed = self.loads
+        if self.rank.limit is not None:
+            self._aimed = Loads(self.table, self.rank.limit)
         self._terms = [CellTerms(problem, shared) for problem in problems]
         self.placements = [problem.initial for problem in problems]
         self._at = self.loads.at(self.placements)

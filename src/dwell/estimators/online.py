@@ -16,8 +16,9 @@ from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
-from dwell.cost import cost_error, hamming, price, tier_nodes
+from dwell.cost import cost_error, hamming
 from dwell.estimators.evidence import Evidence
+from dwell.estimators.fleet_prices import CellTerms
 from dwell.estimators.foreign_threads import ForeignThreads, Stretches
 from dwell.estimators.link_rates import Rate
 from dwell.estimators.measured import Message, Meter, Part, groups, parts_of
@@ -64,7 +65,7 @@ class Online(CellEstimator):
     def start(self, problem: Problem) -> None:
         """Forget everything but the profile."""
         self.problem = problem
-        self.profile, self._tiers = Profile(problem), tier_nodes(problem.objective)
+        self.profile, self._terms = Profile(problem), CellTerms(problem, ())
         self._regimes = 0
         self._meter, self._stretches = Meter(problem), Stretches(problem)
         self._playing = Playing(problem, self.seed, self.shadow_fraction)
@@ -250,7 +251,7 @@ class Online(CellEstimator):
             error = math.hypot(errors.get(name, 0.0), errors.get(incumbent, 0.0))
             if name == incumbent or error <= least / 3:
                 continue
-            gain = self._cost(estimates[incumbent]) - self._cost(estimates[name])
+            gain = self._terms.cost(estimates[incumbent]) - self._terms.cost(estimates[name])
             asked = least + objective.weights.switching * hamming(there, here)
             if -BAND * error < gain < asked + BAND * error:
                 unsure |= {name, incumbent}
@@ -259,15 +260,6 @@ class Online(CellEstimator):
             for name in names
             if name in unsure and errors[name] and not self._playing.is_full(name)
         ]
-
-    def _cost(self, qos: QoS) -> float:
-        """Return J of an estimate without the switching term."""
-        used = qos.utilisation
-        robot, edge, cloud = (
-            max([used[one] for one in of if one in used], default=0.0) for of in self._tiers
-        )
-        metrics = qos.l95_ms, qos.violation_rate, robot, edge, cloud
-        return price(*metrics, 0.0, self.problem.objective)
 
     def _sampled(self, name: str) -> float:
         """Return the standard error of a candidate's J due to few simulated cycles."""

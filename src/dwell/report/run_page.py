@@ -66,8 +66,6 @@ if TYPE_CHECKING:
     from dwell.record import Run
 
 WORST = 10
-#: Metrics of a placement that never moves.
-KEPT = ("violation_rate", "l95_ms", "cost")
 #: Largest number of labels of cycles in a figure.
 LABELS = 25
 #: Largest error of the clocks in a proven window, as a share of the deadline.
@@ -212,8 +210,7 @@ class _RunPage:
             {"placement": name, **numbers} for name, numbers in placements.items()
         ]
         if self.header.policy_name != "Static":
-            name = f"{self._policy()}, this run"
-            rows.append({"placement": name, **{key: self.row[key] for key in KEPT}})
+            rows.append({**self.row, "placement": f"{self._policy()}, this run"})
         columns: Columns = [
             Text("placement", "placement", "placement"),
             RATE._replace(decimals=2),

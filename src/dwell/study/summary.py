@@ -188,6 +188,7 @@ def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Su
     windows, decisions, cycles = (run.arrays(name) for name in ("windows", "decisions", "cycles"))
     missed, final_ns = cycles["missed"][counted], cycles["latency_ns"][counted]
     latencies = Latencies.of(final_ns, problem.pipeline.deadline_ms)
+    answer = _answer(windows, counts, missed)
     placed = windows.names("placement")[counts]
     active = {name: placed.equal(name) for name in problem.candidates}
     used = {name: share[counts] for name, share in used_in(windows, problem).items()}
@@ -195,13 +196,13 @@ def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Su
         **labels,
         "windows": int(counts.sum()),
         "cycles": len(missed),
-        "violation_rate": share_of(missed),
-        "l95_ms": mean_of(windows["seen_l95_ms"][counts]),
+        "violation_rate": answer["violation_rate"],
+        "l95_ms": answer["l95_ms"],
         **_percentiles(latencies),
         **_utilisation(used, problem),
         **_migrations(decisions, decided),
         **{SHARE_OF.format(candidate=name): share_of(those) for name, those in active.items()},
-        "cost": mean_of(windows["cost"][counts]),
+        "cost": answer["cost"],
         **_unfinished(cycles.names("outcome")[counted]),
         "longest_misses": longest_streak(missed),
         **_misses(missed),
@@ -235,9 +236,12 @@ def answer_of(run: Run, problem: Problem) -> dict[str, float]:
         If the run has no window after its warm-up.
     """
     counts, _, counted = _counting(run, problem.window_cycles)
-    windows = run.arrays("windows")
+    return _answer(run.arrays("windows"), counts, run.arrays("cycles")["missed"][counted])
+
+
+def _answer(windows: TableArrays, counts: Mask, missed: Mask) -> dict[str, float]:
     return {
-        "violation_rate": share_of(run.arrays("cycles")["missed"][counted]),
+        "violation_rate": share_of(missed),
         "l95_ms": mean_of(windows["seen_l95_ms"][counts]),
         "cost": mean_of(windows["cost"][counts]),
     }

@@ -186,8 +186,7 @@ def _the_cell(cell: Path | None, of_cell: Path | None) -> Path:
     """Return the cell file, given as an argument or by the hidden option --cell."""
     if cell is not None and of_cell is not None:
         raise typer.BadParameter(f"name one cell, {cell} or {of_cell}")
-    found = cell or of_cell
-    if found is None:
+    if (found := cell or of_cell) is None:
         raise typer.BadParameter("missing argument CELL")
     return found
 
@@ -195,13 +194,18 @@ def _the_cell(cell: Path | None, of_cell: Path | None) -> Path:
 def _cell_and(
     name: str, cell: Path | None, word: str | None, of_cell: Path | None
 ) -> tuple[Path, str]:
-    """Return the cell file and the word after it, which is the first argument with --cell."""
-    if of_cell is not None and word is None:
-        cell, word = None, None if cell is None else str(cell)
-    found = _the_cell(cell, of_cell)
+    """Return the cell file and the required word after it (see `_cell_or`)."""
+    found, word = _cell_or(cell, word, of_cell)
     if word is None:
         raise typer.BadParameter(f"missing argument {name}")
     return found, word
+
+
+def _cell_or(cell: Path | None, word: str | None, of_cell: Path | None) -> tuple[Path, str | None]:
+    """Return the cell file and the word after it, which is the first argument with --cell."""
+    if of_cell is not None and word is None and cell is not None:
+        cell, word = None, str(cell)
+    return _the_cell(cell, of_cell), word
 
 
 @live.command()
@@ -487,9 +491,8 @@ def log(
     from dwell.cellfile import load_without_traces
     from dwell.live.commands import background
 
-    if of_cell is not None and process is None and cell is not None:
-        cell, process = None, str(cell)
-    name, root = load_without_traces(_the_cell(cell, of_cell)).name, state_root(state)
+    file, process = _cell_or(cell, process, of_cell)
+    name, root = load_without_traces(file).name, state_root(state)
     if process is None:
         typer.echo("\n".join(background.logs_of(root, name)))
     else:
