@@ -41,7 +41,9 @@ SHAPES = {
     "the controller": cell_form.CONTROLLER,
     "the servo": cell_form.SERVO,
     "its target": cell_form.TARGET,
+    "a ROS 2 topic": cell_form.ROS_TOPIC,
     "live": cell_form.LIVE,
+    "ROS 2 commands": cell_form.ROS_COMMANDS,
     "a host": cell_form.HOST,
     "a fleet": fleet_file.FLEET.shape,
     "an entry": fleet_file.ENTRY,
@@ -87,6 +89,8 @@ def words(form: Form) -> str:
             return f"`{{{', '.join(form.names)}}}`"
         case cell_form.WordsForm(means, shape):
             return ", ".join([*(f"`{word}`" for word in means), words(shape)])
+        case cell_form.ActuatorForm():
+            return "text, `{ros2}`"
         case cell_form.ProcessForm():
             return "process"
         case fleet_file.PhasesForm():

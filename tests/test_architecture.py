@@ -189,12 +189,17 @@ MAY_IMPORT = {
     "live.transport": ("live", "live.wire"),
     "live.trust": ("live.wire", "files"),
     "live.roles": ("live", "live.transport", "live.wire", "live.trust", "control", "record"),
-    "live.host": (*LIVE, "control", "record", "cellfile", "files"),
+    "live.ros2": ("live", "live.wire"),
+    "live.host": (*LIVE, "live.ros2", "control", "record", "cellfile", "files"),
     "live.local": (*LIVE, "live.host", "sim", "record", "cellfile", "files"),
     "dash": (*LIVE, "live.host", "record", "cellfile", "study"),
     "calibration": ("record", "cellfile", "sim", "files"),
     "cli": SIMULATOR,
-    "live.commands": (*SIMULATOR, *LIVE, "live.host", "live.local", "dash", "calibration", "cli"),
+    "live.commands": (
+        *SIMULATOR,
+        *LIVE,
+        *("live.ros2", "live.host", "live.local", "dash", "calibration", "cli"),
+    ),
     "lab": (*SIMULATOR, *LIVE, "live.host", "live.local", "calibration", "cli"),
 }
 

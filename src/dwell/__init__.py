@@ -53,7 +53,8 @@ def __getattr__(name: str) -> Any:
         If it needs a package that is not installed; with the command that installs it.
     """
     if name not in _HOME:
-        raise AttributeError(f"module 'dwell' has no attribute {name!r}")
+        # A name of the upper flats (dwell.ros2).
+        return import_module("dwell.model.entry_points").added_name(name)
     try:
         return getattr(import_module(_HOME[name]), name)
     except ModuleNotFoundError as error:

@@ -59,10 +59,12 @@ OPTIONAL = {
     "polars": ("Polars", "sim"),
     "prometheus_client": ("prometheus-client", "dash"),
     "psutil": ("psutil", "live"),
+    "rosbags": ("rosbags", "ros2"),
     "scipy": ("SciPy", "sim"),
     "starlette": ("Starlette", "dash"),
     "uvicorn": ("uvicorn", "dash"),
     "vl_convert": ("vl-convert", "report"),
+    "xxhash": ("xxhash", "ros2"),
     "zenoh": ("Zenoh", "live"),
 }
 #: Packages of modules that no extra installs.

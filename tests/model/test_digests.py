@@ -31,6 +31,7 @@ from dwell.model import (
 from dwell.model.declaration import declared_fields
 from dwell.model.document import digests, to_document
 from dwell.model.live import Endpoint, Host
+from dwell.model.ros_topics import RosActuator, RosCommands, RosTopic
 from dwell.model.scenario import Episodes, LinkDisturbance, NodeDisturbance
 from dwell.model.servo import MovingTarget, Servo
 
@@ -78,11 +79,24 @@ tasks:
     start_ms: 10
     state_bytes: 100
     warmup_jobs: 3
+  listen:
+    "on": {R: {exec_ms: 1}}
+    ros2:
+      topic: audio
+      type: audio_msgs/msg/Audio
+      qos: sensor_data
+      depth: 3
+      namespace: /robot
+      domain: 7
+      connect: tcp/localhost:7448
+      mode: client
+      messages: msgs
   look: {"on": {R: {exec_ms: 2, accelerator: gpu}}}
   act: {"on": {R: {exec_ms: 1}}}
 flows:
   - {from: see, to: think, bytes: 100}
   - {from: see, to: look}
+  - {from: listen, to: think}
   - {from: think, to: act}
   - {from: look, to: act}
 candidates: {LOC: {think: R}, FAR: {think: E}}
@@ -128,7 +142,14 @@ live:
   silence: zero
   checkpoint_cycles: 30
   degraded_at: 0.2
-  actuators: {act: "stages:Act"}
+  actuators:
+    act:
+      ros2:
+        topic: /act
+        type: own_msgs/msg/Act
+        zero: {speed: 0.0, joints: [0.0, 1.0]}
+        require_subscriber: false
+        stamp_from: listen
   observer: "stages:Observer"
 """)
 
@@ -145,17 +166,17 @@ DECISION = {
 WORDS = (
     *("edge", "robot", "priority", "fifo", "R", "E", "see", "think", "look", "act", "R->E", "E->R"),
     *("other", "LOC", "FAR", "dtp", "analytic", "warm", "integrator", "estimated", "control"),
-    *("hold", "frames", "latest", "stages:Other"),
+    *("hold", "frames", "latest", "stages:Other", "default", "peer", "tcp/localhost:7"),
 )
 #: Kinds whose keys are in a live cell's file.
 KINDS = (
     *(Bursts, Caps, ControllerSettings, Endpoint, Episodes, Execution, Flow, Host, Link),
     *(LinkDisturbance, LiveSettings, MovingTarget, Node, NodeDisturbance, Objective, Pipeline),
-    *(Problem, Quota, Servo, Targets, Task, Weights),
+    *(Problem, Quota, RosActuator, RosCommands, RosTopic, Servo, Targets, Task, Weights),
 )
 #: Keys that cannot be changed alone: ends of links and flows, kinds of accelerators, what excludes
-#: a phase or goes with a damping.
-FIXED = {"from", "to", "accelerator", "accelerators", "release", "plant"}
+#: a phase or goes with a damping, the only source of stamps.
+FIXED = {"from", "to", "accelerator", "accelerators", "release", "plant", "stamp_from"}
 
 
 def leaves(part: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
@@ -201,7 +222,7 @@ def changed(document: dict[str, Any], path: tuple[Any, ...]) -> Problem | None:
 
 
 def expected(path: tuple[Any, ...]) -> str:
-    if path[0] == "tasks" and path[-1] == "run":
+    if path[0] == "tasks" and {"run", "ros2"} & {*path[2:]}:
         return "code"
     if path[1:2] and path[1] in DECISION.get(path[0], ()):
         return "decision"

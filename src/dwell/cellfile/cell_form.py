@@ -65,6 +65,7 @@ from dwell.model.declaration import DeclaredField, declared_fields
 from dwell.model.document import VERSION
 from dwell.model.pipeline import WORKERS
 from dwell.model.process import DRAWN
+from dwell.model.ros_topics import RosActuator, RosCommands, RosTopic
 from dwell.policies.registry import REGISTRY as POLICIES
 
 NAME = TextForm()
@@ -329,9 +330,37 @@ INPUT = WordsForm(
     ),
     "`queue` (default), `latest` or `{queue: 8}`",
 )
+
+
+def _fields(value: Any) -> Any:
+    if isinstance(value, dict) and all(isinstance(name, str) for name in value):
+        return value
+    raise ValueError(not_allowed(value, "a mapping of the message's fields"))
+
+
+ZERO = WrittenForm("mapping", _fields, shown={"type": "object"})
+ROS_TOPIC = shape_of(RosTopic, {})
+ROS_COMMANDS = shape_of(RosCommands, {}, instead={"zero": ZERO})
+ROS_ACTUATOR = shape_of(RosActuator, {RosCommands: ROS_COMMANDS})
+
+
+@dataclass(frozen=True, eq=False)
+class ActuatorForm(Form):
+    """The name of a class or function, or a mapping with the topic of the commands."""
+
+    def read(self, value: Any, path: str, faults: Faults) -> Any:
+        """Return the name, or the entry of the mapping."""
+        form = ROS_ACTUATOR if isinstance(value, dict) else NAME
+        return form.read(value, path, faults)
+
+    def schema(self, definitions: Definitions) -> JsonSchema:
+        """Return the text or the mapping."""
+        return {"anyOf": [NAME.schema(definitions), ROS_ACTUATOR.schema(definitions)]}
+
+
 TASK = shape_of(
     Task,
-    {},
+    {RosTopic: ROS_TOPIC},
     instead={
         "on": MappingForm(EXECUTION, keeps=True, least=1),
         "depth": optional(
@@ -411,7 +440,12 @@ SERVO = shape_of(Servo, {MovingTarget: TARGET})
 _ADDRESS = TextForm(NOT_EMPTY)
 ENDPOINT = shape_of(Endpoint, {}, instead={"address": _ADDRESS})
 HOST = shape_of(Host, {Endpoint: ENDPOINT}, instead={"address": _ADDRESS})
-LIVE = shape_of(LiveSettings, {Host: HOST}, title="Live")
+LIVE = shape_of(
+    LiveSettings,
+    {Host: HOST},
+    title="Live",
+    instead={"actuators": MappingForm(ActuatorForm())},
+)
 
 # ------------------------------------------------------------------------------------ cell
 

@@ -9,7 +9,7 @@ import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, cast, runtime_checkable
+from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 
 from dwell.errors import LiveError
 
@@ -19,7 +19,10 @@ __all__ = [
     "CellStage",
     "Message",
     "Stage",
+    "StagePlace",
+    "StageReport",
     "Stateful",
+    "TopicRates",
     "load_actuator",
     "load_function",
     "load_stage",
@@ -40,12 +43,76 @@ class Message:
         Release of the cycle on this node's clock, as in ``time.monotonic_ns``.
     age_ms : float
         Time since the release when the stage was called.
+    stamp_ns : int, optional
+        Time at which a sensor took the frame, on any clock: set by a source, passed on by Dwell,
+        and given to the actuator. Inputs of stages do not have it.
     """
 
     payload: Any = None
     cycle: int = 0
     released_ns: int = 0
     age_ms: float = 0.0
+    stamp_ns: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class StagePlace:
+    """Process of a stage or an actuator, and the limits of its messages.
+
+    Parameters
+    ----------
+    cell, task : str
+        Names of the cell and of the task.
+    index : int
+        Number of a standby, from 1; 0 for all others.
+    folder : str, optional
+        Folder of the cell file.
+    max_age_ms : float
+        Age from which a command is not applied.
+    payload_bytes : int
+        Declared bytes of the largest output.
+    is_system_clock : bool
+        Whether the system synchronises the clocks.
+    """
+
+    cell: str = ""
+    task: str = ""
+    index: int = 0
+    folder: str | None = None
+    max_age_ms: float = float("inf")
+    payload_bytes: int = 0
+    is_system_clock: bool = False
+
+
+class TopicRates(NamedTuple):
+    """Messages of a topic that a source reads.
+
+    Parameters
+    ----------
+    rate_hz, jitter_ms : float
+        Rate, and standard deviation of the intervals, of the last messages.
+    lost : int
+        Messages that the publishers have sent and that have not arrived.
+    age_ms : float
+        Time since the last message; -1 before the first.
+    stamp_ms : float, optional
+        Time from the stamp of the last message to its arrival, if the clocks are known to agree.
+    """
+
+    topic: str
+    rate_hz: float = 0.0
+    jitter_ms: float = 0.0
+    lost: int = 0
+    age_ms: float = -1.0
+    stamp_ms: float | None = None
+
+
+class StageReport(NamedTuple):
+    """State of a stage or an actuator between its calls: whether it can work, and why not."""
+
+    ready: bool = True
+    note: str = ""
+    topic: TopicRates | None = None
 
 
 class Stage(Protocol):
@@ -70,7 +137,9 @@ class Stateful(Protocol):
 
 
 class Actuator(Protocol):
-    """Applies the commands that pass the gate. It may also have ``inputs`` and ``stop()``.
+    """Applies the commands that pass the gate.
+
+    It may also have ``inputs``, ``start()`` and ``stop()``.
 
     A call of ``hold``, ``zero`` or ``stop`` that raises is repeated (docs/deploy.md).
     """
@@ -111,9 +180,21 @@ class CellStage(ABC):
     def process(self, inputs: Mapping[str, Message]) -> Message:
         """As `Stage.process`."""
 
+    def placed(self, place: StagePlace) -> None:
+        """Take the process and its limits; called before `start`."""
+        return
+
+    def check(self) -> None:
+        """Raise an error if `start` could not succeed, without an effect outside of the process."""
+        return
+
     def start(self) -> None:
         """Prepare for the first cycle."""
         return
+
+    def report(self) -> StageReport:
+        """Return its state for a beat; another thread calls this, also during `process`."""
+        return StageReport()
 
     def stop(self) -> None:
         """Release all resources after the last cycle."""
@@ -139,9 +220,28 @@ class CellActuator(ABC):
     ----------
     inputs : mapping of str to type
         Type of the `msgspec.Struct` of commands, by its task.
+    stamp_from : str
+        Source task whose stamp the commands get; empty for the oldest stamp.
     """
 
     inputs: Mapping[str, type] = {}
+    stamp_from: str = ""
+
+    def placed(self, place: StagePlace) -> None:
+        """As `CellStage.placed`."""
+        return
+
+    def check(self) -> None:
+        """As `CellStage.check`."""
+        return
+
+    def start(self) -> None:
+        """Prepare for the first command."""
+        return
+
+    def report(self) -> StageReport:
+        """As `CellStage.report`."""
+        return StageReport()
 
     @abstractmethod
     def apply(self, command: Message) -> None:
@@ -178,7 +278,7 @@ class _UserActuator(CellActuator):
 
     def __init__(self, given: object, apply: Callable[[Message], None]) -> None:
         self._apply = apply
-        _take(self, given, ("inputs", "hold", "zero", "stop"))
+        _take(self, given, ("inputs", "start", "hold", "zero", "stop"))
 
     def apply(self, command: Message) -> None:
         self._apply(command)

@@ -8,6 +8,7 @@ from typing import Literal
 from dwell.model.bounds import LARGEST, MAX_COUNT, Bound, require
 from dwell.model.declaration import declared, key
 from dwell.model.frozen import FrozenDict
+from dwell.model.ros_topics import RosActuator
 
 #: Number of closed windows whose V_D determines whether a cell is degraded.
 RECENT_WINDOWS = 3
@@ -99,8 +100,9 @@ class LiveSettings:
         Bound(0, 1),
         default=0.1,
     )
-    actuators: Mapping[str, str] = key(
-        "What applies the commands of a sink task, as `package.module:Name`.",
+    actuators: Mapping[str, str | RosActuator] = key(
+        "What applies the commands of a sink task: `package.module:Name`, or `{ros2: {...}}` for "
+        "a ROS 2 topic.",
         default_factory=FrozenDict,
         digested="code",
         tier="first",
@@ -112,8 +114,9 @@ class LiveSettings:
     )
 
     def __post_init__(self) -> None:
-        for task, name in self.actuators.items():
-            require_callable_name(f"live.actuators.{task}", name)
+        for task, actuator in self.actuators.items():
+            if isinstance(actuator, str):
+                require_callable_name(f"live.actuators.{task}", actuator)
         if self.observer is not None:
             require_callable_name("live.observer", self.observer)
 

@@ -10,6 +10,7 @@ from dwell.model.fabric import accelerator_name
 from dwell.model.frozen import FrozenDict, require_names, shortened
 from dwell.model.live import require_callable_name
 from dwell.model.process import Constant, Process
+from dwell.model.ros_topics import RosTopic
 
 #: Workers of a task on a node, and the task's default for each of its nodes.
 WORKERS = Bound(1, MAX_COUNT, whole=True)
@@ -94,6 +95,12 @@ class Task:
         digested="code",
         tier="first",
     )
+    ros2: RosTopic | None = key(
+        "ROS 2 topic that a source task reads, in place of `run`.",
+        default=None,
+        digested="code",
+        tier="first",
+    )
     warmup_jobs: int = key(
         "First jobs of a live worker that do not count in times of stages and in estimators.",
         Bound(0, MAX_COUNT, whole=True),
@@ -105,6 +112,10 @@ class Task:
     def __post_init__(self) -> None:
         if self.run is not None:
             require_callable_name("run", self.run)
+        if self.ros2 is not None:
+            require(
+                self.run is None, "run", self.run, "left out next to `ros2`: either is the code"
+            )
         require(len(self.on) > 0, "on", dict(self.on), "at least one node")
 
     @property

@@ -35,6 +35,7 @@ NAME_SIGN = re.compile(r"[\w.+:\- ]")
 LONGEST_NAME = 64
 #: Kinds of which a cell has at least one.
 NEEDED = frozenset({"node", "task", "candidate"})
+_ONE_NODE = "a task at a ROS 2 topic runs on one node: keep one of them"
 # How far shares may sum up beyond 1 by rounding.
 SHARE_TOLERANCE = 1e-9
 
@@ -113,6 +114,7 @@ def find_faults(parts: CellParts) -> list[Fault]:
         *_objective(parts),
         *_controller(parts),
         *_live(parts),
+        *_topics(parts),
     ]
 
 
@@ -429,6 +431,39 @@ def _live(parts: CellParts) -> Iterator[Fault]:
         yield from known
         if not known and any(flow.source == task for _, flow in parts.flows):
             yield Fault(path, f"{task} is no sink: other tasks take what it sends; leave it out")
+
+
+def _topics(parts: CellParts) -> Iterator[Fault]:
+    """Faults of the ROS 2 topics at the ends of a cell."""
+    targets = {flow.target for _, flow in parts.flows}
+    sources = {name: task for name, task in parts.tasks.items() if task is not None and task.ros2}
+    seen: dict[tuple[str, int | None], str] = {}
+    for name, task in sources.items():
+        path, topic = f"tasks.{name}.ros2", task.ros2
+        if name in targets:
+            yield Fault(path, f"{name} has inputs; only a source reads a topic: remove it")
+        if not task.anchored:
+            yield Fault(path, f"{name} can run on {' and '.join(task.on)}; {_ONE_NODE}")
+        if topic is not None:
+            read = topic.resolved, topic.domain
+            if read in seen:
+                yield Fault(f"{path}.topic", f"{topic.resolved} is read by {seen[read]}, too")
+            seen.setdefault(read, name)
+    for name, actuator in parts.live.actuators.items() if parts.live is not None else ():
+        sink = parts.tasks.get(name)
+        if sink is None or parts.live is None or isinstance(actuator, str):
+            continue
+        path, commands = f"live.actuators.{name}.ros2", actuator.ros2
+        if not sink.anchored:
+            where = " and ".join(sink.on)
+            yield Fault(path, f"{name} can run on {where}, and each would publish; {_ONE_NODE}")
+        if parts.live.silence == "zero" and not commands.stops:
+            what = f"missing, with live.silence zero: {commands.type} has no message that stops"
+            yield Fault(f"{path}.zero", f"{what} a robot; give its fields, or set silence: hold")
+        if commands.stamp_from is not None and commands.stamp_from not in sources:
+            yield from _unknown(
+                f"{path}.stamp_from", "task with `ros2`", commands.stamp_from, sources
+            )
 
 
 def _columns(parts: CellParts) -> Iterator[Fault]:

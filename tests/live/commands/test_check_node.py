@@ -211,3 +211,40 @@ def test_frames_need_a_method_that_waits_for_them(tmp_path: Path) -> None:
     file = example(tmp_path, "waiting_stages", runs, **{**live, "release": "frames"})
     words = "waiting_stages:perceive has no method wait(), and live.release is frames"
     assert words in call("check", "--node", "R1", file).stderr
+
+
+def ros_cell(folder: Path, **changed: object) -> Path:
+    """Write the example's cell of ROS 2 topics, with changes of its camera's topic."""
+    known = to_document(dwell.load(EXAMPLE / "ros2.yaml"))
+    known["tasks"]["camera"]["ros2"] |= changed
+    for name in ("stages", "ros_stages"):
+        shutil.copy(EXAMPLE / f"{name}.py", folder / f"{name}.py")
+    file = folder / "cell.yaml"
+    file.write_text(yaml.safe_dump({**known, "name": folder.name}, sort_keys=False))
+    return file
+
+
+def test_topics_of_a_node_are_checked(tmp_path: Path) -> None:
+    assert call("check", ros_cell(tmp_path), "--node", "R1").exit_code == 0
+    file = ros_cell(tmp_path, type="own_msgs/msg/Picture")
+    result = call("check", file, "--node", "R1")
+    assert result.exit_code == 2
+    assert "tasks.camera.run: unknown type own_msgs/msg/Picture; types of your own" in result.stderr
+    for folder, field in (("wide", "wstring name"), ("plain", "uint8[] pixels")):
+        types = tmp_path / folder / "own_msgs" / "msg" / "Picture.msg"
+        types.parent.mkdir(parents=True)
+        types.write_text(f"{field}\n")
+        file = ros_cell(tmp_path, type="own_msgs/msg/Picture", messages=folder)
+        result = call("check", file, "--node", "R1")
+        assert ("Picture.name: a wstring" in result.stderr) == (folder == "wide")
+    assert result.exit_code == 0
+
+
+def test_topics_without_keys_of_a_cell_with_keys_are_a_warning(tmp_path: Path) -> None:
+    keys = tmp_path / "keys"
+    file = ros_cell(tmp_path)
+    assert call("keys", "init", file, "--out", keys).exit_code == 0
+    words = "check", file, "--node", "R1", "--keys", keys / "R1"
+    assert "tasks.camera.ros2: the cell has keys, and this topic has none" in call(*words).stderr
+    ros_cell(tmp_path, connect="tls/router:7447")
+    assert "this topic has none" not in call(*words).stderr

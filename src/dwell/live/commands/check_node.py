@@ -14,8 +14,9 @@ import typer
 from dwell.cli.output import aligned, print_json
 from dwell.errors import Fault, LiveError, TrustError, installing
 from dwell.live.host.security import Security, environment, exposed
+from dwell.live.host.stage_modules import actuator_of, ros_topics, stage_of
 from dwell.live.lint import lint
-from dwell.live.stage import CellStage, load_actuator, load_stage
+from dwell.live.stage import CellStage
 from dwell.live.wire.wiring import PORTS_PER_ROLE, Role, Wiring, roles, wire
 from dwell.model import Problem
 from dwell.model.bounds import counted
@@ -78,6 +79,8 @@ def check_node(
     stages = _stages(problem, node, states)
     faults += [*unsafe, *_packages(), *stages, *_actuators(problem, node)]
     warnings = [*(str(caution) for caution in lint(problem)), *states.warnings]
+    if security is not None and security.keyring is not None:
+        warnings += _open_topics(problem, node)
     if security is not None:
         warnings += [line.removeprefix("warning: ") for line in security.warnings()]
     if as_json:
@@ -98,6 +101,18 @@ def check_node(
                 f"restore() {one['restore_ms']:g} ms"
             )
     return not faults
+
+
+def _open_topics(problem: Problem, node: str) -> Iterator[str]:
+    """Yield a warning for each ROS topic of a node that is not encrypted, in a cell with keys."""
+    for path, topic in ros_topics(problem, node).items():
+        from dwell.live.ros2.ros_session import is_encrypted
+
+        if not is_encrypted(topic):
+            yield (
+                f"{path}: the cell has keys, and this topic has none: who reaches its router can "
+                "read it and publish on it; connect by tls/ (docs/howto/ros2.md)"
+            )
 
 
 def _packages() -> Iterator[Fault]:
@@ -137,11 +152,8 @@ def _stages(problem: Problem, node: str, states: StateTimes) -> Iterator[Fault]:
         if node not in task.on:
             continue
         where = f"tasks.{name}.run"
-        if task.run is None:
-            yield Fault(where, "missing; name its stage, as module:Name")
-            continue
         try:
-            stage = load_stage(task.run, where)
+            stage = stage_of(problem, name)
         except LiveError as error:
             yield Fault(where, str(error).removeprefix(f"{where}: "))
             continue
@@ -149,7 +161,7 @@ def _stages(problem: Problem, node: str, states: StateTimes) -> Iterator[Fault]:
         frames = problem.live.release == "frames" and name == first
         if frames and not stage.has_frames:
             yield Fault(where, f"{task.run} has no method wait(), and live.release is frames")
-        yield from _state(name, task.run, stage, task.state_bytes)
+        yield from _state(name, task.run or "ros2", stage, task.state_bytes)
         if stage.stateful and task.state_bytes:
             states.measure(problem, name, stage)
 
@@ -176,12 +188,8 @@ def _actuators(problem: Problem, node: str) -> Iterator[Fault]:
         if problem.pipeline.outputs(name) or node not in task.on:
             continue
         where = f"live.actuators.{name}"
-        run = problem.live.actuators.get(name)
-        if run is None:
-            yield Fault(where, "missing; name what applies its commands, as module:Name")
-            continue
         try:
-            load_actuator(run, where)
+            actuator_of(problem, name)
         except LiveError as error:
             yield Fault(where, str(error).removeprefix(f"{where}: "))
 

@@ -587,6 +587,13 @@ def status_lines(status: dict[str, Any], *, stages: bool = False) -> list[str]:
             f"{window['cost']:.3f}, {window['reason']}; {released}silences {status['silences']}; "
             f"utilisation {used}"
         )
+    for who, topic in status["topics"].items():
+        stamp_ms = topic["stamp_ms"]
+        lines.append(
+            f"  {who:24} {topic['topic']}: {topic['rate_hz']:.3g} Hz of "
+            f"{1e3 / topic['period_ms']:.3g}, jitter {topic['jitter_ms']:.1f} ms, {topic['lost']} "
+            f"lost, stamp to arrival {'not known' if stamp_ms is None else f'{stamp_ms:.1f} ms'}"
+        )
     if status["changed"]:
         lines.append(f"controller: {status['changed']}")
     lines += [f"  {who:24} differs    {why}" for who, why in sorted(status["strangers"].items())]

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from dwell.cli.output import write_file
+from dwell.live.host.stage_modules import ros_topics
 from dwell.live.log import say
 from dwell.model import Problem
 
@@ -114,6 +115,11 @@ def unit_texts(
         called = f"Dwell controller of cell {problem.name}"
         name = f"dwell-controller@{escaped_name(problem.name)}.service"
         units[name] = unit(called, controller, CONTROLLER)
+        if any(ros_topics(problem, one) for one in problem.fabric.nodes):
+            called = f"ROS 2 diagnostics of cell {problem.name}"
+            text = unit(called, ("ros2", "diagnostics", str(cell)), "")
+            name = f"dwell-diagnostics@{escaped_name(problem.name)}.service"
+            units[name] = text.replace("Type=notify", "Type=exec")
     return units
 
 

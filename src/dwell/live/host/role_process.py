@@ -23,6 +23,7 @@ from dwell.live.host.hosting import (
 )
 from dwell.live.host.lowest_class import take_lowest_class
 from dwell.live.host.security import Security
+from dwell.live.host.stage_modules import actuator_of, stage_of
 from dwell.live.host.state_files import (
     BookFile,
     HighestFile,
@@ -38,7 +39,6 @@ from dwell.live.roles.sink import Rest, Sink
 from dwell.live.roles.stage_counts import StageBook, book_path
 from dwell.live.roles.stamper import Stamper
 from dwell.live.roles.worker import Job, Worker
-from dwell.live.stage import CellActuator, load_actuator, load_stage
 from dwell.live.wire.messages import Header
 from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import Role as Named
@@ -94,7 +94,8 @@ def _run(
             stamper.group_clock = group.taken_ns
         _host(stamper, place, stopped, clock)
         return True
-    actuator = _actuator(problem, role.task)
+    actuator = actuator_of(problem, role.task)
+    actuator.start()
     highest = HighestFile(folder / f"{role.who}.highest")
     sink = Sink(place, role.task, actuator, highest)
     if group is not None:
@@ -136,15 +137,6 @@ def bring_to_rest(sink: Sink, patience_s: float = ENDING_S) -> bool:
     return rests
 
 
-def _actuator(problem: Problem, task: str) -> CellActuator:
-    name = problem.live.actuators.get(task)
-    if name is None:
-        raise LiveError(
-            f"live.actuators.{task}: missing; name what applies its commands, as module:Name"
-        )
-    return load_actuator(name, f"live.actuators.{task}")
-
-
 def _work(
     role: Named,
     place: RolePlace,
@@ -154,11 +146,8 @@ def _work(
     group: ControlGroup | None,
 ) -> None:
     problem = place.problem
-    name = problem.pipeline.tasks[role.task].run
     try:
-        if name is None:
-            raise LiveError(f"tasks.{role.task}.run: missing; name its stage, as module:Name")
-        stage = load_stage(name, f"tasks.{role.task}.run")
+        stage = stage_of(problem, role.task, role.index)
     except LiveError as error:
         # The process keeps running and reports the error in its beats, as restarts would hide it.
         print(error, file=sys.stderr, flush=True)

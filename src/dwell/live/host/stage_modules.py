@@ -1,12 +1,14 @@
-"""Check of the modules of a cell's stages, before the first process starts."""
+"""Stages and actuators of a cell: their modules are checked, and their objects made."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
 from pathlib import Path
 
-from dwell.errors import LiveError, missing_package
+from dwell.errors import LiveError, missing_package, not_installed
+from dwell.live.stage import CellActuator, CellStage, StagePlace, load_actuator, load_stage
 from dwell.model import Problem
+from dwell.model.ros_topics import RosActuator, RosTopic
 from dwell.model.user_classes import import_user_module
 
 
@@ -19,16 +21,23 @@ def require_stages(problem: Problem, cell: Path, nodes: Collection[str]) -> None
     tasks = [
         task for task in problem.pipeline.tasks.values() if not task.on.keys().isdisjoint(nodes)
     ]
-    if without := [task.name for task in tasks if task.run is None]:
+    if without := [task.name for task in tasks if task.run is None and task.ros2 is None]:
         raise LiveError(
             f"{cell}: nothing to run for {', '.join(without)}; a live cell needs `run: "
             "module:Name` for every task (docs/live-tutorial.md)"
         )
     actuators = problem.live.actuators
+    names: dict[str, str | RosActuator | None]
     names = {f"tasks.{task.name}.run": task.run for task in tasks}
     names |= {f"live.actuators.{task.name}": actuators.get(task.name) for task in tasks}
+    missing = not_installed("ros2")
+    if missing and any(ros_topics(problem, node) for node in nodes):
+        missing_names = " and ".join(missing)
+        raise LiveError(
+            f"{missing_names} not installed; in a checkout of Dwell: pip install '.[ros2]'"
+        )
     for where, name in names.items():
-        if name is None:
+        if not isinstance(name, str):
             continue
         module = name.partition(":")[0]
         try:
@@ -37,3 +46,67 @@ def require_stages(problem: Problem, cell: Path, nodes: Collection[str]) -> None
             cause = error.__cause__
             missing = missing_package(cause) if isinstance(cause, ModuleNotFoundError) else None
             raise missing or error from cause
+
+
+def ros_topics(problem: Problem, node: str) -> dict[str, RosTopic]:
+    """Return the ROS topics at the ends of the cell on a node, by their paths in the cell file."""
+    found: dict[str, RosTopic] = {}
+    for name, task in problem.pipeline.tasks.items():
+        actuator = problem.live.actuators.get(name)
+        if node in task.on and task.ros2 is not None:
+            found[f"tasks.{name}.ros2"] = task.ros2
+        if node in task.on and isinstance(actuator, RosActuator):
+            found[f"live.actuators.{name}.ros2"] = actuator.ros2
+    return found
+
+
+def stage_of(problem: Problem, name: str, index: int = 0) -> CellStage:
+    """Make the stage of a task, for its process or standby `index`."""
+    task = problem.pipeline.tasks[name]
+    where = f"tasks.{name}.run"
+    if task.ros2 is not None:
+        from dwell.live.ros2 import Source
+
+        stage: CellStage = Source.of(task.ros2)
+    elif task.run is not None:
+        stage = load_stage(task.run, where)
+    else:
+        raise LiveError(f"{where}: missing; name its stage, as module:Name")
+    stage.placed(_place(problem, name, index))
+    _check(stage, where)
+    return stage
+
+
+def actuator_of(problem: Problem, name: str) -> CellActuator:
+    """Make the actuator of a sink task."""
+    where, given = f"live.actuators.{name}", problem.live.actuators.get(name)
+    if given is None:
+        raise LiveError(f"{where}: missing; name what applies its commands, as module:Name")
+    if isinstance(given, RosActuator):
+        from dwell.live.ros2 import Sink
+
+        actuator: CellActuator = Sink.of(given.ros2)
+    else:
+        actuator = load_actuator(given, where)
+    actuator.placed(_place(problem, name, 0))
+    _check(actuator, where)
+    return actuator
+
+
+def _check(made: CellStage | CellActuator, where: str) -> None:
+    try:
+        made.check()
+    except Exception as error:
+        known = isinstance(error, LiveError)
+        raise LiveError(
+            f"{where}: {error if known else f'check() raised {type(error).__name__}: {error}'}"
+        ) from error
+
+
+def _place(problem: Problem, name: str, index: int) -> StagePlace:
+    """Return the place of the process of a stage or an actuator."""
+    return StagePlace(
+        *(problem.name, name, index, problem.folder, problem.max_age_ms),
+        max((flow.payload_bytes for flow in problem.pipeline.outputs(name)), default=0),
+        problem.live.clock == "system",
+    )

@@ -765,6 +765,7 @@ class ControlledCell:
             "flows": {},
             **(self.windows.status() if self.windows is not None else {}),
             **(self.windows.symptoms(now_ns) if self.windows is not None else {}),
+            "topics": self._topics(now_ns),
             "processes": self._processes(now_ns),
             "certificates": self._certificates(now_ns),
             **self._missing(now_ns),
@@ -795,6 +796,23 @@ class ControlledCell:
                 "note": beat.note,
             }
             for who, beat, age_ns in self.pulse.detector.everybody(now_ns)
+        }
+
+    def _topics(self, now_ns: int) -> dict[str, dict[str, Any]]:
+        """Return the rates of the topics that sources read, by source."""
+        silent_ns = silent_after_ns(self.place.problem)
+        return {
+            who: {
+                "topic": rates.topic,
+                "rate_hz": round(rates.rate_hz, 3),
+                "period_ms": self.place.problem.pipeline.period_ms,
+                "jitter_ms": round(rates.jitter_ms, 3),
+                "lost": rates.lost,
+                "age_ms": round(rates.age_ms, 1) if rates.age_ms >= 0 else None,
+                "stamp_ms": None if rates.stamp_ms is None else round(rates.stamp_ms, 3),
+            }
+            for who, beat, age_ns in self.pulse.detector.everybody(now_ns)
+            if (rates := beat.rates) is not None and age_ns <= silent_ns
         }
 
     def _certificates(self, now_ns: int) -> dict[str, dict[str, Any]]:

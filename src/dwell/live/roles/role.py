@@ -23,6 +23,7 @@ from dwell.live.wire.messages import (
     Header,
     Heard,
     Load,
+    Rates,
     Stamp,
     decode,
     encode,
@@ -61,6 +62,7 @@ class BeatState(NamedTuple):
     placement: str = ""
     run: int = 0
     moving: bool = False
+    rates: Rates | None = None
 
 
 class RoleLogic(Protocol):
@@ -423,12 +425,12 @@ class Pulse:
 
     def _put(self, now_ns: int, ready: bool, note: str, heard: tuple[Heard, ...]) -> None:
         place = self.place
-        term, placement, run, moving = self._holds()
+        term, placement, run, moving, rates = self._holds()
         keyring = None if place.seals is None else place.seals.keyring
         keys = (0, 0) if keyring is None else (keyring.own.generation, keyring.roster.number)
         beat = Beat(
             *(place.who, place.node, place.life, now_ns, ready, heard, term, placement),
-            *(self._digest, printable(note)[:2000], __version__, run, moving, *keys),
+            *(self._digest, printable(note)[:2000], __version__, run, moving, *keys, rates),
         )
         place.put_twice(self._key, beat)
 

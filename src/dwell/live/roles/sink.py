@@ -117,7 +117,8 @@ class Sink:
             command = read_payload(header.kind, payload, expected)
             released_ns, _ = self.offsets.from_reference(self.place.node, stamp.released_ns)
             self._call = f"cycle {stamp.cycle}: apply()", now_ns
-            self.actuator.apply(Message(command, stamp.cycle, released_ns, age_ms))
+            stamp_ns = self._oldest_ns(header)
+            self.actuator.apply(Message(command, stamp.cycle, released_ns, age_ms, stamp_ns))
         except Exception as error:  # the user's code
             self.trouble = self._complain(f"cycle {stamp.cycle}: apply()", error)
             return False
@@ -126,6 +127,12 @@ class Sink:
         self.trouble = self._restless = ""
         self._alarm_ns, self._rests = alarm_ns, False
         return True
+
+    def _oldest_ns(self, header: Header) -> int | None:
+        """Return the stamp of the oldest source, or of the source that the actuator names."""
+        wanted = self.actuator.stamp_from
+        found = [hop.stamp_ns for hop in header.hops if wanted in ("", hop.task)]
+        return min((one for one in found if one is not None), default=None)
 
     def rest(self, how: Rest) -> bool:
         """Call an actuator's method that brings it to rest; return False if it raised."""
@@ -156,7 +163,8 @@ class Sink:
         return trouble
 
     def _state(self) -> tuple[bool, str]:
-        return True, "; ".join(filter(None, (self._restless, self.trouble)))
+        report = self.actuator.report()
+        return report.ready, "; ".join(filter(None, (self._restless, self.trouble, report.note)))
 
     def _passed(self) -> BeatState:
         return BeatState(run=max(self.newest[0], 0))

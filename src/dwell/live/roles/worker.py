@@ -19,6 +19,7 @@ from dwell.live.wire.messages import (
     Completion,
     Header,
     Hop,
+    Rates,
     Restored,
     Snapshot,
     Stamp,
@@ -679,7 +680,8 @@ class Worker:
         before, cpu_ns, after = self._counted
         spent = cpu_ns, *after.since(before)
         group_ns = before.group_ns, after.group_ns
-        hop = Hop(self.task, place.node, *times, inputs, state_age, *spent, group_ns, warmup)
+        stamp_ns, here = output.stamp_ns, (self.task, place.node)
+        hop = Hop(*here, *times, inputs, state_age, *spent, group_ns, warmup, stamp_ns)
         seal, hops = job.header.seal, (*job.hops(), hop)
         header = Header(stamp, self.task, place.node, kind, hops, job.shadow, seal)
         head = encode(header)
@@ -736,6 +738,9 @@ class Worker:
         recent = self._now_ns < self._failed_ns + EVIDENCE_NS
         if recent and count >= self.place.problem.controller.failures_in_a_row:
             return False, f"{self.trouble}, {count} calls in a row"
+        report = self.stage.report()
+        if not report.ready:
+            return False, f"{where}: {report.note}"
         if self.triggers and self._framed_ns is None:
             self._framed_ns = self._now_ns
         if self._framed_ns is not None and self._now_ns - self._framed_ns > limit_ns:
@@ -744,7 +749,7 @@ class Worker:
                 True,
                 self.trouble or f"{where}: wait() has brought no frame for {silent_s:.0f} s",
             )
-        return True, self.trouble or self._without_checkpoints()
+        return True, self.trouble or report.note or self._without_checkpoints()
 
     def _without_checkpoints(self) -> str:
         if not (self._too_slow and self._checkpoint_nodes):
@@ -757,7 +762,9 @@ class Worker:
         """Return `moving`, set while a call of snapshot() or restore() for a migration runs."""
         since_ns, chore = self.busy_since_ns, self._chore
         called = chore is not None and chore.number > 0 and since_ns is not None
-        return BeatState(moving=called and self._now_ns - (since_ns or 0) <= MOVING_NS)
+        moving = called and self._now_ns - (since_ns or 0) <= MOVING_NS
+        topic = self.stage.report().topic
+        return BeatState(moving=moving, rates=None if topic is None else Rates(*topic))
 
     def wake(self, now_ns: int) -> int:
         """Send the beat if it is due; return the instant of the next one."""

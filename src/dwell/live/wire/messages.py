@@ -39,6 +39,8 @@ Spent: TypeAlias = Annotated[int, msgspec.Meta(ge=-1, lt=NEVER_NS)]
 Instant: TypeAlias = Annotated[int, msgspec.Meta(ge=-NEVER_NS, lt=NEVER_NS)]
 Forks: TypeAlias = Annotated[tuple[tuple[Name, Name], ...], msgspec.Meta(max_length=16)]
 Words: TypeAlias = Annotated[str, msgspec.Meta(max_length=2_000)]
+#: A finite number; NaN is outside of all bounds.
+Finite: TypeAlias = Annotated[float, msgspec.Meta(ge=-1e300, le=1e300)]
 
 
 class _Array(msgspec.Struct, array_like=True, frozen=True, gc=False):
@@ -114,6 +116,8 @@ class Hop(_Array, frozen=True):
         CPU time that the group had used at the start of the job and when the stage returned.
     warmup : bool
         Whether it is one of its worker's first `warmup_jobs`.
+    stamp_ns : int, optional
+        Stamp of the frame of a source, on any clock; no time is computed from it.
     """
 
     task: Name
@@ -128,6 +132,7 @@ class Hop(_Array, frozen=True):
     outside_ns: Spent = -1
     group_ns: tuple[Spent, Spent] = (-1, -1)
     warmup: bool = False
+    stamp_ns: Instant | None = None
 
 
 class Header(_Array, frozen=True):
@@ -205,6 +210,17 @@ class Heard(_Array, frozen=True):
     at_ns: Instant
 
 
+class Rates(_Array, frozen=True):
+    """Messages of a topic outside of the cell; see `dwell.live.stage.TopicRates`."""
+
+    topic: Annotated[str, msgspec.Meta(max_length=300)]
+    rate_hz: Finite
+    jitter_ms: Finite
+    lost: Count
+    age_ms: Finite
+    stamp_ms: Finite | None
+
+
 class Beat(_Array, frozen=True):
     """Heartbeat of a process, with the last beats that it received, to compare clocks.
 
@@ -228,6 +244,8 @@ class Beat(_Array, frozen=True):
         Whether a worker is saving or restoring a state for a migration.
     generation, roster : int
         Generation of the process's certificate, and number of its roster; 0 without keys.
+    rates : Rates, optional
+        The topic that a source reads, if it reads one.
     """
 
     who: Name
@@ -245,6 +263,7 @@ class Beat(_Array, frozen=True):
     moving: bool = False
     generation: Count = 0
     roster: Count = 0
+    rates: Rates | None = None
 
 
 class Order(_Array, frozen=True):

@@ -1,0 +1,67 @@
+"""`dwell ros2`: the state of a live cell for ROS 2."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dwell.cli.options import Insecure, Keys, argument, flag, option
+
+#: Seconds between two messages.
+EVERY_S = 1.0
+
+ros2 = typer.Typer(no_args_is_help=True, help="Show the state of a live cell to ROS 2.")
+
+
+@ros2.callback()
+def _group() -> None:
+    """Show the state of a live cell to ROS 2."""
+
+
+@ros2.command()
+def diagnostics(
+    cell: Annotated[Path, argument("CELL", "Cell file.")],
+    connect: Annotated[
+        str | None, option("ENDPOINT", "Zenoh router; by default tcp/localhost:7447.")
+    ] = None,
+    domain: Annotated[int | None, option("N", "Domain; by default ROS_DOMAIN_ID, or 0.")] = None,
+    once: Annotated[bool, flag("--once", "Publish one message, and end.")] = False,
+    keys: Keys = None,
+    insecure: Insecure = False,
+) -> None:
+    """Publish the state of a cell on /diagnostics, once per second."""
+    import dwell
+    from dwell.errors import LiveError
+    from dwell.live.host.operator_client import OperatorClient
+    from dwell.live.host.security import environment
+    from dwell.live.ros2.diagnostics import TOPIC, TYPE
+    from dwell.live.ros2.diagnostics import diagnostics as fields_of
+    from dwell.live.ros2.topic_sink import Sink
+    from dwell.live.stage import Message, StagePlace
+
+    problem = dwell.load(cell)
+    sink = Sink(TOPIC, TYPE, connect=connect, domain=domain, require_subscriber=once)
+    sink.placed(StagePlace(problem.name, "diagnostics"))
+    sink.start()
+    try:
+        with OperatorClient(problem, environment(keys, insecure=insecure)) as visitor:
+            trouble = ""
+            while True:
+                until_s = time.monotonic() + EVERY_S
+                status = visitor.look(patience_s=EVERY_S)
+                try:
+                    sink.apply(Message(fields_of(problem, status, time.time_ns())))
+                except LiveError as error:
+                    if str(error) != trouble:
+                        typer.echo(f"warning: {error}", err=True)
+                    trouble = str(error)
+                else:
+                    trouble = ""
+                    if once:
+                        return
+                time.sleep(max(until_s - time.monotonic(), 0.0))
+    finally:
+        sink.stop()
