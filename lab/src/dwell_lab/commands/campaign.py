@@ -49,27 +49,29 @@ def campaign(
             autocompletion=several_policies,
         ),
     ] = None,
-    repetitions: Annotated[int, typer.Option(min=1, help="Of everything.")] = 5,
+    repetitions: Annotated[int, typer.Option(min=1, help="How often each run is repeated.")] = 5,
     windows: Windows = None,
     seconds: Seconds = None,
     seed: Seed = 1,
     out: Annotated[
-        Path | None, option("FOLDER", "Of the campaign; campaigns/CELL if not given.")
+        Path | None, option("FOLDER", "Folder of the campaign; campaigns/CELL if not given.")
     ] = None,
     name: TestbedName = "campaign",
     minutes: Annotated[
-        float | None, typer.Option(min=0, help="Begin no run that would end after these.")
+        float | None, typer.Option(min=0, help="Start no run that would end later.")
     ] = None,
     inventory: Annotated[
         Path | None, option("FILE", "Real hosts (YAML), instead of this machine's testbed.")
     ] = None,
-    report: Annotated[bool, flag("--report", "Measure nothing: report on what is there.")] = False,
+    report: Annotated[
+        bool, flag("--report", "Measure nothing: report on the finished runs.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Measure all policies in all scenarios, in random order.
 
-    What is done stays in the folder, whatever ends the work: the same command goes on. A run takes
-    120 s, if neither --windows nor --seconds is given.
+    Finished runs stay in the folder; the same command continues after an interruption. A run takes
+    120 s without --windows and --seconds.
     """
     length_s = seconds_of_runs(cell, windows, seconds)
     problem = dwell.load(cell)
@@ -143,7 +145,7 @@ def _run(campaign: Campaign, folder: Path, play: Play, name: str, minutes: float
         done, planned = len(list(folder.glob("runs/*/run.json"))), len(campaign.plan())
         interrupted(
             f"{done} of {counted(planned, 'run')} are done and stay in {folder}; the same command "
-            "goes on from there"
+            "continues"
         )
 
 
@@ -191,7 +193,7 @@ def _print(
     if state is not None and state.given_up:
         typer.echo(f"given up: {', '.join(state.given_up)}", err=True)
     if state is not None and state.left:
-        typer.echo(f"{counted(state.left, 'run')} left; the same command goes on", err=True)
+        typer.echo(f"{counted(state.left, 'run')} left; the same command continues", err=True)
 
 
 def _document(
