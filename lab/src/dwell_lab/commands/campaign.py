@@ -38,27 +38,32 @@ def campaign(
     cell: CellArgument,
     scenarios: Annotated[
         str | None,
-        option("NAME,NAME", "The paper's four if not given.", autocompletion=several_scenarios),
+        option(
+            "NAME,NAME",
+            "Scenarios.",
+            default="the paper's four",
+            autocompletion=several_scenarios,
+        ),
     ] = None,
     policies: Annotated[
         str | None,
         option(
             "NAME,NAME",
-            "Policies, candidates, or policies with an estimator, as cusum+corrected; all "
-            "candidates, atp, dtp and cusum+corrected if not given.",
+            "Policies, candidates, or policies with an estimator, such as cusum+corrected.",
+            default="all candidates, atp, dtp, cusum+corrected",
             autocompletion=several_policies,
         ),
     ] = None,
-    repetitions: Annotated[int, typer.Option(min=1, help="How often each run is repeated.")] = 5,
+    repetitions: Annotated[int, option("N", "Repetitions of each run.", min=1)] = 5,
     windows: Windows = None,
     seconds: Seconds = None,
     seed: Seed = 1,
     out: Annotated[
-        Path | None, option("FOLDER", "Folder of the campaign; campaigns/CELL if not given.")
+        Path | None, option("FOLDER", "Folder of the campaign.", default="campaigns/CELL")
     ] = None,
     name: TestbedName = "campaign",
     minutes: Annotated[
-        float | None, typer.Option(min=0, help="Start no run that would end later.")
+        float | None, option("N", "Start no run that would end later.", min=0)
     ] = None,
     inventory: Annotated[
         Path | None, option("FILE", "Real hosts (YAML), instead of this machine's testbed.")

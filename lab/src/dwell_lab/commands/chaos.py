@@ -19,17 +19,15 @@ MARK = ".dwell-chaos"
 
 
 def chaos(
-    cell: Annotated[
-        Path | None, argument("[CELL]", "Cell file; a light cell if not given.")
-    ] = None,
-    minutes: Annotated[float | None, typer.Option(min=0.1, help="No fault begins later.")] = None,
-    faults: Annotated[int | None, typer.Option(min=1, help="How many.")] = None,
+    cell: Annotated[Path | None, argument("CELL", "Cell file; a light cell without it.")] = None,
+    minutes: Annotated[float | None, option("N", "Start no fault later.", min=0.1)] = None,
+    faults: Annotated[int | None, option("N", "Number of faults.", min=1)] = None,
     seed: Seed = 1,
     only: Annotated[
-        int | None, typer.Option(min=1, help="Inject only this fault of the timeline.")
+        int | None, option("N", "Inject only this fault of the timeline.", min=1)
     ] = None,
     out: Annotated[
-        Path | None, option("FOLDER", "Folder for logs, runs and observations; kept afterwards.")
+        Path | None, option("FOLDER", "Folder for logs, runs and observations, which are kept.")
     ] = None,
     hosts: Annotated[
         bool, flag("--hosts", "Give each node its own host of a testbed; needs root.")

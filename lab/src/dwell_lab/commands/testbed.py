@@ -45,7 +45,7 @@ def run(
     seed: Seed = 1,
     out: Annotated[
         Path | None,
-        option("FOLDER", "Folder for logs and the run; below testbed-out if not given."),
+        option("FOLDER", "Folder for logs and the run.", default="below testbed-out"),
     ] = None,
     name: TestbedName = "bed",
     jobs: Annotated[bool, flag("--jobs", "Keep every job of the run.")] = False,
@@ -119,7 +119,7 @@ def _lines(totals: dict[str, Any]) -> str:
 
 @testbed.command()
 def doctor(
-    cells: Annotated[list[Path] | None, argument("CELL...", "Cell files to check as well.")] = None,
+    cells: Annotated[list[Path] | None, argument("CELL", "Cell files to check as well.")] = None,
     watch: Annotated[
         float, option("SECONDS", "Time to watch for pauses of the machine.", min=0)
     ] = 0.0,
@@ -151,8 +151,8 @@ def calibrate(
     runs: Annotated[
         list[Path] | None,
         argument(
-            "RUN...",
-            "Folders of runs with their jobs: baseline, and single-task stress. Without any, "
+            "RUN",
+            "Folders of runs with their jobs: baseline and single-task stress. Without them, "
             "the baseline is run under every candidate.",
         ),
     ] = None,

@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 
 
 def validate(
-    runs: Annotated[list[Path], argument("RUN...", "Folders of measured runs.")],
+    runs: Annotated[list[Path], argument("RUN", "Folders of measured runs.")],
     cell: Annotated[Path, option("FILE", "Calibrated cell file (YAML).")],
     out: Annotated[
-        Path | None, option("FOLDER", "Folder for page and table; validations/CELL if not given.")
+        Path | None, option("FOLDER", "Folder for page and table.", default="validations/CELL")
     ] = None,
     seeds: Annotated[
         int, option("N", "Seeds 1 to N of every run.", min=2, callback=require_few)
