@@ -19,11 +19,11 @@ ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "lab").rglob("*.md")])
 EXECUTED = (
     "docs/start/first-result.md",
-    "docs/estimators.md",
-    "docs/live-tutorial.md",
-    "docs/profiling.md",
-    "docs/studies.md",
-    "docs/tutorial.md",
+    "docs/reference/estimators.md",
+    "docs/start/live-tutorial.md",
+    "docs/howto/profiling.md",
+    "docs/howto/studies.md",
+    "docs/start/tutorial.md",
     "lab/docs/validation.md",
 )
 

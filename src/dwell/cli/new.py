@@ -39,7 +39,7 @@ HEAD = """\
 #   objective           what a good placement is: weights, targets, caps
 #   controller.policy   who decides: `policy:Patient` is the class in policy.py
 {more}
-# Keys of the tier `first`; docs/cells.md lists all keys by tier:
+# Keys of the tier `first`; docs/reference/cells.md lists all keys by tier:
 {keys}
 # `dwell check cell.yaml` finds every fault in it; `python test_cell.py` plays it.
 """
