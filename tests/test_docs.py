@@ -16,7 +16,10 @@ from docs import commands as commands_page
 from dwell.cli.commands import app
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "lab").rglob("*.md")])
+FOLDERS = ("docs", "lab", "reproduction")
+PAGES = sorted(
+    [*ROOT.glob("*.md"), *(page for name in FOLDERS for page in (ROOT / name).rglob("*.md"))]
+)
 EXECUTED = (
     "docs/start/first-result.md",
     "docs/reference/estimators.md",
