@@ -31,8 +31,8 @@ def check(
     node: Annotated[
         str | None,
         typer.Option(
-            help="Check instead that this computer can be that node of the live cell: import and "
-            "make its stages and actuators.",
+            help="Check instead that this computer can be this node of the live cell: import and "
+            "construct its stages and actuators.",
             autocompletion=nodes,
             hidden=True,
         ),
@@ -44,8 +44,8 @@ def check(
 ) -> None:
     """Find all faults of a cell, or show what its candidates do.
 
-    Faults go to stderr, one a line as file:line: path: message, and the exit code is 2. Warnings
-    go there too, but do not change it.
+    Faults and warnings go to stderr, one per line as file:line: path: message. The exit code is 2
+    with faults, 0 with warnings only.
     """
     try:
         problem = dwell.load(cell, traces=traces)

@@ -32,8 +32,8 @@ def completion(
 ) -> None:
     """Print the completion script of bash, zsh or fish.
 
-    Read it where your shell begins: source <(dwell completion bash) in ~/.bashrc, the same with zsh
-    in ~/.zshrc after compinit, dwell completion fish | source in ~/.config/fish/config.fish.
+    Put `source <(dwell completion bash)` into ~/.bashrc, the same with zsh into ~/.zshrc after
+    compinit, or `dwell completion fish | source` into ~/.config/fish/config.fish.
     """
     from typer.completion import show_callback
 

@@ -63,7 +63,7 @@ STAGES_HEAD = {
 def new(
     folder: Annotated[Path, argument("NAME", "Folder to make.")],
     origin: Annotated[
-        Origin, typer.Option("--from", help="Example to begin as: simulated, or live.")
+        Origin, typer.Option("--from", help="Example to start from: simulated or live.")
     ] = Origin.CANONICAL,
 ) -> None:
     """Make a folder with a cell, a policy, stages and a test.

@@ -36,22 +36,18 @@ PAGE = "report.html"
 
 
 def report(
-    folder: Annotated[
-        Path, argument("FOLDER", "Of a saved run, of a fleet, of a study, or of a campaign.")
-    ],
+    folder: Annotated[Path, argument("FOLDER", "Folder of a run, fleet, study or campaign.")],
     out: Annotated[
-        Path | None, option("FILE", "Page to write [default: FOLDER/report.html].")
+        Path | None, option("FILE", "Page to write.", default="FOLDER/report.html")
     ] = None,
     trace: Annotated[
         Path | None,
-        option(
-            "FILE", "Also write every job as a trace for Perfetto; the run must have kept its jobs."
-        ),
+        option("FILE", "Also write every job as a trace for Perfetto; needs a run with --jobs."),
     ] = None,
     mcap: Annotated[
         Path | None,
         option(
-            "FILE", "Also write its tables as an MCAP file for Foxglove, PlotJuggler and others."
+            "FILE", "Also write the tables as an MCAP file for Foxglove, PlotJuggler and others."
         ),
     ] = None,
     figures: Annotated[
@@ -59,10 +55,10 @@ def report(
         option("FOLDER", "Also write figures and tables for a paper: PDF, SVG, LaTeX, CSV."),
     ] = None,
     static: Annotated[
-        bool, flag("--static", "A page without scripts: nothing to hover or choose.")
+        bool, flag("--static", "Write a page without scripts: no tooltips, no menus.")
     ] = False,
     cells: Annotated[
-        bool, flag("--cells", "Of a fleet: also write the page of every cell.")
+        bool, flag("--cells", "Also write the page of every cell of a fleet.")
     ] = False,
     as_json: Json = False,
 ) -> None:

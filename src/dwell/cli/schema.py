@@ -18,11 +18,9 @@ SCHEMA_FILE = "cell.schema.json"
 
 def schema(
     file: Annotated[
-        Path | None, argument("FILE", "What to write; cell.schema.json if not given.")
+        Path | None, argument("FILE", "File to write; cell.schema.json without it.")
     ] = None,
-    write: Annotated[
-        bool, flag("--write", "Write it, for an editor, instead of printing it.")
-    ] = False,
+    write: Annotated[bool, flag("--write", "Write it to a file for an editor.")] = False,
 ) -> None:
     """Print the JSON Schema of the cell file, or write it."""
     if write:

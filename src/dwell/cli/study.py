@@ -38,34 +38,34 @@ SHOWN = 40
 def study(
     file: Annotated[Path, argument("FILE", "Study file (YAML).")],
     out: Annotated[
-        Path | None, option("FOLDER", "Where parts and tables go; studies/NAME if not given.")
+        Path | None, option("FOLDER", "Folder for parts and tables.", default="studies/NAME")
     ] = None,
     processes: Processes = None,
     dask: Annotated[
-        str | None, option("ADDRESS", "Scheduler of a Dask cluster that does the work.")
+        str | None, option("ADDRESS", "Scheduler of a Dask cluster that simulates.")
     ] = None,
     seeds: Annotated[
         int | None,
         option(
-            "N", "Seeds 1 to N of every run; the file's if not given.", min=1, callback=require_few
+            "N", "Seeds 1 to N of every run.", default="the file's", min=1, callback=require_few
         ),
     ] = None,
     windows: Windows = None,
     seconds: Seconds = None,
     shard: Annotated[
         str | None,
-        option("I/N", "Simulate one of N shards, in a folder of its own."),
+        option("I/N", "Simulate one of N shards, in its own folder."),
     ] = None,
     merge: Annotated[
-        bool, flag("--merge", "Put all shards in the folder together, and simulate nothing.")
+        bool, flag("--merge", "Merge all shards in the folder; simulate nothing.")
     ] = False,
     as_json: Json = False,
 ) -> None:
     """Simulate all scenarios, policies and seeds of a study.
 
-    Finished runs stay in the folder, whatever ends the work: the same command plays the rest. Runs
-    have the length of the file, if neither --windows nor --seconds is given. Several computers
-    share a study with --shard; copy their shards into one folder, and --merge them.
+    Finished runs stay in the folder; the same command continues after an interruption. Runs have
+    the file's length without --windows and --seconds. Several computers share a study with
+    --shard; copy their shards into one folder and --merge them.
     """
     from dwell.estimators import unplayed
     from dwell.study import Shard, load_study, merge_shards, run_shard, run_study

@@ -33,19 +33,19 @@ def dash(
         Path | None,
         argument(
             "CELL|RUN|FLEET",
-            "Cell file of a cell that runs, or the folder of a run, or of a fleet's runs; "
-            "./cell.yaml if not given.",
+            "Cell file of a live cell, or folder of a run or of a fleet's runs; ./cell.yaml "
+            "without it.",
         ),
     ] = None,
     beside: Annotated[
-        Path | None, option("RUN", "Another run, to be shown on the same time line.")
+        Path | None, option("RUN", "Another run, shown on the same time line.")
     ] = None,
-    port: Annotated[int, option("P", "Of loopback; 0 takes a free one.", min=0, max=65_535)] = PORT,
+    port: Annotated[int, option("P", "Local port; 0 takes a free one.", min=0, max=65_535)] = PORT,
     no_browser: Annotated[
-        bool, flag("--no-browser", "Print the address only, and open no browser.")
+        bool, flag("--no-browser", "Print the address; open no browser.")
     ] = False,
     control: Annotated[
-        bool, flag("--control", "Let the page pin and drain; with keys, it takes an operator's.")
+        bool, flag("--control", "Let the page pin and drain; with keys, it needs an operator's.")
     ] = False,
     mcap: Annotated[
         Path | None,
@@ -56,7 +56,7 @@ def dash(
     ] = None,
     token: Annotated[
         Path | None,
-        option("FILE", "Where the page's token is kept, for Prometheus; made where there is none."),
+        option("FILE", "File with the page's token, for Prometheus; made if it is missing."),
     ] = None,
     keys: Keys = None,
     insecure: Insecure = False,
