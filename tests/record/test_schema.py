@@ -18,7 +18,7 @@ from dwell.record import OUTCOME_SENTENCES, OUTCOMES, REASON_SENTENCES, column_t
 from dwell.record.schema import frame_of, polars_schema, row_of
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "columns.md"
+PAGE = ROOT / "docs" / "reference" / "columns.md"
 HEAD = """\
 | column | type | unit | what it says | null |
 |---|---|---|---|---|
