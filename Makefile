@@ -19,7 +19,7 @@ COMPILE := $(UV) pip compile --quiet --python $(BIN)/python --universal --python
 	--generate-hashes --custom-compile-command "make lock" $(if $(UPGRADE),--upgrade)
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test test-sim test-live test-lab test-all check types tidy bench paper planted faults seeds chaos soak fuzz audit sbom lock clean again
+.PHONY: help env demo docs test test-sim test-live test-lab test-all check types tidy bench paper planted faults seeds chaos soak fuzz audit sbom lock clean again
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' Makefile
@@ -101,6 +101,9 @@ types:
 tidy:
 	$(BIN)/clang-tidy --quiet $(filter %.cpp,$(SOURCES))
 
+docs: $(VENV)/tools/site ## Make the site from the pages into build/site (strict)
+	PYTHONPATH=$< $(BIN)/python -m docs.site
+
 bench: env ## Run the benchmarks
 	$(BIN)/python -m benchmarks $(ARGS)
 
@@ -150,6 +153,7 @@ lock: $(VENV)/.uv ## Pin the dependencies of pyproject.toml again (UPGRADE=1: to
 		--output-file requirements/dev.txt
 	$(COMPILE) --group fuzz --output-file requirements/fuzz.txt
 	$(COMPILE) --group release --output-file requirements/release.txt
+	$(COMPILE) --group site --output-file requirements/site.txt
 	$(COMPILE) --group zig --output-file requirements/zig.txt
 	@! grep -nE '://|^ *--(index|extra-index|find-links|trusted-host)' requirements/*.txt
 
