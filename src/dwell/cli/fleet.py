@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 #: Cells, and rounds, that the terminal shows, and columns that time has there.
 SHOWN, TIMES = 24, 40
 THE_LIMIT = "the limit".rjust(TIMES // 2 + 4)
-#: Keys of a change that serves what was asked for.
+#: Keys of a change that serves the wanted number.
 CHANGE = ("change", "times")
 
 fleet = typer.Typer(
@@ -256,9 +256,7 @@ def capacity(
                 served = served_by(read, asked, **settings)
     except KeyboardInterrupt:
         runs = counted(kept.count, "run")
-        interrupted(
-            f"the results of {runs} are in {kept.file}; the same command goes on from there"
-        )
+        interrupted(f"the results of {runs} are in {kept.file}; the same command continues")
     if page is not None or figures is not None:
         shown_page = capacity_page(read.name, found, changes)
         with working("writing the report"):
@@ -417,7 +415,7 @@ def _cells(result: FleetRun, cells: Sequence[Mapping[str, Any]]) -> Iterator[str
 
 
 def _letters(names: Iterable[str]) -> dict[str, str]:
-    """Return a letter for each of some names: one of its own, if there is one left."""
+    """Return a letter for each name: a distinct letter while any is left."""
     letters: dict[str, str] = {}
     for name in names:
         free = (sign for sign in (*name.upper(), *"0123456789", "?") if sign.isalnum())
@@ -426,7 +424,7 @@ def _letters(names: Iterable[str]) -> dict[str, str]:
 
 
 def _placements(result: FleetRun, cell: str) -> list[str]:
-    """Return where a cell is over time, in at most so many columns as are shown."""
+    """Return a cell's placements over time, in at most TIMES columns."""
     placed = result.cells[cell].windows["placement"].to_list()
     count = min(len(placed), TIMES)
     return [str(placed[i * len(placed) // count]) for i in range(count)]
@@ -461,7 +459,7 @@ def _capacity_text(of: Fleet, found: Capacity, changes: Sequence[WhatIf]) -> str
     from dwell.report.capacity_page import answer, busy, errors, written
 
     limits = found.limits
-    excess = " beyond that of one cell" if found.limit_on == "excess" else ""
+    excess = " above one cell alone" if found.limit_on == "excess" else ""
     point = found.point(found.robots)
     facts = [
         ("robots", answer(found)),
@@ -469,7 +467,7 @@ def _capacity_text(of: Fleet, found: Capacity, changes: Sequence[WhatIf]) -> str
         ("played", f"{found.policy}, phases {found.phases}"),
     ]
     if limits is not None:
-        share = f"{limits.share:.0%} of what cycles that missed have waited"
+        share = f"{limits.share:.0%} of the waiting of missed cycles"
         used = point.utilisation.get(limits.name)
         told = "" if used is None else f", busy {used:.0%} at {point.robots}"
         facts.append(("what limits", f"{limits.name}, {share}{told}"))

@@ -140,11 +140,11 @@ def report(
     if figures is not None:
         typer.echo(f"figures: {figures}")
     if cells:
-        typer.echo(f"of cells: {folder}/*/{PAGE}")
+        typer.echo(f"cells: {folder}/*/{PAGE}")
 
 
 def _write_cells(folder: Path, runs: Mapping[str, Run], *, static: bool) -> dict[str, Path]:
-    """Write the page of every cell of a fleet beside its run; return them by the cells' names."""
+    """Write the page of each cell of a fleet next to its run; return the paths by cell."""
     from dwell.report.run_page import run_page
 
     pages: dict[str, Path] = {}
@@ -159,6 +159,6 @@ def _write_cells(folder: Path, runs: Mapping[str, Run], *, static: bool) -> dict
 
 
 def _links(folder: Path, page: Path) -> dict[str, str]:
-    """Return where a page finds those of a fleet's cells that are there."""
+    """Return links from a page to the existing pages of a fleet's cells."""
     known = folder.glob(f"*/{PAGE}")
     return {one.parent.name: quote(os.path.relpath(one, page.parent)) for one in known}

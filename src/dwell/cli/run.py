@@ -141,7 +141,7 @@ def run(
 
 
 def default_folder(*parts: str) -> Path:
-    """Return where a run is saved: its parts are told by their digest where they are long."""
+    """Return the folder for a run; a digest shortens a long name."""
     name = file_name("-".join(parts), more="+=")
     if len(name.encode()) > LONGEST_NAME:
         digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
@@ -150,12 +150,12 @@ def default_folder(*parts: str) -> Path:
 
 
 def _require_same(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Raise a RunError where a folder holds another run: other than this one made again."""
+    """Raise a RunError if a folder holds a run with other settings."""
     if not (folder / "run.json").is_file():
         return
     from dwell.study.other_placements import PLACEMENTS
 
-    # The software's version and the other placements' results do not make it another run.
+    # Versions and results of other placements are no settings.
     beside = {"versions": None, PLACEMENTS: None}
     kept = read_document(folder / "run.json")
     if {**kept, **beside} != {**json.loads(json.dumps(settings)), **beside}:

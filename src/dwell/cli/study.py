@@ -130,12 +130,12 @@ def _interruptible(folder: Path, study: Study) -> Iterator[Progress]:
     except KeyboardInterrupt:
         interrupted(
             f"{done} of {counted(of, 'run')} are finished and stay in {folder}; the same command "
-            "goes on from there"
+            "continues"
         )
 
 
 def _measures(study: Study) -> list[Measure]:
-    """Return what the terminal shows."""
+    """Return the columns of the terminal."""
     from dwell.report.formatting import COST, MIGRATIONS, ORACLE_REGRET, RATE, REGRET, own_measures
 
     compared = [REGRET, ORACLE_REGRET] if study.references else []
@@ -143,7 +143,7 @@ def _measures(study: Study) -> list[Measure]:
 
 
 def _text(result: StudyResult) -> str:
-    """Return a table a point and scenario."""
+    """Return one table per point and scenario."""
     from dwell.report.formatting import (
         few_seeds,
         independent_runs,
@@ -156,7 +156,7 @@ def _text(result: StudyResult) -> str:
     study = result.study
     measures = _measures(study)
     groups = len(study.points) * len(study.scenarios)
-    # Intervals take time: only of what is shown.
+    # Intervals take time, so only the shown rows get them.
     some = result.runs.head(SHOWN * len(study.policies) * len(study.seeds))
     keys = (*result.parameters, "scenario", "policy")
     rows = over_seeds(some, keys, [measure.column for measure in measures]).to_dicts()

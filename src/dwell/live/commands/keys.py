@@ -52,8 +52,8 @@ def init(
     _show(authority.roster, as_json=as_json)
     if not as_json:
         typer.echo(
-            f"\n{out}/ca stays here: whoever has it can be anybody.\n"
-            "Take every other folder to its host alone, and name it there with --keys."
+            f"\nKeep {out}/ca here: it can issue any certificate.\n"
+            "Copy each other folder to its host only, and name it there with --keys."
         )
 
 
