@@ -23,7 +23,7 @@ PAGES = ("docs", "lab/docs")
 #: The most habits per 1,000 words. Lower a figure with the text; the goal is 5 everywhere.
 MOST = {
     "docs": 6.8,
-    "docs.reference": 9.1,
+    "docs.reference": 7.9,
     "dwell.cellfile": 21.2,
     "dwell.dash": 15.2,
     "dwell.estimators": 18.8,
