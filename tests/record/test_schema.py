@@ -127,5 +127,6 @@ def test_every_outcome_and_reason_has_a_sentence() -> None:
     assert tuple(REASON_SENTENCES) == REASONS == get_args(Reason)
 
 
-def test_the_page_of_columns_is_the_generated_one() -> None:
+def test_the_page_of_columns_is_the_schema() -> None:
+    """`python -m docs.columns` writes its tables."""
     assert columns.PAGE.read_text(encoding="utf-8") == columns.page()
