@@ -22,8 +22,8 @@ SOURCES = ("src/dwell", "lab/src/dwell_lab")
 PAGES = ("docs", "lab/docs")
 #: The most habits per 1,000 words. Lower a figure with the text; the goal is 5 everywhere.
 MOST = {
-    "docs": 6.8,
-    "docs.reference": 7.9,
+    "docs": 6.7,
+    "docs.reference": 5.4,
     "dwell.cellfile": 21.2,
     "dwell.dash": 15.2,
     "dwell.estimators": 18.8,
