@@ -3,7 +3,8 @@
 Builds a wheel per processor, and looks at each with auditwheel. Installs the wheel with the pinned
 packages in each Python of this computer and simulates a packaged example; for other versions it
 looks up whether each pinned package has a wheel. Then it does what README says as a stranger: a
-clone in an empty folder, without the variables and the home folder of the user.
+clone in an empty folder and an empty home folder, with no variables except those by which this
+computer reaches a package index.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ PINS = ROOT / "requirements" / "runtime.txt"
 BLOCK = re.compile(r"^```(?:sh|console)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 #: Commands of README that a stranger's way leaves out: they take minutes, or need a wheel.
 LEFT_OUT = ("uv build", "make test", "make demo")
+#: Variables of a computer by which it reaches a package index.
+REACHES_INDEX = re.compile(r"SSL_CERT_|PIP_|UV_|(?:https?|no)_proxy$", re.IGNORECASE)
 
 
 def run(
@@ -105,9 +108,10 @@ def check_stranger(folder: Path) -> str:
     home.mkdir()
     run("git", "clone", "--quiet", ROOT, clone)
     commands = lines_of((clone / "README.md").read_text(encoding="utf-8"))
-    script = "set -e\n" + "\n".join(commands)
+    script = "\n".join(f"{command} || exit 1" for command in commands)
     path = os.environ["PATH"].replace(f"{Path(sys.executable).parent}{os.pathsep}", "")
-    run("env", "-i", f"PATH={path}", f"HOME={home}", "bash", "-c", script, folder=clone)
+    kept = {name: value for name, value in os.environ.items() if REACHES_INDEX.match(name)}
+    run("bash", "-c", script, folder=clone, environment={**kept, "PATH": path, "HOME": str(home)})
     return f"README in an empty home folder: {len(commands)} lines work"
 
 
