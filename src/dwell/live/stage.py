@@ -141,7 +141,7 @@ class Actuator(Protocol):
 
     It may also have ``inputs``, ``start()`` and ``stop()``.
 
-    A call of ``hold``, ``zero`` or ``stop`` that raises is repeated (docs/deploy.md).
+    A call of ``hold``, ``zero`` or ``stop`` that raises is repeated (docs/howto/deploy.md).
     """
 
     def apply(self, command: Message) -> None:

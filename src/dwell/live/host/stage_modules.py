@@ -24,7 +24,7 @@ def require_stages(problem: Problem, cell: Path, nodes: Collection[str]) -> None
     if without := [task.name for task in tasks if task.run is None and task.ros2 is None]:
         raise LiveError(
             f"{cell}: nothing to run for {', '.join(without)}; a live cell needs `run: "
-            "module:Name` for every task (docs/live-tutorial.md)"
+            "module:Name` for every task (docs/start/live-tutorial.md)"
         )
     actuators = problem.live.actuators
     names: dict[str, str | RosActuator | None]
