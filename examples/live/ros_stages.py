@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
 
 import msgspec
-from stages import Turn
 
 from dwell.live.stage import Message
 
@@ -29,9 +27,7 @@ class Twist(msgspec.Struct):
 class Steer:
     """The sink task: forward, and towards the light."""
 
-    inputs: ClassVar = {"planning": Turn}
-
     def process(self, inputs: Mapping[str, Message]) -> Message:
-        """Return the command; positive z turns left."""
-        rate = min(max(inputs["planning"].payload.rate, -0.8), 0.8)
+        """Return the command; positive z turns left. A struct without `inputs` is a dict."""
+        rate = min(max(inputs["planning"].payload["rate"], -0.8), 0.8)
         return Message(Twist(Vector(x=0.1), Vector(z=-rate)))

@@ -30,12 +30,9 @@ def require_stages(problem: Problem, cell: Path, nodes: Collection[str]) -> None
     names: dict[str, str | RosActuator | None]
     names = {f"tasks.{task.name}.run": task.run for task in tasks}
     names |= {f"live.actuators.{task.name}": actuators.get(task.name) for task in tasks}
-    missing = not_installed("ros2")
-    if missing and any(ros_topics(problem, node) for node in nodes):
-        missing_names = " and ".join(missing)
-        raise LiveError(
-            f"{missing_names} not installed; in a checkout of Dwell: pip install '.[ros2]'"
-        )
+    packages = " and ".join(not_installed("ros2"))
+    if packages and any(ros_topics(problem, node) for node in nodes):
+        raise LiveError(f"{packages} not installed; in a checkout of Dwell: pip install '.[ros2]'")
     for where, name in names.items():
         if not isinstance(name, str):
             continue
