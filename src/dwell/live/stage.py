@@ -16,6 +16,7 @@ from dwell.errors import LiveError
 __all__ = [
     "Actuator",
     "CellActuator",
+    "CellCode",
     "CellStage",
     "Message",
     "Stage",
@@ -93,8 +94,8 @@ class TopicRates(NamedTuple):
         Rate, and standard deviation of the intervals, of the last messages.
     lost : int
         Messages that the publishers have sent and that have not arrived.
-    age_ms : float
-        Time since the last message; -1 before the first.
+    age_ms : float, optional
+        Time since the last message.
     stamp_ms : float, optional
         Time from the stamp of the last message to its arrival, if the clocks are known to agree.
     """
@@ -103,7 +104,7 @@ class TopicRates(NamedTuple):
     rate_hz: float = 0.0
     jitter_ms: float = 0.0
     lost: int = 0
-    age_ms: float = -1.0
+    age_ms: float | None = None
     stamp_ms: float | None = None
 
 
@@ -154,20 +155,50 @@ class Actuator(Protocol):
         """Stop, because no command has arrived for too long."""
 
 
-class CellStage(ABC):
-    """Base class of stages, with defaults for the optional methods.
+class CellCode:
+    """Base class of stages and actuators, with defaults for the optional methods.
 
     Attributes
     ----------
     inputs : mapping of str to type
-        Type of the `msgspec.Struct` from each source task; other structs become dicts.
+        Type of the `msgspec.Struct` from each source task, or of the commands of a task; other
+        structs become dicts.
+    """
+
+    inputs: Mapping[str, type] = {}
+
+    def placed(self, place: StagePlace) -> None:
+        """Take the process and its limits; called before `start`."""
+        return
+
+    def check(self) -> None:
+        """Raise an error if `start` could not succeed, without an effect outside of the process."""
+        return
+
+    def start(self) -> None:
+        """Prepare for the first cycle or command."""
+        return
+
+    def stop(self) -> None:
+        """Release all resources at the end; called after `zero` of an actuator."""
+        return
+
+    def report(self) -> StageReport:
+        """Return its state for a beat; another thread calls this, also during a call."""
+        return StageReport()
+
+
+class CellStage(CellCode, ABC):
+    """Base class of stages.
+
+    Attributes
+    ----------
     stateful : bool
         Whether it has a state: it overrides `snapshot`.
     has_frames : bool
         Whether it can wait for a frame: it overrides `wait`.
     """
 
-    inputs: Mapping[str, type] = {}
     stateful: bool = False
     has_frames: bool = False
 
@@ -179,26 +210,6 @@ class CellStage(ABC):
     @abstractmethod
     def process(self, inputs: Mapping[str, Message]) -> Message:
         """As `Stage.process`."""
-
-    def placed(self, place: StagePlace) -> None:
-        """Take the process and its limits; called before `start`."""
-        return
-
-    def check(self) -> None:
-        """Raise an error if `start` could not succeed, without an effect outside of the process."""
-        return
-
-    def start(self) -> None:
-        """Prepare for the first cycle."""
-        return
-
-    def report(self) -> StageReport:
-        """Return its state for a beat; another thread calls this, also during `process`."""
-        return StageReport()
-
-    def stop(self) -> None:
-        """Release all resources after the last cycle."""
-        return
 
     def wait(self) -> object:
         """Wait for a new frame, which begins a cycle."""
@@ -213,35 +224,16 @@ class CellStage(ABC):
         raise LiveError("no method restore()")
 
 
-class CellActuator(ABC):
-    """Base class of actuators, with defaults for the optional methods.
+class CellActuator(CellCode, ABC):
+    """Base class of actuators.
 
     Attributes
     ----------
-    inputs : mapping of str to type
-        Type of the `msgspec.Struct` of commands, by its task.
     stamp_from : str
         Source task whose stamp the commands get; empty for the oldest stamp.
     """
 
-    inputs: Mapping[str, type] = {}
     stamp_from: str = ""
-
-    def placed(self, place: StagePlace) -> None:
-        """As `CellStage.placed`."""
-        return
-
-    def check(self) -> None:
-        """As `CellStage.check`."""
-        return
-
-    def start(self) -> None:
-        """Prepare for the first command."""
-        return
-
-    def report(self) -> StageReport:
-        """As `CellStage.report`."""
-        return StageReport()
 
     @abstractmethod
     def apply(self, command: Message) -> None:
@@ -253,10 +245,6 @@ class CellActuator(ABC):
 
     def zero(self) -> None:
         """As `Actuator.zero`."""
-        return
-
-    def stop(self) -> None:
-        """Release all resources; called after `zero` when its process ends in order."""
         return
 
 
@@ -284,7 +272,7 @@ class _UserActuator(CellActuator):
         self._apply(command)
 
 
-def _take(own: CellStage | CellActuator, given: object, members: Sequence[str]) -> None:
+def _take(own: CellCode, given: object, members: Sequence[str]) -> None:
     """Replace the defaults of some members by the members that a user's object has."""
     for name in members:
         if (member := getattr(given, name, None)) is not None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from tests.ports import free_ports
 
@@ -31,6 +34,7 @@ class RosNetwork:
 
     port: int
     processes: list[subprocess.Popen[str]] = field(default_factory=list)
+    readers: list[threading.Thread] = field(default_factory=list)
 
     @property
     def router(self) -> str:
@@ -54,9 +58,18 @@ class RosNetwork:
         """Start a node that publishes."""
         return self.start("sdk_node", "talk", str(self.port), topic, kind, str(rate_hz))
 
-    def listen(self, topic: str, kind: str) -> subprocess.Popen[str]:
-        """Start a node that prints each message as JSON."""
-        return self.start("sdk_node", "listen", str(self.port), topic, kind)
+    def listen(self, topic: str, kind: str) -> list[dict[str, Any]]:
+        """Start a node that listens; its messages are added to the list."""
+        process = self.start("sdk_node", "listen", str(self.port), topic, kind)
+        heard: list[dict[str, Any]] = []
+
+        def read() -> None:
+            for line in process.stdout or ():
+                heard.append(json.loads(line))  # noqa: PERF401 - as they come
+
+        self.readers.append(threading.Thread(target=read, daemon=True))
+        self.readers[-1].start()
+        return heard
 
 
 @contextmanager
@@ -70,6 +83,9 @@ def ros_network() -> Iterator[RosNetwork]:
             with suppress(OSError):
                 process.kill()
             process.wait()
+        for reader in network.readers:
+            reader.join()
+        for process in network.processes:
             if process.stdout is not None:
                 process.stdout.close()
 

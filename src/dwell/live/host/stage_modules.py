@@ -6,7 +6,14 @@ from collections.abc import Collection
 from pathlib import Path
 
 from dwell.errors import LiveError, missing_package, not_installed
-from dwell.live.stage import CellActuator, CellStage, StagePlace, load_actuator, load_stage
+from dwell.live.stage import (
+    CellActuator,
+    CellCode,
+    CellStage,
+    StagePlace,
+    load_actuator,
+    load_stage,
+)
 from dwell.model import Problem
 from dwell.model.ros_topics import RosActuator, RosTopic
 from dwell.model.user_classes import import_user_module
@@ -69,8 +76,7 @@ def stage_of(problem: Problem, name: str, index: int = 0) -> CellStage:
         stage = load_stage(task.run, where)
     else:
         raise LiveError(f"{where}: missing; name its stage, as module:Name")
-    stage.placed(_place(problem, name, index))
-    _check(stage, where)
+    _prepare(stage, where, problem, name, index)
     return stage
 
 
@@ -85,25 +91,18 @@ def actuator_of(problem: Problem, name: str) -> CellActuator:
         actuator: CellActuator = Sink.of(given.ros2)
     else:
         actuator = load_actuator(given, where)
-    actuator.placed(_place(problem, name, 0))
-    _check(actuator, where)
+    _prepare(actuator, where, problem, name)
     return actuator
 
 
-def _check(made: CellStage | CellActuator, where: str) -> None:
+def _prepare(made: CellCode, where: str, problem: Problem, name: str, index: int = 0) -> None:
+    """Tell a stage or an actuator its place, and check it; raise a LiveError that names it."""
+    longest = max((flow.payload_bytes for flow in problem.pipeline.outputs(name)), default=0)
+    limits = problem.folder, problem.max_age_ms, longest, problem.live.clock == "system"
+    made.placed(StagePlace(problem.name, name, index, *limits))
     try:
         made.check()
-    except Exception as error:
-        known = isinstance(error, LiveError)
-        raise LiveError(
-            f"{where}: {error if known else f'check() raised {type(error).__name__}: {error}'}"
-        ) from error
-
-
-def _place(problem: Problem, name: str, index: int) -> StagePlace:
-    """Return the place of the process of a stage or an actuator."""
-    return StagePlace(
-        *(problem.name, name, index, problem.folder, problem.max_age_ms),
-        max((flow.payload_bytes for flow in problem.pipeline.outputs(name)), default=0),
-        problem.live.clock == "system",
-    )
+    except LiveError as error:
+        raise LiveError(f"{where}: {error}") from error
+    except Exception as error:  # the user's code
+        raise LiveError(f"{where}: check() raised {type(error).__name__}: {error}") from error

@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any, Literal, Protocol, TypeAlias
 
+from msgspec.structs import asdict
+
 from dwell.control import Controller, Proposal
 from dwell.errors import LiveError
 from dwell.live.roles.health import PATIENCE_NS, diagnose, silent_after_ns
@@ -800,19 +802,11 @@ class ControlledCell:
 
     def _topics(self, now_ns: int) -> dict[str, dict[str, Any]]:
         """Return the rates of the topics that sources read, by source."""
-        silent_ns = silent_after_ns(self.place.problem)
+        silent_ns, period_ms = silent_after_ns(self.place.problem), self.place.period_ns / 1e6
         return {
-            who: {
-                "topic": rates.topic,
-                "rate_hz": round(rates.rate_hz, 3),
-                "period_ms": self.place.problem.pipeline.period_ms,
-                "jitter_ms": round(rates.jitter_ms, 3),
-                "lost": rates.lost,
-                "age_ms": round(rates.age_ms, 1) if rates.age_ms >= 0 else None,
-                "stamp_ms": None if rates.stamp_ms is None else round(rates.stamp_ms, 3),
-            }
+            who: {**asdict(beat.rates), "period_ms": period_ms}
             for who, beat, age_ns in self.pulse.detector.everybody(now_ns)
-            if (rates := beat.rates) is not None and age_ns <= silent_ns
+            if beat.rates is not None and age_ns <= silent_ns
         }
 
     def _certificates(self, now_ns: int) -> dict[str, dict[str, Any]]:

@@ -40,8 +40,8 @@ ROUTER = "tcp/localhost:7447"
 CONFIG, DOMAIN = "ZENOH_SESSION_CONFIG_URI", "ROS_DOMAIN_ID"
 #: Time between two looks at the connections, and two attempts to open the session.
 LOOK_S = 0.25
-#: Shortest and longest pause between attempts to connect, ms.
-RETRY_MS = 250, 1_000
+#: Pauses between attempts to connect.
+RETRY = {"period_init_ms": 250, "period_max_ms": 1_000, "period_increase_factor": 2}
 #: Number of an endpoint in the session; its node has the number 0.
 _ENDPOINT = 1
 #: Most different warnings of one endpoint.
@@ -62,32 +62,23 @@ def configuration(settings: RosTopic, environment: Mapping[str, str] = os.enviro
     """Return the configuration of a session, as rmw_zenoh's where nothing else is given."""
     import zenoh
 
-    first_ms, last_ms = RETRY_MS
-    file = environment.get(CONFIG, "")
+    file, is_client = environment.get(CONFIG, ""), settings.mode == "client"
     config = zenoh.Config.from_file(file) if file else zenoh.Config()
     values: dict[str, object] = {
-        "connect/timeout_ms": 0 if settings.mode == "client" else -1,
-        "connect/exit_on_failure": settings.mode == "client",
-        "connect/retry": {
-            "period_init_ms": first_ms,
-            "period_max_ms": last_ms,
-            "period_increase_factor": 2,
-        },
+        "connect/timeout_ms": 0 if is_client else -1,
+        "connect/exit_on_failure": is_client,
+        "connect/retry": RETRY,
         # The caches of transient-local publishers order their messages by time stamps.
         "timestamping/enabled": True,
     }
-    if not file:
-        values |= {
-            "scouting/multicast/enabled": False,
-            "transport/shared_memory/enabled": True,
-            "listen/endpoints": ["tcp/localhost:0"],
-        }
-    if not file or settings.mode == "client":
+    if is_client or not file:
         values["mode"] = settings.mode
-    if settings.mode == "client":
-        values["listen/endpoints"] = []
+        values["listen/endpoints"] = [] if is_client else ["tcp/localhost:0"]
     if settings.connect or not file:
         values["connect/endpoints"] = [settings.connect or ROUTER]
+    if not file:
+        values["scouting/multicast/enabled"] = False
+        values["transport/shared_memory/enabled"] = True
     for path, value in values.items():
         config.insert_json5(path, json.dumps(value))
     return config
@@ -199,28 +190,23 @@ class RosSession:
         heard = zenoh.handlers.Callback(self._heard, indirect=False)
         live = session.liveliness()
         graph = live.declare_subscriber(f"{ADMIN}/{self.domain}/**", heard, history=True)
+        late = self.qos.transient_local
         end: Any
         if self.kind == PUBLISHER:
-            # Never block the actuator's thread, on which the watchdog runs.
-            drop = zenoh.CongestionControl.DROP
-            if self.qos.transient_local:
-                end = ext.declare_advanced_publisher(
-                    *(session, key),
-                    congestion_control=drop,
-                    express=True,
-                    cache=ext.CacheConfig(max_samples=depth),
-                    publisher_detection=True,
-                )
-            else:
-                end = session.declare_publisher(key, congestion_control=drop, express=True)
-            self._publisher = end
+            self._publisher = end = ext.declare_advanced_publisher(
+                *(session, key),
+                # Never block the actuator's thread, on which the watchdog runs.
+                congestion_control=zenoh.CongestionControl.DROP,
+                express=True,
+                cache=ext.CacheConfig(max_samples=depth) if late else None,
+                publisher_detection=late,
+            )
         else:
             taken = zenoh.handlers.Callback(self._taken, indirect=False)
-            if self.qos.transient_local:
-                history = ext.HistoryConfig(detect_late_publishers=True, max_samples=depth)
-                end = ext.declare_advanced_subscriber(session, key, taken, history=history)
-            else:
-                end = session.declare_subscriber(key, taken)
+            history = ext.HistoryConfig(detect_late_publishers=True, max_samples=depth)
+            end = ext.declare_advanced_subscriber(
+                session, key, taken, history=history if late else None
+            )
         tokens = [live.declare_token(name) for name in (node.token(), token)]
         self._declared = [graph, end, *tokens]
 

@@ -165,15 +165,14 @@ class Source(CellStage):
         with self._changed:
             arrivals, newest, lost = list(self._arrivals), self._newest, self._lost
         gaps_ms = [(later - one) / 1e6 for one, later in pairwise(arrivals)]
-        age_ms = self._age_ms(newest) if newest is not None else -1.0
-        # After the last message the rate falls, as if the next came now.
-        mean_ms = max(statistics.fmean(gaps_ms), age_ms / len(gaps_ms)) if gaps_ms else 0.0
-        jitter_ms = statistics.pstdev(gaps_ms) if gaps_ms else 0.0
-        known = self._session is not None and (
-            self._place.is_system_clock or self._session.is_local
-        )
+        age_ms = self._age_ms(newest) if newest is not None else None
+        rate_hz = jitter_ms = 0.0
+        if gaps_ms and age_ms is not None:
+            # After the last message the rate falls, as if the next came now.
+            rate_hz = 1e3 / max(statistics.fmean(gaps_ms), age_ms / len(gaps_ms), 1e-6)
+            jitter_ms = statistics.pstdev(gaps_ms)
+        is_local = self._session is not None and self._session.is_local
         stamp_ms = None
-        if known and self._stamp_age_ns is not None:
+        if self._stamp_age_ns is not None and (is_local or self._place.is_system_clock):
             stamp_ms = self._stamp_age_ns / 1e6
-        rate_hz = 1e3 / mean_ms if mean_ms else 0.0
         return TopicRates(self.settings.resolved, rate_hz, jitter_ms, lost, age_ms, stamp_ms)

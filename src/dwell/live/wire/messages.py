@@ -217,7 +217,7 @@ class Rates(_Array, frozen=True):
     rate_hz: Finite
     jitter_ms: Finite
     lost: Count
-    age_ms: Finite
+    age_ms: Finite | None
     stamp_ms: Finite | None
 
 
