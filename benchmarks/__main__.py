@@ -49,6 +49,7 @@ BENCHMARKS = {
     "live-fleet": ("fleet_live", "measure"),
     "restart": ("restart", "measure"),
     "leaving": ("leaving", "measure"),
+    "ros": ("ros_ends", "measure"),
 }
 
 

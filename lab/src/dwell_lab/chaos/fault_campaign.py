@@ -95,6 +95,8 @@ def _witnessed(problem: Problem, folder: Path) -> tuple[Problem, dict[str, str]]
     actuators = dict(problem.live.actuators)
     if len(actuators) != 1:
         raise LiveError("chaos needs a cell with one sink, whose actuator live.actuators names")
+    if not all(isinstance(one, str) for one in actuators.values()):
+        raise LiveError("chaos cannot watch a ROS 2 topic: give live.actuators a module:Name")
     witnessed = FrozenDict(dict.fromkeys(actuators, "dwell_lab.chaos.stages:Witnessed"))
     environment = environment_of(folder, {}, actuators=actuators)
     return replace(problem, live=replace(problem.live, actuators=witnessed)), environment
