@@ -120,8 +120,8 @@ class Online(CellEstimator):
         return {**self.__dict__, "_has_changed": True}
 
     @abstractmethod
-    def _take_in(self, demands: Mapping[Part, Floats], evidence: Evidence) -> None:
-        """Learn from the measured demands of a window."""
+    def _take_in(self, evidence: Evidence) -> None:
+        """Learn from the demands that the meter has found in a window."""
 
     @abstractmethod
     def _otherwise(self) -> Mapping[Part, Floats]:
@@ -144,7 +144,8 @@ class Online(CellEstimator):
         """Learn from the demands of the last window, once per window."""
         evidence, self._pending = self._pending, None
         if evidence is not None:
-            self._take_in(self._meter.demands(evidence, self._threads), evidence)
+            self._meter.measure(evidence, self._threads)
+            self._take_in(evidence)
 
     @property
     def regimes(self) -> int:

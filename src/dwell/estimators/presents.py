@@ -702,4 +702,4 @@ def _evidence_of(problem: Problem, real: Realisation, arrays: Arrays) -> Evidenc
     """What all cycles show that have run under a candidate."""
     flows = flow_rows(problem.pipeline)
     rows = logged_window(CellArrays(arrays), 0, real.cycles, flows)
-    return Evidence.of(rows, int(real.release_ns[-1]), real.release_ns[:-1])
+    return Evidence(int(real.release_ns[-1]), real.release_ns[:-1], rows)

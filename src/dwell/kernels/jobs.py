@@ -58,20 +58,28 @@ class WaitingJobs:
         rows = [node.row(flows) for node in nodes]
         self._rows: Array[Any] = (structs()["NodeJobs"] * len(rows))(*rows)
         # Reuse the memory: to allocate it takes longer than the computation.
-        self._scratch = np.empty(0)
+        self._scratch, self._scratch_at = np.empty(0), 0
+        self._out = WindowRows(np.empty((0, 0), np.int64), 0, 0)
 
     def __reduce__(self) -> tuple[type[WaitingJobs], tuple[Sequence[NodeJobs], int]]:
         # A copy needs its own addresses.
         return WaitingJobs, (self._nodes, self._flows)
 
-    def add(self, window: WindowRows, foreign_threads: Sequence[float]) -> None:
-        """Add the typical wait of each task's jobs to the work of own jobs in a window."""
+    def added(self, window: WindowRows, foreign_threads: Sequence[float]) -> WindowRows:
+        """Return a window with the typical wait of each task's jobs in the work of own jobs.
+
+        The next call overwrites the result.
+        """
         for row, threads in zip(self._rows, foreign_threads, strict=True):
             row.foreign = threads
         if len(self._scratch) < len(window.table) * window.tasks * SCRATCH:
             self._scratch = _scratch(window)
-        of = self._scratch.ctypes.data
-        _add_waits()(self._rows, len(self._rows), byref(window.row), of)
+            self._scratch_at = self._scratch.ctypes.data
+        if self._out.table.shape != window.table.shape:
+            self._out = WindowRows(np.empty_like(window.table), window.tasks, window.flows)
+        of, out = byref(window.row), byref(self._out.row)
+        _add_waits()(self._rows, len(self._rows), of, self._scratch_at, out)
+        return self._out
 
 
 def level(
@@ -101,5 +109,5 @@ def _scratch(window: WindowRows) -> Floats:
     return np.empty(len(window.table) * window.tasks * SCRATCH)
 
 
-_add_waits = foreign("dwell_add_waits", None, c_void_p, c_int64, c_void_p, c_void_p)
+_add_waits = foreign("dwell_add_waits", None, c_void_p, c_int64, *(c_void_p,) * 3)
 _level = foreign("dwell_level", c_int64, *(c_void_p,) * 3, c_int64, *(c_void_p,) * 2)

@@ -147,26 +147,38 @@ class PoolRows:
         return self._support.tolist()
 
     def learn(
-        self, found: PartTimes, parts: Ints, window: int, memory: float, cycles: int, least: float
-    ) -> list[int]:
+        self,
+        found: PartTimes,
+        window: int,
+        memory: float,
+        cycles: int,
+        least: float,
+        parts: Ints | None = None,
+    ) -> list[tuple[int, int]]:
         """Add what a window brought to the pools that stay as they are, declared or not.
 
         Parameters
         ----------
-        parts : int64 array, shape (n,)
-            Numbers of the parts.
         least : float
             Deviations that are another regime.
+        parts : int64 array, shape (n,), optional
+            Numbers of the parts; all that were found where None.
 
         Returns
         -------
-        list of int
-            Of each part, why another look is needed (`NOT_ADDED`, `ADDED`, `GROWN`), else 0.
+        list of tuple of (number, why)
+            Parts that need another look, and why (`NOT_ADDED`, `ADDED`, `GROWN`).
         """
-        pools, why = self._addresses
-        asked = parts.ctypes.data, len(parts), window, memory, cycles, least
-        n = _learn()(pools, byref(found.found), *asked, why)
-        return self._out[: len(parts)].tolist() if n else []
+        pools, out = self._addresses
+        of, count = found.found.order, found.found.n_parts
+        if parts is not None:
+            of, count = parts.ctypes.data, len(parts)
+        n = _learn()(pools, byref(found.found), of, count, window, memory, cycles, least, out)
+        if not n:
+            return []
+        numbers = found.numbers if parts is None else parts.tolist()
+        why = zip(numbers, self._out[:count].tolist(), strict=True)
+        return [(number, one) for number, one in why if one]
 
 
 def places(

@@ -550,7 +550,7 @@ def _evidence(
 
     def cut(first: int, last: int, close_ns: int) -> Evidence:
         rows = logged_window(arrays, first, last, flows)
-        return Evidence.of(rows, close_ns, realisation.release_ns[first:last].copy())
+        return Evidence(close_ns, realisation.release_ns[first:last].copy(), rows)
 
     return cut
 
