@@ -11,7 +11,6 @@ import pytest
 from numpy.typing import NDArray
 
 from dwell.estimators.pool import ENOUGH, LARGEST, PlaceSums, Pool, Reference, least_deviations
-from dwell.kernels.elementary import moments
 from dwell.kernels.meter import CyclesLayout, PartTimes, WindowRows
 from dwell.kernels.pools import ADDED, GROWN, HeldValues, PoolRows, fill
 
@@ -169,16 +168,3 @@ def test_cycles_meet_finite_values_in_turn(seed: int) -> None:
         ]
     fill(list(rows), values, 0.7, begin, offset)
     np.testing.assert_array_equal(rows, expected)
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 24])
-def test_moments_are_sums_one_after_another(count: int) -> None:
-    values = np.random.default_rng(count).gamma(3.0, size=count).tolist()
-    total = squares = products = 0.0
-    for value in values:
-        total += value - values[0]
-    mean = values[0] + total / count
-    for i, value in enumerate(values):
-        squares += (value - mean) * (value - mean)
-        products += (values[i - 1] - mean) * (value - mean) if i else 0.0
-    assert moments(values) == (mean, squares, products)

@@ -108,9 +108,15 @@ class Evidence:
 
     def with_instants(self, cycles: Instants, shadows: Instants | None) -> Evidence:
         """Return the evidence with other instants."""
-        through = self.placement, cycles, self.shadow_placement, shadows
-        at = self.close_ns, self.release_ns
-        return Evidence.of(*at, *through, shadows_share=self.shadows_share)
+        return Evidence.of(
+            self.close_ns,
+            self.release_ns,
+            self.placement,
+            cycles,
+            self.shadow_placement,
+            shadows,
+            shadows_share=self.shadows_share,
+        )
 
     # Most windows need only the table.
 
