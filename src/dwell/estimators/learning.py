@@ -214,8 +214,9 @@ class Learning(Online):
     def support(self) -> dict[str, Support]:
         """Return the support of each candidate's estimate: the support of its weakest part."""
         self._take_in_pending()
+        now, every = self._window, self.problem.decisions_per_window
         return {
-            name: Support(samples, self._windows_since(last))
+            name: Support(samples, (now - last) / every)
             for name, (samples, last) in zip(self._parts, self._rows.weakest(), strict=True)
         }
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -190,7 +189,9 @@ class Online(CellEstimator):
                 self._playing.go_on(self._playing.present, unsure, STEPS)
                 estimates = self._priced(names, foreign)
         for name in names:
-            estimates[name] = replace(estimates[name], error=self._stated_error(name))
+            one, error = estimates[name], self._stated_error(name)
+            known = one.l95_ms, one.violation_rate, one.utilisation, one.cut_from_ms
+            estimates[name] = unchecked_qos(*known, error)
         return estimates
 
     def _stated_error(self, name: str) -> tuple[float, float]:
@@ -222,8 +223,10 @@ class Online(CellEstimator):
                 estimates[name] = unchecked_qos(*one.latency, shares[name], *one.others)
                 continue
             one_played = played[name]
-            l95_ms, rate = one_played.l95_ms, one_played.violation_rate
-            estimates[name] = QoS(l95_ms, rate, shares[name], one_played.uncut_l95_ms)
+            l95_ms, uncut_ms = one_played.l95_ms, one_played.uncut_l95_ms
+            cut_from_ms = None if uncut_ms == l95_ms else uncut_ms
+            metrics = l95_ms, one_played.violation_rate, shares[name], cut_from_ms
+            estimates[name] = unchecked_qos(*metrics)
         return estimates
 
     def _as_declared(self, name: str) -> _Declared:
@@ -247,20 +250,19 @@ class Online(CellEstimator):
         problem, least = self.problem, self.problem.controller.min_improvement
         objective, here = problem.objective, problem.candidates[incumbent]
         errors = {name: self._sampled(name) for name in names}
-        unsure = set()
+        can_go_on = {name for name in names if errors[name] and not self._playing.is_full(name)}
+        if not can_go_on:
+            return []
+        unsure, cost = set(), self._terms.cost(estimates[incumbent])
         for name, there in problem.candidates.items():
             error = math.hypot(errors.get(name, 0.0), errors.get(incumbent, 0.0))
             if name == incumbent or error <= least / 3:
                 continue
-            gain = self._terms.cost(estimates[incumbent]) - self._terms.cost(estimates[name])
+            gain = cost - self._terms.cost(estimates[name])
             asked = least + objective.weights.switching * hamming(there, here)
             if -BAND * error < gain < asked + BAND * error:
                 unsure |= {name, incumbent}
-        return [
-            name
-            for name in names
-            if name in unsure and errors[name] and not self._playing.is_full(name)
-        ]
+        return [name for name in names if name in unsure & can_go_on]
 
     def _sampled(self, name: str) -> float:
         """Return the standard error of a candidate's J due to few simulated cycles."""

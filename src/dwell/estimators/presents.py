@@ -23,7 +23,7 @@ from dwell.estimators.prices import SEED, Question, most_windows, prices_of
 from dwell.estimators.sent_shadows import SentShadows, stamps_of
 from dwell.estimators.slow_processes import slow_processes, unseen_error
 from dwell.estimators.spans import patience_ns
-from dwell.kernels.advance import logged_window, play
+from dwell.kernels.advance import LoggedCycles, play
 from dwell.kernels.arrays import Arrays, CellArrays, flow_rows, lay_out
 from dwell.kernels.codes import LAST_NS
 from dwell.kernels.pools import fill
@@ -703,6 +703,6 @@ def _shown(problem: Problem, arrays: Arrays) -> tuple[Floats, Floats]:
 
 def _evidence_of(problem: Problem, real: Realisation, arrays: Arrays) -> Evidence:
     """What all cycles show that have run under a candidate."""
-    flows = flow_rows(problem.pipeline)
-    rows = logged_window(CellArrays(arrays), 0, real.cycles, flows)
+    logged = LoggedCycles(CellArrays(arrays), flow_rows(problem.pipeline))
+    rows = logged.window(0, real.cycles)
     return Evidence(int(real.release_ns[-1]), real.release_ns[:-1], rows)
