@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 
 import numpy as np
 import pytest
 
-from dwell.kernels.sampling_errors import PAIRS, held_error, step_sums, tail_error_ms
+from dwell.kernels.pools import HeldValues
+from dwell.kernels.sampling_errors import PAIRS, Steps, tail_error_ms
 from dwell.model.number_arrays import Floats
 
 
@@ -36,7 +38,13 @@ def percentile_error(ordered: Floats, off: float) -> float:
 def test_sums_of_steps_add_one_after_another(count: int, resources: int) -> None:
     steps = np.random.default_rng(count).gamma(3.0, size=(count, PAIRS + resources))
     steps[::2, 1] = steps[::2, 0]
-    *pairs, sums = step_sums(steps)
+    table = Steps(24, PAIRS + resources)
+    for step in (*np.ones_like(steps), *steps):
+        table.add(step)
+    table.keep(count)
+    *pairs, sums = table.sums()
+    np.testing.assert_array_equal(table.table, steps)
+    assert len(table) == count
     for column, found in zip((0, 2), pairs, strict=True):
         shown, declared = steps[:, column].tolist(), steps[:, column + 1].tolist()
         more = [one - other for one, other in zip(shown, declared, strict=True)]
@@ -52,11 +60,14 @@ def test_sums_of_steps_add_one_after_another(count: int, resources: int) -> None
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 8, 12, 129, 200, 2400])
 def test_held_values_have_the_larger_of_two_errors(count: int) -> None:
-    rng = np.random.default_rng(count)
-    for share, measured in ((0.0, 0), (0.3, count), (0.9, 1), (0.05, 3 * count)):
+    rng, held = np.random.default_rng(count), HeldValues(np.arange(3.0), math.inf, 0.0, 1)
+    for share, measured in ((0.0, 0), (0.3, count), (0.9, 1), (0.05, count // 2)):
         values = np.where(rng.random(count) < share, np.inf, rng.lognormal(3.0, 1.0, count))
         known, independent = np.sort(values[np.isfinite(values)]), max(measured, 2)
-        lost, error_ms = held_error(values, measured)
+        held.begin(values, (0.0, 0.0, 0.0), 1)
+        held.row.measured = measured
+        lost, error_ms = copy.deepcopy(held).error()
+        assert (lost, error_ms) == held.error()
         assert lost == (count - len(known)) / max(count, 1)
         if len(known) < 2:
             assert error_ms == 0.0

@@ -156,9 +156,12 @@ class Online(CellEstimator):
     def present(self) -> Present:
         """The measured conditions that differ from the declared ones."""
         self._take_in_pending()
+        return self._present(self._otherwise())
+
+    def _present(self, otherwise: Mapping[Part, Floats]) -> Present:
         threads = {name: one.beyond for name, one in self._foreign.items() if one.beyond}
         rates_mbps = FrozenDict({link: rate.mbps for link, rate in self._rates.items()})
-        return Present(FrozenDict(self._otherwise()), FrozenDict(threads), self._down, rates_mbps)
+        return Present(FrozenDict(otherwise), FrozenDict(threads), self._down, rates_mbps)
 
     @property
     def _threads(self) -> dict[str, float]:
@@ -174,12 +177,13 @@ class Online(CellEstimator):
         if evidence is not None:
             self._look_at_nodes(evidence, foreign, own, incumbent)
             self._take_in_pending()
-        names = self._names
+        otherwise = self._otherwise()
+        names = self._names(otherwise)
         if self._plays and not names:
             self.revision += 1
         self._plays = bool(names)
         if names and (evidence is not None or self._has_changed):
-            self._play(names)
+            self._play(names, otherwise)
         estimates = self._priced(names, foreign)
         if evidence is not None and names:
             for _ in range(ROUNDS):
@@ -314,10 +318,8 @@ class Online(CellEstimator):
             if len(after) >= 2 and not works:
                 yield node
 
-    @property
-    def _names(self) -> list[str]:
+    def _names(self, otherwise: Mapping[Part, Floats]) -> list[str]:
         """Candidates with a part, node or link that differs from its declaration."""
-        otherwise = self._otherwise()
         nodes = {name for name, foreign in self._foreign.items() if foreign.beyond} | self._down
         links = {part.link for part in otherwise if isinstance(part, Message)}
         links |= self._rates.keys()
@@ -333,9 +335,9 @@ class Online(CellEstimator):
             )
         ]
 
-    def _play(self, names: list[str]) -> None:
+    def _play(self, names: list[str], otherwise: Mapping[Part, Floats]) -> None:
         """Simulate the affected candidates; start again if the measured conditions changed."""
-        present = self.present
+        present = self._present(otherwise)
         self._count_presents()
         if self._has_changed:
             self._playing.begin(present)

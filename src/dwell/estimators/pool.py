@@ -18,7 +18,6 @@ import numpy as np
 
 from dwell.kernels.elementary import cube_root, logarithms
 from dwell.kernels.pools import HeldValues, places
-from dwell.kernels.sampling_errors import held_error
 from dwell.model.number_arrays import Floats
 
 #: Most values that a pool holds, and fewest that it keeps however old they are.
@@ -246,7 +245,7 @@ class Pool:
         """Return figures of the held values, computed once per change of these."""
         held = self.held
         if self._summary.of is not held:
-            self._summary = _Summary(held, *held_error(held, self.measured))
+            self._summary = _Summary(held, *self.rows.error())
         return self._summary
 
     def reset(self) -> None:

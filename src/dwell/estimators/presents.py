@@ -30,7 +30,7 @@ from dwell.kernels.pools import fill
 from dwell.kernels.random_draws import Drawing
 from dwell.kernels.realisation import LinkSegments, NodeChange, NodeChanges, Realisation
 from dwell.kernels.rows import Rows, row_types
-from dwell.kernels.sampling_errors import PAIRS, SeriesSums, step_sums, tail_error_ms
+from dwell.kernels.sampling_errors import PAIRS, SeriesSums, Steps, tail_error_ms
 from dwell.model.fabric import Node
 from dwell.model.frozen import FrozenDict
 from dwell.model.number_arrays import Floats, Ints
@@ -105,29 +105,21 @@ class _Twin:
         self.cursor = 0
         #: Means of each step, the oldest first: L95 (ms) and V_D, each with its mean as declared in
         #: the same windows; uncut L95; the cell's own share of every resource.
-        self._steps = np.zeros((KEPT, PAIRS + 1 + resources))
+        self.steps = Steps(KEPT, PAIRS + 1 + resources)
         #: Latencies of its cycles.
         self.latency_ns: deque[Ints] = deque(maxlen=KEPT)
         self.price: PlayedPrice | None = None
 
-    @property
-    def steps(self) -> Floats:
-        """The steps, shape (n, columns)."""
-        return self._steps[: len(self.latency_ns)]
-
     def add(self, means: Sequence[float], latency_ns: Ints) -> None:
         """Add a step; the oldest leaves when there are too many."""
-        self.keep(KEPT - 1)
-        self._steps[len(self.latency_ns)] = means
+        self.steps.add(means)
         self.latency_ns.append(latency_ns)
 
     def keep(self, most: int) -> None:
         """Keep the newest steps."""
-        excess = len(self.latency_ns) - most
-        if excess > 0:
-            self._steps[:most] = self._steps[excess : excess + most]
-            for _ in range(excess):
-                self.latency_ns.popleft()
+        self.steps.keep(most)
+        while len(self.latency_ns) > most:
+            self.latency_ns.popleft()
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,7 +205,7 @@ class Playing:
         self._set_links(present)
         self._set_losses(present)
         for twin in self._twins.values():
-            twin.latency_ns.clear()
+            twin.keep(0)
             twin.arrays.replace(changes=changes)
         self._restart()
 
@@ -280,10 +272,9 @@ class Playing:
         """Return standard deviations of one window: of its L95, milliseconds, and its V_D."""
         price = self.prices[name]
         usual = price.l95_deviation_ms, price.violation_deviation
-        steps = self._twins[name].steps if self._twins else np.empty((0, PAIRS))
-        if len(steps) < 2:
+        if not self._twins or len(steps := self._twins[name].steps) < 2:
             return usual
-        shown = np.ascontiguousarray(steps[:, :PAIRS:2])
+        shown = np.ascontiguousarray(steps.table[:, :PAIRS:2])
         # Of few values the deviation is itself hardly known.
         few = (len(steps) + 1) / (len(steps) - 1) * math.sqrt(self._step)
         l95_ms, rate = (few * shown.std(axis=0)).tolist()
@@ -294,9 +285,9 @@ class Playing:
         latency_ns = np.concatenate(self._twins[name].latency_ns)
         return tail_error_ms(latency_ns, self._censor_ms, off)
 
-    def _price(self, name: str, steps: Floats) -> PlayedPrice:
+    def _price(self, name: str, steps: Steps) -> PlayedPrice:
         count, known = len(steps), self.prices[name]
-        l95, rates, (uncut, *own) = step_sums(steps)
+        l95, rates, (uncut, *own) = steps.sums()
         l95_ms, l95_error_ms = _estimated(
             l95, count, known.l95_ms, known.l95_error_ms, usual=self._usual[name][0]
         )
@@ -320,7 +311,7 @@ class Playing:
 
     def is_full(self, name: str) -> bool:
         """Whether the price of a candidate is of as many windows as it ever is."""
-        return len(self._twins[name].latency_ns) == KEPT
+        return len(self._twins[name].steps) == KEPT
 
     def _lay_out(self) -> None:
         problem = _with_short_windows(self.problem)

@@ -42,6 +42,7 @@ class HeldValues:
         self._known, self._held = known, np.empty(ROOM)
         self._before, self._values = np.empty(ROOM), (-1, np.empty(0))
         self._chunks = (structs()["Chunk"] * ROOM)()
+        self._scratch = (c_double * 0)()
         self._set_addresses()
 
     def __getstate__(self) -> tuple[Any, ...]:
@@ -50,7 +51,7 @@ class HeldValues:
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         # A copy has addresses of its own.
         row, self._known, self._held, self._before, chunks = state
-        self._values = -1, np.empty(0)
+        self._values, self._scratch = (-1, np.empty(0)), (c_double * 0)()
         self.row = structs()["Pool"].from_buffer_copy(row)
         self._chunks = (structs()["Chunk"] * ROOM).from_buffer_copy(chunks)
         self._set_addresses()
@@ -81,6 +82,18 @@ class HeldValues:
             self._set_addresses()
         self.row.n_before = 0 if values is self._known else len(values)
         self._before[: self.row.n_before] = values[: self.row.n_before]
+
+    def error(self) -> tuple[float, float]:
+        """Return the lost share of the values, and the standard error of their 95th percentile.
+
+        The error is no less than the error of the mean. Infinite values are lost; of the others,
+        at least two must be known for an error above 0.
+        """
+        if len(self._scratch) < self.row.size:
+            self._scratch = (c_double * len(self._held))()
+        out = (c_double * 2)()
+        _held_error()(byref(self.row), self._scratch, out)
+        return out[0], out[1]
 
     def begin(self, values: Floats, sums: tuple[float, float, float], window: int) -> None:
         """Hold some values, none of which was measured, in the place of all others."""
@@ -233,6 +246,7 @@ _pool_add = foreign(
     None,
     *(c_void_p, c_void_p, c_int64, c_double, c_double, c_double, c_int64, c_double, c_int64),
 )
+_held_error = foreign("dwell_held_error", None, c_void_p, c_void_p, c_void_p)
 _learn = foreign(
     "dwell_learn",
     c_int64,

@@ -88,17 +88,18 @@ DWELL_EXPORT void dwell_step_sums(const f64* steps, i64 n, i64 width, f64* out) 
   }
 }
 
-// Writes the share of some values that are lost, and the error of the 95th percentile of the
+// Writes the share of what a pool holds that is lost, and the error of the 95th percentile of the
 // others, no less than the error of their mean; `scratch` has room for all of them.
-DWELL_EXPORT void dwell_held_error(const f64* values, i64 n, i64 measured, f64* scratch,
-                                   f64* out) noexcept {
+DWELL_EXPORT void dwell_held_error(const Pool* pool, f64* scratch, f64* out) noexcept {
+  const f64* values = pool->held + pool->first;
+  const i64 n = pool->size;
   f64* end = std::copy_if(values, values + n, scratch, [](f64 ms) { return std::isfinite(ms); });
   const i64 known = end - scratch;
   out[0] = static_cast<f64>(n - known) / static_cast<f64>(std::max(n, i64{1}));
   out[1] = 0.0;
   if (known < 2) return;
   std::sort(scratch, end, kIsLess);
-  const f64 count = static_cast<f64>(std::max(measured, i64{2}));
+  const f64 count = static_cast<f64>(std::max(pool->measured, i64{2}));
   const auto at = [&](i64 place) { return scratch[place]; };
   const f64 of_place = percentile_error(known, std::sqrt(0.05 * (1.0 - 0.05) / count), at);
   const f64 mean = pairwise_sum(scratch, known) / static_cast<f64>(known);

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from ctypes import c_double, c_int64, c_void_p
 from typing import NamedTuple
 
@@ -10,7 +11,7 @@ import numpy as np
 from dwell.kernels.library import foreign
 from dwell.model.number_arrays import Floats, Ints
 
-#: First columns of the steps of `step_sums`: L95 and V_D, each with its declared value.
+#: First columns of `Steps`: L95 and V_D, each with its declared value.
 PAIRS = 4
 
 
@@ -36,35 +37,47 @@ class SeriesSums(NamedTuple):
     apart: float
 
 
-def step_sums(steps: Floats) -> tuple[SeriesSums, SeriesSums, list[float]]:
-    """Return the sums of L95, those of V_D, and the sums of all columns after `PAIRS`.
+class Steps:
+    """Means that the newest steps of a simulation have shown.
 
     Parameters
     ----------
-    steps : float64 array, shape (n, columns)
-        At least one step; contiguous.
+    most : int
+        Largest number of steps.
+    columns : int
+        Number of columns: `PAIRS`, and others.
     """
-    count, width = steps.shape
-    out = (c_double * (14 + width - PAIRS))()
-    _step_sums()(steps.ctypes.data, count, width, out)
-    sums: list[float] = out[:]
-    return SeriesSums(*sums[:7]), SeriesSums(*sums[7:14]), sums[14:]
 
+    def __init__(self, most: int, columns: int) -> None:
+        self._table, self._count = np.zeros((most, columns)), 0
+        self._out = (c_double * (14 + columns - PAIRS))()
+        self._address = self._table.ctypes.data
 
-def held_error(values: Floats, measured: int) -> tuple[float, float]:
-    """Return the lost share of values, and the standard error of their 95th percentile.
+    def __len__(self) -> int:
+        return self._count
 
-    The error is no less than the error of the mean. Infinite values are lost; of the others, at
-    least two must be known for an error above 0.
+    @property
+    def table(self) -> Floats:
+        """The steps, the oldest first, shape (n, columns)."""
+        return self._table[: self._count]
 
-    Parameters
-    ----------
-    measured : int
-        Number of independent values.
-    """
-    out, scratch = (c_double * 2)(), np.empty(len(values))
-    _held_error()(values.ctypes.data, len(values), measured, scratch.ctypes.data, out)
-    return out[0], out[1]
+    def add(self, means: Sequence[float]) -> None:
+        """Add a step; the oldest leaves when there are too many."""
+        self.keep(len(self._table) - 1)
+        self._table[self._count] = means
+        self._count += 1
+
+    def keep(self, most: int) -> None:
+        """Keep the newest steps."""
+        if self._count > most:
+            self._table[:most] = self._table[self._count - most : self._count]
+            self._count = most
+
+    def sums(self) -> tuple[SeriesSums, SeriesSums, list[float]]:
+        """Return the sums of L95, those of V_D, and of each column after `PAIRS`."""
+        _step_sums()(self._address, self._count, self._table.shape[1], self._out)
+        sums: list[float] = self._out[:]
+        return SeriesSums(*sums[:7]), SeriesSums(*sums[7:14]), sums[14:]
 
 
 def tail_error_ms(latency_ns: Ints, most_ms: float, off: float) -> float:
@@ -81,5 +94,4 @@ def tail_error_ms(latency_ns: Ints, most_ms: float, off: float) -> float:
 
 
 _step_sums = foreign("dwell_step_sums", None, c_void_p, c_int64, c_int64, c_void_p)
-_held_error = foreign("dwell_held_error", None, c_void_p, c_int64, c_int64, c_void_p, c_void_p)
 _tail_error = foreign("dwell_tail_error", c_double, c_void_p, c_int64, c_double, c_double)
