@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from ctypes import addressof, byref, c_double, c_int64, c_void_p
+from ctypes import addressof, byref, c_double, c_int32, c_int64, c_void_p
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,8 @@ from dwell.model.number_arrays import Floats, Ints
 
 #: Room for values, and for windows.
 ROOM = 408
+#: Equal parts of the range of the declared values, in which the kernel looks for a value.
+GUIDE_PARTS = 512
 #: What `PoolRows.learn` did with the values of a part where Python has to look at the pool: it left
 #: them out; it added them; it added them to a pool that is not as declared and has not changed.
 NOT_ADDED, ADDED, GROWN = 1, 2, 3
@@ -42,6 +44,10 @@ class HeldValues:
         self._known, self._held = known, np.empty(ROOM)
         self._before, self._values = np.empty(ROOM), (-1, np.empty(0))
         self._chunks = (structs()["Chunk"] * ROOM)()
+        finite = known[np.isfinite(known)]
+        low, high = (finite[0].item(), finite[-1].item()) if len(finite) else (0.0, 0.0)
+        self.row.guide_low = low
+        self.row.guide_parts_per_ms = GUIDE_PARTS / (high - low) if high > low else 0.0
         self._scratch = (c_double * 0)()
         self._set_addresses()
 
@@ -59,6 +65,10 @@ class HeldValues:
     def _set_addresses(self) -> None:
         self.row.known, self.row.held = self._known.ctypes.data, self._held.ctypes.data
         self.row.before, self.row.chunks = self._before.ctypes.data, addressof(self._chunks)
+        self._guide = (c_int32 * (GUIDE_PARTS + 1))()
+        self.row.guide = addressof(self._guide)
+        where = self.row.guide_low, self.row.guide_parts_per_ms, self._guide
+        _guide()(self.row.known, len(self._known), *where)
 
     @property
     def values(self) -> Floats:
@@ -247,6 +257,7 @@ _pool_add = foreign(
     *(c_void_p, c_void_p, c_int64, c_double, c_double, c_double, c_int64, c_double, c_int64),
 )
 _held_error = foreign("dwell_held_error", None, c_void_p, c_void_p, c_void_p)
+_guide = foreign("dwell_guide", None, c_void_p, c_int64, c_double, c_double, c_void_p)
 _learn = foreign(
     "dwell_learn",
     c_int64,
