@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dwell.estimators.pool import ENOUGH, LARGEST, PlaceSums, Pool, Reference, least_deviations
 from dwell.kernels.meter import CyclesLayout, PartTimes, WindowRows
-from dwell.kernels.pools import ADDED, GROWN, HeldValues, PoolRows, fill
+from dwell.kernels.pools import ADDED, GROWN, HeldValues, PoolRows, TimesRow, fill
 
 Floats = NDArray[np.float64]
 PARTS, BLOCK = 5, 10
@@ -166,5 +166,5 @@ def test_cycles_meet_finite_values_in_turn(seed: int) -> None:
         expected[:, begin:] = demands[(np.arange(begin, max(begin, 100)) + offset) % len(known)][
             : max(100 - begin, 0)
         ]
-    fill(list(rows), values, 0.7, begin, offset)
+    fill(list(map(TimesRow.of, rows)), values, 0.7, begin, offset)
     np.testing.assert_array_equal(rows, expected)

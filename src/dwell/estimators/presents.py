@@ -26,7 +26,7 @@ from dwell.estimators.spans import patience_ns
 from dwell.kernels.advance import LoggedCycles, play
 from dwell.kernels.arrays import Arrays, CellArrays, flow_rows, lay_out
 from dwell.kernels.codes import LAST_NS
-from dwell.kernels.pools import fill
+from dwell.kernels.pools import TimesRow, fill
 from dwell.kernels.random_draws import Drawing
 from dwell.kernels.realisation import LinkSegments, NodeChange, NodeChanges, Realisation
 from dwell.kernels.rows import Rows, row_types
@@ -338,12 +338,12 @@ class Playing:
         self._declared_rates, self._declared_segments = tables.rates.copy(), tables.segments.copy()
         self._declared_layers = tables.layers.copy()
         self._nothing_ns = np.zeros(self._real.cycles, np.int64)
-        self._rows: dict[Part, list[Ints]] = {}
+        self._rows: dict[Part, list[TimesRow]] = {}
         for _, played in self._replaced:
             for site, row in zip(played.sites, played.exec_ns, strict=True):
-                self._rows.setdefault(Site(*site), []).append(row)
+                self._rows.setdefault(Site(*site), []).append(TimesRow.of(row))
             for hop, row in zip(played.hops, played.delay_ns, strict=True):
-                self._rows.setdefault(Message(*hop), []).append(row)
+                self._rows.setdefault(Message(*hop), []).append(TimesRow.of(row))
         self._stretched: dict[Part, float] = {
             Site(*site): _stretched(self.problem, Site(*site)) for site in self._real.sites
         }
@@ -568,7 +568,7 @@ def realised(problem: Problem, real: Realisation, present: Present) -> Realisati
             known, times = real.hops, delay_ns
             extra_ns[[real.hops[hop] == part for hop, _ in real.layers]] = 0
         if part in known:
-            fill([times[known.index(part)]], values, stretched, 0, 0)
+            fill([TimesRow.of(times[known.index(part)])], values, stretched, 0, 0)
     for name, mbps in present.rates_mbps.items():
         rates[state[:, 1] == segments.links.index(name), 0] = mbps
     for name, share in _lost(present).items():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from ctypes import addressof, byref, c_double, c_int32, c_int64, c_void_p
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from dwell.model.number_arrays import Floats, Ints
 
 #: Room for values, and for windows.
 ROOM = 408
+#: Size of an instant.
+BYTES = 8
 #: Equal parts of the range of the declared values, in which the kernel looks for a value.
 GUIDE_PARTS = 512
 #: What `PoolRows.learn` did with the values of a part where Python has to look at the pool: it left
@@ -228,12 +230,26 @@ def places(
     return out[0], out[1], out[2]
 
 
-def fill(rows: Sequence[Ints], values: Floats, stretched: float, begin: int, offset: int) -> None:
+class TimesRow(NamedTuple):
+    """The times of cycles: an int64 array, as an argument of `fill`."""
+
+    address: int
+    cycles: int
+
+    @classmethod
+    def of(cls, row: Ints) -> TimesRow:
+        """Return the row of a contiguous array, for as long as the array exists."""
+        return cls(row.ctypes.data, len(row))
+
+
+def fill(
+    rows: Sequence[TimesRow], values: Floats, stretched: float, begin: int, offset: int
+) -> None:
     """Let cycles meet known values in turn (see `dwell.estimators.presents`).
 
     Parameters
     ----------
-    rows : sequence of int64 array, shape (cycles,)
+    rows : sequence of TimesRow
         Nanoseconds; as they were if all values are lost.
     values : float64 array
         Milliseconds; what is infinite is left out.
@@ -244,9 +260,8 @@ def fill(rows: Sequence[Ints], values: Floats, stretched: float, begin: int, off
     """
     values = np.ascontiguousarray(values)
     where = values.ctypes.data, len(values), stretched, begin + offset
-    for row in rows:
-        later = row[begin:]
-        _fill()(*where, len(later), later.ctypes.data)
+    for address, cycles in rows:
+        _fill()(*where, cycles - begin, address + begin * BYTES)
 
 
 _places = foreign("dwell_places", None, c_void_p, c_int64, c_void_p, c_int64, c_double, c_void_p)
