@@ -1,4 +1,4 @@
-// What the jobs of a window say of waits, and of foreign threads beside them.
+// Waits of a window's jobs, and foreign threads on their nodes.
 
 #include <algorithm>
 #include <cmath>
@@ -373,9 +373,9 @@ DWELL_EXPORT i64 dwell_level(const NodeJobs* node, const Window* window, const i
   return is_slowed ? 2 : 1;
 }
 
-// What has to be looked at in a window: 1 where an own job that began before the limit has not
-// ended, 2 where the work of an own job that has ended is not known, 4 where a shadow's is not, 8
-// where its cycles went through several candidates.
+// Returns the flaws of a window as a sum: 1 if an own job that began before the limit is
+// unfinished, 2 if the work of a completed own job is unknown, 4 for a completed shadow job, 8 if
+// its cycles have several candidates.
 DWELL_EXPORT i64 dwell_unknown(i64 n_tasks, i64 n_flows, const Window* window,
                                i64 limit_ns) noexcept {
   i64 found = 0;

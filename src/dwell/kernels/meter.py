@@ -138,7 +138,7 @@ class WindowRows:
 
 
 class PartTimes:
-    """Times, or demands, of the parts of a window's cycles, milliseconds, infinite where lost.
+    """Times, or demands, of the parts of a window's cycles, milliseconds; infinite if lost.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-// Pools: what is held of each part of a cycle, next to what it is as declared (pool.py).
+// Pools: the measured and the declared values of each part of a cycle (pool.py).
 
 #include <algorithm>
 #include <cmath>
@@ -41,14 +41,14 @@ const f64* first_not_below(const f64* known, i64 n, f64 value) {
   return known + (*known < value ? 1 : 0);
 }
 
-// Which of equal parts of the range of declared values has a value; what is outside is at its ends.
+// Returns the part of the range of declared values that contains a value; an end if it is outside.
 i64 part_of(f64 value, f64 low, f64 parts_per_ms) {
   const f64 place = (value - low) * parts_per_ms;
   if (place >= static_cast<f64>(kGuideParts)) return kGuideParts - 1;
   return place > 0.0 ? static_cast<i64>(place) : 0;
 }
 
-// The first declared value that is not below another one: in the part of that one.
+// Returns the first declared value that is not below `value`; it is in the same part.
 const f64* first_declared_not_below(const Pool& pool, f64 value) {
   const i32* part = pool.guide + part_of(value, pool.guide_low, pool.guide_parts_per_ms);
   return first_not_below(pool.known + part[0], part[1] - part[0], value);
@@ -175,8 +175,8 @@ bool run_goes_on(const Pool& pool, i64 cycles) {
   return pool.run_cycles > 0 && pool.run_cycles + cycles <= pool.block;
 }
 
-// Adds what a window brought to a pool that is not as declared, if it is neither near what is
-// declared, nor of another regime.
+// Adds the values of a window to a pool that is not as declared, unless they are near the declared
+// values, or show another regime.
 i64 learn_otherwise(Pool& pool, const f64* values, i64 n, i64 window, f64 memory, i64 cycles) {
   if (pool.doubts != 0 || pool.size > kLargest) return kNotAdded;
   PlaceSums declared, run;

@@ -18,7 +18,7 @@ from dwell.model.number_arrays import Floats, Ints
 ROOM = 408
 #: Size of an instant.
 BYTES = 8
-#: Equal parts of the range of the declared values, in which the kernel looks for a value.
+#: Number of equal parts of the range of the declared values; the kernel searches in one of them.
 GUIDE_PARTS = 512
 #: What `PoolRows.learn` did with the values of a part where Python has to look at the pool: it left
 #: them out; it added them; it added them to a pool that is not as declared and has not changed.
@@ -180,7 +180,7 @@ class PoolRows:
         least: float,
         parts: Ints | None = None,
     ) -> list[tuple[int, int]]:
-        """Add what a window brought to the pools that stay as they are, declared or not.
+        """Add the values of a window to the pools whose regime stays the same.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-// How far estimates of few samples may be off: sums of steps, and errors of percentiles
+// Errors of estimates from few samples: sums of steps, and errors of percentiles
 // (sampling_errors.py).
 
 #include <algorithm>
@@ -12,10 +12,10 @@ namespace {
 
 // Without it, std::sort of numbers is a function of the C++ library with clang, which links none.
 constexpr auto kIsLess = [](auto one, auto other) { return one < other; };
-// A share of the values at the 95th percentile, and how many errors off its limits are.
+// Place of the 95th percentile, and distance of its limits in errors of the place.
 constexpr f64 kPlace = 0.95, kOff = 2.0;
 
-// Adds up as NumPy does: eight sums side by side, and halves of what is longer.
+// Adds up in the order of NumPy: eight sums in parallel; a longer array is halved first.
 f64 pairwise_sum(const f64* values, i64 n) {
   constexpr i64 kBlock = 128, kSums = 8;
   if (n > kBlock) {
@@ -34,9 +34,9 @@ f64 pairwise_sum(const f64* values, i64 n) {
   return sum;
 }
 
-// The error of the 95th percentile of `n` values whose place has an error; `at` is the value at a
-// place, which is asked for in ascending order. The values two errors off are the limits (Woodruff,
-// DOI 10.2307/2280781); half the distance to the farther one is the error.
+// Returns the error of the 95th percentile of `n` values if its place has the error `off`. `at`
+// returns the value at a place; the places of its calls ascend. The values two errors from the
+// place are the limits (Woodruff, DOI 10.2307/2280781). The error is half the larger distance.
 template <class At>
 f64 percentile_error(i64 n, f64 off, At at) {
   const f64 last = static_cast<f64>(n - 1);
@@ -52,7 +52,7 @@ f64 percentile_error(i64 n, f64 off, At at) {
 template <class Value>
 void write_moments(i64 n, Value value, f64* out) {
   f64 sum = 0.0, squares = 0.0, products = 0.0;
-  // Of equal values exactly that, and no deviation.
+  // Equal values have exactly this mean, and no deviation.
   for (i64 i = 0; i < n; ++i) sum += value(i) - value(0);
   const f64 mean = value(0) + sum / static_cast<f64>(n);
   for (i64 i = 0; i < n; ++i) {
@@ -69,9 +69,9 @@ void write_moments(i64 n, Value value, f64* out) {
 
 using namespace dwell;
 
-// Of `n` steps of `width` numbers: for L95 and V_D, each followed by its value as declared, writes
-// the moments of what the steps show, the moments of the differences, and the sum of the absolute
-// differences; then the sums of the other columns.
+// Writes the sums of `n` steps of `width` numbers. L95 and V_D, each followed by its declared
+// value, give the moments of the metric, the moments of the differences, and the sum of the
+// absolute differences. Every other column gives its sum.
 DWELL_EXPORT void dwell_step_sums(const f64* steps, i64 n, i64 width, f64* out) noexcept {
   for (i64 column = 0; column < 4; column += 2, out += 7) {
     const auto shown = [&](i64 i) { return steps[i * width + column]; };
@@ -88,8 +88,8 @@ DWELL_EXPORT void dwell_step_sums(const f64* steps, i64 n, i64 width, f64* out) 
   }
 }
 
-// Writes the share of what a pool holds that is lost, and the error of the 95th percentile of the
-// others, no less than the error of their mean; `scratch` has room for all of them.
+// Writes the lost share of a pool's values, and the error of the 95th percentile of the finite
+// values, which is no less than the error of their mean. `scratch` has room for all values.
 DWELL_EXPORT void dwell_held_error(const Pool* pool, f64* scratch, f64* out) noexcept {
   const f64* values = pool->held + pool->first;
   const i64 n = pool->size;
@@ -105,12 +105,12 @@ DWELL_EXPORT void dwell_held_error(const Pool* pool, f64* scratch, f64* out) noe
   const f64 mean = pairwise_sum(scratch, known) / static_cast<f64>(known);
   for (f64* value = scratch; value != end; ++value) *value = (*value - mean) * (*value - mean);
   const f64 deviation = std::sqrt(pairwise_sum(scratch, known) / static_cast<f64>(known));
-  // Of few values the deviation is itself hardly known.
+  // A deviation from few values is uncertain, so enlarge it.
   const f64 few = (count + 1.0) / (count - 1.0);
   out[1] = std::max(few * deviation / std::sqrt(count), of_place);
 }
 
-// Returns the error of the 95th percentile of latencies whose place has an error; sorts some.
+// Returns the error of the 95th percentile of latencies, and sorts some of them.
 DWELL_EXPORT f64 dwell_tail_error(i64* latency_ns, i64 n, f64 most_ms, f64 off) noexcept {
   i64 from = 0;
   return percentile_error(n, off, [&](i64 place) {

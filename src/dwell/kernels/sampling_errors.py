@@ -1,4 +1,4 @@
-"""How far estimates from few samples may be off (see ``sampling_errors.cpp``)."""
+"""Errors of estimates from few samples (see ``sampling_errors.cpp``)."""
 
 from __future__ import annotations
 
