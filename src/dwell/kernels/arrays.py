@@ -29,7 +29,7 @@ from dwell.model.number_arrays import Ints
 from dwell.model.window_close import close_after_ns, window_close_ns
 
 SCHEDULERS = {"fair": Scheduler.FAIR, "fifo": Scheduler.FIFO, "priority": Scheduler.PRIORITY}
-RING_START = 64
+RING_START = 8
 #: A shadow is given up after the release of a window and this many further cycles.
 GIVEN_UP_AFTER = 64
 #: Number of events after which the kernel returns to Python, about every 20 ms.
