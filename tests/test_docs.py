@@ -16,14 +16,17 @@ from docs import commands as commands_page
 from dwell.cli.commands import app
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "lab").rglob("*.md")])
+FOLDERS = ("docs", "lab", "reproduction")
+PAGES = sorted(
+    [*ROOT.glob("*.md"), *(page for name in FOLDERS for page in (ROOT / name).rglob("*.md"))]
+)
 EXECUTED = (
     "docs/start/first-result.md",
-    "docs/estimators.md",
-    "docs/live-tutorial.md",
-    "docs/profiling.md",
-    "docs/studies.md",
-    "docs/tutorial.md",
+    "docs/reference/estimators.md",
+    "docs/start/live-tutorial.md",
+    "docs/howto/profiling.md",
+    "docs/howto/studies.md",
+    "docs/start/tutorial.md",
     "lab/docs/validation.md",
 )
 
