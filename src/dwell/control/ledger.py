@@ -82,6 +82,8 @@ class FleetLedger:
         Called with the number of simulated levels of the table, and their total.
     limit : float, optional
         Largest V_D of a cell that is served, with the objective ``served``.
+    moves : bool
+        Whether a cell may move; without moves the table has no columns.
 
     Attributes
     ----------
@@ -110,9 +112,12 @@ class FleetLedger:
         prices: FleetPrices | None = None,
         progress: Progress | None = None,
         limit: float | None = None,
+        moves: bool = True,
     ) -> None:
         self.cells, self.shared, self.objective = tuple(cells), tuple(shared), objective
         problems = [cell.problem for cell in cells]
+        if table is None and not moves:
+            table = LoadTable(cells, shared, with_columns=False)
         self.table = table or load_table(tabled or cells, shared, progress)
         self.prices = prices or FleetPrices(cells, shared)
         self.loads = Loads(self.table)

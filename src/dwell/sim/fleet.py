@@ -285,6 +285,7 @@ def coordinations(
             tabled=tabled_cells(fleet, seed),
             progress=progress,
             limit=fleet.limit,
+            moves=not fleet.is_static,
         )
     for i, cell in enumerate(fleet.cells):
         if fleet.coordination == "ledger":
