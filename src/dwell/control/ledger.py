@@ -47,7 +47,13 @@ from dwell.control.watchdog import (
     Watchdog,
 )
 from dwell.cost import exceeds, excess, hamming
-from dwell.estimators.fleet_prices import CellTerms, FleetPrice, FleetPrices, PricedCell
+from dwell.estimators.fleet_prices import (
+    CellPrice,
+    CellTerms,
+    FleetPrice,
+    FleetPrices,
+    PricedCell,
+)
 from dwell.estimators.load_table import LoadTable, load_table
 from dwell.estimators.presents import Present
 from dwell.estimators.prices import prices_of
@@ -143,6 +149,7 @@ class FleetLedger:
         self.turn_ns = max(round(problem.window_ms * 1e6) for problem in problems)
         self.absent: set[int] = set()
         self._watchdogs = [Watchdog(problem.window_cycles) for problem in problems]
+        self._expected: list[tuple[CellPrice, Expected] | None] = [None] * len(cells)
         #: Doubted candidates of each cell at the end of its last window.
         self._doubted: list[set[str]] = [set()] * len(self.cells)
         #: Number of changes of placements, of doubts and of the cells in Φ.
@@ -195,9 +202,8 @@ class FleetLedger:
             self._begin()
             price = self._search.play(tuple(self.placements))
             cell = None if price is None else price.cells[index]
-            cycles = self.cells[index].problem.window_cycles
             if cell is not None:
-                played = Expected.of(cell.windows, self._declared[index][name], cycles)
+                played = self._expect(index, cell)
                 if dog.compare(seen, played) and estimator.learns:
                     self.absent ^= {index}
                     self._changes += 1
@@ -208,6 +214,16 @@ class FleetLedger:
         self._changes += doubted != self._doubted[index]
         self._doubted[index] = doubted
         return dog.trusts
+
+    def _expect(self, index: int, played: CellPrice) -> Expected:
+        """Return the expected windows of a cell at its placement, computed once per simulation."""
+        known = self._expected[index]
+        if known is None or known[0] is not played:
+            price = self._declared[index][self.placements[index]]
+            cycles = self.cells[index].problem.window_cycles
+            known = played, Expected.of(played.windows, price, cycles)
+            self._expected[index] = known
+        return known[1]
 
     def _begin(self) -> None:
         """Pass the measured conditions to the simulation; absent cells add none of shared nodes."""
