@@ -24,7 +24,7 @@ WITHOUT = {
     },
     "docs/concepts.md": {"Concepts", "Words", "Glossary"},
     "docs/background/statistics.md": {
-        "Statistics: what is computed, and why",
+        "Which statistics does Dwell compute?",
         "Global sensitivity",
         "References",
     },
