@@ -72,9 +72,7 @@ def _at_levels(
         yield from _at_some(cells, first, min(first + TOGETHER, len(levels)))
 
 
-def _at_some(
-    cells: Sequence[Sequence[_Option]], first: int, end: int
-) -> Iterator[tuple[str, ...]]:
+def _at_some(cells: Sequence[Sequence[_Option]], first: int, end: int) -> Iterator[tuple[str, ...]]:
     """Yield the cheapest placements at some of the levels."""
     # Smallest sum of costs of the cells so far, by level and by their work.
     least, chosen = np.zeros((end - first, end)), []
