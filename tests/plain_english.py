@@ -24,7 +24,6 @@ PAGES = ("docs", "lab/docs")
 MOST = {
     "docs": 6.7,
     "docs.reference": 5.4,
-    "dwell.cellfile": 21.2,
     "dwell.dash": 15.2,
     "dwell.estimators": 18.8,
     "dwell.kernels": 18.1,
