@@ -27,7 +27,6 @@ MOST = {
     "dwell.dash": 15.2,
     "dwell.estimators": 18.8,
     "dwell.kernels": 18.1,
-    "dwell_lab.validation": 25.9,
     "lab.docs": 5.9,
 }
 
