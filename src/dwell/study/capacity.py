@@ -213,7 +213,7 @@ class FleetPlayer:
         fleets = [self.of(size) for size in range(unit.first, unit.last + 1)]
         if self.fleet.is_static:
             static = StaticFleet(seed=unit.seed, duration_ns=self.duration_ns)
-            return [PlayedSize.of(*static.play(fleet)) for fleet in fleets]
+            return [PlayedSize.of(*run) for run in static.play_sizes(fleets)]
         return [self._moving(fleet, unit.seed) for fleet in fleets]
 
     def _moving(self, fleet: Fleet, seed: int) -> PlayedSize:
