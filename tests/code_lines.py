@@ -21,7 +21,7 @@ FLATS = {
     "simulator": ("src/dwell",),
 }
 #: The most lines of code.
-MOST = {"simulator": 24_805, "live": 14_265, "lab": 6_841}
+MOST = {"simulator": 24_817, "live": 14_265, "lab": 6_819}
 
 
 def code_lines(text: str) -> int:
