@@ -21,7 +21,7 @@ FLATS = {
     "simulator": ("src/dwell",),
 }
 #: The most lines of code.
-MOST = {"simulator": 24_817, "live": 14_265, "lab": 6_819}
+MOST = {"simulator": 24_839, "live": 14_266, "lab": 6_823}
 
 
 def code_lines(text: str) -> int:
