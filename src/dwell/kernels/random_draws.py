@@ -54,7 +54,8 @@ def stream(seed: int, name: str) -> np.random.SeedSequence:
     all others unchanged.
     """
     digest = hashlib.blake2b(name.encode(), digest_size=16).digest()
-    return np.random.SeedSequence(seed, spawn_key=struct.unpack("<4I", digest))
+    words = struct.unpack("<4I", digest)
+    return np.random.SeedSequence(seed, spawn_key=words)
 
 
 def draw(
