@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from dwell.display import write_number
@@ -14,6 +15,8 @@ from dwell.report.formatting import write_ms
 from dwell.report.palette import INK, MUTED, PAPER, SHADE
 
 if TYPE_CHECKING:
+    import polars as pl
+
     from dwell.model import Link
 
 #: Width of a node, and height of a line of text in it, pixels.
@@ -28,8 +31,6 @@ def topology(problem: Problem) -> Figure:
     A line shows the links of both directions, with the delay and rate of the link that the cell
     declares first. A node lists the tasks that it can run, anchored tasks in parentheses.
     """
-    import polars as pl
-
     nodes = sorted(problem.fabric.nodes.values(), key=lambda node: TIERS.index(node.tier))
     step = 2 * math.pi / len(nodes)
     # Angles grow clockwise from the top, where the first node is.
@@ -44,21 +45,7 @@ def topology(problem: Problem) -> Figure:
         ]
         for node in nodes
     }
-    boxes = [
-        {"node": name, "x": x, "y": y, "line": line, "text": text, "head": line == 0}
-        for name, (x, y) in places.items()
-        for line, text in enumerate(texts[name])
-    ]
-    pairs: dict[frozenset[str], Link] = {}
-    for link in problem.fabric.links.values():
-        pairs.setdefault(frozenset((link.source, link.target)), link)
-    lines = []
-    for link in pairs.values():
-        (x, y), (x2, y2) = places[link.source], places[link.target]
-        ends = {"x": x, "y": y, "x2": x2, "y2": y2}
-        lines.append({**ends, "mx": (x + x2) / 2, "my": (y + y2) / 2, "text": _link(link)})
-    schema = dict.fromkeys(("x", "y", "x2", "y2", "mx", "my"), pl.Float64) | {"text": pl.String}
-    frames = {"boxes": pl.DataFrame(boxes), "links": pl.DataFrame(lines, schema=schema)}
+    frames = {"boxes": _boxes(places, texts), "links": _lines(problem, places)}
     most = max(map(len, texts.values()))
     tall = LINE_PX * most + 14
     height = tall if len(nodes) == 1 else max(2.6 * tall, 75 * len(nodes))
@@ -100,6 +87,37 @@ def topology(problem: Problem) -> Figure:
         }
 
     return Figure("topology", f"Topology of {problem.name}", frames, draw)
+
+
+def _boxes(
+    places: Mapping[str, tuple[float, float]], texts: Mapping[str, Sequence[str]]
+) -> pl.DataFrame:
+    """Return one row per line of text in a node."""
+    import polars as pl
+
+    return pl.DataFrame(
+        [
+            {"node": name, "x": x, "y": y, "line": line, "text": text, "head": line == 0}
+            for name, (x, y) in places.items()
+            for line, text in enumerate(texts[name])
+        ]
+    )
+
+
+def _lines(problem: Problem, places: Mapping[str, tuple[float, float]]) -> pl.DataFrame:
+    """Return one line per pair of linked nodes, with its text in the middle."""
+    import polars as pl
+
+    pairs: dict[frozenset[str], Link] = {}
+    for link in problem.fabric.links.values():
+        pairs.setdefault(frozenset((link.source, link.target)), link)
+    lines = []
+    for link in pairs.values():
+        (x, y), (x2, y2) = places[link.source], places[link.target]
+        ends = {"x": x, "y": y, "x2": x2, "y2": y2}
+        lines.append({**ends, "mx": (x + x2) / 2, "my": (y + y2) / 2, "text": _link(link)})
+    schema = dict.fromkeys(("x", "y", "x2", "y2", "mx", "my"), pl.Float64) | {"text": pl.String}
+    return pl.DataFrame(lines, schema=schema)
 
 
 def _tasks(problem: Problem, node: str) -> list[str]:
