@@ -65,7 +65,8 @@ struct Simulation : Tables {
   template <class T>
   static void fetch_next(const T& value) {
     constexpr i64 kLineBytes = 64;
-    if constexpr (!kPlain) __builtin_prefetch(&value + kLineBytes / sizeof(T));
+    const i64 values = kLineBytes / static_cast<i64>(sizeof(T));
+    if constexpr (!kPlain) __builtin_prefetch(&value + values);
   }
 
   // Hop that a flow takes in a cycle, -1 on the same node.
