@@ -195,4 +195,4 @@ def test_phases_have_the_placements_that_some_phase_was_on() -> None:
     problem = replace(many_cell, scenarios={"stress": stressed})
     page = run_page(simulate(problem, scenario="stress", policy="R-R-R", seed=1, windows=8))
     columns = [one.column for one in table_of(page, "phases").columns]
-    assert [one for one in columns if one.startswith("share")] == ["share R-R-R"]
+    assert [one for one in columns if one.startswith("share")] == ["share_R-R-R"]
