@@ -190,13 +190,13 @@ def says_it_ran_elsewhere(patch: pytest.MonkeyPatch) -> None:
 
 
 def says_what_nobody_reads(patch: pytest.MonkeyPatch) -> None:
-    sealed = RolePlace._sealed
+    sealed = RolePlace.sealed
 
     def torn(self: RolePlace, key: str, message: Any) -> bytes:
         data = sealed(self, key, message)
         return data[:-1] if "/done/" in key else data
 
-    patch.setattr(RolePlace, "_sealed", torn)
+    patch.setattr(RolePlace, "sealed", torn)
 
 
 def trusts_a_book_of_another_boot(patch: pytest.MonkeyPatch) -> None:
