@@ -21,7 +21,7 @@ FLATS = {
     "simulator": ("src/dwell",),
 }
 #: The most lines of code.
-MOST = {"simulator": 24_814, "live": 14_427, "lab": 6_834}
+MOST = {"simulator": 25_043, "live": 14_434, "lab": 6_829}
 
 
 def code_lines(text: str) -> int:

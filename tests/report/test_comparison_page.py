@@ -13,7 +13,7 @@ from dwell.report import comparison_html, comparison_text
 from dwell.report.comparison_page import comparison_page
 from dwell.study import compare
 from tests.cells.small import SEEDS, make_comparison, make_problem
-from tests.report.pages import Page, small_comparison, table_of
+from tests.report.pages import Page, silent_on_warmup, small_comparison, table_of
 
 Shown: TypeAlias = dict[tuple[str, str], Mapping[str, float | Sequence[float]]]
 
@@ -39,6 +39,10 @@ def test_the_answer_and_its_figure_come_first() -> None:
     assert figure is next(page.figures)
     assert counts is next(page.tables)
     assert figure.slug == "violation_rate"
+
+
+def test_every_table_says_whether_the_warm_up_is_in() -> None:
+    assert silent_on_warmup(comparison_page(small_comparison())) == []
 
 
 def test_every_policy_stands_in_every_scenario_and_a_reader_can_choose() -> None:

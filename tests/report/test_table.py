@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from dwell.report.formatting import Measure
+from dwell.display import Measure
 from dwell.report.palette import MUTED, Palette
 from dwell.report.table import Cell, Columns, Table, Text, interval_row, table_text
 from dwell.study import Interval

@@ -214,13 +214,13 @@ class RecordedFleet:
             "placements": [{"name": name, "hue": self._hues[name]} for name in self._placements],
             "shared": list(self._load),
             "has_phi": bool(len(self._rounds.at)),
-            "mean_rate": plain(np.array([np.mean([one.rate for one in self._members])]), 4)[0],
+            "mean_rate": plain(np.array([np.mean([one.rate for one in self._members])]), 9)[0],
             "cells": [
                 {
                     "place": one.place,
                     "name": one.name,
                     "deadline_ms": one.problem.pipeline.deadline_ms,
-                    "rate": plain(np.array([one.rate]), 4)[0],
+                    "rate": plain(np.array([one.rate]), 9)[0],
                 }
                 for one in self._members
             ],

@@ -8,11 +8,23 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dwell.record import shown_reason
 from dwell.record.moves import GUARD
-from dwell.report.charts import coloured, disc, is_wide, layer, limit_rule, name_of, names, quantity
+from dwell.report.charts import (
+    coloured,
+    disc,
+    is_wide,
+    layer,
+    limit_rule,
+    name_of,
+    names,
+    number_of,
+    quantity,
+)
 from dwell.report.figure import Draw, Figure, Spec
 from dwell.report.palette import BAD, INK, MUTED, SHADE, Palette
 from dwell.study import AIM
+from dwell.study.metric import METRICS
 
 if TYPE_CHECKING:
     import polars as pl
@@ -39,7 +51,7 @@ ROW_PX, ROWS_PX = 17, 640
 DASHES: tuple[list[int], ...] = ([], [6, 3], [2, 2], [6, 2, 2, 2])
 #: Scales that panels do not share.
 OWN = ("color", "strokeDash")
-L95 = "L95 seen (ms)"
+RATE, L95 = METRICS["violation_rate"], METRICS["l95_ms"].called("L95 seen")
 WARMUP, UNPROVEN = "warm-up", "clocks unproven"
 AT = quantity("time", "at (s)", format=".1f")
 #: Layer of every panel: shades for warm-up, unproven clocks and disturbances.
@@ -116,8 +128,8 @@ def run_timeline(
     used = set(frame["placement"])
     colours = {name: colour for name, colour in placements.items() if name in used}
     panels: list[tuple[float, list[Spec]]] = [
-        (PANEL_PX, [*aim, *_marks("v_d", "V_D (%)", colours, each)]),
-        (PANEL_PX, [*due, *_marks("l95", L95, colours, each, log=wide)]),
+        (PANEL_PX, [*aim, *_marks("v_d", RATE.heading, colours, each)]),
+        (PANEL_PX, [*due, *_marks("l95", L95.heading, colours, each, log=wide)]),
         (PANEL_PX, [_others(placements), *_marks("j", "J", colours, each)]),
         (USE_PX, _use(resources, each)),
     ]
@@ -317,7 +329,7 @@ def _moves(timed: pl.DataFrame) -> pl.DataFrame:
     return timed.filter("migrated").select(
         "time",
         pl.format("{} → {}", "incumbent", "placement").alias("move"),
-        pl.col("reason").cast(pl.String),
+        pl.col("reason").cast(pl.String).map_elements(shown_reason, return_dtype=pl.String),
     )
 
 
@@ -464,7 +476,7 @@ def _placed(cells: Sequence[str], colours: Mapping[str, str]) -> Spec:
             *names("cell", "placement"),
             quantity("begin", "from (s)", format=".1f"),
             quantity("end", "to (s)", format=".1f"),
-            quantity("v_d", "V_D (%)"),
+            number_of("v_d", RATE),
         ],
     }
     return layer("rect", encoding, rows="placed", height={"band": 0.8})
@@ -473,9 +485,9 @@ def _placed(cells: Sequence[str], colours: Mapping[str, str]) -> Spec:
 def _rates() -> list[Spec]:
     """Return the layers of the mean of V_D over cells and of its range, a band."""
     about = [AT, *names("worst")]
-    about += [quantity(how, f"{how} (%)") for how in ("max", "mean", "min")]
-    up = {"y": quantity("mean", "V_D (%)", axis={"tickCount": 4})}
-    band = {"y": quantity("min", "V_D (%)"), "y2": "max"}
+    about += [number_of(how, RATE.called(how)) for how in ("max", "mean", "min")]
+    up = {"y": quantity("mean", RATE.heading, axis={"tickCount": 4})}
+    band = {"y": quantity("min", RATE.heading), "y2": "max"}
     return [
         layer("area", band, rows="rates", color=MUTED, opacity=0.3),
         layer("line", up, rows="rates", color=INK, strokeWidth=1.1),

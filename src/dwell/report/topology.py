@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from dwell.display import write_number
 from dwell.model import Problem, Trace
 from dwell.model.bounds import counted
 from dwell.report.charts import layer, quantity
 from dwell.report.figure import Figure, Spec
-from dwell.report.formatting import write_ms, write_number
+from dwell.report.formatting import write_ms
 from dwell.report.palette import INK, MUTED, PAPER, SHADE
 
 if TYPE_CHECKING:

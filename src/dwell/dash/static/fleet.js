@@ -38,7 +38,7 @@ class Small {
     this.root = make(
       "li",
       { class: "small" },
-      make("h4", {}, this.link, make("span", { class: "rate", text: `V_D ${percent(cell.rate, 1)}` })),
+      make("h4", {}, this.link, make("span", { class: "rate", text: `V_D ${percent(cell.rate, 2)}` })),
       make("p", {}, this.health),
       make("div", { class: "plot" }, make("div", { class: "lanes", "aria-hidden": "true" }, this.deadline, ...names), make("div", { class: "drawn" }, svg)),
       this.seen,
@@ -79,7 +79,7 @@ class Small {
   show(state) {
     panel.health(this.root, state, false);
     const { window: seen, decision } = state;
-    say(this.seen, seen ? `window ${seen.number}: L95 ${number(seen.seen.l95_ms, 1)} ms, V_D ${percent(seen.seen.violation_rate, 0)}` : "");
+    say(this.seen, seen ? `window ${seen.number}: L95 ${number(seen.seen.l95_ms, 1)} ms, V_D ${percent(seen.seen.violation_rate, 2)}` : "");
     say(this.last, decision ? `decided: ${panel.decided_in_words(decision)}` : `${state.placement}; no decision yet`);
   }
 }
@@ -167,8 +167,8 @@ export class FleetView {
   facts({ cells, phi }) {
     const [worst] = this.cell.cells;
     const rates = cells.flatMap(({ window: seen }) => seen?.seen.violation_rate ?? []);
-    const parts = [`V_D: worst ${percent(worst.rate, 1)} (${worst.name}), mean ${percent(this.cell.mean_rate, 1)}`];
-    if (rates.length) parts.push(`in the last window: worst ${percent(Math.max(...rates), 0)}, mean ${percent(rates.reduce((a, b) => a + b) / rates.length, 0)}`);
+    const parts = [`V_D: worst ${percent(worst.rate, 2)} (${worst.name}), mean ${percent(this.cell.mean_rate, 2)}`];
+    if (rates.length) parts.push(`in the last window: worst ${percent(Math.max(...rates), 2)}, mean ${percent(rates.reduce((a, b) => a + b) / rates.length, 2)}`);
     if (phi !== null) parts.push(`Φ a cell ${number(phi, 3)}`);
     say(this.part("facts"), parts.join(" · "));
   }

@@ -8,7 +8,7 @@ const REASONS = {
   hold: "no other candidate is better by enough",
   migrate: "another candidate is better by enough",
   capped: "the cheaper candidate is over a cap",
-  infeasible: "every candidate is over a cap",
+  infeasible: "all candidates are over a cap, this one least",
   guard: "the guard moved it by itself",
 };
 
@@ -60,7 +60,7 @@ export const decided = (root, cell, page) => {
   return (state) => {
     for (const [name, { row, values, mark, button }] of rows) {
       const known = state.candidates?.[name] ?? {};
-      const texts = [number(known.cost, 2), number(known.l95_ms, 1), percent(known.violation_rate, 1)];
+      const texts = [number(known.cost, 2), number(known.l95_ms, 1), percent(known.violation_rate, 2)];
       values.forEach((value, i) => say(value, texts[i]));
       row.classList.toggle("here", name === state.placement);
       const marks = [];
@@ -74,7 +74,7 @@ export const decided = (root, cell, page) => {
     say(why, decision(state));
     const { window } = state;
     say(against.querySelector("caption"), window ? `Predicted against seen: window ${window.number}, under ${window.placement}` : "Predicted against seen: no window yet");
-    const line = (name, value) => [name, number(value?.cost, 2), number(value?.l95_ms, 1), percent(value?.violation_rate, 1)];
+    const line = (name, value) => [name, number(value?.cost, 2), number(value?.l95_ms, 1), percent(value?.violation_rate, 2)];
     predicted.replaceChildren(
       ...[line("predicted", state.predicted), line("seen", window?.seen)].map(([name, ...texts]) =>
         make("tr", {}, make("th", { scope: "row", text: name }), ...cells(texts)),
@@ -90,14 +90,16 @@ export const decided = (root, cell, page) => {
 /** What was decided, in a few words. */
 export const decided_in_words = ({ incumbent, placement, reason, refused }) => {
   const moves = placement && placement !== incumbent;
-  return `${moves ? `${incumbent} → ${placement}` : incumbent}, ${reason}${refused ? `; ✕ refused: ${refused}` : ""}`;
+  const word = reason === "infeasible" ? REASONS.infeasible : reason;
+  return `${moves ? `${incumbent} → ${placement}` : incumbent}, ${word}${refused ? `; ✕ refused: ${refused}` : ""}`;
 };
 
 const decision = (state) => {
   const { decision: last, proving } = state;
   const parts = [];
   if (last) {
-    parts.push(`Last decision: ${decided_in_words({ ...last, refused: null })}: ${REASONS[last.reason] ?? "see the reasons in the documentation"}.`);
+    const why = last.reason === "infeasible" ? "" : `: ${REASONS[last.reason] ?? "see the reasons in the documentation"}`;
+    parts.push(`Last decision: ${decided_in_words({ ...last, refused: null })}${why}.`);
     if (last.refused) parts.push(`✕ Refused: ${last.refused}.`);
     if (last.delta_j !== null && last.delta_j !== undefined) parts.push(`ΔJ ${number(last.delta_j, 3)}.`);
   } else parts.push("No decision yet.");
