@@ -50,7 +50,7 @@ class Instant(NamedTuple):
     bound_ns: int
 
 
-class Interval(NamedTuple):
+class ClockOffset(NamedTuple):
     """Offset of a node's clock: between `low_ns` and `high_ns` at `t_ns` of the reference."""
 
     t_ns: int = -NEVER_NS
@@ -135,12 +135,12 @@ class Offsets:
         self._adopted_life: int | None = None
 
     @property
-    def interval(self) -> Interval:
+    def interval(self) -> ClockOffset:
         """Offset of this node's clock, for other processes of this node."""
         pair = self._pairs.get(self.node)
-        return Interval() if pair is None else Interval(pair.t_ns, pair.low_ns, pair.high_ns)
+        return ClockOffset() if pair is None else ClockOffset(pair.t_ns, pair.low_ns, pair.high_ns)
 
-    def adopt(self, interval: Interval, life: int) -> None:
+    def adopt(self, interval: ClockOffset, life: int) -> None:
         """Use the interval of the node's agent, of a life.
 
         A restarted agent has compared no clocks: then the last interval stays valid.

@@ -12,7 +12,7 @@ import msgspec
 from dwell.errors import LiveError, TrustError
 from dwell.live.log import printable
 from dwell.live.roles.failure_detector import FailureDetector
-from dwell.live.roles.offsets import Interval, Offsets
+from dwell.live.roles.offsets import ClockOffset, Offsets
 from dwell.live.wire.keys import BEATS, CONTROLLER, RELAYED, Keys
 from dwell.live.wire.messages import (
     MAX_HEADER_BYTES,
@@ -480,7 +480,7 @@ class Pulse:
         if not 0 <= now_ns - receipt.sent_ns <= late_ns:
             return False
         if self._offsets is not None:
-            self._offsets.adopt(Interval(*receipt.clock), receipt.life)
+            self._offsets.adopt(ClockOffset(*receipt.clock), receipt.life)
         return now_ns - receipt.beats.get(place.who, -NEVER_NS) <= self._every_ns + late_ns
 
     def own(self, who: str, now_ns: int) -> None:

@@ -270,7 +270,7 @@ class Receipt(_Array, frozen=True):
     beats : dict of str to int
         Times of the beats of the processes.
     clock : tuple of int
-        Offset of the node's clock (see `dwell.live.roles.offsets.Interval`).
+        Offset of the node's clock (see `dwell.live.roles.offsets.ClockOffset`).
     """
 
     life: int
