@@ -27,7 +27,7 @@ from dwell.live.trust.keyring import Keyring
 from dwell.live.trust.roster import Roster
 from dwell.live.trust.signing import Seals
 from dwell.live.wire import messages
-from dwell.live.wire.keys import TWICE, Keys
+from dwell.live.wire.keys import RELAYED, Keys
 from dwell.live.wire.messages import (
     MAX_HEADER_BYTES,
     Beat,
@@ -111,6 +111,7 @@ def _keys() -> tuple[str, ...]:
         *(keys.command("control"), keys.done("control"), keys.ended(), keys.stamped()),
         *(keys.frame(), keys.order(), keys.accepted(), keys.load("E"), keys.restored()),
         *(keys.beat("R1", "stamper@R1"), keys.beat("E", "agent@E"), keys.snapshot("planning", "E")),
+        *(keys.beats("E"), keys.missed()),
         *(keys.state("planning", "E"), keys.ask(), keys.look(), keys.carried(), keys.gathered()),
     ]
     return *plain, *(keys.detour(key) for key in plain), *(keys.relay(key) for key in plain)
@@ -161,7 +162,7 @@ def read_bundle(data: bytes) -> None:
     """As it comes over the detour."""
     place = _world(keys=False).stamper.place
     for sample in place.around(Arrival(place.keys.carried(), data)):
-        assert place.keys.word(sample.key) in TWICE
+        assert place.keys.word(sample.key) in RELAYED
         assert len(sample.payload) <= len(data)
 
 
@@ -312,6 +313,8 @@ def wholes() -> list[msgspec.Struct]:
         Completion(STAMP, "control", 9, "actuated", (HOP,), "R2"),
         messages.Heard("stamper@R1", "R1", 1, 2),
         Beat("agent@E", "E", 1, 5, True, (messages.Heard("stamper@R1", "R1", 1, 2),), cell="x"),
+        messages.Beats((Beat("agent@E", "E", 1, 5, True), Beat("planning@E", "E", 1, 4, True))),
+        messages.Receipt(1, 5, {"planning@E": 4}, (0, -9, 9)),
         Order(1, "me", 1, 1, "SO", 0.5, (("planning", "E"),)),
         Carried((("beat/E/agent@E", b"b"), ("done/control", b"c"))),
         messages.Ask("me", "pin", "SO"),

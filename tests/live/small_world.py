@@ -196,6 +196,19 @@ def forget_jobs(worker: Worker) -> bool:
     return waited
 
 
+class MemorySlots:
+    """Slots of a node's processes that outlive them."""
+
+    def __init__(self, slots: dict[str, bytes], who: str) -> None:
+        self.slots, self.who = slots, who
+
+    def write(self, content: bytes) -> None:
+        self.slots[self.who] = content
+
+    def read(self, who: str) -> bytes:
+        return self.slots.get(who, b"")
+
+
 class Bench:
     """Drives a worker: runs its jobs for as long as they take.
 
@@ -328,6 +341,8 @@ class World:
         self.roles: dict[str, object] = {}
         #: By worker: the memory of its counts, which outlives it.
         self.books: dict[str, bytearray] = {}
+        #: By node: the slots of its processes.
+        self.slots: dict[str, dict[str, bytes]] = {node: {} for node in problem.fabric.nodes}
         self.lives = 0
         self.run_id = 1
         self.boot = ""
@@ -348,6 +363,8 @@ class World:
         subject = CONTROLLER if role.kind == "controller" else role.node
         seals = self.seals.get(subject)
         place = RolePlace(self.problem, who, role.node, end, self.life_of(role), seals=seals)
+        if role.kind != "controller":
+            place.slots = MemorySlots(self.slots[role.node], who)
         made: Stamper | Sink | Quiet | ControlledCell | Bench
         if role.kind == "stamper":
             made = Stamper(place, self.book, self.time_of_day(role), end.now_ns, self.boot)

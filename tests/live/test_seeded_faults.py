@@ -198,7 +198,7 @@ def says_what_nobody_reads(patch: pytest.MonkeyPatch) -> None:
         data: bytes = sealed(self, key, message)
         return data[:-1] if "/done/" in key else data
 
-    around(patch, RolePlace, "_sealed", torn)
+    around(patch, RolePlace, "sealed", torn)
 
 
 def trusts_a_book_of_another_boot(patch: pytest.MonkeyPatch) -> None:

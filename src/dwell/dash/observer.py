@@ -288,9 +288,8 @@ class Observer:
                     self._take(arrival)
             case "stamped":
                 self._stamped(decode(sample.payload, Stamped))
-            case "beat":
-                beat = self._pulse.receive(sample, time.time_ns())
-                if beat is not None:
+            case "beat" | "beats":
+                for beat, _, _ in self._pulse.receive(sample, time.time_ns()):
                     for heard in beat.heard:
                         self._offsets.sample(heard.node, beat.node, heard.beat_ns, heard.at_ns)
             case "done" | "ended":

@@ -484,6 +484,7 @@ def test_a_stage_that_takes_longer_than_a_period_is_named(
     world = World(cell, policy=placement, exec_ms={**EXEC_MS, "perception": 76.0})
     named = 0
     detector = f"perception@{cell.candidates[placement]['perception']}"
+    world.run(750)  # the first cycles are on their way
     for _ in range(100):
         world.run(100)
         health, headline = told(world)

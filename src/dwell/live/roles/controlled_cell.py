@@ -16,7 +16,7 @@ from dwell.control import Controller, Proposal
 from dwell.errors import LiveError
 from dwell.live.roles.health import PATIENCE_NS, diagnose, silent_after_ns
 from dwell.live.roles.live_windows import LiveWindows
-from dwell.live.roles.role import AGENT_BEAT, REPEATED_NS, Pulse, RolePlace
+from dwell.live.roles.role import CONTROLLER_BEAT, REPEATED_NS, Pulse, RolePlace
 from dwell.live.roles.run_rows import Resume, Rows
 from dwell.live.wire.continuity import Continuity, SetbackDetector
 from dwell.live.wire.keys import CONTROLLER
@@ -25,7 +25,6 @@ from dwell.live.wire.messages import (
     Accepted,
     Answer,
     Ask,
-    Beat,
     Order,
     Restored,
     Snapshot,
@@ -113,11 +112,9 @@ class ControlledCell:
         self._recorder, self._changed = recorder, changed
         self.offsets = place.offsets()
         self.windows: LiveWindows | None = None
-        # Other processes' beats arrive in batches of the relay's agent. Beats carry their own
-        # times of sending and arrival, so a delay on the detour does not harm clock comparisons.
-        relay = place.problem.relay_node
-        agent = relay, f"agent@{relay}"
-        self.pulse = Pulse(place, lambda: (True, recorder.trouble), hears=[agent], every=AGENT_BEAT)
+        # Beats arrive in batches of the relay's agent. They carry their own times of sending and
+        # arrival, so a delay on the detour does not harm clock comparisons.
+        self.pulse = Pulse(place, lambda: (True, recorder.trouble), hears=(), every=CONTROLLER_BEAT)
         self._keys = place.keys
         # Run, term and placement from the stamper's answers and stamps; its last answer, or None
         # if only stamps have confirmed the current term.
@@ -204,9 +201,9 @@ class ControlledCell:
                 self._take(arrival, now_ns)
             return
         if self.pulse.hears(sample):
-            beat = self.pulse.receive(sample, now_ns)
-            if beat is not None:
-                self._compare_clocks(beat, now_ns, direct=keys.came_directly(sample.key))
+            for beat, _, _ in self.pulse.receive(sample, now_ns):
+                for heard in beat.heard:
+                    self.offsets.sample(heard.node, beat.node, heard.beat_ns, heard.at_ns)
                 if beat.moving and self._move is not None:
                     # A stage is writing or restoring its state.
                     self._move.since_ns = now_ns
@@ -238,14 +235,6 @@ class ControlledCell:
                     self._asked(looks, now_ns)
         except LiveError as error:
             self.place.complain(error)
-
-    def _compare_clocks(self, beat: Beat, now_ns: int, *, direct: bool) -> None:
-        """Compare clocks by a beat; from the detour, only by its sender's own receptions."""
-        if direct:
-            self.offsets.hear(beat, now_ns)
-        else:
-            for heard in beat.heard:
-                self.offsets.sample(heard.node, beat.node, heard.beat_ns, heard.at_ns)
 
     def _require_candidate(self, placement: str) -> None:
         """Raise a LiveError if the stamper's placement is not a candidate here."""

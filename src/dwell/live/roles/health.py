@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, TypeAlias
 
-from dwell.live.roles.role import AGENT_BEAT
+from dwell.live.roles.role import CONTROLLER_BEAT
 from dwell.live.wire.messages import STALE
 from dwell.live.wire.wiring import Role, lane_of, roles
 from dwell.model import Problem
@@ -47,10 +47,10 @@ BAD_WINDOWS = 2
 def silent_after_ns(problem: Problem) -> int:
     """Return the age of the last beat above which a process is silent.
 
-    The age is the guard's g periods plus the controller's delay: agents beat every `AGENT_BEAT`
-    periods, and the relay's agent passes beats on at the same interval.
+    The age is the guard's g periods, and twice the `CONTROLLER_BEAT` periods after which the
+    relay's agent passes beats on.
     """
-    periods = problem.controller.guard_cycles + 2 * AGENT_BEAT
+    periods = problem.controller.guard_cycles + 2 * CONTROLLER_BEAT
     return max(round(periods * problem.pipeline.period_ms * 1e6), LEAST_NS)
 
 

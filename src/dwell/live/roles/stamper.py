@@ -31,6 +31,7 @@ from dwell.live.wire.messages import (
 )
 from dwell.live.wire.routing import STAMPER, Destination, Routes
 from dwell.live.wire.transport import Arrival
+from dwell.model.instants import NEVER_NS
 
 #: Time without orders after which another controller may take over.
 LEASE_NS = 1_000_000_000
@@ -97,7 +98,9 @@ class Stamper:
         #: Run, term and placement of the cell.
         self.course = self.guard.course
         self.course.enter(entry.run, entry.term)
-        self.pulse = Pulse(place, self._ready, self._holds, hears=[("*", "*")])
+        self.pulse = Pulse(place, self._ready, self._holds, hears=[("*", "*")], nodes=["*"])
+        self._agents = [f"agent@{node}" for node in problem.fabric.nodes]
+        self._asked_ns = -NEVER_NS
         self.timer = problem.live.release == "timer"
         self._next_ns = now_ns + place.period_ns
         self._framed_ns = now_ns - place.period_ns
@@ -111,7 +114,7 @@ class Stamper:
         self._sinks = frozenset(
             name for name in problem.pipeline.tasks if not problem.pipeline.outputs(name)
         )
-        self.intervals = Intervals(place.who, self._sinks)
+        self.intervals = Intervals(place.node, self._sinks)
         self._partial: dict[int, set[str]] = {}
         self.shadow_fraction = 0.0
         self.forks: tuple[tuple[str, str], ...] = ()
@@ -158,9 +161,8 @@ class Stamper:
                 self.receive(arrival, now_ns)
             return
         if self.pulse.hears(sample):
-            beat = self.pulse.receive(sample, now_ns)
-            if beat is not None:
-                self._heard(beat, now_ns, self.place.keys.came_directly(sample.key))
+            for beat in self.pulse.receive(sample, now_ns):
+                self._heard(*beat)
             return
         try:
             match word := self.place.keys.word(sample.key):
@@ -189,6 +191,7 @@ class Stamper:
         self._release(now_ns, now_ns)
 
     def _heard(self, beat: Beat, now_ns: int, direct: bool) -> None:
+        """Process a beat that arrived at `now_ns`."""
         presence = self.guard.presence
         presence.heard(beat.node, now_ns)
         if direct:
@@ -382,13 +385,25 @@ class Stamper:
             self._next_ns += behind * self.place.period_ns
             self._release(self._next_ns, now_ns)
             self._next_ns += self.place.period_ns
-        due_ns = self.pulse.wake(now_ns)
+        due_ns = min(self.pulse.wake(now_ns), self._miss(now_ns))
         if self.timer:
             due_ns = min(due_ns, self._next_ns)
         guard_ns = self.guard.due_ns
         # While no fallback is complete, the guard looks again every quarter of a period.
         again_ns = now_ns + self.place.period_ns // 4
         return due_ns if guard_ns is None else min(due_ns, max(guard_ns, again_ns))
+
+    def _miss(self, now_ns: int) -> int:
+        """Ask the relay for beats of nodes that are missing; return when others would be."""
+        period_ns, detector = self.place.period_ns, self.pulse.detector
+        late_ns = period_ns * 5 // 4
+        ages = [detector.direct_age_ns(who, now_ns) for who in self._agents]
+        missing = any(age_ns is None or age_ns > late_ns for age_ns in ages)
+        if missing and not 0 <= now_ns - self._asked_ns < period_ns:
+            self._asked_ns = now_ns
+            self.place.transport.put(self.place.keys.missed(), b"")
+        due_ns = [now_ns + late_ns - age_ns for age_ns in ages if age_ns and age_ns <= late_ns]
+        return min(due_ns, default=now_ns + period_ns) + 1
 
     def _begin_anew(self, now_ns: int) -> None:
         """Restart timer and guard after the clock was set back."""
@@ -436,8 +451,6 @@ class Stamper:
         if stamp.shadow:
             self.guard.shadow_sent(stamp.cycle, released_ns, stamp.shadow)
         self._send(stamp, here=True, elsewhere=early is None)
-        # Beats wake every process and would delay the source, so send the next one mid-period.
-        self.pulse.put_off(released_ns + self.place.period_ns // 2)
         intervals = self.intervals.take_unreported()
         stamped = Stamped(**asdict(stamp), intervals=intervals, group_ns=group_ns)
         self.place.transport.put(self.place.keys.stamped(), encode(stamped))
