@@ -164,7 +164,10 @@ def test_small_multiples_say_how_every_cell_is(shown: Page, served: Served) -> N
     names = [cell["name"] for cell in fleet["cells"]]
     assert shown.locator(".small h4 a").all_inner_texts() == names
     assert shown.locator(".fleet .name").first.inner_text() == "pack"
-    assert names[0] in shown.locator(".facts").inner_text()
+    assert names[0] in shown.locator(".verdict").first.inner_text()
+    assert all(cell["verdict"] in ("kept", "missed", "open") for cell in fleet["cells"])
+    rates = shown.locator(".small .rate").all_inner_texts()
+    assert [rate.split(": ")[1] for rate in rates] == [cell["verdict"] for cell in fleet["cells"]]
     shown.evaluate("window.page.moveTo(4.003)")
     settled(shown)
     state = served.get("/state?at=4.003")
@@ -186,6 +189,7 @@ def test_a_click_opens_a_cell_at_the_same_place_and_leads_back(shown: Page, runs
     name = shown.locator(".small h4 a").first.inner_text()
     shown.locator(".small").first.click()
     wait_for_page(shown, "**/cell/*")
+    settled(shown)
     assert shown.evaluate("window.page.at") == 3
     assert shown.locator(".source").inner_text() == name
     assert f"of {runs.cells[name].cycles.height} cycles" in shown.locator(".facts").inner_text()

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -62,18 +63,17 @@ def _read(folder: Path, beside: Path | None) -> dict[str, Any]:
         return {"fleet": RecordedFleet(folder)}
     for path in filter(None, (folder, beside)):
         _require_run(path)
-    from dwell.dash.recorded_cell import RecordedCell, same_realisation
+    from dwell.dash.recorded_cell import RecordedCell, difference, same_realisation
 
     one = RecordedCell(folder)
     if beside is None:
         return {"cells": [one]}
     other = RecordedCell(beside)
-    if same_realisation(one.run, other.run):
-        cells = [RecordedCell(folder, "cycle"), RecordedCell(beside, "cycle")]
-        line = "by number of the cycle: both runs met the same realisation"
-        return {"cells": cells, "line": line}
     line = "by seconds since the first release: the runs met different realisations"
-    return {"cells": [one, other], "line": line}
+    if same_realisation(one.run, other.run):
+        one, other = RecordedCell(folder, "cycle"), RecordedCell(beside, "cycle")
+        line = "by number of the cycle: both runs met the same realisation"
+    return {"cells": [one, other], "line": line, "difference": partial(difference, one, other)}
 
 
 @contextmanager

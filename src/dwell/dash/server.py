@@ -72,6 +72,8 @@ class Dash:
         What carries out acts on the first cell; the page is read-only without.
     read_only : str
         Why it is.
+    difference : callable, optional
+        V_D of the second cell less V_D of the first between two places, in at most so many bins.
     metrics : callable, optional
         From the header `Accept` to the page of the first cell's metrics, and its type.
     """
@@ -81,6 +83,7 @@ class Dash:
     line: str = ""
     act: Act | None = None
     read_only: str = "this page only looks; `dwell dash --control` lets it act"
+    difference: Callable[[float, float, int], Plain] | None = None
     metrics: Callable[[str], tuple[bytes, str]] | None = None
     _news: asyncio.Condition = field(default_factory=asyncio.Condition, repr=False)
     _tick: tuple[int, bytes] = field(default=(0, b""), repr=False)
@@ -95,6 +98,7 @@ class Dash:
             Route("/cells", self._cells),
             Route("/view", self._view),
             Route("/state", self._state),
+            Route("/difference", self._difference),
             Route("/jobs", self._jobs),
             Route("/events", self._events),
             Route("/metrics", self._metrics),
@@ -125,6 +129,7 @@ class Dash:
                 "cells": [await run_in_threadpool(cell.described) for cell in cells],
                 "fleet": fleet,
                 "line": self.line,
+                "difference": self.difference is not None,
                 "control": control,
                 "read_only": None if control else self.read_only,
             }
@@ -132,9 +137,13 @@ class Dash:
 
     async def _view(self, request: Request) -> Response:
         shown, begin, end = await self._shown(request), *_places(request)
-        bins = round(_number(request, "bins", 600.0))
-        bins = min(max(bins, LEAST_BINS), MOST_BINS)
-        return JSONResponse(await run_in_threadpool(shown.view, begin, end, bins))
+        return JSONResponse(await run_in_threadpool(shown.view, begin, end, _bins(request)))
+
+    async def _difference(self, request: Request) -> Response:
+        if self.difference is None:
+            raise HTTPException(HTTPStatus.NOT_FOUND, "there is one run alone")
+        begin, end = _places(request)
+        return JSONResponse(await run_in_threadpool(self.difference, begin, end, _bins(request)))
 
     async def _state(self, request: Request) -> Response:
         shown = await self._shown(request)
@@ -344,6 +353,10 @@ def _places(request: Request) -> tuple[float, float]:
     if not begin < end:
         raise HTTPException(HTTPStatus.BAD_REQUEST, f"begin {begin:g} is not before end {end:g}")
     return begin, end
+
+
+def _bins(request: Request) -> int:
+    return min(max(round(_number(request, "bins", 600.0)), LEAST_BINS), MOST_BINS)
 
 
 def _number(request: Request, name: str, usual: float | None = None) -> float:
