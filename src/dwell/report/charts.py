@@ -36,6 +36,8 @@ MOST_LINES = 20
 SYMBOL_PX, LETTER_PX = 34, 6.2
 #: Smallest share of cycles on the axis of a distribution.
 LEAST_SHARE = 1e-4
+#: Outline of bars, whose fills may have little contrast with the paper.
+OUTLINE: dict[str, Any] = {"stroke": MUTED, "strokeWidth": 0.6}
 #: Vega tests of a row: its policy is chosen by the reader; its interval is known.
 CHOSEN = "indexof(policies, datum.policy) >= 0"
 BOUNDED = "isValid(datum.low) && isValid(datum.high)"
@@ -219,7 +221,8 @@ def stacked(
         "color": coloured("part", parts, legend={"symbolType": "square"}),
         "tooltip": [*names("policy", "part"), quantity("value", heading)],
     }
-    bars = in_order(layer("bar", encoding, where=[CHOSEN], height={"band": 0.7}), parts)
+    bars = layer("bar", encoding, where=[CHOSEN], height={"band": 0.7}, **OUTLINE)
+    bars = in_order(bars, parts)
     return _panels(frame, policies, lambda _: [bars, *limit_rule("x", *limit)])
 
 

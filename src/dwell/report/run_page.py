@@ -17,6 +17,7 @@ from dwell.model.bounds import counted
 from dwell.record import OUTCOME_SENTENCES, REASON_SENTENCES
 from dwell.record.moves import Move, moves_in
 from dwell.report.charts import (
+    OUTLINE,
     PART_COLOURS,
     PARTS_SHOWN,
     Limit,
@@ -286,7 +287,7 @@ class _RunPage:
         }
         top = {"x": across, "y": {"value": 6}, "tooltip": [cycle, outcome]}
         layers = [
-            in_order(layer("bar", time, rows="parts"), PART_COLOURS),
+            in_order(layer("bar", time, rows="parts", **OUTLINE), PART_COLOURS),
             *limit_rule("y", self.header.deadline_ms, "deadline"),
         ]
         if len(lost):
