@@ -170,7 +170,7 @@ def test_a_run_that_is_all_warm_up_has_no_verdict(tmp_path: Path) -> None:
     assert told["worst"] is None
 
 
-@pytest.mark.parametrize(("policy", "shown"), [("dtp", "DTP"), ("LOC", "LOC, which never moves")])
+@pytest.mark.parametrize(("policy", "shown"), [("dtp", "DTP"), ("LOC", "LOC, without moves")])
 def test_a_policy_is_shown_without_its_parameters(tmp_path: Path, policy: str, shown: str) -> None:
     small_run(tmp_path / "run", policy=policy)
     assert RecordedCell(tmp_path / "run").described()["about"]["policy"] == shown

@@ -121,6 +121,23 @@ def difference(
     return difference_of_misses(second.strip, first.strip, begin, end, bins, length)
 
 
+def policy_of(run: Run, placed: NDArray[np.int32]) -> str | None:
+    """Return the policy without its parameters, or the placement that never moves.
+
+    Parameters
+    ----------
+    placed : int32 array
+        Index of each window's placement in the candidates.
+    """
+    policy = run.meta.get("policy")
+    if policy is None:
+        return None
+    name = str(policy).partition("(")[0].strip()
+    if name == STATIC and len(placed):
+        return f"{list(run.problem.candidates)[placed[0]]}, without moves"
+    return name
+
+
 def same_realisation(one: Run, other: Run) -> bool:
     """Whether two runs met the same draws, cycle by cycle."""
     simulated = one.is_simulated and other.is_simulated
@@ -176,7 +193,9 @@ class _Contents:
         return float(self._cycle[min(row, len(self._cycle) - 1)])
 
     def described(self) -> Plain:
-        about = {name: self.run.meta.get(name) for name in ABOUT} | {"policy": self._policy()}
+        about = {name: self.run.meta.get(name) for name in ABOUT} | {
+            "policy": policy_of(self.run, self.windows.placement)
+        }
         cycle = self.problem.pipeline.period_ms / 1e3 if self.unit == "s" else 1.0
         return {
             **cell_document(self.problem),
@@ -196,16 +215,6 @@ class _Contents:
             "disturbed": merged(self._bands),
             **self._verdict,
         }
-
-    def _policy(self) -> str | None:
-        """Return the policy without its parameters, or the placement that never moves."""
-        policy = self.run.meta.get("policy")
-        if policy is None:
-            return None
-        name = str(policy).partition("(")[0].strip()
-        if name == STATIC and len(self.windows.placement):
-            return f"{self._candidates[self.windows.placement[0]]}, which never moves"
-        return name
 
     def view(self, begin: float, end: float, bins: int) -> Plain:
         windows = self.windows

@@ -28,6 +28,7 @@ from dwell.errors import DwellError
 
 if TYPE_CHECKING:
     from dwell.dash.recorded_fleet import RecordedFleet
+    from dwell.dash.runs_folder import RunsFolder
 
 _LOG = logging.getLogger(__name__)
 
@@ -58,7 +59,7 @@ ACTS = {"pin": "candidate", "unpin": None, "drain": "node", "undrain": "node"}
 
 @dataclass(slots=True)
 class Dash:
-    """Cells on one page, or a fleet whose cells have a page each.
+    """Cells on one page, or a fleet or a folder of runs with one page per cell or run.
 
     Parameters
     ----------
@@ -66,6 +67,8 @@ class Dash:
         On one time line.
     fleet : RecordedFleet, optional
         Shown instead of them.
+    runs : RunsFolder, optional
+        Listed instead of them.
     line : str
         What the time line counts where there are several, and why; empty for one.
     act : callable, optional
@@ -80,6 +83,7 @@ class Dash:
 
     cells: Sequence[PagedCell] = ()
     fleet: RecordedFleet | None = None
+    runs: RunsFolder | None = None
     line: str = ""
     act: Act | None = None
     read_only: str = "this page only looks; `dwell dash --control` lets it act"
@@ -96,6 +100,8 @@ class Dash:
             *(Route(path, partial(_file, "index.html")) for path in ("/", "/cell/{place:int}")),
             *(Route(f"/static/{name}", partial(_file, name)) for name in static_files()),
             Route("/cells", self._cells),
+            Route("/runs", self._runs),
+            Route("/lines", self._lines),
             Route("/view", self._view),
             Route("/state", self._state),
             Route("/difference", self._difference),
@@ -114,8 +120,12 @@ class Dash:
     # ---------------------------------------------------------------------- what is read
 
     async def _cells(self, request: Request) -> Response:
-        fleet = None
-        if self.fleet is None:
+        fleet = runs = None
+        cells: Sequence[PagedCell]
+        if self.runs is not None:
+            cells = [await self._cell(request)] if "cell" in request.query_params else []
+            runs = {"name": self.runs.name} if cells else self.runs.described()
+        elif self.fleet is None:
             cells = self.cells
         elif "cell" in request.query_params:
             cells = [await self._cell(request)]
@@ -128,12 +138,29 @@ class Dash:
             {
                 "cells": [await run_in_threadpool(cell.described) for cell in cells],
                 "fleet": fleet,
+                "runs": runs,
                 "line": self.line,
                 "difference": self.difference is not None,
                 "control": control,
                 "read_only": None if control else self.read_only,
             }
         )
+
+    async def _runs(self, request: Request) -> Response:
+        runs, since = self._folder(), _number(request, "since", 0.0)
+        return JSONResponse(runs.rows(max(int(since), 0)))
+
+    async def _lines(self, request: Request) -> Response:
+        runs, named = self._folder(), request.query_params.get("cells", "").split(",")
+        places = [int(name) for name in named if PLACE.fullmatch(name)]
+        if len(places) != len(named) or max(places) >= runs.count:
+            raise HTTPException(HTTPStatus.BAD_REQUEST, "cells has to be numbers of runs")
+        return JSONResponse(await run_in_threadpool(runs.lines, places))
+
+    def _folder(self) -> RunsFolder:
+        if self.runs is None:
+            raise HTTPException(HTTPStatus.NOT_FOUND, "this page lists no runs")
+        return self.runs
 
     async def _view(self, request: Request) -> Response:
         shown, begin, end = await self._shown(request), *_places(request)
@@ -162,9 +189,10 @@ class Dash:
     async def _cell(self, request: Request) -> PagedCell:
         name = request.query_params.get("cell", "0")
         place = int(name) if PLACE.fullmatch(name) else -1
-        if self.fleet is not None and 0 <= place < self.fleet.count:
-            return await run_in_threadpool(self.fleet.cell, place)
-        if self.fleet is None and 0 <= place < len(self.cells):
+        several = self.fleet or self.runs
+        if several is not None and 0 <= place < several.count:
+            return await run_in_threadpool(several.cell, place)
+        if several is None and 0 <= place < len(self.cells):
             return self.cells[place]
         raise HTTPException(HTTPStatus.NOT_FOUND, f"no cell {name[:20]!r}")
 

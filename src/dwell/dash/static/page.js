@@ -5,6 +5,7 @@ import { count, make, place, say } from "./dom.js";
 import { FleetView } from "./fleet.js";
 import { gantt } from "./gantt.js";
 import * as panel from "./panel.js";
+import { RunsView } from "./runs.js";
 import { act, get, latest } from "./server.js";
 import { Topology } from "./topology.js";
 
@@ -79,7 +80,7 @@ class CellView {
 
 class Page {
   /** Show cells, or a fleet; a cell of a fleet is asked for by its number there. */
-  constructor({ cells: alone, fleet, line, control, read_only, difference: differs }, numbered, at) {
+  constructor({ cells: alone, fleet, runs, line, control, read_only, difference: differs }, numbered, at) {
     const cells = alone.length ? alone : [fleet];
     this.described = cells;
     this.extremes = new Map();
@@ -99,7 +100,8 @@ class Page {
     element("cells").classList.toggle("two", cells.length > 1);
     this.cells = alone.length ? cells.map((cell, i) => new CellView(cell, numbered ?? i, this)) : [new FleetView(fleet, this)];
     element("cycles").hidden = !alone.length;
-    if (fleet && alone.length) this.leadBack(fleet);
+    if (fleet) this.leadBack(`${fleet.name}, the fleet`);
+    if (runs) this.leadBack(`all runs in ${runs.name}`);
     if (differs) this.compare(cells);
     this.windowLength = (cell) => (this.unit === "cycle" ? cell.window_cycles : (cell.window_cycles * cell.period_ms) / 1000);
     this.listen();
@@ -141,9 +143,10 @@ class Page {
     };
   }
 
-  /** Lead from a cell's page to that of its fleet. */
-  leadBack({ name }) {
-    const link = make("a", { href: "/", text: `◀ ${name}, the fleet` });
+  /** Link a cell's page to the page of its fleet, or a run's page to the list of runs. */
+  leadBack(name) {
+    if (this.cells[0] instanceof FleetView) return;
+    const link = make("a", { href: "/", text: `◀ ${name}` });
     this.lead(link);
     element("back-to-fleet").replaceChildren(link);
   }
@@ -395,7 +398,8 @@ const [, numbered] = location.pathname.match(/^\/cell\/(\d+)$/) ?? [];
 history.replaceState(null, "", location.pathname);
 try {
   const found = await get("/cells", numbered === undefined ? {} : { cell: numbered });
-  window.page = new Page(found, numbered, Number.isFinite(before) ? before : null);
+  if (found.runs && !found.cells.length) window.page = new RunsView(found.runs);
+  else window.page = new Page(found, numbered, Number.isFinite(before) ? before : null);
 } catch (error) {
   element("connection").classList.add("bad");
   say(element("connection"), `✕ ${error.message}`);

@@ -32,9 +32,9 @@ def dash(
     shown: Annotated[
         Path | None,
         argument(
-            "CELL|RUN|FLEET",
-            "Cell file of a cell that runs, or the folder of a run, or of a fleet's runs; "
-            "./cell.yaml if not given.",
+            "CELL|RUN|FLEET|FOLDER",
+            "Cell file of a cell that runs, or the folder of a run, of a fleet's runs, or of "
+            "several runs [default: ./cell.yaml]",
         ),
     ] = None,
     beside: Annotated[
