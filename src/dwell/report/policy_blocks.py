@@ -32,10 +32,11 @@ from dwell.report.formatting import (
     shown_policy,
     shown_scenario,
 )
-from dwell.report.method import method_blocks
+from dwell.report.method import method_blocks, placements_table
 from dwell.report.page import Block, Definitions
 from dwell.report.palette import Palette
 from dwell.report.table import Columns, Table, Text
+from dwell.report.topology import topology
 from dwell.study import AIM, over_seeds, under, windows_behind
 
 if TYPE_CHECKING:
@@ -65,6 +66,8 @@ MORE = (
     Measure("aoi_peak_ms", "largest age", "ms"),
     Measure("tracking_rms_mm", "tracking error", "mm"),
 )
+#: Most columns of a table on a page, next to the names of policies.
+MOST_COLUMNS = 5
 #: In the unit of `RATE`.
 THE_AIM = Limit(100 * AIM, "the aim, 5 %")
 #: The one sentence that is made of numbers (docs/decisions/0007-reports.md).
@@ -105,6 +108,11 @@ class PolicyBlocks:
     def answer(self) -> list[Block]:
         """Return the first blocks of a page: V_D of all policies, and counts under the aim."""
         return [self.rate(), self.counts()]
+
+    def cell(self) -> list[Block]:
+        """Return the drawing of the cell, and its placements with the nodes of movable tasks."""
+        slug = f"{self.prefix}topology"
+        return [topology(self.problem, slug), placements_table(self.problem, self.prefix)]
 
     def method(self, **about: str) -> list[Block]:
         """Return descriptions of cell, scenarios, policies and versions, and the terms `about`."""

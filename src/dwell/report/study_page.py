@@ -24,7 +24,7 @@ from dwell.report.formatting import (
 )
 from dwell.report.method import numbered
 from dwell.report.page import Block, Definitions, Page, Section, page_html
-from dwell.report.policy_blocks import THE_AIM, PolicyBlocks, named, scaled
+from dwell.report.policy_blocks import MOST_COLUMNS, THE_AIM, PolicyBlocks, named, scaled
 from dwell.report.table import Table, Text
 from dwell.study import StudyRuns, over_seeds
 
@@ -60,23 +60,25 @@ def _sections(study: StudyRuns, blocks: PolicyBlocks) -> Iterator[Section]:
     if study.parameters:
         for place in range(len(study.axes)):
             yield from _by_axis(study, blocks, place)
+        yield Section("The cell and its placements", blocks.cell())
         yield Section("Every point", [_points(study, blocks)], folded=True)
     else:
         yield Section("", blocks.answer())
-        yield Section("Results", [blocks.results()])
+        yield Section("The cell and its placements", blocks.cell())
+        yield Section("Results", blocks.results().parts(MOST_COLUMNS))
         figures = [blocks.tail(), blocks.measure(COST, title="J"), blocks.distribution()]
         if REGRET in _measures(study):
             figures.append(blocks.measure(REGRET, title="Regret"))
             figures.append(blocks.measure(ORACLE_REGRET, title="J over the oracle"))
         figures += [blocks.measure(one, title=one.name) for one in own_measures(study.metrics)]
         yield Section("Figures", [*figures, *blocks.placed(), blocks.split()])
-        yield Section("More numbers", [blocks.more()])
+        yield Section("More numbers", blocks.more().parts(MOST_COLUMNS), folded=True)
     method = blocks.method(
         runs=f"{counted(study.windows, 'window')}, {numbered(study.seeds)}",
         intervals="95 %, two-sided, over seeds, by the studentised bootstrap, each on its own."
         f"{independent_runs(study.runs)}",
     )
-    yield Section("How it was made", method)
+    yield Section("Method", method, folded=True)
 
 
 def _measures(study: StudyRuns) -> list[Measure]:

@@ -53,7 +53,8 @@ export class Topology {
     for (const row of rowsOf(nodes, wide)) {
       const width = Math.min(230, (wide - GAP * (row.length + 1)) / row.length);
       const height = HEAD + FOOT + SLOT * Math.max(1, ...row.map((node) => mayRun(node).length));
-      const left = (wide - row.length * width - (row.length - 1) * GAP) / 2;
+      // One cloud is right of the edge, so that its links to robots are visible.
+      const left = row.length === 1 && row[0].tier === "cloud" ? wide - width - GAP / 2 : (wide - row.length * width - (row.length - 1) * GAP) / 2;
       row.forEach((node, i) => {
         const x = row.length === 2 ? (i === 0 ? GAP / 2 : wide - width - GAP / 2) : left + i * (width + GAP);
         this.boxes.set(node.name, { x, y, width, height });
