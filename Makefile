@@ -19,10 +19,10 @@ COMPILE := $(UV) pip compile --quiet --python $(BIN)/python --universal --python
 	--generate-hashes --custom-compile-command "make lock" $(if $(UPGRADE),--upgrade)
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test test-sim test-live test-lab test-all check types tidy bench paper planted faults seeds chaos soak fuzz audit sbom lock clean again
+.PHONY: help env demo docs test test-sim test-live test-lab test-all check types tidy bench paper planted faults seeds chaos soak fuzz audit release-check sbom lock clean again
 
 help: ## Show this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-13s %s\n", $$1, $$2}' Makefile
 
 env: $(VENV)/.installed ## Make .venv from the lock files (only when they changed)
 
@@ -41,7 +41,8 @@ $(VENV)/.uv: requirements/uv.txt
 
 # A machine without a C++20 compiler gets one for the kernel.
 $(VENV)/.pinned: $(VENV)/.uv requirements/dev.txt requirements/zig.txt
-	$(SYNC) requirements/dev.txt
+	@echo "make env: installing the packages of requirements/dev.txt (about a minute)"
+	@$(SYNC) requirements/dev.txt
 	@$(BIN)/python hatch_build.py 2>/dev/null || $(UV) pip install --quiet --python $(BIN)/python \
 		--require-hashes -r requirements/zig.txt || true
 	@touch $@
@@ -49,12 +50,15 @@ $(VENV)/.pinned: $(VENV)/.uv requirements/dev.txt requirements/zig.txt
 # Compiles the kernel; where that is not possible, says so, and tries again the next time. A short
 # run has Python compile the modules that runs need.
 $(VENV)/.installed: $(VENV)/.pinned pyproject.toml lab/pyproject.toml hatch_build.py $(SOURCES) $(if $(wildcard $(KERNEL)),,again)
-	$(UV) pip install --quiet --python $(BIN)/python --no-build-isolation --no-deps --editable . --editable lab
-	$(UV) pip check --quiet --python $(BIN)/python
+	@echo "make env: compiling the kernel and installing Dwell (5 to 60 s)"
+	@$(UV) pip install --quiet --python $(BIN)/python --no-build-isolation --no-deps --editable . --editable lab
+	@$(UV) pip check --quiet --python $(BIN)/python
 	@test -f $(KERNEL) || $(BIN)/python hatch_build.py || true
+	@echo "make env: compiling Python modules with a short run"
 	@$(BIN)/python -m dwell run examples/canonical.yaml --windows 20 \
 		--out build/first-run --force >/dev/null 2>&1 || true
 	@git config core.hooksPath .githooks 2>/dev/null || true
+	@echo "make env: done; activate with . $(VENV)/bin/activate"
 	@touch $@
 
 demo: env ## Simulate and report an example into demo-out/ (REAL=path: on a real trace)
@@ -101,6 +105,9 @@ types:
 tidy:
 	$(BIN)/clang-tidy --quiet $(filter %.cpp,$(SOURCES))
 
+docs: $(VENV)/tools/site ## Make the site from the pages into build/site (strict)
+	PYTHONPATH=$< $(BIN)/python -m docs.site
+
 bench: env ## Run the benchmarks
 	$(BIN)/python -m benchmarks $(ARGS)
 
@@ -137,6 +144,9 @@ audit: $(VENV)/tools/release ## Look up known vulnerabilities of all that is pin
 			-r requirements/$$file.txt || exit 1; \
 	done
 
+release-check: $(VENV)/tools/release ## Build wheels and try them in each Python, and README as a stranger (minutes)
+	PYTHONPATH=$< $(BIN)/python -m tests.release_check $(ARGS)
+
 sbom: $(VENV)/tools/release ## Write what is pinned to dist/sbom.json (CycloneDX)
 	@mkdir -p dist
 	PYTHONPATH=$< $(BIN)/python -m cyclonedx_py requirements --pyproject pyproject.toml \
@@ -150,6 +160,7 @@ lock: $(VENV)/.uv ## Pin the dependencies of pyproject.toml again (UPGRADE=1: to
 		--output-file requirements/dev.txt
 	$(COMPILE) --group fuzz --output-file requirements/fuzz.txt
 	$(COMPILE) --group release --output-file requirements/release.txt
+	$(COMPILE) --group site --output-file requirements/site.txt
 	$(COMPILE) --group zig --output-file requirements/zig.txt
 	@! grep -nE '://|^ *--(index|extra-index|find-links|trusted-host)' requirements/*.txt
 

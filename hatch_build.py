@@ -3,7 +3,7 @@
 An editable install has the library beside its sources, a wheel gets it from `build/`. The compiler
 is $CXX, else the first of the system's that knows C++20, else that of the package `ziglang`, which
 isolated builds then ask for. DWELL_WHEEL_PLATFORM=manylinux_2_17_aarch64 has ziglang build a wheel
-for that platform (docs/releasing.md).
+for that platform (docs/howto/releasing.md).
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""What rules of coordination come to: `python -m benchmarks.coordination [--cells N] [--seeds K]`.
+"""Rules of coordination compared: `python -m benchmarks.coordination [--cells N] [--seeds K]`.
 
-Makes the tables of docs/fleets.md: N canonical cells on one edge server, all of whose robots are
-stressed from window 20 on, under every rule and estimator, beside all fixed splits. J is the mean
-over cells of windows 30 to 59. `--table` compares the table of loads with long runs, `--away` takes
-the edge away for 8 s, with guards, while all robots are stressed, `--objectives` compares the
+Makes the tables in reproduction/evidence/fleets.md: N canonical cells on one edge server, all
+robots stressed from window 20 on, under every rule and estimator, and all fixed splits. J is the
+mean over cells of windows 30 to 59. `--table` compares the table of loads with long runs, `--away`
+takes the edge away for 8 s, with guards, while all robots are stressed, `--objectives` compares the
 objectives of the ledger, and the plans by them.
 """
 

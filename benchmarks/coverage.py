@@ -1,8 +1,8 @@
 """How often intervals and limits hold what they should: `python -m benchmarks.coverage`.
 
-Makes the tables of docs/decisions/0005-statistics.md: of populations whose means are known, and of
-the canonical cell, whose means are those of all seeds played (8,000: an hour on two cores;
-`--seeds 800` for a look). Studies are disjoint: the seeds of one are none of another's.
+Makes tables of reproduction/evidence/interval-coverage.md: for known populations, and for
+the canonical cell, whose means are over all simulated seeds (8,000: an hour on two cores;
+`--seeds 800` for a look). Studies are disjoint: no two share a seed.
 """
 
 from __future__ import annotations

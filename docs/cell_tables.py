@@ -23,7 +23,8 @@ from dwell.cellfile.forms import (
     WrittenForm,
 )
 
-FILES = tuple(Path(__file__).parent / name for name in ("cells.md", "fleets.md"))
+FOLDER = Path(__file__).parent / "reference"
+FILES = tuple(FOLDER / name for name in ("cells.md", "fleets.md"))
 SHAPES = {
     "the file": cell_form.CELL.shape,
     "a trace": cell_form.TRACE,

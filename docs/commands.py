@@ -10,12 +10,12 @@ import typer
 
 from dwell.cli.commands import app
 
-PAGE = Path(__file__).with_name("commands.md")
+PAGE = Path(__file__).with_name("reference") / "commands.md"
 TEXT = """# Commands
 
-`dwell COMMAND --help` lists the options; [one file](../tests/regression/data/commands.txt) has the
-options of all commands. Commands with `--json` print for programs. Exit codes: 0 done, 1 the work
-failed, 2 the input is wrong, 130 interrupted. Files are complete or absent. `python -m
+`dwell COMMAND --help` lists the options; [one file](../../tests/regression/data/commands.txt) has
+the options of all commands. Commands with `--json` print for programs. Exit codes: 0 done, 1 the
+work failed, 2 the input is wrong, 130 interrupted. Files are complete or absent. `python -m
 docs.commands` writes this page.
 
 | command | does |

@@ -114,8 +114,8 @@ HEAD = """# Static placements in the dynamic scenarios
 `python docs/dynamic_tables.py` wrote this page on {day} ({machine}, commit
 {commit}). J and V_D of each placement if it never moves, 20 seeds of 300 windows, the warm-up left
 out; ± is the 95 % interval over seeds. The lowest J is bold if its interval to the next, seed by
-seed, leaves out 0. [Dynamic scenarios](../../docs/dynamic-scenarios.md) describes the phases and
-faults.
+seed, leaves out 0. [Dynamic scenarios](../../docs/background/dynamic-scenarios.md) describes the
+phases and faults.
 """
 
 

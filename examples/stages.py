@@ -1,4 +1,4 @@
-"""Stages to measure: the example of docs/profiling.md."""
+"""Stages to measure: the example of docs/howto/profiling.md."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ FLATS = {
     "simulator": ("src/dwell",),
 }
 #: The most lines of code.
-MOST = {"simulator": 24_963, "live": 14_502, "lab": 6_830}
+MOST = {"simulator": 24_985, "live": 14_503, "lab": 6_834}
 
 
 def code_lines(text: str) -> int:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
+import pkgutil
 import re
 import shlex
 from collections.abc import Iterator
@@ -13,17 +16,21 @@ import typer.main
 from typer.testing import CliRunner
 
 from docs import commands as commands_page
+from docs import site
 from dwell.cli.commands import app
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "lab").rglob("*.md")])
+FOLDERS = ("docs", "lab", "reproduction")
+PAGES = sorted(
+    [*ROOT.glob("*.md"), *(page for name in FOLDERS for page in (ROOT / name).rglob("*.md"))]
+)
 EXECUTED = (
     "docs/start/first-result.md",
-    "docs/estimators.md",
-    "docs/live-tutorial.md",
-    "docs/profiling.md",
-    "docs/studies.md",
-    "docs/tutorial.md",
+    "docs/reference/estimators.md",
+    "docs/start/live-tutorial.md",
+    "docs/howto/profiling.md",
+    "docs/howto/studies.md",
+    "docs/start/tutorial.md",
     "lab/docs/validation.md",
 )
 
@@ -133,3 +140,37 @@ def test_links_lead_somewhere(page: Path) -> None:
 def test_pictures_are_small() -> None:
     for picture in (ROOT / "docs" / "images").iterdir():
         assert picture.stat().st_size < 400_000
+
+
+def test_the_site_has_each_page_and_what_it_links_to(tmp_path: Path) -> None:
+    pages = site.stage(tmp_path)
+    assert {page_name(page) for page in (ROOT / "docs").rglob("*.md")} <= pages.keys()
+    assert not list((tmp_path / "docs").glob("*.py"))
+    for page, text in pages.items():
+        for name in site.linked(page, text):
+            assert (tmp_path / name).is_file(), f"{page}: {name}"
+
+
+@pytest.mark.parametrize(
+    ("loaded", "is_external"),
+    [
+        ('<script src="https://example.org/a.js"></script>', True),
+        ("<script src=//example.org/a.js></script>", True),
+        ('<link rel="stylesheet" href="https://example.org/a.css">', True),
+        ('<link href="https://example.org" rel="preconnect">', True),
+        ('<script src="assets/a.js"></script><a href="https://example.org">link</a>', False),
+    ],
+)
+def test_pages_that_load_from_another_host_are_found(
+    loaded: str, is_external: bool, tmp_path: Path
+) -> None:
+    (tmp_path / "page.html").write_text(loaded)
+    assert site.external(tmp_path) == ["page.html"] * is_external
+
+
+@pytest.mark.parametrize("name", site.NAME.findall((ROOT / site.API).read_text(encoding="utf-8")))
+def test_public_names_have_a_docstring(name: str) -> None:
+    module, _, attribute = name.rpartition(".")
+    public = importlib.import_module(module)
+    assert attribute in public.__all__
+    assert inspect.getdoc(pkgutil.resolve_name(f"{module}:{attribute}"))

@@ -279,7 +279,7 @@ RELEASED = {"manylinux_2_17_x86_64": "x86_64", "manylinux_2_17_aarch64": "aarch6
 @pytest.mark.parametrize("platform", RELEASED)
 def test_a_wheel_of_a_release_needs_glibc_2_17_alone(platform: str, tmp_path: Path) -> None:
     command = f"DWELL_WHEEL_PLATFORM={platform} .venv/bin/uv build --wheel\n"
-    assert command in (ROOT / "docs" / "releasing.md").read_text(encoding="utf-8")
+    assert command in (ROOT / "docs" / "howto" / "releasing.md").read_text(encoding="utf-8")
     done = hatchling(ROOT, f"build_wheel({str(tmp_path)!r})", DWELL_WHEEL_PLATFORM=platform)
     assert done.returncode == 0, done.stderr
     (wheel,) = tmp_path.glob("*.whl")

@@ -145,7 +145,11 @@ def test_the_registries_load_without_the_classes() -> None:
 
 @pytest.mark.parametrize(
     ("registry", "page"),
-    [(REGISTRY, "concepts.md"), (ESTIMATORS, "estimators.md"), (ESTIMATORS, "cells.md")],
+    [
+        (REGISTRY, "concepts.md"),
+        (ESTIMATORS, "reference/estimators.md"),
+        (ESTIMATORS, "reference/cells.md"),
+    ],
 )
 def test_the_pages_list_every_name_of_ours(registry: Mapping[str, object], page: str) -> None:
     text = (ROOT / "docs" / page).read_text(encoding="utf-8")

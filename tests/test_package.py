@@ -128,7 +128,7 @@ def test_a_robot_runs_and_moves_a_cell_with_the_extra_live_alone(
     python = environment("live")
     listed = json.loads(run(UV, "pip", "list", "--python", python, "--format", "json").stdout)
     names = {one["name"] for one in listed} - {"dwell-placement"}
-    said = (ROOT / "docs" / "deploy.md").read_text(encoding="utf-8")
+    said = (ROOT / "docs" / "howto" / "deploy.md").read_text(encoding="utf-8")
     told = re.search(r"brings these packages, (\d+) MB at most:(.*?)\.", said, re.DOTALL)
     assert told is not None
     assert set(re.findall(r"`([\w.-]+)`", told[2])) == names

@@ -32,6 +32,8 @@ WRITTEN = {
     ".py": '"""{0}"""\n\nx = 1  # {1}\nprint("{2}")\n',
     ".h": "// {0}\nint x;  // {1}\n/* {2} */\n",
     ".js": "// {0}\nconst x = `{1}`;\n/** {2} */\n",
+    ".md": "# A heading of four words\n\n**{0}**\n\n* [{1}](page.md)\n\n| a | {2} |\n"
+    "```sh\ndwell run a cell with options\n```\n",
     ".html": '<p>{0}</p>\n<!-- {1} -->\n<b title="{2}">x</b>\n',
 }
 

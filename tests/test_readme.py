@@ -51,7 +51,7 @@ def test_the_readme_has_at_most_600_words() -> None:
 
 
 def test_commands_print_what_the_page_on_capacity_says(tmp_path: Path) -> None:
-    page = ROOT / "docs" / "capacity.md"
+    page = ROOT / "docs" / "howto" / "capacity.md"
     check(transcript(page.read_text(encoding="utf-8")), tmp_path)
 
 

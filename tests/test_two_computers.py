@@ -1,4 +1,4 @@
-"""The quickstart of docs/two-computers.md: its commands, executed on two computers."""
+"""The quickstart of docs/howto/two-computers.md: its commands, executed on two computers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs" / "two-computers.md"
+PAGE = ROOT / "docs" / "howto" / "two-computers.md"
 ADDRESSES = {"robot": "10.0.0.11", "edge": "10.0.0.12"}
 PATIENCE_S = 120.0
 

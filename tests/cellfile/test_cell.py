@@ -105,7 +105,7 @@ def test_episodes_are_shared_and_ramps_are_read() -> None:
 
 
 def test_the_scenarios_of_the_manual_can_be_read() -> None:
-    text = (ROOT / "docs" / "cells.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "reference" / "cells.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"```yaml\n(scenarios:\n.*?)```", text, re.DOTALL)
     scenarios = yaml.safe_load(block)["scenarios"]
     cell = to_document(load(EXAMPLE))

@@ -17,7 +17,7 @@ from tests.cells.with_traces import LINK, faults_of, read_tables, trace_cell
     [
         ("u.parquet", None, ("does not exist", "did you mean 't.parquet'?")),
         ("other-run.csv", None, ("does not exist", "relative to the cell file")),
-        ("no/t.csv", None, ("does not exist", "there is no folder")),
+        ("no/t.csv", None, ("does not exist", "is not a folder")),
         ("t.xlsx", b"", (".parquet or .csv",)),
         ("e.csv", b"", ("is empty",)),
         ("h.csv", b"up,work\n", ("no rows",)),

@@ -73,7 +73,7 @@ VALUES: list[tuple[tuple[str | int, ...], object, str, tuple[str, ...]]] = [
         ("nodes", "R1"),
         {"tier": "robot", "background_hz": 50, "quota": {"cpu": 1, "period_ms": 4}},
         "nodes.R1.background_hz",
-        ("50", "no `quota` with `tick_ms`"),
+        ("50", "without a `quota` with `tick_ms`"),
     ),
     (("nodes", "R1", "background_hz"), 1e6, "nodes.R1.background_hz", ("from 0 to 100000",)),
     (

@@ -113,7 +113,7 @@ def test_infinite_and_huge_values_are_refused(tmp_path: Path) -> None:
             ("run", "run"),
             {"group": "client"},
             f"{LINK}.group",
-            ("group 0 begins again at row 5", "stand together"),
+            ("group 0 begins again at row 5", "sort the file by group"),
         ),
     ],
 )

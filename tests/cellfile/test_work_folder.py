@@ -57,7 +57,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="is no study"), open_work_folder(tmp_path, STUDY, {}):
         pass
     with (
-        pytest.raises(RunError, match="is no folder"),
+        pytest.raises(RunError, match="is not a folder"),
         open_work_folder(tmp_path / "thesis.tex", STUDY, {}),
     ):
         pass

@@ -73,7 +73,7 @@ def test_the_default_is_the_canonical_cell(here: Path) -> None:
 def test_names_that_are_no_folders(here: Path, name: str) -> None:
     found = call("new", name)
     assert found.exit_code == 2
-    assert "is no name for a cell's folder" in found.stderr
+    assert "is no name for a folder" in found.stderr
     assert list(here.iterdir()) == []
 
 
@@ -88,7 +88,7 @@ def test_nothing_is_overwritten(here: Path, kind: str) -> None:
     found = call("new", "hall")
     assert (found.exit_code, found.stderr) == (
         2,
-        "error: hall is there already; choose another name\n",
+        "error: hall exists already; choose another name\n",
     )
     assert kind != "folder" or list(Path("hall").iterdir()) == []
     assert kind != "file" or Path("hall").read_text(encoding="utf-8") == "mine"
@@ -97,7 +97,7 @@ def test_nothing_is_overwritten(here: Path, kind: str) -> None:
 def test_a_folder_around_it_that_is_missing(here: Path) -> None:
     found = call("new", "absent/hall")
     assert (found.exit_code, found.stderr.count("\n")) == (2, 1)
-    assert "there is no folder absent" in found.stderr
+    assert "absent is not a folder" in found.stderr
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")

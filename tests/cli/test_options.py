@@ -97,7 +97,10 @@ def test_seconds_of_windows_that_differ_in_length_are_refused(tmp_path: Path) ->
     study.write_text(yaml.safe_dump({**told, "parameters": {"window_cycles": [100, 200]}}))
     refused = call("study", study, "--seconds", "20")
     assert refused.exit_code == 2
-    assert "--seconds 20: windows last 3.33333, 6.66667 s here; give --windows" in refused.stderr
+    assert (
+        "--seconds 20: the cells have windows of 3.33333, 6.66667 s; give --windows"
+        in refused.stderr
+    )
 
 
 @pytest.mark.parametrize(

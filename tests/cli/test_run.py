@@ -268,7 +268,7 @@ def test_a_long_list_of_values_still_names_a_folder(cell: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        (["period_ms"], ["--set period_ms: there is no `=`; write it as PATH=VALUE"]),
+        (["period_ms"], ["--set period_ms: has no `=`; write PATH=VALUE"]),
         (["=5"], ["--set : not a path"]),
         (["perid_ms=5"], ["--set perid_ms: unknown key 'perid_ms'; did you mean 'period_ms'?"]),
         (["tasks.plann.input=all"], ["the cell's tasks have no 'plann'; did you mean 'plan'?"]),
@@ -282,7 +282,7 @@ def test_a_long_list_of_values_still_names_a_folder(cell: Path) -> None:
             ["objective.caps={latency_ms: 5}", "objective.caps.latency_ms=6"],
             ["--set objective.caps.latency_ms: is a part of objective.caps; give one of them"],
         ),
-        (["period_ms=0", "seed", "links[1].loss=0"], ["--set seed: there", "--set links[1].loss:"]),
+        (["period_ms=0", "seed", "links[1].loss=0"], ["--set seed: has", "--set links[1].loss:"]),
         (
             ["window_cycles=0", "nodes.E.cores=0"],
             ["--set window_cycles: 0", "--set nodes.E.cores:"],

@@ -49,10 +49,10 @@ def test_no_other_file_is_replaced(tmp_path: Path) -> None:
     for text in ("mine", '{"title": "mine"}', "[1]", "dwell: 1\n"):
         path.write_text(text, encoding="utf-8")
         refused = call("schema", "--write", path)
-        assert_refused(refused, "is there already, and is no schema")
+        assert_refused(refused, "exists and is no schema")
         assert refused.stderr.count("\n") == 1
         assert path.read_text(encoding="utf-8") == text
     assert_refused(call("schema", "--write", tmp_path), "is a folder")
-    assert_refused(call("schema", "--write", tmp_path / "a" / "b"), "there is no folder")
-    assert_refused(call("schema", tmp_path / "other.json"), "say --write")
+    assert_refused(call("schema", "--write", tmp_path / "a" / "b"), "is not a folder")
+    assert_refused(call("schema", tmp_path / "other.json"), "add --write")
     assert not (tmp_path / "other.json").exists()

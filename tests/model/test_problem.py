@@ -80,11 +80,11 @@ PLACED = {"a": "R", "b": "R"}
         (lambda: LinkDisturbance("R", "E", loss=2), "loss", "from 0 to 1"),
         (lambda: NodeDisturbance("R", ramp_s=-1), "ramp_s", "from 0 to 1e9"),
         (lambda: NodeDisturbance("R", for_s=3, ramp_s=2), "ramp_s", "at most half of for_s = 3"),
-        (lambda: NodeDisturbance("R", down=True, ramp_s=2), "ramp_s", "left out of what is `down`"),
+        (lambda: NodeDisturbance("R", down=True, ramp_s=2), "ramp_s", "left out with `down`"),
         (
             lambda: LinkDisturbance("R", "E", ramp_s=2, episodes=EPISODES),
             "ramp_s",
-            "left out where there are `episodes`",
+            "left out with `episodes`",
         ),
         (lambda: Episodes("x", Constant(1), Constant(0)), "episodes.for_s", "mean is a number"),
         (
@@ -172,7 +172,7 @@ PLACED = {"a": "R", "b": "R"}
                 objective=replace(_problem().objective, accelerators={"E.gpu": "edge"}),
             ),
             "objective.accelerators",
-            "those of all nodes of tiers, nothing",
+            "name the accelerators of all nodes in tiers, nothing",
         ),
         (lambda: _problem().scenario("baselin"), "", "did you mean 'baseline'?"),
     ],
@@ -213,7 +213,7 @@ def test_a_cold_migration_needs_links_for_its_state() -> None:
     stateful = replace(good, pipeline=replace(good.pipeline, tasks=tasks))
     (fault,) = _faults(lambda: replace(stateful, controller=cold))
     assert fault.path == "tasks.b.state_bytes"
-    for words in ("there is no link E->R;", "declare it", "migration: warm"):
+    for words in ("without the link E->R;", "declare it", "migration: warm"):
         assert words in fault.message
     links = {**good.fabric.links, "E->R": Link("E", "R", Constant(1.0))}
     linked = replace(stateful, fabric=replace(good.fabric, links=links))

@@ -189,8 +189,8 @@ def test_a_policy_and_an_estimator_in_one_name(cell: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "told"),
     [
-        ("absent:Last", "there is no module 'absent', neither in "),
-        ("own.absent:Last", "there is no module 'own.absent', neither in "),
+        ("absent:Last", "no module 'absent', neither in "),
+        ("own.absent:Last", "no module 'own.absent', neither in "),
         ("raises:Last", "importing raises failed: RuntimeError: no camera (raises.py:1)"),
         ("syntax:Last", "importing syntax failed: SyntaxError: "),
         ("own.choice:Lost", "own.choice has no class 'Lost'; did you mean 'Last'?"),
@@ -293,7 +293,7 @@ def test_a_folder_without_a_module_does_not_get_the_one_of_another(
     bare = tmp_path / "bare"
     bare.mkdir()
     shutil.copy(cell, bare)
-    with pytest.raises(PolicyError, match="there is no module 'own'"):
+    with pytest.raises(PolicyError, match="no module 'own'"):
         dwell.simulate(dwell.load(bare / cell.name), policy="own.choice:Last", seed=1, windows=4)
 
 
@@ -306,7 +306,8 @@ def test_a_study_over_processes_plays_a_changed_module_again_and_nothing_else(ce
     study.write_text(text, encoding="utf-8")
     command = (sys.executable, "-m", "dwell", "study", study, "--processes", "2")
     found = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (found.returncode, found.stderr) == (0, "")
+    # A slow study prints its progress on stderr.
+    assert found.returncode == 0
     runs = pl.read_parquet("studies/own/runs.parquet")
     costs = {name: table["cost"].to_list() for (name,), table in runs.group_by("policy")}
     assert costs["own.choice:Last"] == costs["mine"] != costs["LOC"]
@@ -314,7 +315,7 @@ def test_a_study_over_processes_plays_a_changed_module_again_and_nothing_else(ce
     module = cell.parent / "own" / "choice.py"
     module.write_text(POLICY.replace("[-1]", "[0]"), encoding="utf-8")
     again = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (again.returncode, again.stderr) == (0, "")
+    assert again.returncode == 0
     changed = pl.read_parquet("studies/own/runs.parquet")
     own = pl.col("policy").is_in(["own.choice:Last", "mine"])
     assert changed.filter(~own).equals(runs.filter(~own))

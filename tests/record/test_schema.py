@@ -12,17 +12,13 @@ import polars as pl
 import pytest
 
 import dwell
+from docs import columns
 from dwell.model import REASONS, Problem, Reason
 from dwell.model.table_columns import TABLES, Column, Feature
 from dwell.record import OUTCOME_SENTENCES, OUTCOMES, REASON_SENTENCES, column_types
 from dwell.record.schema import frame_of, polars_schema, row_of
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "columns.md"
-HEAD = """\
-| column | type | unit | what it says | null |
-|---|---|---|---|---|
-"""
 
 
 @pytest.fixture(scope="module")
@@ -131,29 +127,6 @@ def test_every_outcome_and_reason_has_a_sentence() -> None:
     assert tuple(REASON_SENTENCES) == REASONS == get_args(Reason)
 
 
-def page() -> str:
-    """Return the part of the page that the schema says."""
-    parts = []
-    for name, table in TABLES.items():
-        asked = "; kept on request" if table.on_request else ""
-        parts.append(f"## {name}\n\nOne row is {table.sentence}{asked}.\n\n{HEAD}")
-        parts[-1] += "".join(map(row, table.columns))
-    parts.append(
-        "## Outcomes and reasons\n\n| outcome | what became of a cycle or a job |\n|---|---|\n"
-    )
-    parts[-1] += "".join(f"| `{name}` | {text} |\n" for name, text in OUTCOME_SENTENCES.items())
-    parts[-1] += "\n| reason | why it was decided so |\n|---|---|\n"
-    parts[-1] += "".join(f"| `{name}` | {text} |\n" for name, text in REASON_SENTENCES.items())
-    return "\n".join(parts)
-
-
-def row(column: Column) -> str:
-    name = column.name.replace("{", "<").replace("}", ">")
-    of = f" ({' or '.join(column.of)})" if column.of else ""
-    return f"| `{name}`{of} | {column.kind} | {column.unit} | {column.sentence} | {column.null} |\n"
-
-
 def test_the_page_of_columns_is_the_schema() -> None:
-    """Where it differs, the part from its first table on is `page()`."""
-    text = PAGE.read_text(encoding="utf-8")
-    assert text[text.index("## cycles") :] == page()
+    """`python -m docs.columns` writes its tables."""
+    assert columns.PAGE.read_text(encoding="utf-8") == columns.page()

@@ -146,7 +146,7 @@ def test_what_stays_in_this_process_need_not_be_imported() -> None:
         (
             "policies: {mine: 'absent:Mine'}",
             PolicyError,
-            "policy 'absent:Mine': there is no module",
+            "policy 'absent:Mine': no module",
         ),
         (
             "policies: {mine: {policy: dtp, estimator: 'own:Lost'}}",
@@ -156,7 +156,7 @@ def test_what_stays_in_this_process_need_not_be_imported() -> None:
         (
             "policies: [dtp]\nparameters: {controller.estimator: [profile, 'absent:Mine']}",
             ProblemError,
-            "estimator 'absent:Mine': there is no module",
+            "estimator 'absent:Mine': no module",
         ),
         (
             "policies: {mine: 'own:Fails'}",

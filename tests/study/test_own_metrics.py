@@ -143,7 +143,7 @@ def test_another_source_of_a_metric_plays_all_again(study: Path) -> None:
 @pytest.mark.parametrize(
     ("metric", "message"),
     [
-        ("absent:slowest", "metrics.slowest_ms: metric 'absent:slowest': there is no module"),
+        ("absent:slowest", "metrics.slowest_ms: metric 'absent:slowest': no module"),
         ("hall_metrics:slowst", "has no function 'slowst'; did you mean 'slowest'?"),
         ("hall_metrics:constant", "'constant' in hall_metrics is not a function"),
         ("slowest", "'slowest' is not allowed; it must be package.module:function"),
@@ -193,7 +193,7 @@ def test_a_metric_of_python_that_is_not_there_is_found_before_the_folder_is_made
     tmp_path: Path,
 ) -> None:
     study = make_study(metrics={"mine": "absent:metric"}, folder=str(tmp_path))
-    with pytest.raises(SimulationError, match="there is no module 'absent', neither in"):
+    with pytest.raises(SimulationError, match="no module 'absent', neither in"):
         run_study(study, folder=tmp_path / "out", processes=1)
     assert not (tmp_path / "out").exists()
 

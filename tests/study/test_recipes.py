@@ -1,4 +1,4 @@
-"""The recipes of docs/recipes.md: their fleets carry as many robots as the page says."""
+"""The recipes of docs/howto/recipes.md: their fleets carry as many robots as the page says."""
 
 from __future__ import annotations
 

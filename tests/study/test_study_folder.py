@@ -257,7 +257,7 @@ def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="is no study; choose another folder"):
         run_study(make_study(), folder=tmp_path, processes=1)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
-    with pytest.raises(RunError, match="is no folder"):
+    with pytest.raises(RunError, match="is not a folder"):
         run_study(make_study(), folder=tmp_path / "thesis.tex", processes=1)
 
 

@@ -42,7 +42,7 @@ def test_the_page_is_whole_and_loads_nothing(measured: MeasuredCampaign) -> None
     assert page.outside == []
     assert "script" not in page.tags
     assert len(page.ids) == len(set(page.ids))
-    for heading in ("Results", "Figures", "What jobs took", "What messages took"):
+    for heading in ("Results", "Figures", "Times of jobs", "Delays of messages"):
         assert heading in page.headings
     # Of every policy and scenario: four measures, five distributions; shares, parts, delays.
     assert page.tags.count("svg") == 12

@@ -120,7 +120,7 @@ def test_faults_come_before_the_folder_is_touched(problem: Problem, tmp_path: Pa
         )
     settings = replace(problem.controller, policy="nowhere:Mine")
     unknown = replace(problem, controller=settings)
-    with pytest.raises(PolicyError, match="there is no module 'nowhere'"):
+    with pytest.raises(PolicyError, match="no module 'nowhere'"):
         run_once(
             unknown, scenario="baseline", policy=None, seconds=5, seed=1, out=tmp_path, name="x"
         )

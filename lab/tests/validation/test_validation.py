@@ -260,7 +260,7 @@ class TestBadInput:
             scenarios={"robot-cpu-stress": (NodeDisturbance("R1", stress_threads=1),)},
         )
         run = simulate(other, scenario="robot-cpu-stress", policy="LOC", seed=1, windows=6)
-        with pytest.raises(RunError, match="'robot-cpu-stress' was another one in the run"):
+        with pytest.raises(RunError, match="'robot-cpu-stress' differs between the run"):
             validate([run], problem)
 
     def test_calibration_runs(self) -> None:

@@ -47,7 +47,7 @@ def _import(module_name: str, name: str, option: str) -> object:
     except (Exception, SystemExit) as error:
         if isinstance(error, ModuleNotFoundError) and _is_part(error.name, module_name):
             raise ProfileError(
-                f"{option}: there is no module {error.name!r} (from {name!r}), neither in "
+                f"{option}: no module {error.name!r} (from {name!r}), neither in "
                 f"{Path.cwd()} nor among the installed ones"
             ) from None
         raise ProfileError(

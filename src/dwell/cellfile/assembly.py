@@ -61,12 +61,12 @@ PROCESSES = frozenset(DRAWN.values())
 
 @dataclass(slots=True)
 class Assembly:
-    """One cell on its way from its entry to a Problem.
+    """The construction of a Problem from the entry of a cell.
 
     Parameters
     ----------
     entry : Entry
-        Of a cell, less what is at fault.
+        Entry of a cell without its faulty values.
     tables : dict of Source to TraceTable, optional
         Less the sources at fault; where None, traces are named and not read.
     faults : Faults
@@ -99,7 +99,7 @@ class Assembly:
         return problem
 
     def _problem(self, name: str) -> Problem | None:
-        """Return the problem, or None beside at least one fault."""
+        """Return the problem, or None after at least one fault."""
         entry = self.entry
         nodes = {name: self._made(node, name) for name, node in entry.nodes.items()}
         tasks = {name: self._task(name, task) for name, task in entry.tasks.items()}
@@ -167,9 +167,9 @@ class Assembly:
     # ------------------------------------------------------------------ entries and values
 
     def _made(self, entry: Entry | None, *first: object, **further: object) -> Any:
-        """Return the object of the model that an entry is of, or None beside a fault.
+        """Return an entry's object of the model, or None after a fault.
 
-        The model knows the defaults of what is absent; `further` takes the place of what is given.
+        The model supplies defaults for absent values; `further` replaces values of the entry.
         """
         if entry is None:
             return None
@@ -271,7 +271,7 @@ class Assembly:
                 self.faults.add(path, f"belongs to a disturbance of {what}; remove it")
 
     def _disturbance(self, entry: Entry) -> Disturbance | None:
-        # What is at fault must not be said to differ from what shares its name, too.
+        # Faulty episodes shall not also cause a fault about another disturbance of the same name.
         doubtful = entry.episodes is not None and self.faults.touches(entry.episodes.path)
         given: dict[str, object] = {"episodes": None} if doubtful else {}
         others = (*LINK_KEYS, "link") if entry.link is None else ("both_ways", *NODE_KEYS, "link")
@@ -314,7 +314,7 @@ class Assembly:
     # --------------------------------------------------------------------------- meaning
 
     def _judge(self, parts: CellParts) -> None:
-        """Add the faults of meaning, but for those that other faults cause."""
+        """Add the faults of meaning, except consequences of other faults."""
         for name, moves in parts.candidates.items():
             for task_name, node in moves.items():
                 task = parts.tasks.get(task_name)
@@ -326,7 +326,7 @@ class Assembly:
         known = all(
             link.source in parts.nodes and link.target in parts.nodes for _, link in parts.links
         )
-        # Only where every link is good can one be said to be missing.
+        # Only if every link is good can a link be missing.
         parts.links_complete = parts.links_complete and known and not self.faults.at("links")
         parts.links = _forward(parts.links, parts.nodes)
         self._add(find_faults(parts))
@@ -355,12 +355,12 @@ def unknown_names(policy: str | None, estimator: str | None, cell: Problem) -> I
 
 
 def is_estimator(name: str) -> bool:
-    """Whether a name is that of an estimator, or of a class that may be one."""
+    """Whether a name names an estimator or a class."""
     return name in estimators.names() or CLASS_PATH.holds(name)
 
 
 def unregistered(parts: CellParts, name: str) -> list[Fault]:
-    """Return the faults of what a cell names: policies, estimators, columns, itself."""
+    """Return the faults in names: of policies, estimators, columns and the cell."""
     known = policies.names(), estimators.names(), estimators.shadowing()
     return list(find_unregistered(parts, name, *known))
 

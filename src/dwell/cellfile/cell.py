@@ -1,9 +1,9 @@
 """Read a cell: a YAML file, or the same as plain values, into a Problem.
 
-One pass finds every fault. A part that is wrong is blanked, so that what remains of its element
-can still be built; an element that cannot is kept as a bare name, so that references to it
-resolve. Structure (keys and single values), construction (values against each other), traces and
-meaning (names, links, the DAG) then each add their faults to one list.
+One pass finds every fault. A wrong part is blanked, and the rest of its element is built. An
+element that cannot be built stays as a bare name, to which references resolve. Structure (keys and
+single values), construction (values against each other), traces and meaning (names, links, the DAG)
+each add their faults to one list.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def load_without_traces(path: str | PathLike[str]) -> Problem:
 def read_cell(
     source: str, folder: Path | None, known: dict[object, Tables] | None = None
 ) -> tuple[object, Problem]:
-    """Return the plain values of a cell file, and what they say (see `read_problem`).
+    """Return the plain values of a cell file and its problem (see `read_problem`).
 
     Raises
     ------
@@ -88,7 +88,7 @@ def from_document(
     document : mapping
         Content of a cell file, as a YAML parser gives it.
     folder : str or path
-        Where the traces that it names are.
+        Folder of the traces that it names.
     source : str, optional
         Name of the document in messages.
     is_record : bool
@@ -145,11 +145,11 @@ def read_problem(
     faults : Faults
         Faults of the document so far, and the lines of its values.
     folder : Path, optional
-        Where the traces that it names are; where None, they are named and not read.
+        Folder of the traces that it names; with None they are not read.
     name : str
-        For a cell that does not name itself.
+        Name of a cell without a name.
     known : dict, optional
-        Traces that were read for documents like this one; takes those that are read now.
+        Traces already read for similar documents; takes the traces that are read now.
     home : str, optional
         Folder of the modules that it names, for `Problem.folder`.
 
@@ -167,7 +167,7 @@ def read_problem(
     tables: Tables | None = None
     if folder is not None:
         known = {} if known is None else known
-        # Nothing is imported to read none.
+        # Without traces nothing is imported.
         known.setdefault((), {})
         declared = tuple((path, *trace.values.items()) for path, trace in declared_traces(entry))
         if declared not in known:

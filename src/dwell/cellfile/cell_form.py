@@ -1,4 +1,4 @@
-"""The form of a cell file: what the model declares, and what a file says in other words."""
+"""The form of a cell file: the model's declarations, and keys that a file writes otherwise."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ class ProcessForm(Form):
     shape: Shape
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
-        """Return a `Constant`, or the entry of the one process that is named."""
+        """Return a `Constant`, or the entry of the named process."""
         if isinstance(value, dict):
             entry = self.shape.read(value, path, faults)
             if len(value) != 1 and not faults.touches(path):
@@ -232,7 +232,7 @@ NODE = shape_of(
     {Quota: QUOTA, Bursts: NODE_BURSTS},
     instead={
         "tier": _key(Node, "tier", stand_in="robot"),
-        # A node without its accelerators, as if tasks named unknown ones.
+        # Without its accelerators, a node would make the tasks' accelerators unknown.
         "accelerators": _key(Node, "accelerators", breaks=True),
     },
 )
@@ -240,16 +240,16 @@ NODE = shape_of(
 
 @dataclass(frozen=True, eq=False)
 class WordsForm(Form):
-    """One of some words, or a mapping that says more.
+    """One of several words, or a mapping with more detail.
 
     Parameters
     ----------
     means : mapping of str to object
-        What each word means.
+        Meaning of each word.
     shape : Shape
-        Of one key, whose value is meant.
+        Shape with one key, whose value counts.
     remedy : str
-        What a value must be.
+        Description of the allowed values.
     """
 
     means: Mapping[str, Any]
@@ -290,7 +290,7 @@ LINK = shape_of(
         "retransmit_ms": optional(
             "retransmit_ms",
             ON_LOSS,
-            "What happens to a lost message: `drop` or retransmission.",
+            "Treatment of a lost message: `drop` or retransmission.",
             "drop",
             named="on_loss",
         ),
@@ -427,13 +427,13 @@ _SECTION_KEYS = {
 
 
 def _section(name: str, form: Form) -> FormKey:
-    """A section of the file, with what the model says of it."""
+    """An optional section of the file, with its description in the model."""
     about = _SECTION_KEYS[name]
     return optional(name, form, about.says, tier=about.tier)
 
 
 def _needed(name: str, form: Form) -> FormKey:
-    """A section that has to be there."""
+    """A required section of the file."""
     about = _SECTION_KEYS[name]
     return required(name, form, about.says, {}, tier=about.tier)
 

@@ -22,7 +22,7 @@ POINTS = "write decimals with a point, as 1.5, and thousands without a sign"
 
 
 class UnreadableError(Exception):
-    """A file that holds no columns; what is wrong with it."""
+    """A file without columns; the text is the reason."""
 
 
 class FileColumn(NamedTuple):
@@ -31,10 +31,10 @@ class FileColumn(NamedTuple):
     Parameters
     ----------
     values : float64 or object array, shape (rows,)
-        Numbers, NaN where one is missing; or anything else.
+        Numbers, NaN for missing values; or other values.
     kind : str
-        What it holds, where that is no numbers: ``String``, or the first text of a CSV file with
-        its row; empty for numbers.
+        Type of values other than numbers: ``String``, or the first text of a CSV file with its
+        row; empty for numbers.
     """
 
     values: Values
@@ -47,7 +47,7 @@ def column_names(path: Path) -> list[str]:
     Raises
     ------
     UnreadableError
-        If there are none, or Polars is missing.
+        If the file has no columns, or Polars is missing.
     """
     if path.suffix.lower() == ".parquet":
         pl = _polars(path)

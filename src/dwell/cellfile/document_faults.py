@@ -1,4 +1,4 @@
-"""Faults: what is wrong with one document, collected on the way through it."""
+"""Faults of one document, collected while it is read."""
 
 from __future__ import annotations
 
@@ -49,23 +49,23 @@ class Faults:
         """Record that a key is no text, once for all places with its value; return its text."""
         if self.unquoted(key) is None:
             self._unquoted[type(key), key] = text
-            message = f"the key {text} is not a text; put it in quotes, here and wherever it stands"
+            message = f"the key {text} is not a text; put it in quotes everywhere"
             self.add(path, message, line=line)
         return text
 
     def unquoted(self, value: object) -> str | None:
-        """Return the text of a key that is no text and has this value, where there is one."""
+        """Return the text of the key with this value that is no text, or None."""
         plain = value is None or isinstance(value, bool | int | float)
         return self._unquoted.get((type(value), value)) if plain else None
 
     def excuse(self, path: str) -> None:
-        """Count a path as one at fault, of which a fault elsewhere has said all."""
+        """Count a path as faulty; another fault reports the cause."""
         self._paths.add(path)
 
     def attempt(
         self, path: str, make: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs
     ) -> T | None:
-        """Return what `make` makes of the arguments, or record its faults beneath `path`."""
+        """Return the result of `make`, or record its faults below `path`."""
         try:
             return make(*args, **kwargs)
         except ProblemError as error:
@@ -76,7 +76,7 @@ class Faults:
             return None
 
     def of_file(self, path: str, read: Callable[[Path], T], file: Path) -> T | None:
-        """Return what is read of a file, or record each of its faults, whole, at `path`."""
+        """Return the contents of a file, or record each of its faults at `path`."""
         try:
             return read(file)
         except ProblemError as error:
@@ -89,7 +89,7 @@ class Faults:
         return len(self._faults)
 
     def line(self, path: str) -> int | None:
-        """Line of a path, or of what is nearest around it."""
+        """Line of a path, or of its nearest parent with a line."""
         while path and path not in self.lines:
             path = path[: max(path.rfind("."), path.rfind("["), 0)]
         return self.lines.get(path)
@@ -103,11 +103,11 @@ class Faults:
         return any(_around(known, path) or _around(path, known) for known in self._paths)
 
     def refuse(self, path: str, message: str) -> NoReturn:
-        """Raise this one fault, whatever else there is: it makes the rest void."""
+        """Raise this fault alone; it makes all others meaningless."""
         raise ProblemError([Fault(path, message, self.line(path))], self.source)
 
     def error(self) -> ProblemError:
-        """Return one error with every fault; a TraceError where only traces are at fault."""
+        """Return one error with every fault; a TraceError if only traces are faulty."""
         kind = TraceError if set(self._faults.values()) == {TraceError} else ProblemError
         ordered = sorted(self._faults, key=lambda fault: fault.line or 0)
         shown = [Fault(_plain(f.path), _plain(f.message), f.line) for f in ordered]
@@ -115,7 +115,7 @@ class Faults:
 
 
 def _plain(text: str) -> str:
-    """Escape what would break the one line that a fault has, or could not be printed."""
+    """Escape line breaks and characters that cannot be printed."""
     return "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in text)
 
 

@@ -96,14 +96,14 @@ def load_fleet(path: str | PathLike[str]) -> Fleet:
 
 
 class _Reading:
-    """One fleet file on its way to what it says."""
+    """The reading of one fleet file."""
 
     def __init__(self, entry: Entry, path: Path, faults: Faults) -> None:
         self.entry, self.path, self.faults = entry, path, faults
         self.known: dict[str, Problem | None] = {}
 
     def fleet(self) -> Fleet | None:
-        """Return the fleet, or None beside at least one fault."""
+        """Return the fleet, or None after at least one fault."""
         entry, faults = self.entry, self.faults
         name = entry.name or self.path.stem
         if message := bad_name(name):
@@ -118,7 +118,7 @@ class _Reading:
             phases = given.get("phases", "sync")
             wrong = [faults.at(f"cells[{i}].count") for i in range(len(read))]
             if not isinstance(phases, str) and (any(wrong) or None in entry.cells):
-                # How many phases there have to be is known where all counts are.
+                # The required number of phases is known only if all counts are.
                 phases = "sync"
             for fault in fleet_faults([kind for kind, _ in read], given["shared"], phases):
                 faults.add(fault.path, fault.message)
@@ -128,7 +128,7 @@ class _Reading:
         return faults.attempt("", Fleet, name, entries, file=str(self.path), **given)
 
     def _entry(self, path: str, entry: Entry | None) -> tuple[Kind, FleetEntry | None]:
-        """Return count and cell of an entry, and cells of one kind; None beside a fault."""
+        """Return count and cell of an entry, and the fleet's entry; None after a fault."""
         if entry is None:
             return (1, None), None
         values = dict(entry.values)

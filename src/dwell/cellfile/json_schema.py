@@ -12,8 +12,8 @@ NAME = "urn:dwell:cell"
 def schema() -> dict[str, Any]:
     """Return the JSON Schema (draft 2020-12) of the cell file.
 
-    It covers structure: keys, types, units and the bounds of single values. What a cell means as a
-    whole (names, links, the DAG) is checked by `dwell.cellfile.load` alone.
+    It covers structure: keys, types, units and the bounds of single values. Only
+    `dwell.cellfile.load` checks names, links and the DAG.
 
     Returns
     -------

@@ -41,7 +41,7 @@ class Override:
 
 @dataclass(frozen=True, slots=True)
 class OpenCell:
-    """A cell that takes other values: its document, and what it has been read into."""
+    """A cell that takes other values: its document and its problem."""
 
     document: Any
     problem: Problem
@@ -110,7 +110,7 @@ def open_cell(file: Path, traces: Path | None = None) -> OpenCell:
 
 
 def check_apart(places: Mapping[str, tuple[Step, ...] | None], faults: Faults) -> None:
-    """Refuse a path that leads into another one's; `places` are those where they are given."""
+    """Refuse a path that begins with another path; the keys of `places` are for messages."""
     known = {place: steps for place, steps in places.items() if steps is not None}
     for (place, inner), (_, outer) in itertools.permutations(known.items(), 2):
         if inner[: len(outer)] == outer:
@@ -152,13 +152,13 @@ def load_with(
 
 
 def _override(text: str, cell: OpenCell, faults: Faults, given: set[str]) -> Iterator[Override]:
-    """Yield what ``PATH=VALUE`` puts into a cell; nothing beside a fault."""
+    """Yield the override ``PATH=VALUE``; nothing after a fault."""
     from dwell.cellfile.yaml_text import read_value
 
     path, equals, value = text.partition("=")
     place = f"--set {path}"
     if not equals:
-        faults.add(place, "there is no `=`; write it as PATH=VALUE, as `period_ms=40`")
+        faults.add(place, "has no `=`; write PATH=VALUE, such as `period_ms=40`")
         return
     if path in given:
         faults.add(place, "is given twice; give it once")

@@ -30,9 +30,9 @@ class FileKind:
     Parameters
     ----------
     shape : Shape
-        What it may hold; its required keys have stand-ins.
+        Allowed contents; its required keys have stand-ins.
     what : str
-        What it is, for messages: ``cell``.
+        Name of the kind in messages: ``cell``.
     key : str
         The key that holds the version of the format.
     version : int
@@ -48,7 +48,7 @@ class FileKind:
     def of(
         cls, what: str, key: str, version: int, title: str, says: str, *keys: FormKey
     ) -> FileKind:
-        """Return a kind of file with these keys behind that of its version."""
+        """Return a kind of file with these keys after the key of its version."""
         first = required(
             "version", ChoiceForm((version,)), "Version of this format.", version, named=key
         )
@@ -56,12 +56,12 @@ class FileKind:
 
     @property
     def begin(self) -> str:
-        """First line of such a file."""
+        """First line of a file of this kind."""
         return f"{self.key}: {self.version}"
 
 
 def read_structure(document: object, faults: Faults, kind: FileKind) -> Entry:
-    """Return the document as an entry, less what is at fault in it.
+    """Return the document as an entry without its faulty values.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def read_structure(document: object, faults: Faults, kind: FileKind) -> Entry:
             )
     values = _plain_mapping(document, (), faults)
     _check_version(values, faults, kind)
-    # What it requires has a stand-in, so that it never is at fault itself.
+    # Required keys have stand-ins, so the entry itself is never faulty.
     entry: Entry = kind.shape.read(values, "", faults)
     return entry
 
@@ -105,7 +105,7 @@ def _check_version(values: dict[str, Any], faults: Faults, kind: FileKind) -> No
         return
     values[kind.key] = kind.version
     if type(version) is int and version > kind.version:
-        # Whatever else looks wrong may be right in that version.
+        # Other apparent faults may be right in that version.
         faults.refuse(
             kind.key,
             f"schema version {shown(version)} is newer than this Dwell, which reads "
@@ -117,7 +117,7 @@ def _check_version(values: dict[str, Any], faults: Faults, kind: FileKind) -> No
 def _plain_mapping(
     document: Mapping[Any, object], steps: tuple[Step, ...], faults: Faults
 ) -> dict[str, Any]:
-    """Return a copy in dicts and lists; what is no document is None."""
+    """Return a copy in dicts and lists, with None for other objects."""
     values: dict[str, Any] = {}
     for key, item in document.items():
         path, name = (*steps, str(key)), key

@@ -1,7 +1,7 @@
 """Read a study file: a cell, and the scenarios, policies, parameters and seeds to try on it.
 
-Whatever a study file puts into the cell goes through the reader of cells, so that a wrong value
-gets the message that it would get there, with its place in the study file.
+The reader of cells reads each value that a study file puts into the cell: a wrong value gets the
+same message as in a cell file, with its place in the study file.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ Axes: TypeAlias = "Sequence[tuple[str, ...]]"
 
 
 class DeclaredPolicy(NamedTuple):
-    """A policy of a study: its name in tables, what it is, and its settings of the cell."""
+    """A policy of a study: its name in tables, policy, estimator, and settings of the cell."""
 
     name: str
     policy: str
@@ -106,7 +106,7 @@ def read_study(path: str | PathLike[str], *, references: Collection[str] = ()) -
 
 
 class _Plays(NamedTuple):
-    """What a study plays, and cells whose windows are to be enough."""
+    """Points, scenarios and policies of a study, and the cells that need enough windows."""
 
     points: tuple[DeclaredPoint, ...]
     scenarios: tuple[str, ...]
@@ -116,7 +116,7 @@ class _Plays(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Reading:
-    """One study file on its way from its entry to what it declares."""
+    """The reading of one study file."""
 
     entry: Entry
     path: Path
@@ -124,7 +124,7 @@ class _Reading:
     reserved: Collection[str]
 
     def study(self) -> DeclaredStudy | None:
-        """Return the study, or None beside at least one fault."""
+        """Return the study, or None after at least one fault."""
         entry = self.entry
         name = entry.name or self.path.stem
         self._check_name("name", name)
@@ -240,7 +240,7 @@ class _Reading:
     def _grid(self) -> dict[str, list[Any]]:
         """Return the values of every parameter whose structure is right."""
         grid: dict[str, list[Any]] = {}
-        # What goes with another parameter may take a value again.
+        # A parameter that follows another may repeat a value.
         following = {path for group in self.entry.zip or () for path in group[1:]}
         for path, values in (self.entry.parameters or {}).items():
             place = f"parameters.{path}"
@@ -256,9 +256,9 @@ class _Reading:
         return grid
 
     def _axes(self, grid: Mapping[str, list[Any]]) -> list[tuple[str, ...]]:
-        """Return the paths of every axis of the grid: those of a group, or one alone.
+        """Return the axes of the grid: the paths of a group, or a single path.
 
-        Of more points than there may be, no axis.
+        A grid with too many points has no axes.
         """
         axes: dict[str, tuple[str, ...]] = {path: (path,) for path in grid}
         for place, group in self._groups():
@@ -326,7 +326,7 @@ class _Reading:
         return points
 
     def _steps(self, place: str, path: str, cell: OpenCell) -> tuple[Step, ...] | None:
-        """Split a path into steps; None beside a fault."""
+        """Split a path into steps; None after a fault."""
         unread = path.startswith("scenarios.") and self.faults.touches("scenarios")
         return None if unread else self.faults.attempt(place, steps_of, path, cell.document)
 
@@ -351,7 +351,7 @@ class _Reading:
         return declared
 
     def _policy(self, path: str, name: str, keys: Mapping[str, Any]) -> list[DeclaredPolicy]:
-        """Return a policy, or nothing beside at least one fault."""
+        """Return a policy, or nothing after at least one fault."""
         before = len(self.faults)
         texts: dict[str, str] = {}
         settings: dict[str, object] = {}
@@ -423,7 +423,7 @@ class _Reading:
                 cell.attempt(overrides, self.faults, path)
 
 
-#: Of the parameters of a study of a fleet: what a value makes of it.
+#: Parameters of a study of a fleet: functions that apply a value.
 FLEET_PARAMETERS: Mapping[str, Callable[[Fleet, Any], Fleet]] = {
     "fleet.count": lambda fleet, value: fleet.with_count(value),
     "fleet.phases": lambda fleet, value: fleet.changed(phases=value),
@@ -432,12 +432,12 @@ FLEET_PARAMETERS: Mapping[str, Callable[[Fleet, Any], Fleet]] = {
 
 
 class _FleetReading(_Reading):
-    """One study of a fleet on its way from its entry to what it declares."""
+    """The reading of one study of a fleet."""
 
     __slots__ = ()
 
     def _plays(self, grid: Grid, axes: Axes, policies: list[DeclaredPolicy]) -> _Plays | None:
-        """Return what is played of the fleet, or None where it cannot be read."""
+        """Return the simulations of the fleet, or None if it cannot be read."""
         fleet = self._fleet()
         if fleet is None:
             return None
@@ -488,7 +488,7 @@ class _FleetReading(_Reading):
         return points
 
     def _changed(self, fleet: Fleet, values: Mapping[str, Any], place: str) -> Fleet | None:
-        """Return the fleet with some values, or None beside a fault at a place."""
+        """Return the fleet with some values, or None after a fault at a place."""
         try:
             for path, value in values.items():
                 fleet = FLEET_PARAMETERS[path](fleet, value)

@@ -77,7 +77,7 @@ def _scenarios(value: object) -> dict[str, object]:
 
 
 def _policies(value: object) -> dict[str, object]:
-    """Return what each policy is: its name, or a mapping of what it is."""
+    """Return the policies by name: their names, or mappings of their keys."""
     if isinstance(value, dict):
         return value
     return {name: name for name in _names(value, "policies")}
@@ -96,7 +96,7 @@ STUDY = FileKind.of(
     "dwell-study",
     VERSION,
     "Study",
-    "Scenarios, policies, parameters and seeds, of which every combination is simulated.",
+    "Scenarios, policies, parameters and seeds; every combination is simulated.",
     optional("name", NAME, "Name of the study.", "the file's"),
     required("cell", NAME, "The cell file, relative to this file's folder.", ""),
     optional(
@@ -127,7 +127,7 @@ STUDY = FileKind.of(
     required(
         "policies",
         WrittenForm("list of names, name → policy", _policies),
-        "Policies and candidates, or a mapping of names to what they are.",
+        "Policies and candidates, or a mapping from names to policies.",
         {},
     ),
     optional(
@@ -159,7 +159,7 @@ FLEET_STUDY = FileKind.of(
     "dwell-study",
     VERSION,
     "FleetStudy",
-    "Policies, parameters and seeds, of which every combination is played by the cells of a fleet.",
+    "Policies, parameters and seeds; every combination is simulated for the cells of a fleet.",
     required("fleet", NAME, "The fleet file, relative to this file's folder.", ""),
     *(
         key
@@ -170,6 +170,6 @@ FLEET_STUDY = FileKind.of(
         "scenarios",
         ListForm(NO_TEXT),
         "Scenarios of the first entry's cells; the others keep theirs.",
-        "what the fleet says",
+        "the fleet's",
     ),
 )

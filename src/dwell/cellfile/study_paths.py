@@ -11,16 +11,16 @@ from dwell.model import Problem, evolve
 from dwell.model.dotted_paths import Step
 from dwell.model.fabric import accelerator_tiers
 
-#: Where the settings of a policy are: what they change is drawn nowhere.
+#: Prefixes of a policy's settings, which change no random number.
 SETTINGS = ("controller.", "objective.")
-#: Which accelerators count follows from the tiers that do.
+#: The counted accelerators follow from the counted tiers.
 TIERS, ACCELERATORS = "objective.tiers", "objective.accelerators"
 
 
 def put(document: Any, steps: tuple[Step, ...], value: object) -> Any:
     """Return a document with a value at a place; the given one is not changed.
 
-    Mappings on the way are made where there are none (see `steps_of`).
+    Missing mappings on the way are made (see `steps_of`).
     """
     if not steps:
         return value
@@ -29,7 +29,7 @@ def put(document: Any, steps: tuple[Step, ...], value: object) -> Any:
         items = list(document)
         items[step] = put(items[step], tuple(rest), value)
         return items
-    # What is no mapping was put there by a path that this one leads into: a fault, and told.
+    # Another value here comes from a path that begins this path, which is a reported fault.
     inner = document if isinstance(document, Mapping) else {}
     return {**inner, step: put(inner.get(step, {}), tuple(rest), value)}
 
@@ -54,7 +54,7 @@ def with_settings(problem: Problem, settings: Mapping[str, object]) -> Problem:
     for path in settings:
         if not path.startswith(SETTINGS):
             begin = " or ".join(f"`{name}`" for name in SETTINGS)
-            faults.add(path, f"not a setting; those of a policy begin with {begin}")
+            faults.add(path, f"not a setting; settings of a policy begin with {begin}")
     changes = dict(settings)
     if TIERS in changes or ACCELERATORS in changes:
         counts = changes.get(ACCELERATORS, bool(problem.objective.accelerators))
@@ -65,7 +65,7 @@ def with_settings(problem: Problem, settings: Mapping[str, object]) -> Problem:
             return _registered(evolve(problem, changes))
         except ProblemError as error:
             together = error
-    # One by one, so that each tells its own.
+    # Each change alone reports its own faults.
     for path, value in changes.items():
         if path.startswith(SETTINGS):
             faults.attempt("", evolve, problem, {path: value})

@@ -33,7 +33,7 @@ from dwell.model.semantics import nearest
 Frame: TypeAlias = Mapping[str, FileColumn]
 
 RELATIVE = (
-    "file names are relative to the cell file's folder, or to the one given as `traces` "
+    "file names are relative to the cell file's folder, or to the folder given as `traces` "
     "(`--traces FOLDER`)"
 )
 RECORD_AGAIN = "no row could stay; record it again, or name another column"
@@ -96,7 +96,7 @@ class Reading:
     failed: bool = field(default=False, init=False)
 
     def table(self, frame: Frame) -> TraceTable | None:
-        """Return the table of the columns read, or None beside at least one fault."""
+        """Return the table of the columns, or None after at least one fault."""
         values = {name: _floats(frame[name]) for name in dict.fromkeys(self._columns())}
         starts = self._starts(frame)
         time = None
@@ -180,7 +180,7 @@ class Reading:
         return not self.failed
 
     def _starts(self, frame: Frame) -> NDArray[np.int64]:
-        """Return the first row of every group; each must stand in one piece."""
+        """Return the first row of every group; the rows of a group must be consecutive."""
         if not self.source.groups:
             return np.zeros(1, np.int64)
         columns = [_labels(frame[name]) for name in dict.fromkeys(self.source.groups)]
@@ -195,7 +195,7 @@ class Reading:
                 self._fail(
                     "group",
                     f"group {values} begins again at row {row + 1} after another group; sort the "
-                    "file so that the rows of each group stand together",
+                    "file by group",
                 )
             seen.add(labels)
             starts.append(row)
@@ -203,9 +203,9 @@ class Reading:
         return np.array(starts, np.int64)
 
     def _judge(self, values: dict[str, Floats], time: Floats | None) -> tuple[Mask, int]:
-        """Return which rows stay, and how many were clipped; what may not be is a fault."""
+        """Return the kept rows and the number of clipped rows; record invalid values as faults."""
         used = [(path, "column", values[entry.column]) for path, entry in self.uses]
-        # Of a column and of instants: what is negative, and what no number can stand for.
+        # Negative and unusable values of columns and of instants.
         negative = [column < 0 for *_, column in used]
         lost = [~(column <= VALUE.high) for *_, column in used]  # and so is NaN
         if time is not None:
@@ -218,7 +218,7 @@ class Reading:
             return left, 0
         remedies = {
             "set `on_negative: drop` to leave such rows out of all columns": left.any(),
-            "`on_negative: clip` to make negative ones 0": not np.any(lost) and mode == "error",
+            "`on_negative: clip` to set negative values to 0": not np.any(lost) and mode == "error",
         }
         remedy = ", or ".join(text for text, works in remedies.items() if works)
         for (path, key, column), below, gone in zip(used, negative, lost, strict=True):
@@ -247,8 +247,8 @@ class Reading:
             if entry.sha256 is not None and digest(Trace(table, entry.column)) != entry.sha256:
                 self._fail(
                     "sha256",
-                    f"{self.source.file} does not hold the data that were recorded; find the file "
-                    "that does, or remove the key to go on with this one",
+                    f"{self.source.file} does not hold the recorded data; find the file that "
+                    "does, or remove the key to use this file",
                     path,
                 )
 
@@ -299,11 +299,11 @@ def _frozen(column: Floats) -> Floats:
 
 
 def _beside(path: Path) -> str:
-    """Return a remedy for a file that is not there."""
+    """Return a remedy for a missing file."""
     try:
         names = [item.name for item in path.parent.iterdir() if item.suffix.lower() in SUFFIXES]
     except OSError:
-        return f"there is no folder {path.parent}; {RELATIVE}"
+        return f"{path.parent} is not a folder; {RELATIVE}"
     match = difflib.get_close_matches(path.name, names, n=1)
     if match:
         return f"did you mean {match[0]!r}?"

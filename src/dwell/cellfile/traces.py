@@ -1,7 +1,7 @@
-"""Traces: recorded columns that a cell names, and where they are read from.
+"""Traces: recorded columns that a cell names, and their files.
 
-Processes that name the same file in the same way share one table, so that a row dropped for one
-column is dropped for all and the columns of a cycle come from one row.
+Processes that name the same file in the same way share one table: a row dropped for one column is
+dropped for all, and the columns of a cycle come from one row.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Work folders: each belongs to one piece of work, which fills it in as many attempts as needed.
 
-A file in the folder says whose it is. Whoever comes with another description is told what differs,
-and nothing is touched. What is written appears complete or not at all.
+A file in the folder has the work's description. Work with another description is refused with the
+differences, and nothing changes. Files appear complete or not at all.
 """
 
 from __future__ import annotations
@@ -55,19 +55,19 @@ class FolderMark(NamedTuple):
 def open_work_folder(
     folder: Path, mark: FolderMark, description: Description, notes: Description | None = None
 ) -> Iterator[None]:
-    """Open a folder for this process alone, and make it where there is none.
+    """Open a folder for this process alone; make it if it is missing.
 
     Parameters
     ----------
     description : mapping
         JSON-able: all that the results depend on.
     notes : mapping, optional
-        JSON-able: stands beside the description, and is replaced where it has changed.
+        JSON-able: written next to the description, and replaced after a change.
 
     Raises
     ------
     RunError
-        If the folder holds something else, or other work of the kind, or is in use.
+        If the folder has other contents or other work of this kind, or is in use.
     SimulationError
         If it cannot be made or written.
     """
@@ -91,7 +91,7 @@ def open_work_folder(
 
 
 def _lock(folder: Path, handle: int, what: str) -> None:
-    """Keep other processes out; the kernel lets them in when this one ends, however it does."""
+    """Keep other processes out; the operating system releases the lock at this process's end."""
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -99,12 +99,12 @@ def _lock(folder: Path, handle: int, what: str) -> None:
 
 
 def _require_kind(folder: Path, mark: FolderMark) -> None:
-    """Refuse a folder that holds something else."""
+    """Refuse a folder with other contents."""
     if not folder.is_dir():
-        raise RunError(f"{folder} is no folder; choose another one")
+        raise RunError(f"{folder} is not a folder; choose another")
     if (folder / mark.file).is_file():
         return
-    # Killed at its very beginning, the work leaves these.
+    # Work that was killed at its start leaves these.
     drafts = f".{mark.file}*.draft"
     if any(one.name not in mark.folders and not one.match(drafts) for one in folder.iterdir()):
         raise RunError(f"{folder} exists and is no {mark.what}; choose another folder")
@@ -140,13 +140,13 @@ def unwritable(path: Path, error: OSError) -> SimulationError:
 
 
 def _difference(folder: Path, what: str, known: Any, asked: Any) -> str:
-    """Return what is different about the work in a folder."""
+    """Return the message about other work in a folder."""
     found = [one for one in _differences(known, asked, "") if one.partition(":")[0] != "digest"]
     more = [] if len(found) <= LISTED else [f"and {len(found) - LISTED} more"]
     listed = "\n".join(f"  {line}" for line in (*found[:LISTED], *more))
     return (
-        f"{folder} holds another {what}, or one made with other versions; choose another folder, "
-        f"or remove this one:\n{listed}"
+        f"{folder} holds another {what}, or work of other versions; choose another folder, "
+        f"or remove this folder:\n{listed}"
     )
 
 

@@ -68,14 +68,14 @@ def read_yaml(path: str, faults: Faults, what: str = "cell", begin: str = "dwell
     Parameters
     ----------
     faults : Faults
-        Takes what is wrong with the file as such, and the line of every value.
+        Takes faults of the YAML text, and the line of every value.
     what, begin : str
-        Kind of the file, and how such a file begins, for messages.
+        Kind of the file and its first line, for messages.
 
     Raises
     ------
     ProblemError
-        If it could not be read as such; there is nothing to read on.
+        If it is not YAML.
     """
     text = _read_text(path, faults, what)
     root = None if text is None else _composed(text, faults)
@@ -88,12 +88,12 @@ def read_yaml(path: str, faults: Faults, what: str = "cell", begin: str = "dwell
 
 
 def read_value(text: str, faults: Faults, path: str) -> object:
-    """Read a text that is one value, as an option has it; what is wrong with it is a fault there.
+    """Read the text of an option as one value; record its faults at `path`.
 
     Returns
     -------
     object
-        None where the text is empty, or at fault.
+        None if the text is empty or faulty.
     """
     inner = Faults()
     root = _composed(text, inner)
@@ -104,7 +104,7 @@ def read_value(text: str, faults: Faults, path: str) -> object:
 
 
 def yaml_of(document: object) -> str:
-    """Return plain values as YAML: keys in their order, nothing by reference."""
+    """Return plain values as YAML: keys in their order, without references."""
 
     class Plain(yaml.SafeDumper):
         def ignore_aliases(self, data: object) -> bool:
@@ -114,7 +114,7 @@ def yaml_of(document: object) -> str:
 
 
 def _composed(text: str, faults: Faults) -> yaml.Node | None:
-    """Return the node of a text; None where it is empty, or beside a fault."""
+    """Return the node of a text; None if it is empty, or after a fault."""
     try:
         root: yaml.Node | None = yaml.compose(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
@@ -168,7 +168,7 @@ def _read_text(path: str, faults: Faults, what: str) -> str | None:
 
 
 class _Builder:
-    """Plain values from nodes; aliases are expanded, so that each value has one path."""
+    """Plain values from nodes. Aliases are expanded: each value has one path."""
 
     def __init__(self, faults: Faults) -> None:
         self.faults = faults
@@ -257,7 +257,7 @@ def _tag(node: yaml.Node) -> str:
 def _whole(text: str) -> int | float:
     if text.startswith(("0o", "0x")):
         return int(text, 0)
-    # Python refuses to read thousands of digits; such a number is beyond every bound anyway.
+    # Python refuses thousands of digits; such a number is beyond every bound.
     return int(text) if len(text) < 400 else math.copysign(math.inf, float(text))
 
 

@@ -31,8 +31,8 @@ def check(
     node: Annotated[
         str | None,
         typer.Option(
-            help="Check instead that this computer can be that node of the live cell: import and "
-            "make its stages and actuators.",
+            help="Check instead that this computer can be this node of the live cell: import and "
+            "construct its stages and actuators.",
             autocompletion=nodes,
             hidden=True,
         ),
@@ -44,8 +44,8 @@ def check(
 ) -> None:
     """Find all faults of a cell, or show what its candidates do.
 
-    Faults go to stderr, one a line as file:line: path: message, and the exit code is 2. Warnings
-    go there too, but do not change it.
+    Faults and warnings go to stderr, one per line as file:line: path: message. The exit code is 2
+    with faults, 0 with warnings only.
     """
     try:
         problem = dwell.load(cell, traces=traces)
@@ -150,7 +150,7 @@ def _contents(problem: Problem) -> dict[str, Any]:
 
 
 def _priced(problem: Problem, prices: Mapping[str, Price]) -> dict[str, Any]:
-    """Return candidates and what they come to as plain values."""
+    """Return the candidates with their prices as plain values."""
     return {
         name: {
             "placement": dict(placement),
@@ -212,7 +212,7 @@ def _summary(problem: Problem, prices: Mapping[str, Price], scenario: str) -> st
 
 
 def _shadow_prices(problem: Problem) -> Mapping[str, Sequence[ShadowPrice]]:
-    """Return the prices that the shares of shadows follow from; nothing where they do not."""
+    """Return the prices that decide the shares of shadows; empty if a share is set."""
     from dwell.estimators.registry import shadowing
     from dwell.estimators.shadow_price import shadow_prices
 
@@ -249,5 +249,5 @@ def _notes(price: Price) -> Iterator[str]:
 
 
 def _with_error(mean: str, error: float) -> str:
-    """Return a mean with its standard error, where there is one, to the mean's last digit."""
+    """Return a mean, with a nonzero standard error to the mean's last digit."""
     return f"{mean} ± {error:.{len(mean.partition('.')[2])}f}" if error else mean

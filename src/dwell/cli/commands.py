@@ -1,4 +1,4 @@
-"""All commands: each is declared in a light module, which imports its work when it is called."""
+"""All commands. Each is declared in a light module, which imports the rest when it is called."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from dwell import __version__
 from dwell.cli.check import check
@@ -25,7 +25,7 @@ from dwell.model.entry_points import COMMANDS, added
 
 #: Most characters of a command's line in the help.
 SHORT = 64
-#: Headings of the help, with their commands; commands of no heading follow under `Other`.
+#: Headings of the help, with their commands; the others follow under `Other`.
 GROUPS = {
     "Simulate": ("new", "check", "run", "study", "demo"),
     "See": ("report", "dash"),
@@ -42,7 +42,7 @@ Examples:
 
 
 class Commands(TyperGroup):
-    """All commands; an error that is meant for the user is printed and becomes an exit code."""
+    """All commands. A user's error is printed and becomes an exit code."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the commands under their headings."""
@@ -74,6 +74,32 @@ class Commands(TyperGroup):
             raise typer.Exit(code) from None
         except KeyboardInterrupt:
             raise typer.Exit(ExitCode.INTERRUPTED) from None
+
+
+class Command(TyperCommand):
+    """A command whose help shows arguments by their names, without types and braces."""
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        """Return the words of the line of usage."""
+        pieces = super().collect_usage_pieces(ctx)
+        return [piece.replace("{", "").replace("}", "") for piece in pieces]
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write arguments and options under their headings."""
+        rows: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
+        for parameter in self.get_params(ctx):
+            record = parameter.get_help_record(ctx)
+            if record is None:
+                continue
+            name, text = record
+            if parameter.param_type_name == "argument":
+                rows["Arguments"].append((name.partition(" <")[0], text))
+            else:
+                rows["Options"].append((name, text))
+        for heading, found in rows.items():
+            if found:
+                with formatter.section(heading):
+                    formatter.write_dl(found)
 
 
 def _write_commands(formatter: Any, heading: str, commands: Mapping[str, Any]) -> None:
@@ -113,14 +139,14 @@ def options(
 
 def doctor(
     cell: Annotated[
-        Path | None, argument("CELL", "Cell file whose ports, quotas and keys to look at.")
+        Path | None, argument("CELL", "Cell file; also check its ports, quotas and keys.")
     ] = None,
     keys: Keys = None,
     as_json: Json = False,
 ) -> None:
-    """Check this computer; print a command for whatever is missing.
+    """Check this computer; print a command for each missing part.
 
-    The exit code is 1 where something is broken; an extra that is not installed is not.
+    The exit code is 1 if something is broken. A missing extra is not broken.
     """
     import dwell
     from dwell.cli.doctor import consult
@@ -147,6 +173,14 @@ for name, command in added(COMMANDS).items():
         app.command(name, hidden=name in HIDDEN)(command)
 
 
+def _use_plain_help(group: typer.Typer) -> None:
+    for one in group.registered_commands:
+        one.cls = Command
+    for below in group.registered_groups:
+        if below.typer_instance is not None:
+            _use_plain_help(below.typer_instance)
+
+
 def _missing(name: str) -> Callable[[], None]:
     def command() -> None:
         raise MissingPartError(f"dwell {name} needs dwell-lab; {INSTALL_LAB}")
@@ -161,3 +195,5 @@ for name in set(OF_LAB) - added(COMMANDS).keys():
         "ignore_unknown_options": True,
     }
     app.command(name, hidden=True, context_settings=settings)(_missing(name))
+
+_use_plain_help(app)

@@ -32,8 +32,8 @@ def completion(
 ) -> None:
     """Print the completion script of bash, zsh or fish.
 
-    Read it where your shell begins: source <(dwell completion bash) in ~/.bashrc, the same with zsh
-    in ~/.zshrc after compinit, dwell completion fish | source in ~/.config/fish/config.fish.
+    Put `source <(dwell completion bash)` into ~/.bashrc, the same with zsh into ~/.zshrc after
+    compinit, or `dwell completion fish | source` into ~/.config/fish/config.fish.
     """
     from typer.completion import show_callback
 
@@ -87,7 +87,7 @@ def with_old_cell(offered: Callable[[typer.Context], list[str]]) -> Callable[...
 
 
 def scenarios(context: typer.Context) -> list[str]:
-    """Offer the scenarios of the cell file, and the one that every cell has."""
+    """Offer the scenarios of the cell file and `baseline`."""
     return list(dict.fromkeys(["baseline", *_keys("scenarios")(context)]))
 
 
@@ -99,7 +99,7 @@ def estimators() -> list[str]:
 
 
 def policies(context: typer.Context, incomplete: str) -> list[str]:
-    """Offer policies and candidates; once a + is there, policies with their estimator."""
+    """Offer policies and candidates; after a +, policies with their estimator."""
     from dwell.policies.registry import names
 
     policy, plus, _ = incomplete.partition("+")

@@ -33,24 +33,22 @@ REAL = ("real.yaml", "real-5g.yaml")
 
 def demo(
     real: Annotated[
-        Path | None, option("FOLDER", "Replay the measurements in this folder instead.")
+        Path | None, option("FOLDER", "Replay the measurements in this folder.")
     ] = None,
     seeds: Annotated[
         int, option("N", "Seeds 1 to N of every run.", min=1, callback=require_few)
     ] = 20,
     windows: Windows = None,
     seconds: Seconds = None,
-    out: Annotated[Path, option("FOLDER", "Where report.html goes.")] = Path("demo-out"),
-    examples: Annotated[
-        Path | None, option("FOLDER", "Where the example cells are, if not found.")
-    ] = None,
+    out: Annotated[Path, option("FOLDER", "Folder for report.html.")] = Path("demo-out"),
+    examples: Annotated[Path | None, option("FOLDER", "Folder of the example cells.")] = None,
     processes: Processes = None,
     as_json: Json = False,
 ) -> None:
     """Compare all policies in all scenarios of an example cell.
 
-    It is the study examples/studies/demo.yaml; its runs are 150 windows long, if neither --windows
-    nor --seconds is given.
+    This is the study examples/studies/demo.yaml. Its runs have 150 windows without --windows and
+    --seconds.
     """
     from dwell.report import comparison_html, comparison_text
     from dwell.study import compare_study, load_study

@@ -1,4 +1,4 @@
-"""`dwell doctor`: what this computer has for Dwell, what it lacks, and the line that mends it."""
+"""`dwell doctor`: parts of Dwell on this computer, and the command for each missing part."""
 
 from __future__ import annotations
 
@@ -73,17 +73,17 @@ def consult(problem: Problem | None, *, keys: Path | None, as_json: bool) -> boo
 
 @cache
 def _modules() -> dict[str, str]:
-    """Return the module of every optional package, by the package; looks at all installed ones."""
+    """Return the module of each installed optional package, by package."""
     packages = packages_distributions()
     return {package: module for module in OPTIONAL for package in packages.get(module, ())}
 
 
 def _extra(name: str) -> Finding:
-    """Import what an extra brings: installed is not enough."""
+    """Import the packages of an extra; an installed package may still fail."""
     try:
         lines = requires(DISTRIBUTION) or []
     except PackageNotFoundError:
-        found = f"{DISTRIBUTION} itself is not installed, only its sources are there"
+        found = f"{DISTRIBUTION} itself is not installed; only its sources were found"
         return optional(name, False, found, installing(name))
     modules = _modules()
     wanted = [
@@ -112,7 +112,7 @@ def _extra(name: str) -> Finding:
 
 
 def _kernel() -> Finding:
-    """Load the compiled kernel; who does not simulate needs none, but none that is damaged."""
+    """Load the compiled kernel. It is optional, but a damaged file is a fault."""
     name = "compiled kernel"
     try:
         found = f"of the sources {library.digest()[:12]}, by {library.compiler()}"
@@ -126,7 +126,7 @@ def _kernel() -> Finding:
 
 
 def _runs(extras: Sequence[Finding], kernel: Finding, others: Sequence[Part]) -> Iterator[Finding]:
-    """Yield the commands that work on this computer, and what the others lack."""
+    """Yield the commands: those that work here, and the missing parts of the others."""
     named = {extra.name: replace(extra, name=f"the extra {extra.name}") for extra in extras}
     needs = {
         **{EXTRAS[name]: [extra] for name, extra in named.items()},

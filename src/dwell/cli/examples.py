@@ -14,12 +14,12 @@ def find_examples(given: Path | None) -> Path:
     Raises
     ------
     ProblemError
-        If it is not given and neither beside the package nor here.
+        If it is neither given nor found.
     """
     if given is not None:
         return given
     package = Path(dwell.__file__).parent
-    # Of a wheel, of a checkout, and here.
+    # In a wheel, in a checkout, in the working folder.
     places = (package / "examples", package.parents[1] / "examples", Path("examples"))
     for place in places:
         if (place / "canonical.yaml").is_file():

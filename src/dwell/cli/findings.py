@@ -52,7 +52,7 @@ class Part:
 
 
 def optional(name: str, ok: bool, found: str, remedy: str = "") -> Finding:
-    """Return a finding on what Dwell can do without; its remedy is there where it is not well."""
+    """Return a finding on an optional part; it has its remedy if the part is missing."""
     return Finding(name, ok, found, "" if ok else remedy, needed=False)
 
 

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 #: Cells, and rounds, that the terminal shows, and columns that time has there.
 SHOWN, TIMES = 24, 40
 THE_LIMIT = "the limit".rjust(TIMES // 2 + 4)
-#: Keys of a change that serves what was asked for.
+#: Keys of a change that serves the wanted number.
 CHANGE = ("change", "times")
 
 fleet = typer.Typer(
@@ -53,8 +53,8 @@ Policy = Annotated[
     str | None,
     option(
         "NAME",
-        "Policy of every cell, as dtp or cusum+corrected, or a candidate's name for the "
-        "placement that never moves; what the file says if not given.",
+        "Policy of every cell, such as dtp or cusum+corrected, or a candidate, which never moves.",
+        default="the file's",
         autocompletion=policies,
     ),
 ]
@@ -62,22 +62,21 @@ Estimator = Annotated[
     str | None,
     option(
         "NAME",
-        "Estimator of every cell; what the file says if not given.",
+        "Estimator of every cell.",
+        default="the file's",
         autocompletion=estimators,
     ),
 ]
 Coordination = Annotated[
     str | None,
-    option(
-        "NAME", "What a move is asked for: none, random or ledger; what the file says if not given."
-    ),
+    option("NAME", "Coordination of moves: none, random or ledger.", default="the file's"),
 ]
 Phases = Annotated[
     str | None,
     option(
         "HOW",
-        "When each cell begins: sync, even, random, or so many ms with commas between; what "
-        "the file says if not given.",
+        "Start of each cell: sync, even, random, or offsets in ms, separated by commas.",
+        default="the file's",
     ),
 ]
 
@@ -87,20 +86,21 @@ def run(
     file: FleetArgument,
     seed: Seed = 1,
     windows: Annotated[
-        int, option("N", "Length in windows of the cell whose windows are longest.", min=1)
+        int, option("N", "Length in windows of the cell with the longest windows.", min=1)
     ] = 100,
-    seconds: Annotated[float | None, option("S", "Length in place of --windows.")] = None,
+    seconds: Annotated[float | None, option("S", "Length in seconds instead.")] = None,
     policy: Policy = None,
     estimator: Estimator = None,
     coordination: Coordination = None,
     phases: Phases = None,
-    guard: Annotated[bool, flag("--guard", "Let the robots' guards move to a fallback.")] = False,
-    jobs: Annotated[bool, flag("--jobs", "Keep every job's instants.")] = False,
+    guard: Annotated[bool, flag("--guard", "Let the guards move cells to a fallback.")] = False,
+    jobs: Annotated[bool, flag("--jobs", "Keep the times of every job.")] = False,
     out: Annotated[
         Path | None,
         option(
             "FOLDER",
-            "Where to save the runs; runs/FLEET-POLICY-COORDINATION-PHASES-SEED if not given.",
+            "Folder for the runs.",
+            default="runs/FLEET-POLICY-COORDINATION-PHASES-SEED",
         ),
     ] = None,
     as_json: Json = False,
@@ -149,15 +149,16 @@ def plan(
         float | None,
         option(
             "SHARE",
-            "Also name the cells whose V_D stays above this, as 0.05; with `objective: served` the "
-            "limit of the file if not given.",
+            "Also name the cells whose V_D stays above this share, such as 0.05.",
+            default="with `objective: served` the file's limit",
         ),
     ] = None,
     as_json: Json = False,
 ) -> None:
     """Find the placements with the least cost for all cells.
 
-    Φ of the table of loads is least there; what the placements come to is played.
+    The placements start from the minimum of the table of loads and improve by simulated moves and
+    swaps.
     """
     from dwell.study.fleet_plan import plan_fleet
 
@@ -184,33 +185,32 @@ def plan(
 @fleet.command()
 def capacity(
     file: FleetArgument,
-    limit: Annotated[float, option("SHARE", "V_D that the worst cell may have at most.")] = 0.05,
+    limit: Annotated[float, option("SHARE", "Largest V_D that the worst cell may have.")] = 0.05,
     policy: Policy = None,
     phases: Annotated[
         str | None,
-        option(
-            "HOW", "When each cell begins: sync, even or random; what the file says if not given."
-        ),
+        option("HOW", "Start of each cell: sync, even or random.", default="the file's"),
     ] = None,
-    most: Annotated[int, option("N", "Robots beyond are not asked for.", min=1, max=1000)] = 128,
+    most: Annotated[int, option("N", "Largest number of robots to try.", min=1, max=1000)] = 128,
     what_if: Annotated[
         bool,
         flag(
             "--what-if",
-            "Also with each change that a site can make: phases, deadlines, cores, accelerators, "
+            "Also try each change that a site can make: phases, deadlines, cores, accelerators, "
             "servers, placements.",
         ),
     ] = False,
     asked: Annotated[
         int | None,
-        option("N", "Robots that are wanted; the first change that serves them is named.", min=1),
+        option("N", "Wanted number of robots; names the first change that serves them.", min=1),
     ] = None,
     processes: Processes = None,
     out: Annotated[
         Path | None,
         option(
             "FILE",
-            "Page to write; capacity/FLEET-POLICY-PHASES.html if not given, none with --json.",
+            "Page to write.",
+            default="capacity/FLEET-POLICY-PHASES.html; none with --json",
         ),
     ] = None,
     figures: Annotated[
@@ -220,8 +220,9 @@ def capacity(
 ) -> None:
     """Find how many robots the shared nodes carry.
 
-    The count of the first entry is varied, the others stay. Where phases are drawn and no cell
-    moves, 100 draws of 200 cycles are played of each size; else 10 seeds of 2,000 cycles.
+    The number of cells of the first entry varies, the others stay. Each size is simulated with 100
+    draws of phases of 200 cycles if phases are random and no cell moves, else with 10 seeds of
+    2,000 cycles.
     """
     from dwell.record.fleet_run import fleet_document
     from dwell.report.capacity_page import capacity_page
@@ -255,9 +256,7 @@ def capacity(
                 served = served_by(read, asked, **settings)
     except KeyboardInterrupt:
         runs = counted(kept.count, "run")
-        interrupted(
-            f"the results of {runs} are in {kept.file}; the same command goes on from there"
-        )
+        interrupted(f"the results of {runs} are in {kept.file}; the same command continues")
     if page is not None or figures is not None:
         shown_page = capacity_page(read.name, found, changes)
         with working("writing the report"):
@@ -416,7 +415,7 @@ def _cells(result: FleetRun, cells: Sequence[Mapping[str, Any]]) -> Iterator[str
 
 
 def _letters(names: Iterable[str]) -> dict[str, str]:
-    """Return a letter for each of some names: one of its own, if there is one left."""
+    """Return a letter for each name: a distinct letter while any is left."""
     letters: dict[str, str] = {}
     for name in names:
         free = (sign for sign in (*name.upper(), *"0123456789", "?") if sign.isalnum())
@@ -425,7 +424,7 @@ def _letters(names: Iterable[str]) -> dict[str, str]:
 
 
 def _placements(result: FleetRun, cell: str) -> list[str]:
-    """Return where a cell is over time, in at most so many columns as are shown."""
+    """Return a cell's placements over time, in at most TIMES columns."""
     placed = result.cells[cell].windows["placement"].to_list()
     count = min(len(placed), TIMES)
     return [str(placed[i * len(placed) // count]) for i in range(count)]
@@ -460,7 +459,7 @@ def _capacity_text(of: Fleet, found: Capacity, changes: Sequence[WhatIf]) -> str
     from dwell.report.capacity_page import answer, busy, errors, written
 
     limits = found.limits
-    excess = " beyond that of one cell" if found.limit_on == "excess" else ""
+    excess = " above one cell alone" if found.limit_on == "excess" else ""
     point = found.point(found.robots)
     facts = [
         ("robots", answer(found)),
@@ -468,7 +467,7 @@ def _capacity_text(of: Fleet, found: Capacity, changes: Sequence[WhatIf]) -> str
         ("played", f"{found.policy}, phases {found.phases}"),
     ]
     if limits is not None:
-        share = f"{limits.share:.0%} of what cycles that missed have waited"
+        share = f"{limits.share:.0%} of the waiting of missed cycles"
         used = point.utilisation.get(limits.name)
         told = "" if used is None else f", busy {used:.0%} at {point.robots}"
         facts.append(("what limits", f"{limits.name}, {share}{told}"))

@@ -28,60 +28,60 @@ class Origin(StrEnum):
 CELLS = {Origin.CANONICAL: "first.yaml", Origin.LIVE: "live/cell.yaml"}
 STAGES = {Origin.CANONICAL: "stages.py", Origin.LIVE: "live/stages.py"}
 
-#: First lines of the cell file, after the one for editors.
+#: First lines of the cell file, after the line for editors.
 HEAD = """\
-# The cell {name}, which began as Dwell's example `{origin}`. Change, from top to bottom:
-#   period_ms           how often your pipeline runs; deadline_ms, by when a cycle must be done
-#   nodes, links        your computers, and what connects them
-#   tasks, flows        your stages: where each may run, how long it takes there, what it sends
+# The cell {name}, made from Dwell's example `{origin}`. Change, from top to bottom:
+#   period_ms           period of the pipeline; deadline_ms: deadline of a cycle
+#   nodes, links        your computers and their connections
+#   tasks, flows        your stages: nodes, execution times, messages
 #   candidates          the placements to choose from
-#   scenarios           what may happen to the nodes and links
-#   objective           what a good placement is: weights, targets, caps
-#   controller.policy   who decides: `policy:Patient` is the class in policy.py
+#   scenarios           disturbances of nodes and links
+#   objective           cost of a placement: weights, targets, caps
+#   controller.policy   the policy: `policy:Patient` is the class in policy.py
 {more}
-# Keys of the tier `first`; docs/cells.md lists all keys by tier:
+# Keys of the tier `first`; docs/reference/cells.md lists all keys by tier:
 {keys}
-# `dwell check cell.yaml` finds every fault in it; `python test_cell.py` plays it.
+# `dwell check cell.yaml` finds every fault; `python test_cell.py` simulates the cell.
 """
 MORE = {
     Origin.CANONICAL: "# Execution times: `dwell profile --node R1 --task "
     "perception=stages:perceive --inputs stages:frame`\n# measures functions of stages.py here.",
-    Origin.LIVE: "#   tasks.*.run         functions and classes in stages.py that do the work\n"
+    Origin.LIVE: "#   tasks.*.run         functions and classes in stages.py\n"
     "#   live.hosts          addresses of your computers",
 }
-#: How its policy is tried.
+#: Command that tries the policy.
 RUN = {
     Origin.CANONICAL: "dwell run cell.yaml --windows 20",
     Origin.LIVE: "dwell live run cell.yaml --seconds 20",
 }
 STAGES_HEAD = {
-    Origin.CANONICAL: '"""Stages to measure: change them to what your tasks do."""\n',
-    Origin.LIVE: '"""Stages, and the drive that they steer: change them to yours."""\n',
+    Origin.CANONICAL: '"""Stages to measure: replace them with yours."""\n',
+    Origin.LIVE: '"""Stages, and the drive that they steer: replace them with yours."""\n',
 }
 
 
 def new(
     folder: Annotated[Path, argument("NAME", "Folder to make.")],
     origin: Annotated[
-        Origin, typer.Option("--from", help="Example to begin as: simulated, or live.")
+        Origin, typer.Option("--from", help="Example to start from: simulated or live.")
     ] = Origin.CANONICAL,
 ) -> None:
     """Make a folder with a cell, a policy, stages and a test.
 
-    All of it works as it is; comments say what to change.
+    The files work unchanged; comments name the parts to change.
     """
     if FOLDER.fullmatch(folder.name) is None:
         raise ProblemError(
-            f"{str(folder)!r} is no name for a cell's folder; use letters, digits, _ - . and +, a "
+            f"{str(folder)!r} is no name for a folder; use letters, digits, _ - . and +, a "
             "letter, a digit or _ first, at most 63 characters"
         )
     if not folder.parent.is_dir():
-        raise ProblemError(f"there is no folder {folder.parent} to make {folder.name} in")
+        raise ProblemError(f"{folder.parent} is not a folder; make it first")
     files = _files(find_examples(None), folder.name, origin)
     try:
         folder.mkdir()
     except FileExistsError:
-        raise ProblemError(f"{folder} is there already; choose another name") from None
+        raise ProblemError(f"{folder} exists already; choose another name") from None
     try:
         for name, text in files.items():
             (folder / name).write_text(text, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Options that several commands have: one spelling, one meaning, declared once."""
+"""Options that several commands share."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def require_few(seeds: int | None) -> int | None:
     Raises
     ------
     typer.BadParameter
-        If they are more.
+        If there are more.
     """
     from dwell.model.bounds import SEEDS
 
@@ -30,12 +30,12 @@ def require_few(seeds: int | None) -> int | None:
 
 
 def require_held(seconds: float | None) -> float | None:
-    """Refuse a length that 64 bits of nanoseconds do not hold.
+    """Refuse a length that does not fit into 64 bits of nanoseconds.
 
     Raises
     ------
     typer.BadParameter
-        If they do not.
+        If it does not fit.
     """
     from dwell.model.bounds import LENGTH_S
 
@@ -49,9 +49,13 @@ def _require(bound: Bound, value: float | None) -> None:
         raise typer.BadParameter(f"{shown} is not allowed; it must be {bound}")
 
 
-def option(metavar: str, sentence: str, *names: str, **more: Any) -> Any:
-    """Return an option that takes a value, under the parameter's name or others."""
-    return typer.Option(*names, metavar=metavar, help=sentence, **more)
+def option(metavar: str, sentence: str, *names: str, default: str = "", **more: Any) -> Any:
+    """Return an option that takes a value, under the parameter's name or others.
+
+    `default` describes a default that the command computes.
+    """
+    shown = f"{sentence} [default: {default}]" if default else sentence
+    return typer.Option(*names, metavar=metavar, help=shown, **more)
 
 
 def argument(metavar: str, sentence: str, **more: Any) -> Any:
@@ -60,26 +64,26 @@ def argument(metavar: str, sentence: str, **more: Any) -> Any:
 
 
 def flag(name: str, sentence: str, **more: Any) -> Any:
-    """Return an option that is there or not."""
+    """Return an option without a value."""
     return typer.Option(name, help=sentence, **more)
 
 
 CellArgument = Annotated[Path, argument("CELL", "Cell file (YAML).")]
 Node = Annotated[
     str,
-    typer.Option(help="Node of the cell that this computer is.", autocompletion=nodes),
+    option("NAME", "This computer's node in the cell.", autocompletion=nodes),
 ]
 Traces = Annotated[
-    Path | None, option("FOLDER", "Where its trace files are; beside it if not given.")
+    Path | None, option("FOLDER", "Folder of the trace files.", default="the cell's folder")
 ]
-Scenario = Annotated[str, option("NAME", "One of the cell's scenarios.", autocompletion=scenarios)]
+Scenario = Annotated[str, option("NAME", "Scenario of the cell.", autocompletion=scenarios)]
 Policy = Annotated[
     str | None,
     option(
         "NAME",
-        "A policy, as dtp, or with its estimator, as cusum+corrected; a class of your own, as "
-        "package.module:Class, beside the cell file or installed; or a candidate's name for the "
-        "placement that never moves; what the cell says if not given.",
+        "Policy, such as dtp; policy and estimator, such as cusum+corrected; your own class, as "
+        "package.module:Class; or a candidate, which never moves.",
+        default="the cell's",
         autocompletion=policies,
     ),
 ]
@@ -87,29 +91,29 @@ Estimator = Annotated[
     str | None,
     option(
         "NAME",
-        "An estimator, or a class of your own, as package.module:Class; what the cell says if "
-        "not given.",
+        "Estimator, or your own class, as package.module:Class.",
+        default="the cell's",
         autocompletion=estimators,
     ),
 ]
 Seed = Annotated[
-    int, option("S", "Seed of all that is drawn; one seed, one course of events.", min=0)
+    int, option("S", "Seed of all random numbers; the same seed gives the same run.", min=0)
 ]
-Windows = Annotated[int | None, option("N", "Length in windows, the warm-up included.", min=1)]
+Windows = Annotated[int | None, option("N", "Length in windows, including the warm-up.", min=1)]
 Seconds = Annotated[
     float | None,
-    option("S", "Length in seconds instead, the warm-up included.", min=1, callback=require_held),
+    option("S", "Length in seconds, in place of --windows.", min=1, callback=require_held),
 ]
-Processes = Annotated[int | None, option("N", "How many to use; one a CPU if not given.", min=1)]
+Processes = Annotated[int | None, option("N", "Number of processes.", default="one per CPU", min=1)]
 Samples = Annotated[int, option("N", "Samples of each measurement.", min=1, max=1_000_000)]
 Warmup = Annotated[
-    int, option("N", "Rounds before the samples that are left out.", min=0, max=1_000_000)
+    int, option("N", "Rounds before the samples, not counted.", min=0, max=1_000_000)
 ]
 Keys = Annotated[
     Path | None,
     option(
         "FOLDER",
-        "Keyring: all connections are encrypted and authenticated with it.",
+        "Keyring, which encrypts and authenticates all connections.",
         envvar="DWELL_KEYS",
     ),
 ]
@@ -117,38 +121,36 @@ Insecure = Annotated[
     bool,
     flag(
         "--insecure",
-        "Without keys: leave this computer all the same, in a network that you trust.",
+        "Connect to other computers without keys, in a network that you trust.",
         envvar="DWELL_INSECURE",
     ),
 ]
 
-TestbedName = Annotated[
-    str, typer.Option("--name", help="Of the testbed, among others on this machine.")
-]
+TestbedName = Annotated[str, option("NAME", "Name of the testbed on this machine.", "--name")]
 Json = Annotated[bool, flag("--json", "Print JSON on stdout.")]
 
 
 def require_one_length(windows: int | None, seconds: float | None) -> None:
-    """Refuse a length that is given twice.
+    """Refuse a length in windows and in seconds.
 
     Raises
     ------
     typer.BadParameter
-        If it is.
+        If both are given.
     """
     if windows is not None and seconds is not None:
         raise typer.BadParameter("--windows and --seconds: give one of them")
 
 
 def windows_of(seconds: float, *problems: Problem) -> int:
-    """Return the least number of whole windows that last so many seconds, at least 1.
+    """Return the smallest number of windows, at least 1, that lasts `seconds`.
 
     Raises
     ------
     typer.BadParameter
-        If the problems' windows have not all the same length.
+        If the problems' windows differ in length.
     ProblemError
-        If they are more than a run may have.
+        If a run may not have so many windows.
     """
     from dwell.model.instants import require_length
 
@@ -156,7 +158,7 @@ def windows_of(seconds: float, *problems: Problem) -> int:
     if len(each_s) > 1:
         lengths = ", ".join(f"{window_s:g}" for window_s in each_s)
         raise typer.BadParameter(
-            f"--seconds {seconds:g}: windows last {lengths} s here; give --windows"
+            f"--seconds {seconds:g}: the cells have windows of {lengths} s; give --windows"
         )
     windows = max(1, math.ceil(round(seconds / each_s[0], 9)))
     for problem in problems:

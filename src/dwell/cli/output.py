@@ -123,14 +123,14 @@ def require_own(page: Path, mark: str) -> None:
 def write_report(
     page: Page, path: Path | None, *, figures: Path | None, static: bool, mark: str
 ) -> None:
-    """Write a page, and its figures and tables as files where a folder is named for them.
+    """Write a page; with a folder `figures`, write its figures and tables as files, too.
 
     Parameters
     ----------
     path : Path, optional
-        Of the page; none is written where None.
+        File of the page; None writes no page.
     figures : Path, optional
-        Made where there is none; files of the same names are replaced.
+        Folder, made if missing; files of the same names are replaced.
     static : bool
         Whether the page is without scripts.
     mark : str
@@ -149,7 +149,7 @@ def write_report(
 
 @contextmanager
 def working(what: str) -> Iterator[None]:
-    """Show on stderr, where that is a terminal, that work goes on."""
+    """Show an activity indicator on stderr if that is a terminal."""
     if not sys.stderr.isatty():
         yield
         return

@@ -36,22 +36,18 @@ PAGE = "report.html"
 
 
 def report(
-    folder: Annotated[
-        Path, argument("FOLDER", "Of a saved run, of a fleet, of a study, or of a campaign.")
-    ],
+    folder: Annotated[Path, argument("FOLDER", "Folder of a run, fleet, study or campaign.")],
     out: Annotated[
-        Path | None, option("FILE", "Page to write [default: FOLDER/report.html].")
+        Path | None, option("FILE", "Page to write.", default="FOLDER/report.html")
     ] = None,
     trace: Annotated[
         Path | None,
-        option(
-            "FILE", "Also write every job as a trace for Perfetto; the run must have kept its jobs."
-        ),
+        option("FILE", "Also write every job as a trace for Perfetto; needs a run with --jobs."),
     ] = None,
     mcap: Annotated[
         Path | None,
         option(
-            "FILE", "Also write its tables as an MCAP file for Foxglove, PlotJuggler and others."
+            "FILE", "Also write the tables as an MCAP file for Foxglove, PlotJuggler and others."
         ),
     ] = None,
     figures: Annotated[
@@ -59,10 +55,10 @@ def report(
         option("FOLDER", "Also write figures and tables for a paper: PDF, SVG, LaTeX, CSV."),
     ] = None,
     static: Annotated[
-        bool, flag("--static", "A page without scripts: nothing to hover or choose.")
+        bool, flag("--static", "Write a page without scripts: no tooltips, no menus.")
     ] = False,
     cells: Annotated[
-        bool, flag("--cells", "Of a fleet: also write the page of every cell.")
+        bool, flag("--cells", "Also write the page of every cell of a fleet.")
     ] = False,
     as_json: Json = False,
 ) -> None:
@@ -144,11 +140,11 @@ def report(
     if figures is not None:
         typer.echo(f"figures: {figures}")
     if cells:
-        typer.echo(f"of cells: {folder}/*/{PAGE}")
+        typer.echo(f"cells: {folder}/*/{PAGE}")
 
 
 def _write_cells(folder: Path, runs: Mapping[str, Run], *, static: bool) -> dict[str, Path]:
-    """Write the page of every cell of a fleet beside its run; return them by the cells' names."""
+    """Write the page of each cell of a fleet next to its run; return the paths by cell."""
     from dwell.report.run_page import run_page
 
     pages: dict[str, Path] = {}
@@ -163,6 +159,6 @@ def _write_cells(folder: Path, runs: Mapping[str, Run], *, static: bool) -> dict
 
 
 def _links(folder: Path, page: Path) -> dict[str, str]:
-    """Return where a page finds those of a fleet's cells that are there."""
+    """Return links from a page to the existing pages of a fleet's cells."""
     known = folder.glob(f"*/{PAGE}")
     return {one.parent.name: quote(os.path.relpath(one, page.parent)) for one in known}

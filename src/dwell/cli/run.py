@@ -55,8 +55,8 @@ def run(
         Path | None,
         option(
             "FOLDER",
-            "Where to save the run; runs/CELL-SCENARIO-POLICY-SEED, and what --set says, if "
-            "not given.",
+            "Folder for the run.",
+            default="runs/CELL-SCENARIO-POLICY-SEED, with the values of --set",
         ),
     ] = None,
     traces: Traces = None,
@@ -64,21 +64,21 @@ def run(
         list[str] | None,
         option(
             "PATH=VALUE",
-            "Another value of the cell, as period_ms=40 or links[0].delay_ms=5; YAML. May be "
-            "repeated.",
+            "Change a value of the cell, such as period_ms=40 or links[0].delay_ms=5 (YAML); may "
+            "be repeated.",
             "--set",
         ),
     ] = None,
-    jobs: Annotated[bool, flag("--jobs", "Keep every job's instants.")] = False,
+    jobs: Annotated[bool, flag("--jobs", "Keep the times of every job.")] = False,
     guard: Annotated[
-        bool, flag("--guard", "Let the robots' guard move to a fallback by itself.")
+        bool, flag("--guard", "Let the robots' guard move the cell to a fallback.")
     ] = False,
     force: Annotated[bool, flag("--force", "Replace another run in the folder.")] = False,
     as_json: Json = False,
 ) -> None:
     """Simulate one policy in one scenario, and save the run.
 
-    300 windows, if neither --windows nor --seconds is given.
+    The run has 300 windows without --windows and --seconds.
     """
     from dwell.cellfile.overrides import load_with
 
@@ -141,7 +141,7 @@ def run(
 
 
 def default_folder(*parts: str) -> Path:
-    """Return where a run is saved: its parts are told by their digest where they are long."""
+    """Return the folder for a run; a digest shortens a long name."""
     name = file_name("-".join(parts), more="+=")
     if len(name.encode()) > LONGEST_NAME:
         digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
@@ -150,12 +150,12 @@ def default_folder(*parts: str) -> Path:
 
 
 def _require_same(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Raise a RunError where a folder holds another run: other than this one made again."""
+    """Raise a RunError if a folder holds a run with other settings."""
     if not (folder / "run.json").is_file():
         return
     from dwell.study.other_placements import PLACEMENTS
 
-    # The software's version and the other placements' results do not make it another run.
+    # Versions and results of other placements are no settings.
     beside = {"versions": None, PLACEMENTS: None}
     kept = read_document(folder / "run.json")
     if {**kept, **beside} != {**json.loads(json.dumps(settings)), **beside}:

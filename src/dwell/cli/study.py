@@ -38,34 +38,34 @@ SHOWN = 40
 def study(
     file: Annotated[Path, argument("FILE", "Study file (YAML).")],
     out: Annotated[
-        Path | None, option("FOLDER", "Where parts and tables go; studies/NAME if not given.")
+        Path | None, option("FOLDER", "Folder for parts and tables.", default="studies/NAME")
     ] = None,
     processes: Processes = None,
     dask: Annotated[
-        str | None, option("ADDRESS", "Scheduler of a Dask cluster that does the work.")
+        str | None, option("ADDRESS", "Scheduler of a Dask cluster that simulates.")
     ] = None,
     seeds: Annotated[
         int | None,
         option(
-            "N", "Seeds 1 to N of every run; the file's if not given.", min=1, callback=require_few
+            "N", "Seeds 1 to N of every run.", default="the file's", min=1, callback=require_few
         ),
     ] = None,
     windows: Windows = None,
     seconds: Seconds = None,
     shard: Annotated[
         str | None,
-        option("I/N", "Simulate one of N shards, in a folder of its own."),
+        option("I/N", "Simulate one of N shards, in its own folder."),
     ] = None,
     merge: Annotated[
-        bool, flag("--merge", "Put all shards in the folder together, and simulate nothing.")
+        bool, flag("--merge", "Merge all shards in the folder; simulate nothing.")
     ] = False,
     as_json: Json = False,
 ) -> None:
     """Simulate all scenarios, policies and seeds of a study.
 
-    Finished runs stay in the folder, whatever ends the work: the same command plays the rest. Runs
-    have the length of the file, if neither --windows nor --seconds is given. Several computers
-    share a study with --shard; copy their shards into one folder, and --merge them.
+    Finished runs stay in the folder; the same command continues after an interruption. Runs have
+    the file's length without --windows and --seconds. Several computers share a study with
+    --shard; copy their shards into one folder and --merge them.
     """
     from dwell.estimators import unplayed
     from dwell.study import Shard, load_study, merge_shards, run_shard, run_study
@@ -130,12 +130,12 @@ def _interruptible(folder: Path, study: Study) -> Iterator[Progress]:
     except KeyboardInterrupt:
         interrupted(
             f"{done} of {counted(of, 'run')} are finished and stay in {folder}; the same command "
-            "goes on from there"
+            "continues"
         )
 
 
 def _measures(study: Study) -> list[Measure]:
-    """Return what the terminal shows."""
+    """Return the columns of the terminal."""
     from dwell.report.formatting import COST, MIGRATIONS, ORACLE_REGRET, RATE, REGRET, own_measures
 
     compared = [REGRET, ORACLE_REGRET] if study.references else []
@@ -143,7 +143,7 @@ def _measures(study: Study) -> list[Measure]:
 
 
 def _text(result: StudyResult) -> str:
-    """Return a table a point and scenario."""
+    """Return one table per point and scenario."""
     from dwell.report.formatting import (
         few_seeds,
         independent_runs,
@@ -156,7 +156,7 @@ def _text(result: StudyResult) -> str:
     study = result.study
     measures = _measures(study)
     groups = len(study.points) * len(study.scenarios)
-    # Intervals take time: only of what is shown.
+    # Intervals take time, so only the shown rows get them.
     some = result.runs.head(SHOWN * len(study.policies) * len(study.seeds))
     keys = (*result.parameters, "scenario", "policy")
     rows = over_seeds(some, keys, [measure.column for measure in measures]).to_dicts()

@@ -72,7 +72,7 @@ class Stateful(Protocol):
 class Actuator(Protocol):
     """Applies the commands that pass the gate. It may also have ``inputs`` and ``stop()``.
 
-    A call of ``hold``, ``zero`` or ``stop`` that raises is repeated (docs/deploy.md).
+    A call of ``hold``, ``zero`` or ``stop`` that raises is repeated (docs/howto/deploy.md).
     """
 
     def apply(self, command: Message) -> None:

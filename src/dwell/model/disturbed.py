@@ -34,7 +34,7 @@ class Disturbed(NamedTuple):
 
 
 def disturbed(scenario: Iterable[Disturbance], fabric: Fabric) -> list[Disturbed]:
-    """Return the disturbances of a scenario; equal simultaneous ones are merged.
+    """Return the disturbances of a scenario, with equal simultaneous disturbances merged.
 
     Disturbances in episodes are left out, because their times are random.
     """
@@ -83,7 +83,7 @@ def on_link(item: LinkDisturbance) -> str:
 
 
 def _declared_mean(process: Process) -> float | None:
-    """Return the declared mean of a process, or None if it is declared without one."""
+    """Return the declared mean of a process, or None for a process without a declared mean."""
     if isinstance(process, Constant):
         return process.value
     if isinstance(process, AR1 | Exponential | Gamma | LogNormal | Normal):

@@ -108,24 +108,24 @@ class Node:
         tier="measured",
     )
     background_beside: float | None = key(
-        "What of `background` is taken while jobs run and no foreign thread does, on a node with "
-        "a quota.",
+        "Part of `background` that is used while jobs run without foreign threads, on a node "
+        "with a quota.",
         Bound(0, 4096),
         default=None,
         usual="all of it",
         tier="measured",
     )
     background_hz: float = key(
-        "How often in a second something of `background` wakes, in the mean, on a node whose "
-        "quota has `tick_ms`: the kernel looks at the quota then, too, and picks anew who runs.",
+        "Mean wake-ups of `background` per second, on a node whose quota has `tick_ms`: each "
+        "makes the kernel check the quota and schedule again.",
         BACKGROUND_HZ,
         default=0.0,
         is_rare=True,
         tier="measured",
     )
     interference: float = key(
-        "How many times as much core time jobs take while foreign threads run, whose data take "
-        "the place of theirs in the caches.",
+        "Factor on the core time of jobs while foreign threads run and replace the jobs' data in "
+        "the caches.",
         Bound(1, 100),
         default=1.0,
         is_rare=True,
@@ -136,7 +136,7 @@ class Node:
         if self.bursts is not None and self.bursts.add_delay_ms != Constant(0.0):
             delay = self.bursts.add_delay_ms
             require(False, "bursts.add_delay_ms", delay, "left out: only a link adds a delay")
-        bound = f"less than {self.capacity:g}, what the node can do"
+        bound = f"less than {self.capacity:g}, the node's capacity"
         require(self.background < self.capacity, "background", self.background, bound)
         if self.background_beside is not None:
             beside, bound = self.background_beside, f"0 to {self.background:g}, the background"
@@ -145,7 +145,7 @@ class Node:
             require(self.quota is not None, "background_beside", beside, bound)
         if self.background_hz > 0.0:
             ticks = self.quota is not None and self.quota.tick_ms > 0
-            bound = "0 where there is no `quota` with `tick_ms`; elsewhere it is looked at any time"
+            bound = "0 without a `quota` with `tick_ms`, which is checked at any time"
             require(ticks, "background_hz", self.background_hz, bound)
         if self.quota is not None and self.quota.tick_ms > 0:
             tick_ms, bound = self.quota.tick_ms, "0 where a node has several cores, or is not fair"
@@ -238,7 +238,7 @@ class Link:
     target: str = key("Node that receives.", named="to", tier="first")
     delay_ms: Process = key("Propagation delay of a message, ms.", tier="first")
     rate_mbps: float = key(
-        "Serialisation rate, megabits a second; messages do not queue where there is none.",
+        "Serialisation rate, megabits per second; without it messages do not queue.",
         RATE_MBPS,
         default=math.inf,
         usual="unlimited",
@@ -251,7 +251,7 @@ class Link:
         tier="first",
     )
     retransmit_ms: float | None = key(
-        "Time after which a lost message is sent again, ms; dropped where there is none.",
+        "Time after which a lost message is sent again, ms; without it the message is dropped.",
         Bound(1e-3, LARGEST),
         default=None,
         named="on_loss.retransmit_ms",

@@ -27,7 +27,7 @@ COUNT = Bound(1, MOST_CELLS, whole=True)
 #: Largest V_D of a cell that is served, if a file gives no limit.
 LIMIT = 0.05
 
-#: Count and cell of an entry; None for a cell that could not be read.
+#: Count and cell of an entry; None for an unreadable cell.
 Kind: TypeAlias = "tuple[int, Problem | None]"
 
 
@@ -95,10 +95,10 @@ class Fleet:
     entries: tuple[FleetEntry, ...]
     shared: tuple[str, ...] = key("Nodes that are one computer for all cells.", default=())
     phases: Phases = key(
-        "When each cell begins: all at once, evenly spread, drawn, or by a list.", default="random"
+        "Start of each cell: all at once, evenly spread, random, or by a list.", default="random"
     )
     coordination: Coordination = key(
-        "What a move is asked for: nothing, a chance, or the ledger.", default="ledger"
+        "Approval of a move: none needed, by chance, or by the ledger.", default="ledger"
     )
     objective: FleetObjective = key(
         "Aim of the ledger and of plans: the least sum of costs, the least cost of the worst "

@@ -35,8 +35,7 @@ class Host:
         "First port; each process of the node takes three.", PORT, default=7450, tier="first"
     )
     seen_from: Mapping[str, Endpoint] = key(
-        "Where it is reached from nodes that do not reach it there: behind a translation of "
-        "addresses, a tunnel, or the links of a demonstration.",
+        "Other addresses for nodes that need them: behind NAT, a tunnel, or emulated links.",
         default_factory=FrozenDict,
     )
 
@@ -53,7 +52,7 @@ class LiveSettings:
     """Settings of the live runtime, in addition to the problem."""
 
     hosts: Mapping[str, Host] = key(
-        "Where each node is reached.",
+        "Address of each node.",
         default_factory=FrozenDict,
         usual="all are this machine",
         digested="hosts",
@@ -86,7 +85,7 @@ class LiveSettings:
         usual="two periods",
     )
     silence: Literal["hold", "zero"] = key(
-        "What the actuator is told without commands.", default="hold"
+        "Method of the actuator that is called without commands.", default="hold"
     )
     checkpoint_cycles: int = key(
         "Cycles between copies of a task's state to its fallback; 0: none.",

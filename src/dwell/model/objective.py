@@ -23,13 +23,13 @@ WEIGHT, TARGET, CAP = Bound(0, LARGEST), Bound(1e-9, LARGEST), Bound(0, above=Tr
 class Weights:
     """Weights of the terms of the cost J; at least one above 0."""
 
-    latency: float = key("Of L95 / target.", WEIGHT, default=1.0)
-    violations: float = key("Of the violation rate.", WEIGHT, default=3.0)
-    robot: float = key("Of robot utilisation / target.", WEIGHT, default=0.5)
-    edge: float = key("Of edge utilisation / target.", WEIGHT, default=0.3)
-    switching: float = key("Of the share of moved tasks.", WEIGHT, default=0.5)
+    latency: float = key("Weight of L95 / target.", WEIGHT, default=1.0)
+    violations: float = key("Weight of the violation rate.", WEIGHT, default=3.0)
+    robot: float = key("Weight of robot utilisation / target.", WEIGHT, default=0.5)
+    edge: float = key("Weight of edge utilisation / target.", WEIGHT, default=0.3)
+    switching: float = key("Weight of the share of moved tasks.", WEIGHT, default=0.5)
     cloud: float | None = key(
-        "Of cloud utilisation / target.",
+        "Weight of cloud utilisation / target.",
         WEIGHT,
         default=None,
         usual="cloud nodes count as edge nodes",
@@ -82,9 +82,9 @@ class Objective:
         digested="decision",
     )
     accelerators: Mapping[str, Tier] = key(
-        "Tier of every kind of accelerators that counts in J beside the nodes, by the name of the "
-        "resource (``E.gpu``): those of all nodes of `tiers`, or none, as in the paper. J does "
-        "without those that a QoS does not have.",
+        "Tier of each accelerator that counts in J, by resource (``E.gpu``): all accelerators of "
+        "the nodes in `tiers`, or none, as in the paper. J leaves out accelerators without "
+        "measured utilisation.",
         default_factory=FrozenDict,
     )
 

@@ -21,11 +21,11 @@ class Execution:
     """How a task runs on one of its feasible nodes."""
 
     exec_ms: Process = key(
-        "Time that one job needs when nothing disturbs it, with all its threads, ms.",
+        "Execution time of an undisturbed job, with all its threads, ms.",
         tier="first",
     )
     threads: int = key(
-        "Cores that one job can use at once; on a node with fewer it takes so many times as long.",
+        "Cores that a job can use at once; with fewer cores it takes longer by the ratio.",
         Bound(1, MAX_COUNT, whole=True),
         default=1,
         tier="first",
@@ -71,7 +71,7 @@ class Task:
         default=0,
     )
     scale: str | None = key(
-        "Name under `scales` of what multiplies its execution times on every node.",
+        "Name under `scales` of a factor on its execution times on every node.",
         default=None,
         tier="measured",
     )

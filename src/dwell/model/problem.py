@@ -58,7 +58,7 @@ class Problem(Displayed):
     )
     objective: Objective = key("Cost, targets and caps.", tier="first")
     scenarios: Mapping[str, Scenario] = key(
-        "What happens to the cell, by name: a list of disturbances. `baseline: []` exists always.",
+        "Lists of disturbances, by name. `baseline: []` exists always.",
         default_factory=FrozenDict,
         tier="first",
     )
@@ -72,7 +72,7 @@ class Problem(Displayed):
         default=0,
     )
     servo: Servo | None = key(
-        "Loop that every run's commands are tried on; without one there is no tracking error.",
+        "Control loop that follows the commands of each run; needed for the tracking error.",
         default=None,
     )
     live: LiveSettings = key(
@@ -164,7 +164,7 @@ class Problem(Displayed):
     def policy_and_estimator(self, name: str) -> tuple[str, str | None]:
         """Split a name as ``cusum+corrected`` into policy and estimator.
 
-        The estimator is None for a name without one, as ``cusum`` or ``LOC``.
+        The estimator of ``cusum`` or ``LOC`` is None.
         """
         policy, plus, estimator = name.rpartition("+")
         return (policy, estimator) if plus and name not in self.candidates else (name, None)
@@ -241,7 +241,7 @@ class Problem(Displayed):
 
     @property
     def censor_ms(self) -> float:
-        """Largest latency in J: max(4 D, 2 P), and no less than L_max; longer ones are cut to it.
+        """Largest latency in J: max(4 D, 2 P), at least L_max; J cuts longer latencies to it.
 
         docs/concepts.md explains the reason.
         """

@@ -1,4 +1,4 @@
-"""Random processes of durations: what a number in a cell file may be instead of a number.
+"""Random processes of durations, which a cell file may have in place of a number.
 
 Each process is a frozen description with a stationary marginal distribution. ``marginal`` draws
 independent values of it; drawing a *path* (with an ``ar1`` process's memory, or a trace replayed
@@ -185,16 +185,16 @@ class Exponential(_ByMean):
 class AR1(_ByMean):
     """Positive first-order autoregression: lognormal marginal, lag-1 correlation `rho`.
 
-    The logarithm is a Gaussian AR(1) process. Its own correlation is chosen so that the *value*
-    (not its logarithm) has exactly the mean, coefficient of variation and correlation given:
-    for a lognormal pair, corr = (exp(r s^2) - 1) / (exp(s^2) - 1), hence
+    The logarithm is a Gaussian AR(1) process. Its correlation r gives the *value* (not the
+    logarithm) exactly the declared mean, coefficient of variation and correlation: for a
+    lognormal pair, corr = (exp(r s^2) - 1) / (exp(s^2) - 1), hence
     r = log(1 + rho cv^2) / s^2 with s^2 = log(1 + cv^2).
     """
 
     mean: float = key("Mean.", MEAN)
     cv: float = key(SPREAD, CV)
     rho: float = key(
-        "Correlation of a cycle's value with the one before.",
+        "Correlation of a cycle's value with the previous value.",
         Bound(-1, 1, above=True, below=True),
     )
 
@@ -240,7 +240,7 @@ def _one_group() -> NDArray[np.int64]:
 class TraceTable:
     """Columns of one file of measurements; every process that names the file shares its rows.
 
-    Tables are equal by what they hold, and by how it is replayed.
+    Tables with equal contents and equal replay are equal.
 
     Parameters
     ----------
@@ -255,7 +255,7 @@ class TraceTable:
     time_ms : array of float64, shape (rows,), optional
         Instant of each row since its group's first, ascending; needed by ``by: time``.
     wrap : bool
-        Whether replay goes on at the beginning when the rows end.
+        Whether replay continues with the first row after the last.
     group : str or tuple of str, optional
         Columns whose values make a group.
     on_negative, time
@@ -319,7 +319,7 @@ class TraceTable:
     def stream(self) -> str:
         """Name of the streams that rows of it are drawn from: the file as written.
 
-        Of an absolute path only the last part counts, so that no run changes with the place of its
+        Only the last part of an absolute path counts: a run does not depend on the folder of its
         files.
         """
         return self.file.rpartition("/")[2] if self.file.startswith("/") else self.file
@@ -379,7 +379,7 @@ class TraceTable:
         import numpy as np
 
         if wraps:
-            # The whole file is one loop, so that every row is used and groups keep their order.
+            # The complete file is one loop: every row is used, and groups keep their order.
             return (rng.integers(self.rows) + np.arange(cycles)) % self.rows
         slack = np.maximum(ends - self.starts - cycles + 1, 0)
         before = np.cumsum(slack)
@@ -440,7 +440,7 @@ class Trace:
 
     @property
     def values(self) -> Floats:
-        """The column, milliseconds, one value a row."""
+        """The column, one value per row, milliseconds."""
         return self.table.columns[self.column]
 
     @property
@@ -492,7 +492,7 @@ class UnreadTrace:
 
 
 def require_mean(bound: Bound, path: str, process: Process) -> None:
-    """Require a process to have a mean within a bound; that of a trace without data is not known.
+    """Require the mean of a process to be within a bound; a trace without data passes.
 
     Raises
     ------

@@ -61,11 +61,15 @@ def _for_s() -> Any:
 
 
 def _down() -> Any:
-    return key("Whether the node or the link is down meanwhile.", default=False, tier="first")
+    return key(
+        "Whether the node or the link is down during the disturbance.", default=False, tier="first"
+    )
 
 
 def _episodes() -> Any:
-    return key("When it is on within that time.", default=None, usual="all the time")
+    return key(
+        "Random intervals within that time in which it is on.", default=None, usual="all the time"
+    )
 
 
 def _ramp_s() -> Any:
@@ -95,8 +99,8 @@ class _Timed:
             f"at most half of for_s = {self.for_s:g}: it grows, and it falls",
         )
         require(2 * ramp_s <= self.for_s, "ramp_s", ramp_s, half)
-        require(self.episodes is None, "ramp_s", ramp_s, "left out where there are `episodes`")
-        require(not self.down, "ramp_s", ramp_s, "left out of what is `down`: it has no strength")
+        require(self.episodes is None, "ramp_s", ramp_s, "left out with `episodes`")
+        require(not self.down, "ramp_s", ramp_s, "left out with `down`, which has no strength")
 
     @property
     def end_s(self) -> float:
@@ -108,11 +112,11 @@ class _Timed:
 class NodeDisturbance(_Timed):
     """Foreign CPU load on a node, or the node down."""
 
-    node: str = key("Node that it happens to.", tier="first")
+    node: str = key("Disturbed node.", tier="first")
     at_s: float = _at_s()
     for_s: float = _for_s()
     stress_threads: int = key(
-        "Foreign threads on the node; along a ramp, rounded to whole ones.",
+        "Foreign threads on the node; rounded to integers along a ramp.",
         FOREIGN_THREADS,
         default=0,
         tier="first",
@@ -146,10 +150,13 @@ class LinkDisturbance(_Timed):
         tier="first",
     )
     loss: float = key(
-        "Probability of loss on the link, besides its own.", ADDED_LOSS, default=0.0, tier="first"
+        "Probability of loss on the link, in addition to its own.",
+        ADDED_LOSS,
+        default=0.0,
+        tier="first",
     )
     rate_mbps: float = key(
-        "Rate of the link meanwhile, where its own is not lower, Mbit/s.",
+        "Upper bound of the link's rate during the disturbance, Mbit/s.",
         RATE_MBPS,
         default=math.inf,
         usual="the link's",

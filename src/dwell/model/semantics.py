@@ -33,7 +33,7 @@ from dwell.model.scenario import (
 NAME = re.compile(r"\w[\w.+:-]*(?: [\w.+:-]+)*")
 NAME_SIGN = re.compile(r"[\w.+:\- ]")
 LONGEST_NAME = 64
-#: Kinds of which a cell has at least one.
+#: Kinds that each cell needs.
 NEEDED = frozenset({"node", "task", "candidate"})
 # How far shares may sum up beyond 1 by rounding.
 SHARE_TOLERANCE = 1e-9
@@ -292,7 +292,7 @@ def _placed(parts: CellParts, path: str, moves: Mapping[str, str]) -> Iterator[F
         if node not in parts.nodes:
             yield from _unknown(here, "node", node, parts.nodes)
         elif not all(name in parts.nodes for name in task.on):
-            continue  # a node of the task's is misspelt, and may be this one
+            continue  # The task names an unknown node, possibly a misspelling of this node.
         elif task.anchored:
             yield Fault(here, f"{task_name} is anchored to {feasible}; it cannot move to {node}")
         else:
@@ -393,8 +393,8 @@ def _objective(parts: CellParts) -> Iterator[Fault]:
         names = ", ".join(f"{name}: {tier}" for name, tier in counted.items()) or "nothing"
         yield Fault(
             "objective.accelerators",
-            f"{shown(dict(parts.accelerators))} is not allowed; it must be empty, or those of all "
-            f"nodes of tiers, {names}",
+            f"{shown(dict(parts.accelerators))} is not allowed; it must be empty, or name the "
+            f"accelerators of all nodes in tiers, {names}",
         )
 
 
@@ -432,7 +432,7 @@ def _live(parts: CellParts) -> Iterator[Fault]:
 
 
 def _columns(parts: CellParts) -> Iterator[Fault]:
-    """Names of accelerators, and names of which two columns would be called the same."""
+    """Yield bad names of accelerators, and names that give two columns the same name."""
     for name, node in parts.nodes.items():
         for kind in node.accelerators if node is not None else ():
             if message := bad_name(kind):
@@ -472,6 +472,6 @@ def _state_transfers(parts: CellParts) -> Iterator[Fault]:
         if missing:
             yield Fault(
                 f"tasks.{name}.state_bytes",
-                f"its state cannot be carried where there is no link {', '.join(missing)}; "
+                f"its state cannot be sent without the link {', '.join(missing)}; "
                 "declare it, or use migration: warm",
             )

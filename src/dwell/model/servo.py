@@ -32,12 +32,14 @@ class MovingTarget:
 class Servo:
     """One axis of a robot that follows a moving target with a camera."""
 
-    plant: Plant = key("What a command sets: the velocity (`integrator`), or the acceleration.")
+    plant: Plant = key(
+        "Effect of a command: it sets the velocity (`integrator`) or the acceleration."
+    )
     gain: float = key(
         "Command for an error of 1: 1/s, for a `double-integrator` 1/s².",
         Bound(0, MAX_COUNT, above=True),
     )
-    target: MovingTarget = key("What the robot follows.")
+    target: MovingTarget = key("Target that the robot follows.")
     damping: float = key(
         "Command for an error that grows by 1 a second, 1/s; for a `double-integrator`, which "
         "needs it.",

@@ -101,7 +101,7 @@ CYCLES = (
         "command was not applied. False where a live run's controller could not hear of it, "
         "or after the last window of a simulated run.",
     ),
-    Column("outcome", "outcome", "What became of it."),
+    Column("outcome", "outcome", "Its end."),
     Column("compute_ns", "Int64", "Part of the latency: execution.", "ns", APART),
     Column("queue_ns", "Int64", "Part of the latency: waiting.", "ns", APART),
     Column("network_ns", "Int64", "Part of the latency: links.", "ns", APART),
@@ -109,25 +109,25 @@ CYCLES = (
     Column("run", "Int64", "Id of the run, as stamped.", of=LIVE),
     Column("number", "Int64", "Number of the cycle, as stamped.", of=LIVE),
     Column("term", "Int64", "Term of the order, as stamped.", of=LIVE),
-    Column("heard", "Boolean", "False where it is known by its neighbours only.", of=LIVE),
+    Column("heard", "Boolean", "False if it is known only from neighbouring cycles.", of=LIVE),
     Column("actuated", "Boolean", "Whether all its commands were applied.", of=LIVE),
     Column(
         "interval_ns",
         "Int64",
-        "From its stamp to its last completion, as both arrived at the controller: one clock "
-        "alone, but with what the two messages' ways differ by.",
+        "From the arrival of its stamp at the controller to the arrival of its last completion, "
+        "by one clock; the two messages' delays may differ.",
         "ns",
-        "one of them was not heard",
+        "one of them did not arrive",
         LIVE,
     ),
     Column(
         "stamper_interval_ns",
         "Int64",
         "From its release to the arrival of its last completion at the stamper, less half the "
-        "best round trip to the sink's node: the stamper's clock alone, with what the completion "
-        "was late.",
+        "best round trip to the sink's node, by the stamper's clock; includes the completion's "
+        "extra delay.",
         "ns",
-        "it came over the detour, or not at all",
+        "it arrived through the relay, or not at all",
         LIVE,
     ),
     Column(
@@ -155,9 +155,9 @@ WINDOWS = (
         "Utilisation of a resource, foreign work included.",
         null=UNMEASURED,
     ),
-    Column("cost", "Float64", "J of what was seen.", null=UNSEEN),
+    Column("cost", "Float64", "J of the observed QoS.", null=UNSEEN),
     Column("shadow_cycles", "Int64", "Cycles that were sent twice.", of=SHADOWS),
-    Column("shadow_bytes", "Int64", "What their shadows put on links.", "bytes", of=SHADOWS),
+    Column("shadow_bytes", "Int64", "Bytes of shadows on links.", "bytes", of=SHADOWS),
     Column(
         "shadow_{resource}",
         "Float64",
@@ -167,12 +167,12 @@ WINDOWS = (
     ),
     Column("term", "Int64", "Term of its last cycle.", of=LIVE),
     Column("lead", "Int64", "Cycles before it that belong to no window.", of=LIVE),
-    Column("heard", "Int64", "Cycles of which anything was heard.", of=LIVE),
+    Column("heard", "Int64", "Cycles with at least one received message.", of=LIVE),
     Column("bound_ms", "Float64", "The largest bound of its cycles.", "ms", UNCOMPARED, LIVE),
     Column(
         "unproven",
         "Boolean",
-        "Whether that is over 20 % of D, or it could not be heard how a cycle ended.",
+        "Whether `bound_ms` is over 20 % of D, or the end of a cycle is unknown.",
         of=LIVE,
     ),
     Column("closed_unix_ns", "Int64", "Time of day of its close.", "ns", of=LIVE),
@@ -221,7 +221,7 @@ DECISIONS = (
     Column(
         "est_violation_error_{candidate}",
         "Float64",
-        "Standard error of its estimated V_D; 0 likewise.",
+        "Standard error of its estimated V_D; 0 in the same cases.",
         null=GUARD,
     ),
     Column(
@@ -249,15 +249,15 @@ DECISIONS = (
         SUPPORT,
     ),
     Column("phi_before", "Float64", "Φ of the fleet as it is, as played.", null=UNASKED, of=FLEET),
-    Column("phi_after", "Float64", "Φ with the moves that were played.", null=UNASKED, of=FLEET),
-    Column("round", "Int64", "The ledger's round that it is of.", null="no ledger", of=FLEET),
+    Column("phi_after", "Float64", "Φ with the simulated moves.", null=UNASKED, of=FLEET),
+    Column("round", "Int64", "Round of the ledger.", null="no ledger", of=FLEET),
     Column(
         "refused",
         "String",
-        "What was decided and not done, and why: `migrated` is false then, `placement` the old "
-        "one, and `reason` the policy's. In a fleet also the incumbent while its windows are not "
-        "what was played.",
-        null="what was decided was done",
+        "A decision that was not carried out, and the reason: `migrated` is false, `placement` "
+        "the old placement, and `reason` the policy's. In a fleet also the incumbent while its "
+        "windows disagree with the simulated ones.",
+        null="the decision was carried out",
         of=("live", "fleet"),
     ),
 )
@@ -272,9 +272,9 @@ JOBS = (
         "Int64",
         "When it completed, or was lost.",
         "ns",
-        "neither by the end of the run, or it was replaced in a live one",
+        "neither by the end of the run, or a later input replaced it (live)",
     ),
-    Column("outcome", "outcome", "What became of it."),
+    Column("outcome", "outcome", "Its end."),
     Column("shadow", "Boolean", "Whether it is a shadow's.", of=("live", "shadows")),
     Column(
         "cpu_ns",
@@ -288,7 +288,7 @@ JOBS = (
     Column(
         "others_ns",
         "Int64",
-        "CPU time of all other processes of its node meanwhile.",
+        "CPU time of all other processes of its node during the job.",
         "ns",
         UNTOLD,
         LIVE,
@@ -296,7 +296,7 @@ JOBS = (
     Column(
         "outside_ns",
         "Int64",
-        "CPU time of everybody else on its node's CPUs meanwhile.",
+        "CPU time of all other programs on its node's CPUs during the job.",
         "ns",
         UNTOLD,
         LIVE,

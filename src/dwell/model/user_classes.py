@@ -34,7 +34,7 @@ def make_user_class(
     """Make an object of a user's class, by ``from_problem(problem)`` if defined.
 
     `name` is ``package.module:Class``. Modules in the problem's `folder` take precedence over
-    installed ones. `what` is the kind of class for messages, as ``policy``. Raises an `error` if
+    installed modules. `what` is the kind of class for messages, as ``policy``. Raises an `error` if
     the module or class does not exist, the import raises, the class requires arguments or raises,
     or its object lacks the `method`.
     """
@@ -100,7 +100,7 @@ def user_function(
     """Return a user's function.
 
     `name` is ``package.module:function``, and `what` the kind of function for messages, as
-    ``metric``. Modules in `folder` take precedence over installed ones. Raises an `error` if the
+    ``metric``. Modules in `folder` take precedence over installed modules. Raises an `error` if the
     module or function does not exist, or the import raises.
     """
     who = f"{what} {name!r}"
@@ -180,7 +180,7 @@ def import_user_module(
         missing = fault.name if isinstance(fault, ModuleNotFoundError) else None
         if missing is not None and f"{name}.".startswith(f"{missing}."):
             place = "" if folder is None else f"neither in {folder} nor "
-            raise error(f"{who}: there is no module {missing!r}, {place}installed") from None
+            raise error(f"{who}: no module {missing!r}, {place}installed") from None
         raise error(f"{who}: importing {name} failed: {describe_raised(fault)}") from fault
 
 

@@ -70,7 +70,7 @@ MORE = (
 MOST_COLUMNS = 5
 #: In the unit of `RATE`.
 THE_AIM = Limit(100 * AIM, "the aim, 5 %")
-#: The one sentence that is made of numbers (docs/decisions/0007-reports.md).
+#: The one sentence that is made of numbers (docs/decisions/0007-pages.md).
 HEADLINE = "V_D under 5 %: {most} in {count} of {of} scenarios; in all: {all}; not shown: {open}."
 KEYS = ("scenario", "policy")
 #: Approximate largest number of points of a line: bins of the logarithmic axis.

@@ -300,7 +300,7 @@ def test_a_taken_port_is_named_and_nothing_is_started(cell: Cell) -> None:
     ("live", "options", "code", "words"),
     [
         ({"silence": "shout"}, (), 2, "live.silence"),
-        ({"actuators": {"control": "nowhere:Drive"}}, (), 1, "there is no module 'nowhere'"),
+        ({"actuators": {"control": "nowhere:Drive"}}, (), 1, "no module 'nowhere'"),
         ({}, ("--node", "R9"), 2, "no node 'R9' in cell 'light-follower'; there are R1, E, R2"),
         ({"hosts": "away"}, (), 2, "no node of cell 'light-follower' is this computer"),
         ({"hosts": "away"}, ("--node", "E"), 1, "is beyond this computer, and without keys"),

@@ -290,15 +290,15 @@ class Looking:
         ({"scenario": "storm"}, "storm"),
         (
             {"run": "nowhere:Camera"},
-            "tasks.camera.run (nowhere:Camera): there is no module 'nowhere'",
+            "tasks.camera.run (nowhere:Camera): no module 'nowhere'",
         ),
         (
             {"controller": {"policy": "nowhere:Mine"}},
-            "controller.policy: policy 'nowhere:Mine': there is no module 'nowhere'",
+            "controller.policy: policy 'nowhere:Mine': no module 'nowhere'",
         ),
         (
             {"controller": {"estimator": "nowhere:Mine"}},
-            "controller.estimator: estimator 'nowhere:Mine': there is no module 'nowhere'",
+            "controller.estimator: estimator 'nowhere:Mine': no module 'nowhere'",
         ),
     ],
 )

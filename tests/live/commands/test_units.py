@@ -101,7 +101,7 @@ def test_an_unknown_node_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_manual_shows_these_units() -> None:
-    page = (ROOT / "docs" / "deploy.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "howto" / "deploy.md").read_text(encoding="utf-8")
     shown = re.findall(r"^```ini\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
     made = {
         node: unit_texts(

@@ -36,5 +36,5 @@ def test_it_is_made_beside_the_cell_with_its_folder_and_its_time(tmp_path: Path)
         load_observer("looking_on:Looking", problem, tmp_path, -1)
     with pytest.raises(LiveError, match="observer looking_on:Absent: AttributeError"):
         load_observer("looking_on:Absent", problem, tmp_path, 1)
-    with pytest.raises(LiveError, match="observer absent:Looking: there is no module 'absent'"):
+    with pytest.raises(LiveError, match="observer absent:Looking: no module 'absent'"):
         load_observer("absent:Looking", problem, tmp_path, 1)

@@ -38,38 +38,45 @@ def campaign(
     cell: CellArgument,
     scenarios: Annotated[
         str | None,
-        option("NAME,NAME", "The paper's four if not given.", autocompletion=several_scenarios),
+        option(
+            "NAME,NAME",
+            "Scenarios.",
+            default="the paper's four",
+            autocompletion=several_scenarios,
+        ),
     ] = None,
     policies: Annotated[
         str | None,
         option(
             "NAME,NAME",
-            "Policies, candidates, or policies with an estimator, as cusum+corrected; all "
-            "candidates, atp, dtp and cusum+corrected if not given.",
+            "Policies, candidates, or policies with an estimator, such as cusum+corrected.",
+            default="all candidates, atp, dtp, cusum+corrected",
             autocompletion=several_policies,
         ),
     ] = None,
-    repetitions: Annotated[int, typer.Option(min=1, help="Of everything.")] = 5,
+    repetitions: Annotated[int, option("N", "Repetitions of each run.", min=1)] = 5,
     windows: Windows = None,
     seconds: Seconds = None,
     seed: Seed = 1,
     out: Annotated[
-        Path | None, option("FOLDER", "Of the campaign; campaigns/CELL if not given.")
+        Path | None, option("FOLDER", "Folder of the campaign.", default="campaigns/CELL")
     ] = None,
     name: TestbedName = "campaign",
     minutes: Annotated[
-        float | None, typer.Option(min=0, help="Begin no run that would end after these.")
+        float | None, option("N", "Start no run that would end later.", min=0)
     ] = None,
     inventory: Annotated[
         Path | None, option("FILE", "Real hosts (YAML), instead of this machine's testbed.")
     ] = None,
-    report: Annotated[bool, flag("--report", "Measure nothing: report on what is there.")] = False,
+    report: Annotated[
+        bool, flag("--report", "Measure nothing: report on the finished runs.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Measure all policies in all scenarios, in random order.
 
-    What is done stays in the folder, whatever ends the work: the same command goes on. A run takes
-    120 s, if neither --windows nor --seconds is given.
+    Finished runs stay in the folder; the same command continues after an interruption. A run takes
+    120 s without --windows and --seconds.
     """
     length_s = seconds_of_runs(cell, windows, seconds)
     problem = dwell.load(cell)
@@ -143,7 +150,7 @@ def _run(campaign: Campaign, folder: Path, play: Play, name: str, minutes: float
         done, planned = len(list(folder.glob("runs/*/run.json"))), len(campaign.plan())
         interrupted(
             f"{done} of {counted(planned, 'run')} are done and stay in {folder}; the same command "
-            "goes on from there"
+            "continues"
         )
 
 
@@ -191,7 +198,7 @@ def _print(
     if state is not None and state.given_up:
         typer.echo(f"given up: {', '.join(state.given_up)}", err=True)
     if state is not None and state.left:
-        typer.echo(f"{counted(state.left, 'run')} left; the same command goes on", err=True)
+        typer.echo(f"{counted(state.left, 'run')} left; the same command continues", err=True)
 
 
 def _document(

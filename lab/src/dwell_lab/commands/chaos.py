@@ -19,27 +19,25 @@ MARK = ".dwell-chaos"
 
 
 def chaos(
-    cell: Annotated[
-        Path | None, argument("[CELL]", "Cell file; a light cell if not given.")
-    ] = None,
-    minutes: Annotated[float | None, typer.Option(min=0.1, help="No fault begins later.")] = None,
-    faults: Annotated[int | None, typer.Option(min=1, help="How many.")] = None,
+    cell: Annotated[Path | None, argument("CELL", "Cell file; a light cell without it.")] = None,
+    minutes: Annotated[float | None, option("N", "Start no fault later.", min=0.1)] = None,
+    faults: Annotated[int | None, option("N", "Number of faults.", min=1)] = None,
     seed: Seed = 1,
     only: Annotated[
-        int | None, typer.Option(min=1, help="Nothing but this fault of the timeline.")
+        int | None, option("N", "Inject only this fault of the timeline.", min=1)
     ] = None,
     out: Annotated[
-        Path | None, option("FOLDER", "Where logs, runs and what was seen go, to be kept.")
+        Path | None, option("FOLDER", "Folder for logs, runs and observations, which are kept.")
     ] = None,
     hosts: Annotated[
-        bool, flag("--hosts", "Every node on a host of its own of a testbed; needs root.")
+        bool, flag("--hosts", "Give each node its own host of a testbed; needs root.")
     ] = False,
     as_json: Json = False,
 ) -> None:
     """Inject faults into a cell on this machine; check promises.
 
-    Processes are killed and frozen, links cut, clocks set wrong, CPUs and disks taken away, one
-    after the other, by a seed, for two minutes if nothing else is said.
+    One fault after another, drawn by the seed: processes are killed and frozen, links cut, clocks
+    changed, CPUs and disks taken away. It takes two minutes without --minutes and --faults.
     """
     from dwell.live.local.playing import interruptible, make_folder
     from dwell_lab.chaos.disk import unmount_leftovers
@@ -74,7 +72,7 @@ def chaos(
             typer.echo(line)
     if out is None:
         if result.wrong:
-            typer.echo(f"what there was is kept in {folder}", err=True)
+            typer.echo(f"logs and runs are kept in {folder}", err=True)
         else:
             shutil.rmtree(folder, ignore_errors=True)
     if result.wrong:

@@ -44,7 +44,8 @@ def run(
     seconds: Seconds = None,
     seed: Seed = 1,
     out: Annotated[
-        Path | None, option("FOLDER", "Where logs and the run go; below testbed-out if not given.")
+        Path | None,
+        option("FOLDER", "Folder for logs and the run.", default="below testbed-out"),
     ] = None,
     name: TestbedName = "bed",
     jobs: Annotated[bool, flag("--jobs", "Keep every job of the run.")] = False,
@@ -52,7 +53,7 @@ def run(
 ) -> None:
     """Run a scenario once, then remove everything. Needs root.
 
-    60 windows, if neither --windows nor --seconds is given.
+    The run has 60 windows without --windows and --seconds.
     """
     import dwell
     from dwell_lab.testbed.run import length_s, run_once
@@ -118,11 +119,9 @@ def _lines(totals: dict[str, Any]) -> str:
 
 @testbed.command()
 def doctor(
-    cells: Annotated[
-        list[Path] | None, argument("CELL...", "Cell files to have checked too.")
-    ] = None,
+    cells: Annotated[list[Path] | None, argument("CELL", "Cell files to check as well.")] = None,
     watch: Annotated[
-        float, option("SECONDS", "Watch for so long whether the machine stands still.", min=0)
+        float, option("SECONDS", "Time to watch for pauses of the machine.", min=0)
     ] = 0.0,
     as_json: Json = False,
 ) -> None:
@@ -152,8 +151,8 @@ def calibrate(
     runs: Annotated[
         list[Path] | None,
         argument(
-            "RUN...",
-            "Folders of runs with their jobs: baseline, and single-task stress. Without any, "
+            "RUN",
+            "Folders of runs with their jobs: baseline and single-task stress. Without them, "
             "the baseline is run under every candidate.",
         ),
     ] = None,
@@ -162,12 +161,12 @@ def calibrate(
     seed: Seed = 1,
     name: TestbedName = "calibrate",
     real: Annotated[
-        bool, flag("--real-links", "Links are real: their delays are what was measured.")
+        bool, flag("--real-links", "Links are real: take the measured delays as theirs.")
     ] = False,
 ) -> None:
     """Write measured tasks and links into a cell file.
 
-    A run that is made takes 120 s, if neither --windows nor --seconds is given.
+    Each new run takes 120 s without --windows and --seconds.
     """
     from dwell_lab.testbed.calibrate import calibrate as write_calibrated
     from dwell_lab.testbed.calibrate import make_runs

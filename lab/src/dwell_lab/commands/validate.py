@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 
 
 def validate(
-    runs: Annotated[list[Path], argument("RUN...", "Folders of runs that were measured.")],
+    runs: Annotated[list[Path], argument("RUN", "Folders of measured runs.")],
     cell: Annotated[Path, option("FILE", "Calibrated cell file (YAML).")],
     out: Annotated[
-        Path | None, option("FOLDER", "Where page and table go; validations/CELL if not given.")
+        Path | None, option("FOLDER", "Folder for page and table.", default="validations/CELL")
     ] = None,
     seeds: Annotated[
         int, option("N", "Seeds 1 to N of every run.", min=2, callback=require_few)
@@ -41,8 +41,8 @@ def validate(
         list[Path] | None,
         option(
             "RUN",
-            "A run that the cell was calibrated from, besides those that the file "
-            "CELL.calibration.json beside it names; may be repeated.",
+            "Another run that the cell was calibrated from, in addition to the runs listed in "
+            "CELL.calibration.json; may be repeated.",
         ),
     ] = None,
     traces: Traces = None,
@@ -99,8 +99,8 @@ def _sidecar(cell: Path) -> tuple[list[str], Usual]:
         return [Path(str(name)).name for name in document.get("runs", [])], usual
     except (OSError, ValueError, AttributeError, TypeError) as error:
         raise RunError(
-            f"{file}: cannot be read ({error}); it says in `runs` from which runs the cell was "
-            "calibrated"
+            f"{file}: cannot be read ({error}); its key `runs` lists the runs that the cell was "
+            "calibrated from"
         ) from None
 
 

@@ -81,10 +81,10 @@ def _sections(measured: MeasuredCampaign, blocks: PolicyBlocks) -> Iterator[Sect
     )
     yield Section("More numbers", [blocks.more()], folded=True)
     if not measured.profiles.is_empty():
-        yield Section("What jobs took", [_profiles(measured)])
+        yield Section("Times of jobs", [_profiles(measured)])
     if not measured.links.is_empty():
-        yield Section("What messages took", [_delays(measured), _links(measured)])
-    yield Section("What was run when", [_log(measured), *_failed(measured)])
+        yield Section("Delays of messages", [_delays(measured), _links(measured)])
+    yield Section("Log of runs", [_log(measured), *_failed(measured)])
     method = blocks.method(
         estimators=", ".join(
             f"{shown_contender(name)}: {estimator}"
@@ -92,7 +92,7 @@ def _sections(measured: MeasuredCampaign, blocks: PolicyBlocks) -> Iterator[Sect
             if name not in blocks.problem.candidates
         ),
         order="each repetition is a complete random order of all policies in all scenarios; "
-        "those of a scenario and repetition follow each other",
+        "the runs of a scenario and repetition follow each other",
         intervals="95 %, two-sided, over repetitions, by the studentised bootstrap from 4 on, "
         "by Student’s t below",
     )
@@ -126,7 +126,7 @@ def _question_table(asked: CampaignQuestion, blocks: PolicyBlocks, place: int) -
         rows,
         Text("scenario", "", "scenario"),
         "Paired by repetition; sign-flip tests, Holm over all comparisons of a metric. Least p: "
-        f"the smallest that so few repetitions and so many comparisons allow.{said}",
+        f"the smallest p that this number of repetitions and comparisons allows.{said}",
         blocks.palette,
     )
 
@@ -169,13 +169,13 @@ def _profiles(measured: MeasuredCampaign) -> Table:
             Measure(f"{kind}_ms_p50", "median", "ms", decimals=2),
             Measure(f"{kind}_ms_p95", "95 %", "ms", decimals=2),
         ]
-    columns.append(Measure("told_ms", "the cell says", "ms", decimals=2))
+    columns.append(Measure("told_ms", "in the cell file", "ms", decimals=2))
     return Table(
         "profiles",
         "Compute profiles",
         columns,
         measured.profiles.to_dicts(),
-        caption="Jobs of the baseline after the warm-up, those of shadows left out. Means over "
+        caption="Jobs of the baseline after the warm-up, without shadows. Means over "
         "runs with 95 % intervals; percentiles of all jobs together.",
     )
 
@@ -184,7 +184,7 @@ def _delays(measured: MeasuredCampaign) -> Figure:
     frame = measured.delays.select("scenario", "share", policy="link", value="delay_ms")
     frame = named(frame, ("scenario",))
     links = ramp_styles(str(name) for name in frame["policy"].unique(maintain_order=True))
-    draw = cumulative(frame, links, ("what a message took (ms)", "messages within"))
+    draw = cumulative(frame, links, ("delay of a message (ms)", "messages within"))
     return Figure("delays", "Link delays by scenario", {"rows": frame}, draw)
 
 
@@ -204,8 +204,8 @@ def _links(measured: MeasuredCampaign) -> Table:
         columns,
         measured.links.to_dicts(),
         Text("scenario", "", "scenario"),
-        "From the end of the job that sent a message until it was there, by the clocks of both "
-        "nodes. Messages that were lost are not in it.",
+        "From the end of the sending job to the arrival, by the clocks of both nodes; without lost "
+        "messages.",
     )
 
 

@@ -78,7 +78,7 @@ def validation_page(validation: Validation, *, sections: int | None = None) -> P
     runs = sum(len(group.runs) for group in validation.groups)
     minutes = sum(group.minutes for group in validation.groups)
     return Page(
-        title=f"Predicted beside measured: {validation.problem.name}",
+        title=f"Predicted and measured: {validation.problem.name}",
         subtitle=f"{counted(len(validation.groups), 'group')} of a scenario and a policy, "
         f"{counted(runs, 'run')}, {write_number(minutes)} minutes that count, each run simulated "
         f"{counted(validation.seeds, 'time')}",
@@ -115,19 +115,19 @@ def _sections(validation: Validation) -> Iterator[Section]:
     names = [name for group in validation.groups for name in group.runs]
     allowed = f"{percent(L95_ALLOWED)} of L95, {100 * POINTS_ALLOWED:g} points of V_D, "
     terms = {
-        "met, missed": "the whole interval of the error is within what is allowed, or beyond it; "
-        "else open",
+        "met, missed": "the complete interval of the error is within the allowed error, or "
+        "beyond it; otherwise open",
         "allowed": f"{allowed}{100 * USE_ALLOWED:g} points of U",
-        "explained": "V_D is not met, L95 is, and the measured V_D lies between those of the "
-        "predicted latencies times 0.9 and times 1.1",
-        "intervals": f"95 %, of {DRAWS} resamples: of runs, and of blocks of windows within them; "
-        "of simulations; of errors, both",
+        "explained": "V_D is not met and L95 is; predicted latencies times 0.9 give a V_D below "
+        "the measured one, times 1.1 one above it",
+        "intervals": f"95 %, from {DRAWS} resamples: measured intervals resample runs and blocks "
+        "of windows within them, predicted intervals simulations, intervals of errors both",
         "enough": f"{LEAST_MINUTES:g} minutes measured",
         "sum of means": "mean time of every task and message along the longest path",
         "runs": ", ".join(names),
         "versions": ", ".join(f"{name} {one}" for name, one in validation.versions.items()),
     }
-    yield Section("What this is", [Definitions({**cell_definitions(validation.problem), **terms})])
+    yield Section("Terms", [Definitions({**cell_definitions(validation.problem), **terms})])
 
 
 def _palette(validation: Validation) -> Palette:
@@ -180,7 +180,7 @@ def _goals(validation: Validation) -> Table:
         Text("word", "in the worst group", "word"),
         *(Measure(word, word, decimals=0) for word in ORDER if word),
     ]
-    return Table("goals", "Does the simulator predict what this cell shows?", columns, rows)
+    return Table("goals", "Does the simulator predict this cell?", columns, rows)
 
 
 def _verdicts(validation: Validation, *, compact: bool = False) -> Table:
@@ -232,7 +232,7 @@ def _verdicts(validation: Validation, *, compact: bool = False) -> Table:
     if compact:
         columns = [one for one in columns if one[0] in SHORT]
     caption = (
-        "L95: of all cycles together, ∞ where more than 5 % are lost. Placed: the dominant "
+        "L95 of all cycles together, ∞ if more than 5 % are lost. Placed: the dominant "
         "placement. ATP is our reconstruction."
     )
     return _table(validation, "verdicts", "Every group", columns, rows, caption)
@@ -283,8 +283,8 @@ def _over(validation: Validation) -> Figure:
             ],
             "resolve": {"legend": {"color": "shared", "shape": "shared"}},
         },
-        "A mark is a group, the bar through it the interval of what was measured. Shaded: what is "
-        "allowed. Dashed: deadline.",
+        "One mark per group; its bar is the measured interval. Shaded: allowed error. Dashed: "
+        "deadline.",
     )
 
 
@@ -393,10 +393,10 @@ def _rates(validation: Validation) -> Table:
         Measure("factor", "factor", decimals=2),
     ]
     caption = (
-        "V_D if every predicted latency were as much shorter or longer as L95 may be off; and the "
-        "factor by which the predicted latencies would give the measured V_D."
+        "V_D if every predicted latency were shorter or longer by the allowed error of L95; and "
+        "the factor on the predicted latencies that gives the measured V_D."
     )
-    return _table(validation, "rates", "How much lies at the deadline", columns, rows, caption)
+    return _table(validation, "rates", "Latencies near the deadline", columns, rows, caption)
 
 
 def _parts(validation: Validation) -> Table:
@@ -432,7 +432,7 @@ def _jobs(validation: Validation) -> Table:
         columns += [
             Measure("core_ms", "core time", "ms", decimals=2),
             Measure("core_p95_ms", "P95", "ms", decimals=2),
-            Measure("cell_ms", "the cell says", "ms", decimals=2),
+            Measure("cell_ms", "in the cell file", "ms", decimals=2),
             Measure("cell_p95_ms", "P95", "ms", decimals=2),
         ]
     return _table(
@@ -441,8 +441,8 @@ def _jobs(validation: Validation) -> Table:
         "By task and node",
         columns,
         validation.jobs.to_dicts(),
-        "Of the runs that kept their jobs: from a job’s start to its end. Core time: what the "
-        "job’s own thread used. Jobs of shadows are among them.",
+        "Runs that kept their jobs: from a job’s start to its end, shadows included. Core time: "
+        "CPU time of the job’s own thread.",
     )
 
 

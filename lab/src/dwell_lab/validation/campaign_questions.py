@@ -1,8 +1,8 @@
-"""RQ1 and RQ2 asked of what was measured, as `reproduction` asks them of what is simulated.
+"""RQ1 and RQ2 for measured runs, as `reproduction` answers them for simulated runs.
 
-The same differences, tests and families; a repetition stands for a seed. Repetitions on a testbed
-are few: from n pairs a sign-flip test gives no p below 2 / 2^n, so that for m comparisons nothing
-can be shown below some n, whatever is measured. Every row says the least p that it can have.
+Differences, tests and families are the same; a repetition replaces a seed. Repetitions on a testbed
+are few: a sign-flip test of n pairs gives no p below 2 / 2^n. With m comparisons and few pairs no
+result can be significant. Each row has its smallest possible p.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 Answer: TypeAlias = Literal["yes", "no", "in part", "not shown"]
 
 METRICS = ("violation_rate", "l95_ms", "u_robot", "cost")
-#: The policies that place T2 and T3 together, and the one that moves one stage.
+#: The policies that place T2 and T3 together, and the policy that moves one stage.
 TOGETHER, SINGLE = ("dtp", "cusum"), "atp"
-#: The placement with T2 on E and T3 on R2, and those that binary reversion knows.
+#: The placement with T2 on E and T3 on R2, and the placements of binary reversion.
 HYBRID, BINARY = "HYB", ("LOC", "SO")
 RQ1 = (
     "RQ1: Does concurrent T2+T3 placement reduce V_D further than single-stage ATP under CPU "
@@ -70,7 +70,7 @@ def questions(measured: MeasuredCampaign) -> tuple[CampaignQuestion, ...]:
 
 
 def stress_scenarios(problem: Problem, names: Sequence[str]) -> tuple[str, ...]:
-    """Return the scenarios in which nothing but CPUs is disturbed."""
+    """Return the scenarios that disturb CPUs only."""
     return tuple(
         name
         for name in names

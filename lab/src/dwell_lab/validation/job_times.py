@@ -29,7 +29,7 @@ TIMES = ("measured", "predicted", "core", "cell")
 
 
 def jobs_of(run: Run, scenario: str, policy: str, number: int) -> pl.DataFrame:
-    """Return the finished jobs of the cycles that count, those of shadows left out.
+    """Return the finished jobs of the counted cycles, without shadows.
 
     Parameters
     ----------
@@ -62,20 +62,20 @@ def jobs_of(run: Run, scenario: str, policy: str, number: int) -> pl.DataFrame:
 
 
 def profiles_of(jobs: pl.DataFrame | None, problem: Problem) -> pl.DataFrame:
-    """Return what the jobs of every task took on every node, in the baseline.
+    """Return the times of each task's jobs on each node in the baseline.
 
     Parameters
     ----------
     jobs : DataFrame or None
-        Jobs of all runs; None where no run kept them.
+        Jobs of all runs; None if no run kept them.
 
     Returns
     -------
     DataFrame
         ``task``, ``node``, ``jobs``, ``runs``; ``wall_ms`` from start to end, and ``cpu_ms``, the
-        core time (null where it was not measured): each the mean over runs of their means, with its
+        core time (null if it was not measured): each the mean over runs of their means, with its
         interval (``_low``, ``_high``), and ``_p5``, ``_p50``, ``_p95`` of all jobs; ``told_ms``,
-        what the cell says of its mean.
+        the mean in the cell file.
     """
     import polars as pl
 
@@ -101,7 +101,7 @@ def profiles_of(jobs: pl.DataFrame | None, problem: Problem) -> pl.DataFrame:
 
 
 def _spread(jobs: pl.DataFrame, kind: str) -> dict[str, float | None]:
-    """Mean over runs, its interval, and percentiles of what jobs took, milliseconds."""
+    """Return the mean over runs with its interval, and percentiles of job times, milliseconds."""
     import polars as pl
 
     known = jobs.filter(pl.col(f"{kind}_ns").is_not_null())
@@ -116,10 +116,9 @@ def _spread(jobs: pl.DataFrame, kind: str) -> dict[str, float | None]:
 
 
 def links_of(jobs: pl.DataFrame | None, problem: Problem) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Return what messages took, from the end of the job that sent one until it was there.
+    """Return delays of messages, from the end of the sending job to the arrival.
 
-    Only of flows into tasks with a single input: what becomes ready when the last of several inputs
-    is there says nothing of the others.
+    Only flows into tasks with one input count: with several inputs only the last arrival is known.
 
     Returns
     -------
@@ -275,7 +274,7 @@ def finished_jobs(run: Run, window_cycles: int) -> pl.DataFrame:
 
 
 def _drawn(problem: Problem, task: str, node: str) -> Floats:
-    """Execution times that the cell says a job has (ms)."""
+    """Execution times of a job, drawn from the cell file (ms)."""
     rng = np.random.default_rng(1)
     one = problem.pipeline.tasks[task]
     values = one.on[node].exec_ms.marginal(rng, DRAWN)

@@ -1,8 +1,8 @@
-"""Judged predictions: predicted figures beside measured ones, and whether they are good enough.
+"""Judged predictions: predicted and measured figures, and whether their errors are allowed.
 
-A goal is `met` where the whole 95 % interval of the prediction's error lies within what is
-allowed, `missed` where the whole of it lies beyond, and `open` elsewhere: more runs would tell.
-The error's interval comes from resampling the measured and the simulated runs independently.
+A goal is `met` if the complete 95 % interval of the prediction's error is within the allowed error,
+`missed` if it is completely beyond, else `open`: more runs would decide. The interval comes from
+resampling the measured and the simulated runs independently.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Outcome: TypeAlias = Literal["met", "explained", "open", "missed", ""]
 L95_ALLOWED = 0.10
 POINTS_ALLOWED = 0.02
 USE_ALLOWED = 0.05
-#: From what is fine to what is not.
+#: From good to bad.
 ORDER: tuple[Outcome, ...] = ("", "met", "explained", "open", "missed")
 UNKNOWN = Interval(math.nan, math.nan, math.nan)
 
@@ -44,13 +44,13 @@ class Judged:
     error : Interval
         The prediction's error: relative for ``l95_ms``, elsewhere the difference.
     allowed : float
-        Largest error that is good enough; NaN where nothing is asked.
+        Largest allowed error; NaN without a goal.
     verdict : {"met", "explained", "open", "missed", ""}
-        Empty where nothing is asked.
+        Empty without a goal.
     baseline : float
-        Prediction of the sum of means; NaN where it makes none.
+        Prediction of the sum of means; NaN if it makes none.
     note : str
-        Remark that belongs to the verdict.
+        Remark on the verdict.
     """
 
     metric: str
@@ -64,7 +64,7 @@ class Judged:
 
 
 def judge(error: Interval, allowed: float) -> Outcome:
-    """Whether an error is shown to be within what is allowed, or shown to be beyond it."""
+    """Return whether an error is shown to be within the allowed error, or beyond it."""
     if not error.known:
         return "open"
     if -allowed <= error.low and error.high <= allowed:
@@ -73,9 +73,9 @@ def judge(error: Interval, allowed: float) -> Outcome:
 
 
 def within(value: float, resampled: Floats) -> Interval:
-    """Return a value with the interval that its resamples give."""
+    """Return a value with the interval of its resamples."""
     low, high = ends(resampled)
-    # Rounding, and distributions kept at points only, may put a value beside its resamples.
+    # Rounding, and distributions kept at points only, may put a value outside its resamples.
     return Interval(value, min(low, value), max(high, value))
 
 
@@ -178,7 +178,7 @@ class GroupJudge:
         both, note = self._both("l95_ms"), ""
         error = both.relative_error
         if math.isinf(both.measured) and math.isinf(both.predicted):
-            # More than 5 % are lost, as predicted: what is left to judge is what windows showed.
+            # More than 5 % are lost, as predicted: only the L95 of windows can be judged.
             error = self._both("window_l95_ms").relative_error
             note = "more than 5 % of the cycles are lost: judged by the mean of windows"
         return Judged(
@@ -221,7 +221,7 @@ class GroupJudge:
     def _violations(self, l95: Outcome) -> Judged:
         judged = self._difference("violation_rate")
         measured, error = judged.measured, judged.error
-        # What was not seen is not impossible.
+        # Zero observed misses bound the rate, but do not prove it to be zero.
         most = rule_of_three(self.measured.windows)
         if measured.value == 0:
             measured = measured._replace(high=most)
@@ -271,7 +271,7 @@ class GroupJudge:
         )
 
     def _better(self) -> Judged:
-        """Judge whether the prediction is nearer to what was measured than the sum of means."""
+        """Judge whether the prediction is closer to the measurement than the sum of means is."""
         measured, predicted, seen, simulated = self._both("l95_ms")
         sums = np.full_like(seen, self.sum_ms)
         ours, theirs = np.abs(relative(simulated, seen)), np.abs(relative(sums, seen))

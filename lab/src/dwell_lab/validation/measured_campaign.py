@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasuredCampaign:
-    """A campaign, read.
+    """The contents of a campaign's folder.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ class MeasuredCampaign:
     estimators : mapping of str to str
         By policy.
     kinds : frozenset of str
-        ``live``, or ``simulated`` where runs were simulated in place of the testbed's.
+        ``live``, or ``simulated`` if the runs were simulated.
     where : str
         ``testbed``, or the inventory.
     seconds : float
@@ -48,17 +48,17 @@ class MeasuredCampaign:
     planned : int
         Runs of the campaign, done or not.
     log : DataFrame
-        One row a run that is done, in their order: ``place``, ``repetition``, ``scenario``,
+        One row per finished run, in their order: ``place``, ``repetition``, ``scenario``,
         ``policy``, ``attempt``, ``began_unix_s``, ``idle``, ``waited_s``, ``windows``, ``excluded``
         (the last two after the warm-up).
     failed : DataFrame
-        One row an attempt that failed: ``scenario``, ``policy``, ``repetition``, ``attempt``,
+        One row per failed attempt: ``scenario``, ``policy``, ``repetition``, ``attempt``,
         ``outcome``, ``reason``.
     profiles : DataFrame
         One row per task and node: times of its jobs in the baseline, see
         `dwell_lab.validation.job_times`.
     links : DataFrame
-        One row a scenario, link and flow: what its messages took.
+        One row per scenario, link and flow: delays of its messages.
     delays : DataFrame
         Distribution of these: ``share`` of the messages within ``delay_ms``, by ``scenario`` and
         ``link``.
@@ -82,7 +82,7 @@ class MeasuredCampaign:
 
     @property
     def repetitions(self) -> int:
-        """Repetitions of which all runs are done."""
+        """Number of complete repetitions."""
         pairs = len(self.comparison.scenarios) * len(self.comparison.policies)
         counts = self.log.group_by("repetition").len()
         return int((counts["len"] == pairs).sum())
@@ -162,7 +162,7 @@ def read_measured(folder: Path) -> MeasuredCampaign:
 def without_excluded(run: Run, problem: Problem) -> Run:
     """Return a run without the windows that were measured under pressure, and their cycles.
 
-    Ages at the actuator and tracking errors are of no use in what is left: they go on through the
+    Ages at the actuator and tracking errors of the rest are invalid: they accumulate across the
     gaps.
 
     """

@@ -1,7 +1,7 @@
-"""A run that was measured, read for validation, and the simulations of what it should have shown.
+"""A measured run, read for validation, and its simulations.
 
-A run may be compared with a cell if it is a run of that cell: what calibration changes (execution
-times, delays, rates, payloads) may differ, what the cell is made of may not.
+A run may be compared with a cell if it is a run of that cell. Values that calibration changes
+(execution times, delays, rates, payloads) may differ; tasks, nodes, links and flows may not.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 Document: TypeAlias = Mapping[str, Any]
 
-#: What calibration does not change of nodes and tasks.
+#: Keys of nodes and tasks that calibration keeps.
 MADE_OF = {
     "nodes": ("tier", "cores", "scheduler", "accelerators", "quota"),
     "tasks": ("input",),
@@ -49,8 +49,8 @@ class MeasuredRun:
     name : str
         Name of the run's folder.
     problem : Problem
-        The calibrated cell with this run's warm-up, its scenario as it was played and, where it
-        never moved, its placement.
+        The calibrated cell with this run's warm-up, its scenario as recorded and, if it never
+        moved, its placement.
     policy : str
         A policy's name, or a candidate's for the placement that never moves.
     windows : int
@@ -60,9 +60,9 @@ class MeasuredRun:
     jobs : bool
         Whether the run kept its jobs.
     excluded : frozenset of int
-        Windows that are left out: those of its record and, of a policy that moves, those after them
-        in which what was decided on them holds. Whether it moved there makes no difference: who
-        looks for that would choose by the result.
+        Windows that are left out: the excluded windows of its record and, under a policy that
+        moves, the later windows that depend on decisions in them. They are left out with and
+        without a move, so the result does not select them.
     """
 
     name: str
@@ -83,15 +83,15 @@ class MeasuredRun:
 
 
 def read_measured(name: str, run: Run, problem: Problem, usual: Usual | None = None) -> MeasuredRun:
-    """Find out what a run is a run of, and refuse one that the cell cannot predict.
+    """Return a run's cell, scenario and policy; refuse a run that the cell cannot predict.
 
     Parameters
     ----------
     problem : Problem
         The calibrated cell.
     usual : Usual, optional
-        How fast its CPUs were; where the run says it, too, the cell is predicted on CPUs as fast
-        as the run's.
+        Speeds of the CPUs at the calibration; if the run has them too, the prediction is for CPUs
+        of the run's speed.
 
     Raises
     ------
@@ -148,7 +148,7 @@ def read_measured(name: str, run: Run, problem: Problem, usual: Usual | None = N
 
 
 def excluded_windows(meta: Mapping[str, Any]) -> frozenset[int]:
-    """Return the windows that a run's record says to leave out.
+    """Return the excluded windows of a run's record.
 
     Parameters
     ----------
@@ -204,7 +204,7 @@ def _other_cell(theirs: Document, own: Document) -> Iterator[str]:
 
 
 def _allowance(value: Any) -> Any:
-    """Leave out of a quota how the kernel keeps to it, which is for the model to say."""
+    """Return a quota without `slack_ms` and `tick_ms`, which belong to the model."""
     if not isinstance(value, Mapping):
         return value
     return {key: entry for key, entry in value.items() if key not in ("slack_ms", "tick_ms")}
@@ -271,11 +271,11 @@ def _as_played(
     name: str,
     run: Run,
 ) -> Scenario:
-    """Return the cell's scenario with the times at which its disturbances were played."""
+    """Return the cell's scenario with the recorded times of its disturbances."""
     items, written = problem.scenario(name), own["scenarios"].get(name, [])
     if run.played is None:
         if theirs["scenarios"].get(name, []) != written:
-            raise RunError(f"scenario {name!r} was another one in the run than it is in the cell")
+            raise RunError(f"scenario {name!r} differs between the run and the cell")
         return items
     left = [(item, _timeless(item)) for item in items]
     end_s = _end_s(run.cycles)
@@ -287,7 +287,7 @@ def _as_played(
             raise RunError(f"{told} was played, which scenario {name!r} does not have")
         if match[0].episodes is None:
             left.remove(match)
-        # What was on to the end of a run had no end within it.
+        # A disturbance that lasted to the end of the run has no end in it.
         for_s = math.inf if item.end_s >= end_s else item.for_s
         own_item = replace(match[0], at_s=item.at_s, for_s=for_s, ramp_s=item.ramp_s)
         found.append(replace(own_item, episodes=None))
@@ -301,7 +301,7 @@ def _timeless(item: Disturbance) -> dict[str, Any]:
 
 
 def _end_s(cycles: pl.DataFrame) -> float:
-    """When the last cycle was released, less what two clocks' roundings may differ by."""
+    """Release of the last cycle (s), less the rounding of two clocks."""
     return float(np.max(cycles["release_ns"].to_numpy(), initial=0)) / 1e9 - 0.1
 
 
@@ -309,7 +309,7 @@ def _end_s(cycles: pl.DataFrame) -> float:
 
 
 class Unit(NamedTuple):
-    """One simulation: the group, the run in it, and how many of that run went before."""
+    """One simulation: the group, the run in it, and its number among that run's simulations."""
 
     group: int
     run: int
@@ -318,7 +318,7 @@ class Unit(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Simulated:
-    """The part of a simulation that counts, and its jobs where they were asked for."""
+    """The counted part of a simulation, and its jobs if they are needed."""
 
     piece: Piece
     jobs: pl.DataFrame | None
@@ -326,7 +326,7 @@ class Simulated:
 
 @dataclass(frozen=True, slots=True)
 class Simulator:
-    """Simulates the runs of groups, each `seeds` times, in whatever process."""
+    """Simulates the runs of groups, each `seeds` times, in any process."""
 
     groups: tuple[tuple[MeasuredRun, ...], ...]
     seeds: int
@@ -346,19 +346,19 @@ class Simulator:
         from dwell.sim import simulate
 
         one = self.groups[unit.group][unit.run]
-        # The first of a run keeps its jobs: they are many.
+        # Only a run's first simulation keeps its jobs, as they are many.
         jobs = one.jobs and unit.step == 0
         run = simulate(
             one.problem,
             scenario=one.scenario,
             policy=one.policy,
             estimator=one.estimator,
-            # No two simulations of a group are the same, so that they are independent.
+            # Different seeds make the simulations of a group independent.
             seed=unit.run * self.seeds + unit.step + 1,
             windows=one.windows,
             jobs=jobs,
             guard=one.guard,
         )
-        # Where orders take time a simulation may be some windows shorter than what it is of.
+        # If orders take time, a simulation may be some windows shorter than its run.
         piece = piece_of(run, one.problem, one.excluded)
         return Simulated(piece, finished_jobs(run, one.problem.window_cycles) if jobs else None)

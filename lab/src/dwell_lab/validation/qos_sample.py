@@ -1,7 +1,7 @@
 """QoS sample: cycles and windows of several runs, pooled, and as units that can be resampled.
 
-A unit is a window of a measured run, or a whole simulated run. Every figure is a function of how
-often each unit counts: once each for the figure itself, at random for its interval.
+A unit is a window of a measured run, or a complete simulated run. Every figure is a function of the
+units' weights: 1 for the figure itself, random for its interval.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ POINTS = 4000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Piece:
-    """The part of a run that counts: without warm-up and excluded windows.
+    """The counted part of a run: without warm-up and excluded windows.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class Piece:
         As in the run.
     cycles : DataFrame
         Cycles with the columns needed, and ``place``, the row of their window in `windows`.
-        Cycles between two windows belong to the one before them.
+        Cycles between two windows belong to the earlier window.
     migrations : int
         Migrations by the policy, after the warm-up.
     """
@@ -59,7 +59,7 @@ class Piece:
 
 
 def piece_of(run: Run, problem: Problem, excluded: Collection[int] = ()) -> Piece:
-    """Take from a run what counts.
+    """Return the counted part of a run.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def piece_of(run: Run, problem: Problem, excluded: Collection[int] = ()) -> Piec
     Raises
     ------
     SimulationError
-        If nothing is left.
+        If no window is left.
     """
     import polars as pl
 
@@ -96,16 +96,16 @@ class QosSample:
     latency_ms : float64 array, shape (cycles,)
         Ascending; infinite for cycles that never finished.
     late : bool array, shape (cycles,)
-        Whether each missed though it took no longer than D: its window was closed by then.
+        Whether a cycle missed with a latency of at most D, because its window had ended.
     lengths : tuple of int
         Units of each run.
     grid_ms : float64 array, shape (points,)
     counts : float64 array, shape (units, points + 1)
-        Cycles of each unit up to each point and beyond the one before; the last: beyond all.
+        Cycles of each unit between the previous point and each point; the last: beyond all.
     sums : mapping of str to float64 array, shape (units, 2)
-        By figure: its sum over the unit, and over how many.
+        By figure: its sum over the unit, and the number of values.
     parts_ms : mapping of str to float
-        Mean over cycles that finished of the time spent computing, waiting and on the network.
+        Mean times of finished cycles for computing, waiting and the network.
     placed : mapping of str to int
         Cycles by candidate.
     """
@@ -130,7 +130,7 @@ class QosSample:
         pieces : sequence of Piece
             At least one.
         by_window : bool
-            Whether the windows are the units; the runs elsewhere.
+            Whether the units are windows; else they are runs.
         """
         import polars as pl
 
@@ -181,12 +181,12 @@ class QosSample:
 
     @property
     def dominant(self) -> str:
-        """The placement of most windows."""
+        """Placement of most windows."""
         names = [name for name in self.sums if name.startswith("share_")]
         return max(names, key=self.figure).removeprefix("share_")
 
     def figure(self, name: str) -> float:
-        """Return ``l95_ms``, or the mean of a figure of `sums`; NaN where there is none."""
+        """Return ``l95_ms``, or the mean of a figure of `sums`; NaN without values."""
         if name == "l95_ms":
             return self.l95_ms
         total, count = self.sums[name].sum(axis=0)
@@ -200,7 +200,7 @@ class QosSample:
         name : str
             A figure of `sums`, or ``l95_ms``.
         weights : float64 array, shape (draws, units)
-            How often each unit counts.
+            Weight of each unit.
         """
         if name == "l95_ms":
             return self._resampled_l95(weights)
@@ -217,18 +217,12 @@ class QosSample:
         return l95_ms
 
     def rate_if(self, factor: float) -> float:
-        """V_D, if every latency were `factor` times what it is."""
+        """Return V_D with all latencies multiplied by `factor`."""
         longer = self.latency_ms * factor > self.deadline_ms
         return float((longer | self.late).mean())
 
     def factor_for(self, rate: float) -> float:
-        """Return by what latencies would have to be multiplied for V_D to be `rate`.
-
-        Returns
-        -------
-        float
-            NaN where none does, or almost any: no cycle is to miss, or every one.
-        """
+        """Return the factor on latencies that gives a V_D of `rate`; NaN at 0 and at 1."""
         here = self.latency_ms[~self.late]
         wanted = round(rate * len(self.latency_ms)) - int(self.late.sum())
         if wanted <= 0 or wanted >= len(here):
@@ -237,19 +231,19 @@ class QosSample:
         return self.deadline_ms / float(at) if 0 < at < math.inf else math.nan
 
     def share_within(self, limits_ms: Floats) -> Floats:
-        """Share of the cycles that took no longer than each of several limits."""
+        """Return the share of cycles within each limit."""
         within = np.searchsorted(self.latency_ms, limits_ms, side="right")
         shares: Floats = within / len(self.latency_ms)
         return shares
 
     def share_near(self, allowed: float) -> float:
-        """Share of the cycles whose latency lies within `allowed` of the deadline."""
+        """Return the share of cycles with a latency within `allowed` (relative) of D."""
         low, high = self.deadline_ms * (1 - allowed), self.deadline_ms * (1 + allowed)
         return float(((self.latency_ms >= low) & (self.latency_ms <= high)).mean())
 
 
 def _grid(ascending: Floats) -> Floats:
-    """Return the values themselves, or quantiles of them where they are many."""
+    """Return the values themselves, or quantiles of many values."""
     values = np.unique(ascending[np.isfinite(ascending)])
     if len(values) <= POINTS:
         return values
@@ -264,7 +258,7 @@ def _counts(place: Ints, unit: Ints, units: int, points: int) -> Floats:
 
 
 def _sums(values: Floats, unit: Ints, units: int) -> Floats:
-    """Sum and number, by unit, of the values that are there."""
+    """Return the sum and number of values other than NaN, by unit."""
     there = ~np.isnan(values)
     total = np.bincount(unit[there], weights=values[there], minlength=units)
     return np.stack([total, np.bincount(unit[there], minlength=units)], axis=1)
@@ -292,7 +286,7 @@ def _window_sums(
 
 
 def _migrations(pieces: Sequence[Piece], of_window: Ints, units: int) -> Floats:
-    """Migrations a run: those of a run are spread over its windows."""
+    """Return migrations per run, spread over its windows."""
     heights = np.array([piece.windows.height for piece in pieces])
     moved = np.array([piece.migrations for piece in pieces], np.float64)
     share = np.repeat(1 / heights, heights)

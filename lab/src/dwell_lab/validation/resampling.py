@@ -1,11 +1,10 @@
-"""Resampling runs and stretches of windows: what measured figures could as well have been.
+"""Resampling of runs and blocks of windows, for intervals of measured figures.
 
-Windows that follow each other are not independent, and neither are those of one run: what the
-machine was up to lasts longer. So a resample takes runs with replacement, and within each of them
-blocks of consecutive windows (the moving block bootstrap [1], round the end of the run, so that
-every window is as likely as any other [2]). With few runs the first step alone would see too
-little of what differs between them, and the second adds what a run of another hour would have
-shown; with one run there is only the second.
+Consecutive windows are not independent, nor are the windows of one run: the state of the machine
+lasts longer. A resample draws runs with replacement, and within each run blocks of consecutive
+windows (the moving block bootstrap [1], circular, which makes all windows equally likely [2]). With
+few runs the first step alone would underestimate the differences between runs; the second adds the
+variation within them. With one run only the second step remains.
 
 1. H. R. Künsch, The jackknife and the bootstrap for general stationary observations, *Annals of
    Statistics* 17(3), 1989. DOI 10.1214/aos/1176347265.
@@ -23,12 +22,12 @@ import numpy as np
 from dwell.model.number_arrays import Floats
 from dwell.study.intervals import CONFIDENCE, RESAMPLING_SEED
 
-#: So many that the quantiles of 2.5 % are order statistics of the resamples.
+#: With 999 resamples the quantiles of 2.5 % are order statistics.
 DRAWS = 999
 
 
 def block_windows(windows: int) -> int:
-    """Consecutive windows of a block: the cube root of a run's, rounded up, as theory has it."""
+    """Return the windows of a block: the cube root of a run's windows, rounded up."""
     return max(1, math.ceil(math.cbrt(windows) - 1e-9))
 
 

@@ -1,9 +1,9 @@
-"""The sum-of-means predictor: what a cell would do if nothing varied and nothing waited.
+"""The sum-of-means predictor: a cell without variation and without waiting.
 
 Every task takes its mean time on its node, every message its mean delay and the time its bytes
 take at the link's rate; the latency of a cycle is the longest path through the pipeline. A node's
-quota, and foreign threads that take their share, slow a task down by their mean. That is what one
-computes on the back of an envelope, and what a simulator has to do better than.
+quota, and foreign threads that take their share, slow a task down by their mean. A
+simulator has to predict better than this simple calculation.
 """
 
 from __future__ import annotations
@@ -59,14 +59,14 @@ def sum_of_means(
 def sums_of_shares(
     sums_ms: Mapping[str, float], cycles: Mapping[str, int], deadline_ms: float
 ) -> tuple[float, float]:
-    """L95 and V_D of cycles of several placements, each with the latency of its sum.
+    """Return L95 and V_D of cycles under several placements, each with its sum as latency.
 
     Parameters
     ----------
     sums_ms : mapping of str to float
         By candidate.
     cycles : mapping of str to int
-        How many cycles were measured under each: the predictor is told where they ran.
+        Measured cycles under each candidate; the predictor knows the placements.
 
     Returns
     -------
@@ -99,7 +99,7 @@ def _on(
 
 
 def _slow_down(node: Node, on: Iterable[tuple[Disturbance, float]]) -> float:
-    """Return the mean slow-down of a lone thread among foreign ones, each with the same share."""
+    """Return the mean slow-down of one thread among foreign threads with equal shares."""
     threads = sum(
         share * item.stress_threads for item, share in on if isinstance(item, NodeDisturbance)
     )

@@ -1,19 +1,19 @@
-"""Validation: what the simulator predicts for a cell, beside what runs of that cell measured.
+"""Validation: predictions of the simulator for a cell, and measurements of its runs.
 
-Runs of one scenario and policy are a group. For every run of a group the calibrated cell is
-simulated with as many windows, the same warm-up, the disturbances at the times at which they were
-played, and many seeds; windows that the run leaves out are left out of its simulations too.
+Runs of one scenario and policy are a group. For each run of a group the calibrated cell is
+simulated with the same number of windows, the same warm-up, the recorded times of disturbances, and
+many seeds. Windows that the run leaves out are left out of its simulations, too.
 
-What a prediction has to reach was set before anything was measured:
+The goals were set before the first measurement:
 
 * L95 within 10 %;
-* V_D within 2 percentage points, or explained by the error that L95 is allowed: the measured V_D
-  lies between those of the predicted latencies, all of them multiplied by 0.9 and by 1.1, and L95
-  itself is met. That can be where much of the latency's mass lies at the deadline;
+* V_D within 2 percentage points, or explained by the allowed error of L95: L95 is met, and the
+  measured V_D is between the V_D of the predicted latencies times 0.9 and times 1.1. That happens
+  if many latencies are close to the deadline;
 * U of every node within 5 percentage points;
 * the same dominant placement;
-* a smaller error of L95 than that of the sum-of-means predictor, and no larger one of V_D (but for
-  what is within 2 points for both).
+* a smaller error of L95 than the sum-of-means predictor's, and no larger error of V_D (errors
+  within 2 points count as equal).
 """
 
 from __future__ import annotations
@@ -44,39 +44,38 @@ if TYPE_CHECKING:
     from dwell.record import Run
     from dwell_lab.testbed.speeds import Usual
 
-#: Measured time of a group below which its verdicts say little.
+#: Least measured time of a group for reliable verdicts, minutes.
 LEAST_MINUTES = 5.0
 #: Number of simulations of each run.
 SEEDS = 20
-#: Simulations below which further processes take longer to begin than they save.
+#: Number of simulations from which further processes save more than their start costs.
 WORTH_SPREADING = 100
-#: What is judged in every group, in the order of tables; U is the worst of its nodes.
+#: Goals of every group, in the order of tables; U is the worst node's.
 GOALS = ("l95_ms", "violation_rate", "utilisation", "dominant", "sum_of_means")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Group:
-    """Runs of one scenario and policy, beside their prediction.
+    """Runs of one scenario and policy, with their prediction.
 
     Parameters
     ----------
     policy : str
-        With its estimator where it may move: ``dtp+corrected``.
+        With its estimator if it can move: ``dtp+corrected``.
     minutes : float
         Measured time that counts.
     excluded : int
-        Windows left out for a reason that the runs give.
+        Windows left out, with the runs' reasons.
     figures : mapping of str to Judged
-        By metric: ``l95_ms``, ``window_l95_ms`` (mean over windows of what the controller saw),
-        ``violation_rate``, ``u_NODE``, ``share_CANDIDATE``, ``migrations`` (of a run), and the
-        conditions ``dominant`` and ``sum_of_means``, whose numbers are shares of windows, and
-        L95 (ms).
+        By metric: ``l95_ms``, ``window_l95_ms`` (mean of the L95 that the controller saw),
+        ``violation_rate``, ``u_NODE``, ``share_CANDIDATE``, ``migrations`` (per run), and the
+        conditions ``dominant`` (shares of windows) and ``sum_of_means`` (L95, ms).
     dominant : tuple of str
         The placement of most windows: measured, and predicted.
     allowed_rates : tuple of float
         V_D of the predicted latencies times 0.9, and times 1.1.
     factor : float
-        By what the predicted latencies would have to be multiplied to give the measured V_D.
+        Factor on the predicted latencies that gives the measured V_D.
     """
 
     scenario: str
@@ -93,7 +92,7 @@ class Group:
 
     @property
     def short(self) -> bool:
-        """Whether less was measured than is asked for."""
+        """Whether the measured time is too short."""
         return self.minutes < LEAST_MINUTES
 
     def verdict(self, goal: str) -> Outcome:
@@ -110,7 +109,7 @@ class Group:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Validation(Displayed):
-    """Predictions beside measurements.
+    """Predictions and measurements.
 
     Parameters
     ----------
@@ -121,18 +120,18 @@ class Validation(Displayed):
     seeds : int
         Simulations of each run.
     table : DataFrame
-        One row a group and figure: ``scenario``, ``policy``, ``metric``, and ``measured``,
+        One row per group and figure: ``scenario``, ``policy``, ``metric``, and ``measured``,
         ``predicted`` and ``error`` with their ends (``_low``, ``_high``), ``allowed``,
         ``sum_of_means``, ``verdict``, ``note``. Rates and utilisations are shares, the error of
         L95 is relative, all others are differences.
     jobs : DataFrame
-        One row a group, task and node, of the runs that kept their jobs: how many ``jobs``, their
-        time from start to end (``measured_ms``, ``measured_p95_ms``, ``predicted_ms``,
-        ``predicted_p95_ms``), the core time where the runs know it (``core_ms``,
-        ``core_p95_ms``), and what the cell says it is (``cell_ms``, ``cell_p95_ms``).
+        One row per group, task and node of the runs that kept their jobs: number of ``jobs``,
+        their times from start to end (``measured_ms``, ``measured_p95_ms``, ``predicted_ms``,
+        ``predicted_p95_ms``), the core time if it was measured (``core_ms``, ``core_p95_ms``) and
+        the core time in the cell file (``cell_ms``, ``cell_p95_ms``).
     moves : DataFrame
-        One row a move of the measured runs: ``scenario``, ``policy``, ``run``, and what their
-        estimators said of it beside what was then seen, as of `predicted_moves`.
+        One row per move of the measured runs: ``scenario``, ``policy``, ``run``, and the estimated
+        and observed values of `predicted_moves`.
     versions : mapping of str to str
         Versions of the software that simulated, by package.
     """
@@ -167,7 +166,7 @@ def validate(
     processes: int | None = 1,
     progress: Progress | None = None,
 ) -> Validation:
-    """Set what a calibrated cell predicts beside what its runs measured.
+    """Compare the predictions of a calibrated cell with the measurements of its runs.
 
     Parameters
     ----------
@@ -178,15 +177,14 @@ def validate(
     seeds : int
         Simulations of every run.
     calibrated_from : sequence of str
-        Names of the runs from which the cell was made, or their `Run.run_id`; none of them may
-        be validated on.
+        Names or `Run.run_id` of the runs from which the cell was calibrated; they may not be
+        validated on.
     usual : Usual, optional
-        How fast the CPUs were when the cell was calibrated: runs are predicted on CPUs as fast as
-        theirs.
+        Speeds of the CPUs at the calibration; each run is predicted for CPUs of its own speed.
     processes : int, optional
-        How many to use; where None one a CPU, if there is enough to do.
+        Number of processes; None: one per CPU for enough simulations.
     progress : callable, optional
-        Takes how many simulations are done, and of how many.
+        Takes the number of finished simulations and their total.
 
     Returns
     -------
@@ -251,7 +249,7 @@ def _read(
     used: frozenset[str | None],
     usual: Usual | None,
 ) -> list[MeasuredRun]:
-    """Read every run; what is wrong with any of them is told at once."""
+    """Read every run; raise one error with all faults."""
     measured: list[MeasuredRun] = []
     faults: list[str] = []
     for name, run in named.items():
@@ -318,7 +316,7 @@ def _group(
 
 
 def _moves(one: MeasuredRun, run: Run) -> pl.DataFrame:
-    """Return the predicted moves of a run, behind what it is a run of."""
+    """Return the predicted moves of a run, after its labels."""
     import polars as pl
 
     labels = {"scenario": one.scenario, "policy": one.contender, "run": one.name}
@@ -329,7 +327,7 @@ def _moves(one: MeasuredRun, run: Run) -> pl.DataFrame:
 def _sums(
     mine: Sequence[MeasuredRun], own: Sequence[Piece], problem: Problem
 ) -> tuple[float, float]:
-    """L95 and V_D of the sum-of-means predictor, which is told where the cycles ran."""
+    """Return L95 and V_D of the sum-of-means predictor for the measured placements."""
     sums: dict[str, list[float]] = {}
     cycles: dict[str, int] = {}
     for one, piece in zip(mine, own, strict=True):

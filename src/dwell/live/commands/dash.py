@@ -33,19 +33,19 @@ def dash(
         Path | None,
         argument(
             "CELL|RUN|FLEET|FOLDER",
-            "Cell file of a cell that runs, or the folder of a run, of a fleet's runs, or of "
-            "several runs [default: ./cell.yaml]",
+            "Cell file of a live cell, or folder of a run, of a fleet's runs or of several runs "
+            "[default: ./cell.yaml]",
         ),
     ] = None,
     beside: Annotated[
-        Path | None, option("RUN", "Another run, to be shown on the same time line.")
+        Path | None, option("RUN", "Another run, shown on the same time line.")
     ] = None,
-    port: Annotated[int, option("P", "Of loopback; 0 takes a free one.", min=0, max=65_535)] = PORT,
+    port: Annotated[int, option("P", "Local port; 0 takes a free one.", min=0, max=65_535)] = PORT,
     no_browser: Annotated[
-        bool, flag("--no-browser", "Print the address only, and open no browser.")
+        bool, flag("--no-browser", "Print the address; open no browser.")
     ] = False,
     control: Annotated[
-        bool, flag("--control", "Let the page pin and drain; with keys, it takes an operator's.")
+        bool, flag("--control", "Let the page pin and drain; with keys, it needs an operator's.")
     ] = False,
     mcap: Annotated[
         Path | None,
@@ -56,7 +56,7 @@ def dash(
     ] = None,
     token: Annotated[
         Path | None,
-        option("FILE", "Where the page's token is kept, for Prometheus; made where there is none."),
+        option("FILE", "File with the page's token, for Prometheus; made if it is missing."),
     ] = None,
     keys: Keys = None,
     insecure: Insecure = False,
@@ -79,14 +79,13 @@ def dash(
             raise typer.BadParameter(f"--mcap: dwell report {run} --mcap {mcap} writes a run's")
         if fleet and beside is not None:
             raise typer.BadParameter(
-                f"--beside: {where} is a fleet, which is shown alone; two of its runs can stand "
-                "beside each other"
+                f"--beside: {where} is a fleet, which is shown alone; name two of its runs instead"
             )
         page: AbstractContextManager[Dash] = nullcontext(recorded_page(where, beside))
     elif beside is not None:
-        raise typer.BadParameter("--beside: a run stands beside a run, not beside a live cell")
+        raise typer.BadParameter("--beside: needs a recorded run, not a live cell")
     elif shown is None and not where.is_file():
-        raise typer.BadParameter("there is no cell.yaml here; name a cell file, or a run's folder")
+        raise typer.BadParameter("no cell.yaml here; name a cell file or the folder of a run")
     else:
         from dwell.live.host.security import environment
 
@@ -106,7 +105,7 @@ def _kept(file: Path) -> str:
         write_whole(file, new_token(), private=True)
     token = file.read_text(encoding="utf-8").strip()
     if file.stat().st_mode & 0o007:
-        raise typer.BadParameter(f"--token: everybody here can read {file}; chmod o-rwx {file}")
+        raise typer.BadParameter(f"--token: every user here can read {file}; chmod o-rwx {file}")
     if not TOKEN.fullmatch(token):
         raise typer.BadParameter(f"--token: {file} has no token: 22 to 200 letters, digits, - or _")
     return token

@@ -20,10 +20,10 @@ Folder = Annotated[Path, argument("FOLDER", "Folder of the authority.")]
 Name = Annotated[str, argument("NAME", "Node of the cell, or another subject.")]
 SubjectRole = Annotated[
     str | None,
-    typer.Option(help="node, controller, operator or observer; the one it had if not given."),
+    option("ROLE", "node, controller, operator or observer.", default="the subject's last"),
 ]
-Addresses = Annotated[list[str] | None, option("HOST", "Where it is reached; may be repeated.")]
-Days = Annotated[int, typer.Option(help="How long certificates hold.")]
+Addresses = Annotated[list[str] | None, option("HOST", "Address of the subject; may be repeated.")]
+Days = Annotated[int, option("N", "Days until certificates expire.")]
 
 keys = typer.Typer(
     no_args_is_help=True,
@@ -34,7 +34,7 @@ keys = typer.Typer(
 @keys.command()
 def init(
     cell: Annotated[Path, argument("CELL", "Cell file.")],
-    out: Annotated[Path, option("FOLDER", "Where the authority and all keyrings go.")],
+    out: Annotated[Path, option("FOLDER", "Folder for the authority and all keyrings.")],
     days: Days = 365,
     as_json: Json = False,
 ) -> None:
@@ -52,8 +52,8 @@ def init(
     _show(authority.roster, as_json=as_json)
     if not as_json:
         typer.echo(
-            f"\n{out}/ca stays here: whoever has it can be anybody.\n"
-            "Take every other folder to its host alone, and name it there with --keys."
+            f"\nKeep {out}/ca here: it can issue any certificate.\n"
+            "Copy each other folder to its host only, and name it there with --keys."
         )
 
 
@@ -87,7 +87,7 @@ def request(
     node: Annotated[
         list[str], argument("NODE", "Node of the cell, or another subject; may be repeated.")
     ],
-    out: Annotated[Path, option("FOLDER", "Where keyrings and requests go.")] = Path("keys"),
+    out: Annotated[Path, option("FOLDER", "Folder for keyrings and requests.")] = Path("keys"),
 ) -> None:
     """Make a key on this computer, and a request for it."""
     from dwell.live.trust.request import request_certificate
@@ -104,7 +104,7 @@ def request(
 @keys.command()
 def sign(
     request: Annotated[
-        list[Path], argument("REQUEST", "What dwell keys request has made; may be repeated.")
+        list[Path], argument("REQUEST", "File from `dwell keys request`; may be repeated.")
     ],
     authority: Annotated[Path, option("FOLDER", "Folder of the authority.")] = Path("keys"),
     role: SubjectRole = None,

@@ -43,10 +43,10 @@ WATCH_S = 1.0
 MOVES_S = 3.0
 
 Cpus = Annotated[
-    str | None, option("LIST", "CPUs to use, as 0,2-3; those of this process if not given.")
+    str | None, option("LIST", "CPUs to use, such as 0,2-3.", default="this process's")
 ]
 
-Owner = Annotated[int | None, option("PID", "Process that this one ends with.", hidden=True)]
+Owner = Annotated[int | None, option("PID", "End with this process.", hidden=True)]
 
 Cell = Annotated[Path | None, argument("CELL", "Cell file (YAML).")]
 #: With it, the first argument is the candidate, node or process.
@@ -58,8 +58,8 @@ def _first(offered: Any) -> Any:
     return argument("CELL", "Cell file (YAML).", autocompletion=with_old_cell(offered))
 
 
-def _second(metavar: str, offered: Any) -> Any:
-    return typer.Argument(metavar=metavar, autocompletion=offered)
+def _second(metavar: str, sentence: str, offered: Any) -> Any:
+    return argument(metavar, sentence, autocompletion=offered)
 
 
 live = typer.Typer(no_args_is_help=True, help="Run live cells; show and steer them.")
@@ -71,24 +71,25 @@ def agent(
     of_cell: OldCell = None,
     state: Annotated[
         Path | None,
-        option("FOLDER", "Where processes keep their files; by default below ~/.local."),
+        option("FOLDER", "Folder for the files of processes.", default="below ~/.local"),
     ] = None,
     cpus: Cpus = None,
     cpus_of: Annotated[
         list[str] | None,
-        option("PROCESS=LIST", "CPUs of some processes, as perception@*=2-3; may repeat."),
+        option("PROCESS=LIST", "CPUs of processes, such as perception@*=2-3; may be repeated."),
     ] = None,
     realtime: Annotated[
         list[str] | None,
         option(
             "PROCESS=PRIORITY",
-            "Real-time priority (SCHED_FIFO) of some processes, as sink.*=20; may repeat.",
+            "SCHED_FIFO priority of processes, such as sink.*=20; may be repeated.",
         ),
     ] = None,
     accelerator: Annotated[
         str | None,
         option(
-            "MODULE:FUNCTION", "Returns the utilisation of the node's accelerator, from 0 to 1."
+            "MODULE:FUNCTION",
+            "Function returning the utilisation of the accelerator (0 to 1).",
         ),
     ] = None,
     keys: Keys = None,
@@ -96,7 +97,7 @@ def agent(
     log_format: Logs = LogFormat.TEXT,
     owner: Owner = None,
     renews: Annotated[
-        bool, typer.Option("--renews", help="Restart what it takes over.", hidden=True)
+        bool, typer.Option("--renews", help="Restart the processes that it finds.", hidden=True)
     ] = False,
 ) -> None:
     """Run a node of a live cell: each stage in a process."""
@@ -124,20 +125,20 @@ def controller(
     of_cell: Annotated[
         list[Path] | None, option("FILE", "Cell file (YAML).", "--cell", hidden=True)
     ] = None,
-    out: Annotated[Path, option("FOLDER", "Where the runs' folders go.")] = Path("runs"),
+    out: Annotated[Path, option("FOLDER", "Folder for the runs.")] = Path("runs"),
     state: Annotated[
         Path | None,
-        option("FOLDER", "Where it keeps what it began with; by default below ~/.local."),
+        option("FOLDER", "Folder for the cell file in use.", default="below ~/.local"),
     ] = None,
     policy: Policy = None,
     name: Annotated[
-        str | None, typer.Option(help="Of this controller; its process id if not given.")
+        str | None, option("NAME", "Name of this controller.", default="its process id")
     ] = None,
     jobs: Annotated[
         bool,
         typer.Option(
             envvar="DWELL_JOBS",
-            help="Keep every job, and what each process takes of the CPUs, in the runs, too.",
+            help="Keep every job, and the CPU time of each process, in the runs.",
         ),
     ] = False,
     cpus: Cpus = None,
@@ -145,7 +146,7 @@ def controller(
     insecure: Insecure = False,
     log_format: Logs = LogFormat.TEXT,
     owner: Owner = None,
-    continues: Annotated[str, option("JSON", "Runs that it continues.", hidden=True)] = "{}",
+    continues: Annotated[str, option("JSON", "Runs to continue.", hidden=True)] = "{}",
 ) -> None:
     """Decide where the stages of live cells run; record it."""
     from dwell.live.host import node_command
@@ -230,10 +231,10 @@ def status(
     of_cell: OldCell = None,
     check: Annotated[bool, flag("--check", "Exit with 1 unless the cell's health is ok.")] = False,
     watch: Annotated[
-        bool, flag("--watch", "Look again every second; with --json, a line each time.")
+        bool, flag("--watch", "Repeat every second; with --json, one line each time.")
     ] = False,
     stages: Annotated[
-        bool, flag("--stages", "Show times of stages and counts of flows, too.")
+        bool, flag("--stages", "Also show times of stages and counts of flows.")
     ] = False,
     keys: Keys = None,
     insecure: Insecure = False,
@@ -291,7 +292,7 @@ def _drawn(lines: list[str]) -> str:
 @live.command()
 def pin(
     cell: Annotated[Path | None, _first(candidates)] = None,
-    candidate: Annotated[str | None, _second("CANDIDATE", candidates)] = None,
+    candidate: Annotated[str | None, _second("CANDIDATE", "Candidate to keep.", candidates)] = None,
     of_cell: OldCell = None,
     off: Annotated[bool, flag("--off", "Let the policy decide again.")] = False,
     keys: Keys = None,
@@ -321,7 +322,7 @@ def unpin(
 @live.command()
 def drain(
     cell: Annotated[Path | None, _first(nodes)] = None,
-    node: Annotated[str | None, _second("NODE", nodes)] = None,
+    node: Annotated[str | None, _second("NODE", "Node to drain.", nodes)] = None,
     of_cell: OldCell = None,
     off: Annotated[bool, flag("--off", "Let stages run on the node again.")] = False,
     keys: Keys = None,
@@ -337,7 +338,7 @@ def drain(
 @live.command(hidden=True)
 def undrain(
     cell: Annotated[Path | None, _first(nodes)] = None,
-    node: Annotated[str | None, _second("NODE", nodes)] = None,
+    node: Annotated[str | None, _second("NODE", "Node to drain.", nodes)] = None,
     of_cell: OldCell = None,
     keys: Keys = None,
     insecure: Insecure = False,
@@ -355,7 +356,8 @@ def run(
         str | None,
         option(
             "NAME",
-            "One of the cell's scenarios; its first that disturbs something if not given.",
+            "Scenario of the cell.",
+            default="the first with disturbances",
             autocompletion=scenarios,
         ),
     ] = None,
@@ -363,7 +365,8 @@ def run(
         float | None,
         option(
             "S",
-            "Length, the warm-up included; as the scenario asks for.",
+            "Length, including the warm-up.",
+            default="the scenario's",
             min=5,
             callback=require_held,
         ),
@@ -373,7 +376,7 @@ def run(
     seed: Seed = 1,
     out: Annotated[
         Path | None,
-        option("FOLDER", "Where logs, the run and its report go; live-out/CELL if not given."),
+        option("FOLDER", "Folder for logs, run and report.", default="live-out/CELL"),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -401,7 +404,7 @@ def processes(context: typer.Context) -> list[str]:
 
 Root = Annotated[
     Path | None,
-    option("FOLDER", "Has a folder for each cell; by default below ~/.local.", "--state"),
+    option("FOLDER", "Folder with a folder per cell.", "--state", default="below ~/.local"),
 ]
 
 
@@ -410,19 +413,20 @@ def up(
     cell: CellArgument,
     node: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Node of the cell that this computer is; may repeat. If not given, those whose "
-            "address is this computer's.",
+        option(
+            "NAME",
+            "This computer's node in the cell; may be repeated.",
+            default="the nodes with an address of this computer",
             autocompletion=nodes,
         ),
     ] = None,
     policy: Policy = None,
-    out: Annotated[Path, option("FOLDER", "Where the runs' folders go.")] = Path("runs"),
+    out: Annotated[Path, option("FOLDER", "Folder for the runs.")] = Path("runs"),
     again: Annotated[
-        bool, flag("--again", "Have what runs here take over an edited cell file or module.")
+        bool, flag("--again", "Apply an edited cell file or module to the running processes.")
     ] = False,
     yes: Annotated[
-        bool, flag("--yes", "With --again: end all and start it, if nothing less will do.")
+        bool, flag("--yes", "With --again: restart everything if that is necessary.")
     ] = False,
     state: Root = None,
     keys: Keys = None,
@@ -479,10 +483,14 @@ def log(
     cell: Annotated[Path | None, _first(processes)] = None,
     process: Annotated[
         str | None,
-        argument("PROCESS", "As agent@R1, controller@E, perception@E.", autocompletion=processes),
+        argument(
+            "PROCESS",
+            "Such as agent@R1, controller@E, perception@E.",
+            autocompletion=processes,
+        ),
     ] = None,
     follow: Annotated[
-        bool, typer.Option("--follow", "-f", help="Go on with what is added, until interrupted.")
+        bool, typer.Option("--follow", "-f", help="Print new lines until interrupted.")
     ] = False,
     of_cell: OldCell = None,
     state: Root = None,
@@ -503,12 +511,10 @@ def log(
 def units(
     cell: CellArgument,
     node: Node,
-    out: Annotated[Path, option("FOLDER", "Where the units go; made where it is missing.")] = Path(
+    out: Annotated[Path, option("FOLDER", "Folder for the units; made if it is missing.")] = Path(
         "units"
     ),
-    user: Annotated[
-        str | None, typer.Option(help="User of the services; this one if not given.")
-    ] = None,
+    user: Annotated[str | None, option("NAME", "User of the services.", default="you")] = None,
     keys: Keys = None,
     insecure: Insecure = False,
 ) -> None:

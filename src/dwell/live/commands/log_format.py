@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Annotated
 
-import typer
+from dwell.cli.options import option
 
 
 class LogFormat(StrEnum):
@@ -17,7 +17,7 @@ class LogFormat(StrEnum):
 
 Logs = Annotated[
     LogFormat,
-    typer.Option("--log-format", help="Form of the log on stderr: lines of text, or of JSON."),
+    option("text|json", "Format of the log on stderr.", "--log-format"),
 ]
 
 

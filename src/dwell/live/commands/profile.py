@@ -27,41 +27,37 @@ profile = typer.Typer(no_args_is_help=True)
 
 Out = Annotated[Path | None, option("FILE", "Parquet file to write.")]
 Period = Annotated[
-    float | None, option("MS", "Begin one every so often; one after another if not given.")
+    float | None, option("MS", "Interval between starts.", default="none: one after another")
 ]
 
 
 @profile.callback(invoke_without_command=True)
 def measure(
     context: typer.Context,
-    node: Annotated[
-        str | None, typer.Option(help="Name that this computer has in the cell.")
-    ] = None,
+    node: Annotated[str | None, option("NAME", "This computer's node in the cell.")] = None,
     task: Annotated[
         list[str] | None,
-        option("TASK=MODULE:FUNCTION", "What to measure; may be given several times."),
+        option("TASK=MODULE:FUNCTION", "Function to measure; may be repeated."),
     ] = None,
     inputs: Annotated[
         list[str] | None,
         option(
             "[TASK=]MODULE:FUNCTION",
-            "Called with the number of each run; what it returns is what the task is given "
-            "(all tasks, or the one named).",
+            "Function that gets the number of a run and returns the input of the task (of all "
+            "tasks without a name).",
         ),
     ] = None,
     samples: Samples = 500,
     warmup: Warmup = 50,
-    core: Annotated[
-        str | None, option("CORES", "Core to run on, or several: 2, 0,2 or 0-3.")
-    ] = None,
+    core: Annotated[str | None, option("CORES", "Cores to run on: 2, 0,2 or 0-3.")] = None,
     period_ms: Period = None,
     out: Out = None,
     as_json: Json = False,
 ) -> None:
     """Time tasks on this computer; cells can replay the samples.
 
-    Without a subcommand it measures: every task is a Python function, run again and again on
-    pinned cores. The highest core is taken, and the file is profiles/NODE.parquet, if not given.
+    Without a subcommand, each task, a Python function, is run repeatedly on pinned cores: the
+    highest core without --core. The results go to profiles/NODE.parquet without --out.
     """
     if context.invoked_subcommand is not None:
         _refuse_options(context, context.invoked_subcommand)
@@ -91,7 +87,7 @@ def measure(
 
 @profile.command()
 def merge(
-    files: Annotated[list[Path], argument("FILE...", "Profiles.")],
+    files: Annotated[list[Path], argument("FILE", "Profiles.")],
     out: Annotated[Path, option("FILE", "Parquet file to write.")],
     as_json: Json = False,
 ) -> None:
@@ -105,9 +101,9 @@ def merge(
 
 @profile.command()
 def listen(
-    port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes a free one.")] = PORT,
+    port: Annotated[int, option("P", "Port; 0 takes a free one.", min=0, max=65535)] = PORT,
     host: Annotated[
-        str, typer.Option(help="Address to listen on; this one is reached from this machine only.")
+        str, option("ADDRESS", "Address to listen on; the default serves this machine only.")
     ] = "127.0.0.1",
     once: Annotated[bool, flag("--once", "End after the first connection.")] = False,
 ) -> None:
@@ -123,11 +119,11 @@ def listen(
 
 @profile.command()
 def link(
-    peer: Annotated[str, argument("HOST:PORT", "Where `dwell profile listen` runs.")],
-    source: Annotated[str, typer.Option("--from", help="Name that this computer has in the cell.")],
-    target: Annotated[str, typer.Option("--to", help="Name that the peer has in the cell.")],
+    peer: Annotated[str, argument("HOST:PORT", "Address of `dwell profile listen`.")],
+    source: Annotated[str, option("NAME", "This computer's node in the cell.", "--from")],
+    target: Annotated[str, option("NAME", "The peer's node in the cell.", "--to")],
     payload_bytes: Annotated[
-        int, typer.Option("--bytes", help="Payload of the larger message.")
+        int, option("N", "Bytes of payload in the larger message.", "--bytes")
     ] = 307_200,
     samples: Samples = 500,
     warmup: Warmup = 50,

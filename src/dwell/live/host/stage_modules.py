@@ -22,7 +22,7 @@ def require_stages(problem: Problem, cell: Path, nodes: Collection[str]) -> None
     if without := [task.name for task in tasks if task.run is None]:
         raise LiveError(
             f"{cell}: nothing to run for {', '.join(without)}; a live cell needs `run: "
-            "module:Name` for every task (docs/live-tutorial.md)"
+            "module:Name` for every task (docs/start/live-tutorial.md)"
         )
     actuators = problem.live.actuators
     names = {f"tasks.{task.name}.run": task.run for task in tasks}

@@ -1,0 +1,46 @@
+"""The tables of the page of columns, from their declarations: `python -m docs.columns`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dwell.model.table_columns import TABLES, Column
+from dwell.record import OUTCOME_SENTENCES, REASON_SENTENCES
+
+PAGE = Path(__file__).with_name("reference") / "columns.md"
+#: The first table; the text above it is written by hand.
+FIRST = "## cycles"
+HEAD = "| column | type | unit | meaning | null |\n|---|---|---|---|---|\n"
+
+
+def tables() -> str:
+    """Return the tables of columns, outcomes and reasons."""
+    parts = []
+    for name, table in TABLES.items():
+        kept = "; kept on request" if table.on_request else ""
+        rows = "".join(map(_row, table.columns))
+        parts.append(f"## {name}\n\nOne row is {table.sentence}{kept}.\n\n{HEAD}{rows}")
+    outcomes = "".join(f"| `{name}` | {text} |\n" for name, text in OUTCOME_SENTENCES.items())
+    reasons = "".join(f"| `{name}` | {text} |\n" for name, text in REASON_SENTENCES.items())
+    parts.append(
+        "## Outcomes and reasons\n\n| outcome | end of a cycle or a job |\n|---|---|\n"
+        f"{outcomes}\n| reason | reason of a decision |\n|---|---|\n{reasons}"
+    )
+    return "\n".join(parts)
+
+
+def _row(column: Column) -> str:
+    name = column.name.replace("{", "<").replace("}", ">")
+    tables = f" ({' or '.join(column.of)})" if column.of else ""
+    cells = (f"`{name}`{tables}", column.kind, column.unit, column.sentence, column.null)
+    return f"| {' | '.join(cells)} |\n"
+
+
+def page() -> str:
+    """Return the page."""
+    text = PAGE.read_text(encoding="utf-8")
+    return text[: text.index(FIRST)] + tables()
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")

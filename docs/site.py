@@ -1,0 +1,174 @@
+"""Make the site from the pages: `make docs` (`python -m docs.site`).
+
+Copies pages, pictures and the files that they link to into build/site-source, with the folders of
+the repository, so links work as they are. Zensical makes build/site in strict mode. Fails if the
+site would load anything from another host.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+SOURCE, SITE = ROOT / "build" / "site-source", ROOT / "build" / "site"
+API = "docs/reference/api.md"
+LINK = re.compile(r"\]\(([^)\s#]+)(?:#[^)\s]*)?\)")
+#: A name with its own entry on the page of the Python interface.
+NAME = re.compile(r"^\| `(dwell[\w.]*)` \|", re.MULTILINE)
+#: Attributes by which a page loads a file.
+LOADED = re.compile(r"""<(?:script|img|iframe|source)\b[^>]*?\bsrc=["']?(https?:)?//""")
+STYLE = re.compile(
+    r"""<link\b(?=[^>]*\brel=["']?(?:stylesheet|preconnect|icon))[^>]*href=["']?https?:"""
+)
+TITLE = re.compile(r"^# (.+)$", re.MULTILINE)
+SECTIONS = {
+    "Start": "start",
+    "How to": "howto",
+    "Reference": "reference",
+    "Background": "background",
+    "Decisions": "decisions",
+}
+CONTRACTS = ("concepts", "guard", "live-protocol", "architecture")
+
+
+def linked(page: str, text: str) -> set[str]:
+    """Return the files and folders that a page links to, from the root of the repository."""
+    targets = (target for target in LINK.findall(text) if not re.match(r"[a-z]+:", target))
+    folder = (ROOT / page).parent
+    return {str((folder / target).resolve().relative_to(ROOT)) for target in targets}
+
+
+def pages() -> dict[str, str]:
+    """Return the text of each page by its path: docs, and all pages that these link to."""
+    found: dict[str, str] = {}
+    open_pages = [str(path.relative_to(ROOT)) for path in (ROOT / "docs").rglob("*.md")]
+    open_pages.append("README.md")
+    while open_pages:
+        page = open_pages.pop()
+        if page in found or not (ROOT / page).is_file():  # Zensical names missing pages.
+            continue
+        found[page] = (ROOT / page).read_text(encoding="utf-8")
+        open_pages += [name for name in linked(page, found[page]) if name.endswith(".md")]
+    return found
+
+
+def with_entries(text: str) -> str:
+    """Return the page of the Python interface with the docstring of each name."""
+    return text + "".join(f"\n## `{name}`\n\n::: {name}\n" for name in NAME.findall(text))
+
+
+def stage(folder: Path) -> dict[str, str]:
+    """Write the sources of the site into a folder; return the pages."""
+    found = pages()
+    others = {name for page, text in found.items() for name in linked(page, text)} - found.keys()
+    for name in sorted(others):
+        if (ROOT / name).is_file():
+            target = folder / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(ROOT / name, target)
+    for page, text in found.items():
+        target = folder / page
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(with_entries(text) if page == API else text, encoding="utf-8")
+    return found
+
+
+def title(text: str) -> str:
+    """Return the heading of a page without marks."""
+    heading = TITLE.search(text)
+    return heading[1].replace("`", "") if heading else "Page"
+
+
+def navigation(found: dict[str, str]) -> list[object]:
+    """Return the navigation of the site: each page below the title of its folder."""
+
+    def entry(page: str) -> dict[str, str]:
+        return {title(found[page]): page}
+
+    folders: list[object] = [
+        {
+            name: [
+                entry(page) for page in sorted(found) if Path(page).parent == Path("docs") / folder
+            ]
+        }
+        for name, folder in SECTIONS.items()
+    ]
+    laboratory = [entry(page) for page in sorted(found) if page.startswith("lab/")]
+    evidence = [entry(page) for page in sorted(found) if page.startswith("reproduction/")]
+    return [
+        {"Dwell": "README.md"},
+        {"Documentation": "docs/index.md"},
+        {"Contracts": [entry(f"docs/{name}.md") for name in CONTRACTS]},
+        *folders,
+        {"Laboratory": laboratory},
+        {"Evidence": evidence},
+    ]
+
+
+def settings(found: dict[str, str]) -> dict[str, object]:
+    """Return the settings of Zensical."""
+    handler = {
+        "paths": [str(ROOT / "src")],
+        "options": {
+            "docstring_style": "numpy",
+            "heading_level": 3,
+            "show_root_heading": False,
+            "show_root_toc_entry": False,
+            "show_source": False,
+            "members": False,
+        },
+    }
+    return {
+        "site_name": "Dwell",
+        "docs_dir": SOURCE.name,
+        "site_dir": SITE.name,
+        "use_directory_urls": False,
+        "theme": {"font": False, "features": ["navigation.sections", "search.highlight"]},
+        "nav": navigation(found),
+        "markdown_extensions": {
+            "tables": {},
+            "fenced_code": {},
+            "toc": {"permalink": True},
+            "pymdownx.highlight": {},
+            "pymdownx.superfences": {},
+        },
+        "plugins": [{"mkdocstrings": {"handlers": {"python": handler}}}],
+    }
+
+
+def external(folder: Path) -> list[str]:
+    """Return the pages that would load a file from another host."""
+    return [
+        str(page.relative_to(folder))
+        for page in sorted(folder.rglob("*.html"))
+        if LOADED.search(text := page.read_text(encoding="utf-8")) or STYLE.search(text)
+    ]
+
+
+def main() -> int:
+    """Make the site; return 1 if Zensical warns or a page loads from another host."""
+    shutil.rmtree(SOURCE, ignore_errors=True)
+    found = stage(SOURCE)
+    file = SOURCE.parent / "mkdocs.yml"
+    file.write_text(json.dumps(settings(found), ensure_ascii=False, indent=1), encoding="utf-8")
+    shutil.rmtree(SITE, ignore_errors=True)
+    made = subprocess.run(
+        (sys.executable, "-m", "zensical", "build", "--clean", "--strict", "-f", str(file)),
+        check=False,
+    )
+    if made.returncode:
+        return 1
+    if pages_outside := external(SITE):
+        print(f"loads from another host: {', '.join(pages_outside)}", file=sys.stderr)
+        return 1
+    print(f"site: {SITE / 'index.html'}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
