@@ -21,7 +21,7 @@ FLATS = {
     "simulator": ("src/dwell",),
 }
 #: The most lines of code.
-MOST = {"simulator": 24_985, "live": 14_503, "lab": 6_834}
+MOST = {"simulator": 25_219, "live": 14_510, "lab": 6_829}
 
 
 def code_lines(text: str) -> int:

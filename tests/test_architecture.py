@@ -192,7 +192,10 @@ MAY_IMPORT = {
     "live.wire": ("cellfile",),
     "live.transport": ("live", "live.wire"),
     "live.trust": ("live.wire", "files"),
-    "live.roles": ("live", "live.transport", "live.wire", "live.trust", "control", "record"),
+    "live.roles": (
+        *("live", "live.transport", "live.wire", "live.trust", "control", "record"),
+        "study.metric",
+    ),
     "live.host": (*LIVE, "control", "record", "cellfile", "files"),
     "live.local": (*LIVE, "live.host", "sim", "record", "cellfile", "files"),
     "dash": (*LIVE, "live.host", "record", "cellfile", "study"),

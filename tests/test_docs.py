@@ -16,6 +16,7 @@ import typer.main
 from typer.testing import CliRunner
 
 from docs import commands as commands_page
+from docs import metrics as metrics_page
 from docs import site
 from dwell.cli.commands import app
 
@@ -120,6 +121,10 @@ def test_commands_exist(page: Path) -> None:
 
 def test_the_page_of_commands_is_the_generated_one() -> None:
     assert commands_page.PAGE.read_text(encoding="utf-8") == commands_page.page()
+
+
+def test_the_page_of_metrics_is_the_generated_one() -> None:
+    assert metrics_page.PAGE.read_text(encoding="utf-8") == metrics_page.page()
 
 
 @pytest.mark.parametrize("page", PAGES, ids=page_name)

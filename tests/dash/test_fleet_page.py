@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+import polars as pl
 import pytest
 from playwright.sync_api import Browser, Page
 
@@ -279,3 +280,11 @@ def test_markup_in_the_names_of_a_fleet_is_only_text(
         assert MARKUP in shown.locator("#back-to-fleet").inner_text()
         assert shown.evaluate("window.pwned") is None
         assert shown.locator("main img, main script").count() == 0
+
+
+@in_browser
+def test_a_violation_rate_has_two_decimals_and_a_lowered_index(shown: Page, runs: FleetRun) -> None:
+    rates = [text.inner_html() for text in shown.query_selector_all(".small .rate")]
+    windows = runs.windows.filter(~runs.windows["warmup"])
+    means = windows.group_by("cell").agg(pl.col("violation_rate").mean())["violation_rate"]
+    assert rates == [f"V<sub>D</sub> {100 * rate:.2f} %" for rate in sorted(means, reverse=True)]

@@ -17,7 +17,7 @@ from dwell.report.table import Table
 from dwell.study import compare
 from tests.cells.small import SEEDS, make_comparison, make_problem
 from tests.dash.browser import chromium, in_browser, opened
-from tests.report.pages import Page, small_comparison, table_of
+from tests.report.pages import Page, silent_on_warmup, small_comparison, table_of
 
 Shown: TypeAlias = dict[tuple[str, str], Mapping[str, float | Sequence[float]]]
 
@@ -51,6 +51,10 @@ def test_verdict_rates_and_the_cell_are_first_and_the_rest_is_folded() -> None:
     assert not first.folded
     assert not cell.folded
     assert all(section.folded for section in others)
+
+
+def test_every_table_says_whether_the_warm_up_is_in() -> None:
+    assert silent_on_warmup(comparison_page(small_comparison())) == []
 
 
 def test_every_policy_stands_in_every_scenario_and_a_reader_can_choose() -> None:

@@ -20,7 +20,7 @@ from dwell.report.palette import Palette
 from dwell.report.timeline import MOST_BINS, MOST_MARKS
 from dwell.study.fleet_summary import refusals
 from tests.cells.fleets import fleet_of, one_job, within
-from tests.report.pages import Page, facts_of, figure_of, table_of
+from tests.report.pages import Page, facts_of, figure_of, silent_on_warmup, table_of
 
 WORDS = {"stress": (NodeDisturbance("R", at_s=1.0, for_s=1.0, stress_threads=1),)}
 
@@ -55,6 +55,13 @@ def test_cells_stand_with_the_worst_first(run: FleetRun) -> None:
     drawn = figure_of(page, "cells").frames["rows"]
     assert drawn.filter(measure="L95 (ms)")["limit"].to_list() == [5.0] * 4
     assert drawn.filter(measure="V_D (%)")["limit"].to_list() == [5.0] * 4
+
+
+def test_a_cell_has_the_numbers_of_other_pages(run: FleetRun) -> None:
+    page = fleet_page(run)
+    assert silent_on_warmup(page) == []
+    rate = table_of(page, "cell-table").rows[0]["violation_rate"]
+    assert facts_of(page)["V_D of the worst cell"].value == f"{100 * rate:.2f} %"
 
 
 def test_stays_of_a_cell_follow_each_other(run: FleetRun) -> None:

@@ -119,7 +119,7 @@ def test_the_table_has_errors_where_they_are_known() -> None:
     _, table = blocks({}, UNSEEN)
     ((_, (seen, unseen)),) = table.groups()
     texts = [f"{cell.text} {cell.error}".strip() for cell in seen]
-    assert texts == ["9", "LOC", "SO", "30.0 ± 1.5", "36.0 ± 2.0", "2.0", "8.0 ± 1.0", "4"]
+    assert texts == ["9", "LOC", "SO", "30.0 ± 1.5", "36.0 ± 2.0", "2.00", "8.00 ± 1.00", "4"]
     assert [unseen[place].text for place in (4, 6, 7)] == ["–", "–", "0"]
 
 

@@ -21,7 +21,7 @@ from dwell.report.page import Definitions
 from dwell.report.study_page import study_page
 from dwell.study import Contender, Point, Study, open_study, run_study
 from tests.cells.small import make_problem
-from tests.report.pages import Page, figure_of, table_of
+from tests.report.pages import Page, figure_of, silent_on_warmup, table_of
 
 DWELL, LATE = "controller.min_dwell", "controller.min_improvement"
 
@@ -117,6 +117,10 @@ def test_panels_of_two_parameters_are_told_apart(folder: Path) -> None:
     drawn = svg(figure_of(study_page(open_study(folder)), "violation_rate-0"))
     for heading in ("Baseline", "Robot CPU stress", f"{LATE}: 0.01", f"{LATE}: 0.2"):
         assert heading in drawn
+
+
+def test_every_table_says_whether_the_warm_up_is_in(folder: Path) -> None:
+    assert silent_on_warmup(study_page(open_study(folder))) == []
 
 
 def test_the_page_is_whole(folder: Path) -> None:

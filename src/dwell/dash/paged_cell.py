@@ -13,7 +13,9 @@ from typing import Any, Literal, NamedTuple, Protocol, TypeAlias
 from dwell.display import placement_hues
 from dwell.model import Link, Problem, Trace
 from dwell.model.bounds import counted
+from dwell.study.metric import METRICS
 
+RATE = METRICS["violation_rate"]
 #: What a place on the time line counts.
 Unit: TypeAlias = Literal["s", "cycle"]
 #: Plain values, ready for JSON.
@@ -139,5 +141,5 @@ def health_by(problem: Problem, rates: list[float]) -> Mapping[str, str | None]:
     rate = sum(rates) / len(rates)
     return {
         "health": "degraded",
-        "headline": f"V_D is {rate:.0%} in the last {counted(len(rates), 'window')}",
+        "headline": f"{RATE.name} is {RATE.text(rate)} in the last {counted(len(rates), 'window')}",
     }

@@ -13,7 +13,7 @@ from dwell.dash.strip import plain
 from dwell.model import Problem
 from dwell.model.live import RECENT_WINDOWS
 from dwell.model.number_arrays import Floats
-from dwell.record import Names, Run
+from dwell.record import Names, Run, shown_reason
 from dwell.record.moves import GUARD, by_guard
 
 #: What is both estimated and seen of a window, and the columns that say what was seen.
@@ -113,7 +113,7 @@ class RecordedWindows:
             place = int(self.window_of[row])
             if place < 0:
                 continue
-            reason = self._reasons[row]
+            reason = shown_reason(self._reasons[row])
             beyond = int(self.decisions["last_cycle"][row]) + 1 - int(self._first[place])
             at = float(self.opens[place]) + beyond * self._cycle
             names = [self._candidates[code[row]] for code in (self._incumbent, self._target)]

@@ -19,7 +19,6 @@ from dwell.estimators.presents import Present, realised
 from dwell.estimators.prices import SEED
 from dwell.kernels.advance import play
 from dwell.kernels.arrays import Arrays, lay_out
-from dwell.kernels.codes import EventKind, cell_of, kind_of
 from dwell.kernels.random_draws import draw
 from dwell.model.frozen import FrozenDict
 from dwell.model.number_arrays import Floats
@@ -259,16 +258,7 @@ class FleetPrices:
             if name is not None:
                 stamps[i] = self._index[i][name]
         arrays.replace(stamps=stamps)
-        # A cell that does not play is never released.
-        tables = arrays.tables
-        clock = tables.clock[0]
-        events = tables.events[: clock["n_events"]]
-        kept = [
-            kind_of(key) != EventKind.RELEASE or cell_of(key) in plays
-            for key in events["key"].tolist()
-        ]
-        clock["n_events"] = sum(kept)
-        tables.events[: clock["n_events"]] = events[kept]
+        arrays.leave_out(set(range(len(self.cells))).difference(plays))
         play(arrays)
         return arrays
 

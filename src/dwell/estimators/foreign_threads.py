@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.measured import cores_of, cores_on
-from dwell.kernels.jobs import NodeJobs, level
+from dwell.kernels.jobs import NodeJobs, SlowedJobs
 from dwell.model.fabric import Node
 from dwell.model.pipeline import Execution
 from dwell.model.problem import Problem
@@ -134,7 +134,7 @@ class Stretches:
 
     def __init__(self, problem: Problem, shared: Collection[str] = ()) -> None:
         self._problem, self._shared = problem, shared
-        self._on: dict[str, NodeJobs] = {}
+        self._on: dict[str, SlowedJobs] = {}
 
     def level(self, evidence: Evidence, name: str) -> Level | None:
         """What the jobs on a node say; None where they say nothing.
@@ -149,21 +149,22 @@ class Stretches:
         ):
             return None
         shadows = evidence.shadows_share
-        told = level(self._jobs_on(name), rows, shadows=shadows, is_shared=is_shared)
+        told = self._jobs_on(name).level(rows, shadows=shadows, is_shared=is_shared)
         if told is None:
             return None
         threads, error, is_slowed = told
         # Nanoseconds of an instant are none.
         return Level(max(round(threads, 3), 0.0), error, is_slowed)
 
-    def _jobs_on(self, name: str) -> NodeJobs:
+    def _jobs_on(self, name: str) -> SlowedJobs:
         if name not in self._on:
             node = self._problem.fabric.nodes[name]
             spare = node.spare if node.quota is None else node.capacity
             bursts = 0.0 if node.bursts is None else node.bursts.share
             cores = cores_on(self._problem, node, partial(_turns, node))
             is_fair = node.scheduler == "fair"
-            self._on[name] = NodeJobs(cores, is_fair, node.cores, spare, bursts)
+            jobs = NodeJobs(cores, is_fair, node.cores, spare, bursts)
+            self._on[name] = SlowedJobs(jobs, len(self._problem.pipeline.flows))
         return self._on[name]
 
 

@@ -60,6 +60,8 @@ class LoadTable:
     ----------
     cells : sequence of PricedCell
     shared : sequence of str
+    with_columns : bool
+        Whether to simulate the columns, which propose moves.
     progress : callable, optional
         Told how many of how many levels have been played.
 
@@ -79,11 +81,15 @@ class LoadTable:
         shared: Sequence[str],
         *,
         cycles: int | None = None,
+        with_columns: bool = True,
         progress: Progress | None = None,
     ) -> None:
         self.cells, self.shared = tuple(cells), tuple(shared)
         self.kinds = kinds_of(cells)
         self.work = tuple(_work(cell.problem, shared) for cell in cells)
+        self.columns: dict[tuple[int, str], LoadColumn] = {}
+        if not with_columns:
+            return
         count = sum(map(bool, self.work))
         self._counts = {1 + (count - 1) * i // (LEVELS - 1) for i in range(LEVELS)}
         if cycles is None:
@@ -91,7 +97,6 @@ class LoadTable:
             cycles = min(max(cycles, FEWEST), MOST)
         plays = FleetPrices(cells, shared, cycles * len(cells))
         asked = [(kind, name) for kind in dict.fromkeys(self.kinds) for name in self.work[kind]]
-        self.columns: dict[tuple[int, str], LoadColumn] = {}
         done, levels = 0, len(asked) * len(self._counts)
         for group in asked:
             rows = []

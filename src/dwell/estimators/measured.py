@@ -110,7 +110,8 @@ class Meter:
 
         They are overwritten by those of the next window.
         """
-        return self._take_apart(self._times, evidence, evidence.rows)
+        self._take_apart(self._times, evidence, evidence.rows)
+        return self._by_part(self._times)
 
     def demands(
         self, evidence: Evidence, foreign: Mapping[str, float] | None = None
@@ -130,16 +131,20 @@ class Meter:
             a job received is divided by the node's `interference` where there are some beyond
             those of bursts. Where it is not known, it is told from how long the job took.
         """
-        foreign = foreign or {}
+        self.measure(evidence, foreign or {})
+        return self._by_part(self._demands)
+
+    def measure(self, evidence: Evidence, foreign: Mapping[str, float]) -> None:
+        """Compute the demands of a window (see `demands`) without the mapping: `found` has them."""
         self._cost[:] = self._usual_cost
         for number, node in self._interfered:
             # What bursts cost is in the declared demands, too.
             if foreign.get(node.name, 0.0) - node.burst_threads >= BESIDE:
                 self._cost[number] /= node.interference
         rows = evidence.rows
-        if any(rows.unknown(0)[1:]):
+        if any(rows.unknown(evidence.close_ns - self._patience_ns)[1:]):
             rows = self._with_work(evidence, foreign).rows
-        return self._take_apart(self._demands, evidence, self._with_waits(rows, foreign))
+        self._take_apart(self._demands, evidence, self._with_waits(rows, foreign))
 
     def _with_waits(self, rows: WindowRows, foreign: Mapping[str, float]) -> WindowRows:
         """Add what most jobs of a task waited for to their work.
@@ -149,29 +154,33 @@ class Meter:
         than their core time would have, stretched by what the cell's own jobs and foreign threads
         took meanwhile.
         """
-        rows = rows.copy()
         # Bursts may be on all the while that a job runs.
-        self._waiting.add(rows, [foreign.get(name, 0.0) + most for name, most in self._sharing])
-        return rows
+        threads = [foreign.get(name, 0.0) + most for name, most in self._sharing]
+        return self._waiting.added(rows, threads)
 
     def waited_ns(self, evidence: Evidence, foreign: Mapping[str, float]) -> Ints:
         """Core time of own jobs with their waits, shape (n, tasks); see `demands`."""
-        return self._with_waits(evidence.rows, foreign).columns(shadow=False)[4]
+        return self._with_waits(evidence.rows, foreign).columns(shadow=False)[4].copy()
 
     def _with_work(self, evidence: Evidence, foreign: Mapping[str, float]) -> Evidence:
         """Add the core time of jobs where it is not known."""
         cycles, shadows = evidence.cycles, evidence.shadows
         work_ns = self.work_ns(cycles, evidence.placement, foreign)
-        told = replace(evidence, cycles=replace(cycles, work_ns=work_ns))
-        if shadows is None:
-            return told
-        work_ns = self.work_ns(shadows, evidence.shadow_placement, foreign)
-        return replace(told, shadows=replace(shadows, work_ns=work_ns))
+        cycles = replace(cycles, work_ns=work_ns)
+        if shadows is not None:
+            work_ns = self.work_ns(shadows, evidence.shadow_placement, foreign)
+            shadows = replace(shadows, work_ns=work_ns)
+        return evidence.with_instants(cycles, shadows)
 
     @property
     def found(self) -> PartTimes:
-        """What `demands` has found in the last window."""
+        """What `measure` has found in the last window."""
         return self._demands
+
+    @property
+    def found_parts(self) -> list[Part]:
+        """The parts in `found`."""
+        return [self.parts[number] for number in self._demands.numbers]
 
     def numbers(self, parts: Iterable[Part]) -> Ints:
         """Return the places of some parts in `parts`."""
@@ -190,17 +199,19 @@ class Meter:
         usual, joins = self._usual_cost.copy(), self._link.copy()
         self.set_rate(link, rate_mbps)
         self._cost[:] = self._usual_cost
-        found = self._take_apart(self._demands, evidence, evidence.rows)
+        self._take_apart(self._demands, evidence, evidence.rows)
         self._usual_cost[:], self._link[:] = usual, joins
+        found = self._by_part(self._demands)
         return {part: values for part, values in found.items() if isinstance(part, Message)}
 
-    def _take_apart(
-        self, found: PartTimes, evidence: Evidence, rows: WindowRows
-    ) -> dict[Part, Floats]:
-        found.begin(rows, evidence.close_ns - self._patience_ns)
-        for active, _ in groups(evidence.placement):
+    def _take_apart(self, found: PartTimes, evidence: Evidence, rows: WindowRows) -> None:
+        limit_ns = evidence.close_ns - self._patience_ns
+        found.begin(rows, limit_ns)
+        for active in evidence.rows.candidates(limit_ns):
             found.add(active, self._layout(active))
-        return {self.parts[part]: values for part, values in found.by_part().items()}
+
+    def _by_part(self, found: PartTimes) -> dict[Part, Floats]:
+        return {self.parts[number]: values for number, values in found.by_part().items()}
 
     def work_ns(
         self, instants: Instants, placement: NDArray[np.integer], foreign: Mapping[str, float]

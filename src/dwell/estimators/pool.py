@@ -245,23 +245,8 @@ class Pool:
         """Return figures of the held values, computed once per change of these."""
         held = self.held
         if self._summary.of is not held:
-            finite = np.isfinite(held)
-            known = np.sort(held[finite])
-            lost = (len(held) - len(known)) / max(len(held), 1)
-            self._summary = _Summary(held, lost, self._error_ms(known))
+            self._summary = _Summary(held, *self.rows.error())
         return self._summary
-
-    def _error_ms(self, known: Floats) -> float:
-        if len(known) < 2:
-            return 0.0
-        count = max(self.measured, 2)
-        # Of few values the deviation is itself hardly known (see `Playing`).
-        few = (count + 1) / (count - 1)
-        apart = known - np.add.reduce(known) / len(known)
-        # As `known.std()` adds up, in a third of the time.
-        deviation = math.sqrt(np.add.reduce(apart * apart) / len(known))
-        of_mean = few * deviation / math.sqrt(count)
-        return max(of_mean, quantile_error(known, share_error(0.05, count)))
 
     def reset(self) -> None:
         """Return to what is declared."""
@@ -589,19 +574,6 @@ class _Doubt(NamedTuple):
 def share_error(share: float, count: int) -> float:
     """Return the standard error of a share among independent values."""
     return math.sqrt(share * (1.0 - share) / count)
-
-
-def quantile_error(ordered: Floats, off: float) -> float:
-    """Return the error of the 95th percentile of ascending values whose place has an error.
-
-    The values at the places two errors off are the limits (Woodruff, DOI 10.2307/2280781); half
-    the distance to the farther one is the error.
-    """
-    last = len(ordered) - 1
-    usual: float = ordered.item(round(0.95 * last))
-    low: float = ordered.item(max(round((0.95 - 2 * off) * last), 0))
-    high: float = ordered.item(min(round((0.95 + 2 * off) * last), last))
-    return max(high - usual, usual - low) / 2
 
 
 def newest(values: Floats) -> int:

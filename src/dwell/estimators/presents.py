@@ -12,26 +12,25 @@ import math
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from operator import sub
 from typing import NamedTuple
 
 import numpy as np
 
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.measured import Message, Meter, Part, Site, cores_of, parts_of
-from dwell.estimators.pool import Reference, quantile_error
+from dwell.estimators.pool import Reference
 from dwell.estimators.prices import SEED, Question, most_windows, prices_of
 from dwell.estimators.sent_shadows import SentShadows, stamps_of
 from dwell.estimators.slow_processes import slow_processes, unseen_error
 from dwell.estimators.spans import patience_ns
-from dwell.kernels.advance import logged_window, play
+from dwell.kernels.advance import LoggedCycles, play
 from dwell.kernels.arrays import Arrays, CellArrays, flow_rows, lay_out
 from dwell.kernels.codes import LAST_NS
-from dwell.kernels.elementary import moments
-from dwell.kernels.pools import fill
+from dwell.kernels.pools import TimesRow, fill
 from dwell.kernels.random_draws import Drawing
 from dwell.kernels.realisation import LinkSegments, NodeChange, NodeChanges, Realisation
 from dwell.kernels.rows import Rows, row_types
+from dwell.kernels.sampling_errors import PAIRS, SeriesSums, Steps, tail_error_ms
 from dwell.model.fabric import Node
 from dwell.model.frozen import FrozenDict
 from dwell.model.number_arrays import Floats, Ints
@@ -94,28 +93,33 @@ class PlayedPrice(NamedTuple):
     own: Mapping[str, float]
 
 
-class _Step(NamedTuple):
-    """What a step has shown in the mean, and what the same windows show as declared."""
-
-    l95_ms: float
-    declared_ms: float
-    uncut_ms: float
-    violation_rate: float
-    declared_rate: float
-    own: Floats
-    latency_ns: Ints
-
-
 class _Twin:
     """A candidate that is played beside the cell, and the steps that it has shown."""
 
-    def __init__(self, first: Arrays, index: int, shadows: SentShadows | None) -> None:
+    def __init__(
+        self, first: Arrays, index: int, shadows: SentShadows | None, resources: int
+    ) -> None:
         self.arrays = first.copy()
         self.arrays.replace(stamps=stamps_of(first, index, shadows))
         #: The cycle that it goes on from.
         self.cursor = 0
-        self.steps: deque[_Step] = deque(maxlen=KEPT)
+        #: Means of each step, the oldest first: L95 (ms) and V_D, each with its mean as declared in
+        #: the same windows; uncut L95; the cell's own share of every resource.
+        self.steps = Steps(KEPT, PAIRS + 1 + resources)
+        #: Latencies of its cycles.
+        self.latency_ns: deque[Ints] = deque(maxlen=KEPT)
         self.price: PlayedPrice | None = None
+
+    def add(self, means: Sequence[float], latency_ns: Ints) -> None:
+        """Add a step; the oldest leaves when there are too many."""
+        self.steps.add(means)
+        self.latency_ns.append(latency_ns)
+
+    def keep(self, most: int) -> None:
+        """Keep the newest steps."""
+        self.steps.keep(most)
+        while len(self.latency_ns) > most:
+            self.latency_ns.popleft()
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +174,7 @@ class Playing:
         self.declared = declared_of(problem, seed, shadow_fraction)
         self.prices = prices_of(problem, shadow_fraction=shadow_fraction)
         self._window = min(problem.window_cycles, LONGEST_WINDOW)
-        self._names = tuple(problem.candidates)
+        self._names, self._resources = tuple(problem.candidates), tuple(problem.fabric.resources)
         self._step, self._censor_ms = max(STEP // self._window, 1), problem.censor_ms
         #: Standard deviations of what steps show as declared: L95 (ms) and V_D.
         self._usual = {
@@ -201,7 +205,7 @@ class Playing:
         self._set_links(present)
         self._set_losses(present)
         for twin in self._twins.values():
-            twin.steps.clear()
+            twin.keep(0)
             twin.arrays.replace(changes=changes)
         self._restart()
 
@@ -220,8 +224,7 @@ class Playing:
             self._set_losses(present)
             self._fill(max(twin.cursor for twin in self._twins.values()))
             for name in names:
-                while len(self._twins[name].steps) >= RECENT:
-                    self._twins[name].steps.popleft()
+                self._twins[name].keep(RECENT - 1)
         for _ in range(steps):
             last = max(self._twins[name].cursor for name in names)
             if last + self._step * self._window > self._real.cycles:
@@ -246,17 +249,15 @@ class Playing:
         if first < last:
             tables, stretch = twin.arrays.tables, slice(first, last)
             seen = tables.seen[0, stretch]
-            twin.steps.append(
-                _Step(
-                    _mean(seen["l95_ms"]),
-                    _mean(self.declared.l95_ms[name][stretch]),
-                    _mean(seen["uncut_ms"]),
-                    _mean(seen["missed"]) / self._window,
-                    _mean(self.declared.violation_rate[name][stretch]),
-                    _mean_shares(tables.shares[0, stretch, 1]),
-                    tables.latency_ns[0, first * self._window : twin.cursor].copy(),
-                )
+            means = (
+                _mean(seen["l95_ms"]),
+                _mean(self.declared.l95_ms[name][stretch]),
+                _mean(seen["missed"]) / self._window,
+                _mean(self.declared.violation_rate[name][stretch]),
+                _mean(seen["uncut_ms"]),
+                *_mean_shares(tables.shares[0, stretch, 1]),
             )
+            twin.add(means, tables.latency_ns[0, first * self._window : twin.cursor].copy())
         twin.price = None
         self.cycles += self._step * self._window
 
@@ -271,10 +272,9 @@ class Playing:
         """Return standard deviations of one window: of its L95, milliseconds, and its V_D."""
         price = self.prices[name]
         usual = price.l95_deviation_ms, price.violation_deviation
-        steps = self._twins[name].steps if self._twins else ()
-        if len(steps) < 2:
+        if not self._twins or len(steps := self._twins[name].steps) < 2:
             return usual
-        shown = np.array([[step.l95_ms, step.violation_rate] for step in steps])
+        shown = np.ascontiguousarray(steps.table[:, :PAIRS:2])
         # Of few values the deviation is itself hardly known.
         few = (len(steps) + 1) / (len(steps) - 1) * math.sqrt(self._step)
         l95_ms, rate = (few * shown.std(axis=0)).tolist()
@@ -282,42 +282,36 @@ class Playing:
 
     def tail_error_ms(self, name: str, off: float) -> float:
         """Return the error of a candidate's L95 by the error of the share of lost cycles."""
-        latency_ns = np.concatenate([step.latency_ns for step in self._twins[name].steps])
-        return quantile_error(np.sort(np.minimum(latency_ns / 1e6, self._censor_ms)), off)
+        latency_ns = np.concatenate(self._twins[name].latency_ns)
+        return tail_error_ms(latency_ns, self._censor_ms, off)
 
-    def _price(self, name: str, steps: Collection[_Step]) -> PlayedPrice:
-        l95, declared_l95, uncut, rates, declared_rates, own, _ = zip(*steps, strict=True)
-        known = self.prices[name]
+    def _price(self, name: str, steps: Steps) -> PlayedPrice:
+        count, known = len(steps), self.prices[name]
+        l95, rates, (uncut, *own) = steps.sums()
         l95_ms, l95_error_ms = _estimated(
-            l95,
-            declared_l95,
-            known.l95_ms,
-            known.l95_error_ms,
-            usual=self._usual[name][0],
+            l95, count, known.l95_ms, known.l95_error_ms, usual=self._usual[name][0]
         )
-        count = len(steps)
         violation_rate, violation_error = _estimated(
             rates,
-            declared_rates,
+            count,
             known.violation_rate,
             known.violation_error,
             usual=self._usual[name][1],
             cycles=count * self._step * self._window,
         )
-        l95_ms, shares = min(l95_ms, self._censor_ms), sum(own) / count
+        l95_ms = min(l95_ms, self._censor_ms)
         return PlayedPrice(
             l95_ms,
             l95_error_ms,
-            max(sum(uncut) / count, l95_ms),
+            max(uncut / count, l95_ms),
             min(violation_rate, 1.0),
             violation_error,
-            FrozenDict(zip(self.problem.fabric.resources, shares.tolist(), strict=True)),
+            FrozenDict(zip(self._resources, [share / count for share in own], strict=True)),
         )
 
     def is_full(self, name: str) -> bool:
         """Whether the price of a candidate is of as many windows as it ever is."""
-        steps = self._twins[name].steps
-        return len(steps) == steps.maxlen
+        return len(self._twins[name].steps) == KEPT
 
     def _lay_out(self) -> None:
         problem = _with_short_windows(self.problem)
@@ -344,19 +338,20 @@ class Playing:
         self._declared_rates, self._declared_segments = tables.rates.copy(), tables.segments.copy()
         self._declared_layers = tables.layers.copy()
         self._nothing_ns = np.zeros(self._real.cycles, np.int64)
-        self._rows: dict[Part, list[Ints]] = {}
+        self._rows: dict[Part, list[TimesRow]] = {}
         for _, played in self._replaced:
             for site, row in zip(played.sites, played.exec_ns, strict=True):
-                self._rows.setdefault(Site(*site), []).append(row)
+                self._rows.setdefault(Site(*site), []).append(TimesRow.of(row))
             for hop, row in zip(played.hops, played.delay_ns, strict=True):
-                self._rows.setdefault(Message(*hop), []).append(row)
+                self._rows.setdefault(Message(*hop), []).append(TimesRow.of(row))
         self._stretched: dict[Part, float] = {
             Site(*site): _stretched(self.problem, Site(*site)) for site in self._real.sites
         }
         self._hops = {Message(*hop): number for number, hop in enumerate(self._real.hops)}
         rows = zip(problem.fabric.links, tables.links.tolist(), strict=False)
         self._segments = {link: slice(*row[-2:]) for link, row in rows}
-        self._twins = {name: _Twin(self._first, i, shadows) for i, name in enumerate(self._names)}
+        of = shadows, len(self._resources)
+        self._twins = {name: _Twin(self._first, i, *of) for i, name in enumerate(self._names)}
 
     def _restore(self) -> None:
         """Go back to what is declared."""
@@ -462,8 +457,8 @@ def with_threads(rows: Rows, threads: float, release_ns: Ints) -> Rows:
 
 
 def _estimated(
-    steps: Sequence[float],
-    declared: Sequence[float],
+    steps: SeriesSums,
+    count: int,
     known: float,
     known_error: float,
     *,
@@ -478,8 +473,8 @@ def _estimated(
 
     Parameters
     ----------
-    declared : sequence of float
-        What the same steps show as declared.
+    count : int
+        Number of steps.
     known, known_error : float
         Mean as declared, with its standard error.
     usual : float
@@ -487,15 +482,14 @@ def _estimated(
     cycles : int, optional
         How many there are, where it is a share of them that is estimated.
     """
-    differences = list(map(sub, steps, declared))
-    if not any(differences):
+    mean, squares, products, more, more_squares, more_products, apart = steps
+    if not apart:
         return known, known_error
-    mean, error = _mean_and_error(steps, usual)
-    more, more_error = _mean_and_error(differences)
+    error = _error(count, mean, squares, products, usual)
+    more_error = _error(count, more, more_squares, more_products)
     if cycles is not None:
         error = max(error, unseen_error(mean, cycles))
-        differing = sum(map(abs, differences)) / len(steps)
-        more_error = max(more_error, unseen_error(differing, cycles))
+        more_error = max(more_error, unseen_error(apart / count, cycles))
     more_error = math.hypot(more_error, known_error)
     return (max(known + more, 0.0), more_error) if more_error < error else (mean, error)
 
@@ -505,21 +499,21 @@ def _mean(windows: Floats | Ints) -> float:
     return float(windows.item() if len(windows) == 1 else windows.mean())
 
 
-def _mean_shares(windows: Floats) -> Floats:
-    mean: Floats = windows[0].copy() if len(windows) == 1 else windows.mean(axis=0)
-    return mean
+def _mean_shares(windows: Floats) -> list[float]:
+    mean: Floats = windows[0] if len(windows) == 1 else windows.mean(axis=0)
+    shares: list[float] = mean.tolist()
+    return shares
 
 
-def _mean_and_error(values: Sequence[float], usual: float = 0.0) -> tuple[float, float]:
-    """Return the mean, and its error had one value more deviated as is usual."""
-    count, (mean, squares, products) = len(values), moments(values)
+def _error(count: int, mean: float, squares: float, products: float, usual: float = 0.0) -> float:
+    """Return the error of a mean had one value more deviated as is usual (see `SeriesSums`)."""
     if count < 2:
-        return mean, abs(mean)
+        return abs(mean)
     # Of few values the deviation is itself hardly known: about Student's t over 2.
     few = (count + 1) / (count - 1)
     variance = max(squares / (count - 1), (squares + usual * usual) / count)
     factor = _correlation_factor(count, squares, products)
-    return mean, few * math.sqrt(variance / count * factor)
+    return few * math.sqrt(variance / count * factor)
 
 
 def _correlation_factor(count: int, squares: float, products: float) -> float:
@@ -574,7 +568,7 @@ def realised(problem: Problem, real: Realisation, present: Present) -> Realisati
             known, times = real.hops, delay_ns
             extra_ns[[real.hops[hop] == part for hop, _ in real.layers]] = 0
         if part in known:
-            fill([times[known.index(part)]], values, stretched, 0, 0)
+            fill([TimesRow.of(times[known.index(part)])], values, stretched, 0, 0)
     for name, mbps in present.rates_mbps.items():
         rates[state[:, 1] == segments.links.index(name), 0] = mbps
     for name, share in _lost(present).items():
@@ -700,6 +694,6 @@ def _shown(problem: Problem, arrays: Arrays) -> tuple[Floats, Floats]:
 
 def _evidence_of(problem: Problem, real: Realisation, arrays: Arrays) -> Evidence:
     """What all cycles show that have run under a candidate."""
-    flows = flow_rows(problem.pipeline)
-    rows = logged_window(CellArrays(arrays), 0, real.cycles, flows)
-    return Evidence.of(rows, int(real.release_ns[-1]), real.release_ns[:-1])
+    logged = LoggedCycles(CellArrays(arrays), flow_rows(problem.pipeline))
+    rows = logged.window(0, real.cycles)
+    return Evidence(int(real.release_ns[-1]), real.release_ns[:-1], rows)

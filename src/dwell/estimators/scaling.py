@@ -94,8 +94,8 @@ class Scaling(Learning):
         #: Times of jobs (each alone) and of messages in the last window, milliseconds, by cycle.
         self._jobs, self._messages = np.empty((0, 0)), np.empty((0, 0))
 
-    def _take_in(self, demands: Mapping[Part, Floats], evidence: Evidence) -> None:
-        super()._take_in(demands, evidence)
+    def _take_in(self, evidence: Evidence) -> None:
+        super()._take_in(evidence)
         newest = int(evidence.placement[-1])
         active = tuple(self.problem.candidates.values())[newest]
         self._has_changed |= active != self._active

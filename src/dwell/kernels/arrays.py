@@ -12,7 +12,15 @@ from numpy.typing import NDArray
 
 from dwell.errors import SimulationError
 from dwell.kernels import codes
-from dwell.kernels.codes import LAST_NS, EventKind, Scheduler, ShadowPart, make_key
+from dwell.kernels.codes import (
+    LAST_NS,
+    EventKind,
+    Scheduler,
+    ShadowPart,
+    cell_of,
+    kind_of,
+    make_key,
+)
 from dwell.kernels.realisation import LinkSegments, NodeChanges, Phase, Realisation
 from dwell.kernels.rows import Rows, Tables, row_types
 from dwell.model import Flow, Node, Pipeline, Placement, Problem, Quota
@@ -21,7 +29,7 @@ from dwell.model.number_arrays import Ints
 from dwell.model.window_close import close_after_ns, window_close_ns
 
 SCHEDULERS = {"fair": Scheduler.FAIR, "fifo": Scheduler.FIFO, "priority": Scheduler.PRIORITY}
-RING_START = 64
+RING_START = 8
 #: A shadow is given up after the release of a window and this many further cycles.
 GIVEN_UP_AFTER = 64
 #: Number of events after which the kernel returns to Python, about every 20 ms.
@@ -107,6 +115,19 @@ class Arrays:
         for name, table in tables.items():
             row = self.tables._fields.index(name)
             self._addresses[row] = table.ctypes.data, table.size
+
+    def leave_out(self, rows: Collection[int]) -> None:
+        """Release no cycle of some cells, and close none of their windows."""
+        cells, clock, events = self.tables.cells, self.tables.clock[0], self.tables.events
+        without = [*rows]
+        cells["close_cycle"][without] = cells["n_cycles"][without] + 1
+        first = events[: clock["n_events"]]
+        kept = [
+            kind_of(key) != EventKind.RELEASE or cell_of(key) not in rows
+            for key in first["key"].tolist()
+        ]
+        clock["n_events"] = sum(kept)
+        events[: clock["n_events"]] = first[kept]
 
     def use_rule(
         self,

@@ -196,6 +196,9 @@ void finish(S& s, i64 cell, i64 cycle, i64 task, const Job& job, i64 now) {
   s.latency_ns[row] = now - s.cell(cell).release_ns[cycle];
   s.compute_ns[row] = job.compute_ns;
   s.network_ns[row] = job.network_ns;
+  S::fetch_next(s.latency_ns[row]);
+  S::fetch_next(s.compute_ns[row]);
+  S::fetch_next(s.network_ns[row]);
 }
 
 // Hands a job's outputs over to tasks on its node, and sends the others.
@@ -369,7 +372,9 @@ void release(S& s, i64 cell, i64 cycle, i64 now) {
   }
   const i64 following = cycle + 1;
   if (following < s.cell(cell).n_cycles) {
-    s.post(s.cell(cell).release_ns[following], make_key(kRelease, cell, following, 0));
+    const i64* release_ns = &s.cell(cell).release_ns[following];
+    s.post(*release_ns, make_key(kRelease, cell, following, 0));
+    S::fetch_next(*release_ns);
   }
 }
 

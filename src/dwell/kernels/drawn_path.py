@@ -124,7 +124,7 @@ def _row(process: Process) -> dict[str, float] | None:
 
 
 def _logarithm(process: LogNormal | AR1) -> dict[str, float]:
-    mu, sigma = LogNormal(process.mean, process.cv).log_parameters
+    mu, sigma = process.log_parameters
     # Values below e^-600 ms are 0 ns, too, and the kernel's exponential is exact only from -700 on.
     return {"kind": LOGNORMAL, "location": max(mu, -600.0), "spread": sigma}
 

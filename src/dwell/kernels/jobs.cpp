@@ -1,4 +1,4 @@
-// What the jobs of a window say of waits, and of foreign threads beside them.
+// Waits of a window's jobs, and foreign threads on their nodes.
 
 #include <algorithm>
 #include <cmath>
@@ -309,12 +309,13 @@ bool keep_newest(Jobs& jobs, f64* scratch) {
 
 using namespace dwell;
 
-// Adds waits to the work of the window's own jobs, on each of some nodes.
+// Copies a window, and adds waits to the work of its own jobs, on each of some nodes.
 DWELL_EXPORT void dwell_add_waits(const NodeJobs* nodes, i64 n_nodes, const Window* window,
-                                  RanJob* scratch) noexcept {
-  for (i64 one = -1; (one = next_candidate(*window, 0, one)) >= 0;) {
+                                  RanJob* scratch, const Window* out) noexcept {
+  std::copy(window->rows, window->rows + window->n * window->width, out->rows);
+  for (i64 one = -1; (one = next_candidate(*out, 0, one)) >= 0;) {
     for (i64 i = 0; i < n_nodes; ++i) {
-      if (runs_on(nodes[i], one)) add_waits(nodes[i], *window, one, scratch);
+      if (runs_on(nodes[i], one)) add_waits(nodes[i], *out, one, scratch);
     }
   }
 }
@@ -372,13 +373,15 @@ DWELL_EXPORT i64 dwell_level(const NodeJobs* node, const Window* window, const i
   return is_slowed ? 2 : 1;
 }
 
-// What has to be looked at in a window: 1 where an own job that began before the limit has not
-// ended, 2 where the work of an own job that has ended is not known, 4 where a shadow's is not.
+// Returns the flaws of a window as a sum: 1 if an own job that began before the limit is
+// unfinished, 2 if the work of a completed own job is unknown, 4 for a completed shadow job, 8 if
+// its cycles have several candidates.
 DWELL_EXPORT i64 dwell_unknown(i64 n_tasks, i64 n_flows, const Window* window,
                                i64 limit_ns) noexcept {
   i64 found = 0;
   const i64 width = 1 + 4 * n_tasks + n_flows;
   for (i64 i = 0; i < window->n; ++i) {
+    if (window->rows[i * window->width] != window->rows[0]) found |= 8;
     for (i64 begin = 0; begin < window->width; begin += width) {
       const i64* ready_ns = window->rows + i * window->width + begin + 1;
       const i64 *end_ns = ready_ns + n_tasks, *work_ns = end_ns + n_tasks + n_flows;

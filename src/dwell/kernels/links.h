@@ -45,9 +45,12 @@ inline bool loses(const Hop& hop, const Rate& rate, i64 cycle, i64 attempt) {
 template <class S>
 i64 propagation_ns(const S& s, i64 hop, const Segment& segment, i64 cycle) {
   i64 delay = s.hops[hop].delay_ns[cycle];
+  S::fetch_next(s.hops[hop].delay_ns[cycle]);
   const Times* layer = &s.layers[hop * s.clock[0].n_layers];
   for (i64 on = segment.layers; on != 0; on >>= 1, ++layer) {
-    if (on & 1) delay = later(delay, (*layer)[cycle]);
+    if ((on & 1) == 0) continue;
+    delay = later(delay, (*layer)[cycle]);
+    S::fetch_next((*layer)[cycle]);
   }
   return delay;
 }

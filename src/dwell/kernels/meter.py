@@ -58,6 +58,7 @@ class WindowRows:
     def __init__(self, table: Ints, tasks: int, flows: int, beside: Ints | None = None) -> None:
         self.table, self.tasks, self.flows, self.beside = table, tasks, flows, beside
         self.row = structs()["Window"](table.ctypes.data, *table.shape)
+        self._known: tuple[int, int] | None = None
 
     @classmethod
     def of(
@@ -110,10 +111,6 @@ class WindowRows:
         # A copy has an address of its own.
         return WindowRows, (self.table, self.tasks, self.flows, self.beside)
 
-    def copy(self) -> WindowRows:
-        """Return a copy with its own table."""
-        return WindowRows(self.table.copy(), self.tasks, self.flows, self.beside)
-
     def unknown(self, limit_ns: int) -> tuple[bool, bool, bool]:
         """Return which kinds of unknown values the window has.
 
@@ -123,12 +120,25 @@ class WindowRows:
             Whether an own job that began before `limit_ns` is unfinished; whether the work of a
             completed own job is unknown; whether the work of a completed shadow job is unknown.
         """
-        found = _unknown()(self.tasks, self.flows, byref(self.row), limit_ns)
+        found = self._look(limit_ns)
         return bool(found & 1), bool(found & 2), bool(found & 4)
+
+    def candidates(self, limit_ns: int) -> list[int]:
+        """Return the candidates of the cycles, ascending; one call of the kernel per limit."""
+        if self._look(limit_ns) & 8:
+            return sorted(set(self.table[:, 0].tolist()))
+        return [self.table.item(0, 0)]
+
+    def _look(self, limit_ns: int) -> int:
+        known = self._known
+        if known is None or known[0] != limit_ns:
+            found = _unknown()(self.tasks, self.flows, byref(self.row), limit_ns)
+            known = self._known = limit_ns, found
+        return known[1]
 
 
 class PartTimes:
-    """Times, or demands, of the parts of a window's cycles, milliseconds, infinite where lost.
+    """Times, or demands, of the parts of a window's cycles, milliseconds; infinite if lost.
 
     Parameters
     ----------
@@ -199,11 +209,19 @@ class PartTimes:
         row = byref(self._window.row)
         self._meter(byref(layout.row), row, active, self._limit_ns, byref(self.found))
 
+    @property
+    def numbers(self) -> list[int]:
+        """Numbers of the parts, in the order in which they were found."""
+        numbers: list[int] = self._order[: self.found.n_parts].tolist()
+        return numbers
+
+    def values(self, part: int) -> Floats:
+        """Return the times of a part."""
+        return self._ms[part, : self._count[part]]
+
     def by_part(self) -> dict[int, Floats]:
         """Return the times by number of part, in the order in which they were found."""
-        counts = self._count.tolist()
-        order = self._order[: self.found.n_parts].tolist()
-        return {part: self._ms[part, : counts[part]] for part in order}
+        return {part: self.values(part) for part in self.numbers}
 
 
 _unknown = foreign("dwell_unknown", c_int64, c_int64, c_int64, c_void_p, c_int64)

@@ -1,4 +1,4 @@
-// Pools: what is held of each part of a cycle, next to what it is as declared (pool.py).
+// Pools: the measured and the declared values of each part of a cycle (pool.py).
 
 #include <algorithm>
 #include <cmath>
@@ -23,6 +23,8 @@ constexpr i64 kLargest = 200, kEnough = 12;
 constexpr f64 kMoved = 0.75, kShifted = 4.0, kAlike = 2.0;
 // Room for values and for chunks, of which the newest are held (pools.py).
 constexpr i64 kRoom = 408;
+// Parts of the range of declared values (pools.py).
+constexpr i64 kGuideParts = 512;
 // Why a pool needs another look: what a window brought has not been added, or it has been.
 // The third: it has been added to a pool that is not as declared.
 constexpr i64 kNotAdded = 1, kAdded = 2, kGrown = 3;
@@ -39,15 +41,29 @@ const f64* first_not_below(const f64* known, i64 n, f64 value) {
   return known + (*known < value ? 1 : 0);
 }
 
+// Returns the part of the range of declared values that contains a value; an end if it is outside.
+i64 part_of(f64 value, f64 low, f64 parts_per_ms) {
+  const f64 place = (value - low) * parts_per_ms;
+  if (place >= static_cast<f64>(kGuideParts)) return kGuideParts - 1;
+  return place > 0.0 ? static_cast<i64>(place) : 0;
+}
+
+// Returns the first declared value that is not below `value`; it is in the same part.
+const f64* first_declared_not_below(const Pool& pool, f64 value) {
+  const i32* part = pool.guide + part_of(value, pool.guide_low, pool.guide_parts_per_ms);
+  return first_not_below(pool.known + part[0], part[1] - part[0], value);
+}
+
+template <class Search>
 void add_places(const f64* known, i64 n_known, const f64* values, i64 n, f64 patience_ms,
-                PlaceSums& out) {
+                PlaceSums& out, Search search) {
   // Of so many places the product is far from the least number, and has one logarithm.
   constexpr i64 kTogether = 16;
   out = {n, 0.0, 0.0, 0.0};
   f64 beyond = 1.0, below = 1.0;
   for (i64 i = 0; i < n; ++i) {
     const f64 value = values[i] > patience_ms ? std::numeric_limits<f64>::infinity() : values[i];
-    const f64* first = first_not_below(known, n_known, value);
+    const f64* first = search(value);
     const f64* last = first;
     if (first != known + n_known && *first == value) {
       last = std::upper_bound(first, known + n_known, value);
@@ -63,6 +79,17 @@ void add_places(const f64* known, i64 n_known, const f64* values, i64 n, f64 pat
       beyond = below = 1.0;
     }
   }
+}
+
+void add_places(const f64* known, i64 n_known, const f64* values, i64 n, f64 patience_ms,
+                PlaceSums& out) {
+  add_places(known, n_known, values, n, patience_ms, out,
+             [&](f64 value) { return first_not_below(known, n_known, value); });
+}
+
+void add_declared_places(const Pool& pool, const f64* values, i64 n, PlaceSums& out) {
+  add_places(pool.known, pool.n_known, values, n, pool.patience_ms, out,
+             [&](f64 value) { return first_declared_not_below(pool, value); });
 }
 
 PlaceSums plus(const PlaceSums& one, const PlaceSums& other, i64 sign) {
@@ -148,12 +175,12 @@ bool run_goes_on(const Pool& pool, i64 cycles) {
   return pool.run_cycles > 0 && pool.run_cycles + cycles <= pool.block;
 }
 
-// Adds what a window brought to a pool that is not as declared, if it is neither near what is
-// declared, nor of another regime.
+// Adds the values of a window to a pool that is not as declared, unless they are near the declared
+// values, or show another regime.
 i64 learn_otherwise(Pool& pool, const f64* values, i64 n, i64 window, f64 memory, i64 cycles) {
   if (pool.doubts != 0 || pool.size > kLargest) return kNotAdded;
   PlaceSums declared, run;
-  add_places(pool.known, pool.n_known, values, n, pool.patience_ms, declared);
+  add_declared_places(pool, values, n, declared);
   if (deviations(pool, declared, cycles) < kAlike) return kNotAdded;
   const bool goes_on = run_goes_on(pool, cycles);
   if (!goes_on) {
@@ -181,7 +208,7 @@ i64 learn(Pool& pool, const f64* values, i64 n, i64 window, f64 memory, i64 cycl
   if (pool.n_known == 0 || pool.asks != 0 || n > kLargest) return kNotAdded;
   if (pool.is_declared == 0) return learn_otherwise(pool, values, n, window, memory, cycles);
   PlaceSums declared;
-  add_places(pool.known, pool.n_known, values, n, pool.patience_ms, declared);
+  add_declared_places(pool, values, n, declared);
   const bool goes_on = run_goes_on(pool, cycles);
   const PlaceSums run = goes_on ? plus(run_of(pool), declared, 1) : declared;
   const i64 run_cycles = cycles + (goes_on ? pool.run_cycles : 0);
@@ -224,6 +251,16 @@ DWELL_EXPORT i64 dwell_learn(Pool* const* pools, const Found* found, const i64* 
     n += out[i] != 0 ? 1 : 0;
   }
   return n;
+}
+
+// Writes how many declared values are below each part of their range, and below its end.
+DWELL_EXPORT void dwell_guide(const f64* known, i64 n_known, f64 low, f64 parts_per_ms,
+                              i32* out) noexcept {
+  i64 part = 0;
+  for (i64 i = 0; i < n_known; ++i) {
+    for (; part <= part_of(known[i], low, parts_per_ms); ++part) out[part] = static_cast<i32>(i);
+  }
+  for (; part <= kGuideParts; ++part) out[part] = static_cast<i32>(n_known);
 }
 
 DWELL_EXPORT void dwell_pool_add(Pool* pool, const f64* values, i64 n, f64 larger, f64 smaller,

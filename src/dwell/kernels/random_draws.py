@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import os
+import struct
 from collections.abc import Collection, Iterator
 from dataclasses import replace
 from functools import cached_property
@@ -53,8 +54,7 @@ def stream(seed: int, name: str) -> np.random.SeedSequence:
     all others unchanged.
     """
     digest = hashlib.blake2b(name.encode(), digest_size=16).digest()
-    words = tuple(int(word) for word in np.frombuffer(digest, dtype="<u4"))
-    return np.random.SeedSequence(seed, spawn_key=words)
+    return np.random.SeedSequence(seed, spawn_key=struct.unpack("<4I", digest))
 
 
 def draw(

@@ -276,7 +276,8 @@ struct Crossing;  // of meter.cpp
 // last ceased to be as declared, or got another value since; whether Python asks for the next window;
 // how often the held values have changed; whether Python doubts that they still hold;
 // the cycles and sums of a run of windows that are larger, or smaller, 0 for none; and the values,
-// ascending, that were held before it, 0 where these are the declared ones.
+// ascending, that were held before it, 0 where these are the declared ones; how many declared values
+// are below each of equal parts of their range.
 #define DWELL_POOL(field)                                                                        \
   field(const f64*, known) field(i64, n_known) field(f64, patience_ms) field(f64, likeness)      \
   field(i64, block) field(f64*, held) field(i64, first) field(i64, size)                         \
@@ -286,7 +287,8 @@ struct Crossing;  // of meter.cpp
   field(i64, touched) field(i64, is_declared) field(i64, asks) field(i64, changes)                \
   field(i64, doubts) field(i64, run_cycles) field(i64, run_size)                                                    \
   field(f64, run_larger) field(f64, run_smaller) field(f64, run_places)                          \
-  field(f64*, before) field(i64, n_before)
+  field(f64*, before) field(i64, n_before)                                                       \
+  field(const i32*, guide) field(f64, guide_low) field(f64, guide_parts_per_ms)
 
 #define DWELL_ROWS(row)                                                                          \
   row(Clock, DWELL_CLOCK) row(Cell, DWELL_CELL) row(Task, DWELL_TASK) row(Flow, DWELL_FLOW)      \

@@ -357,6 +357,7 @@ void admit(S& s, i64 key, i64 now) {
   const Site& site = s.site(job);
   Server& server = s.server(site);
   const i64 work_ns = site.exec_ns[cycle_of(key)];
+  S::fetch_next(site.exec_ns[cycle_of(key)]);
   if (takes_turns(s, server)) {
     line_up(s, server, job, key, work_ns, now);
     return;

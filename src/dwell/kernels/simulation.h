@@ -60,6 +60,14 @@ struct Simulation : Tables {
     return log_row(cell, cycle) * n_tasks + task;
   }
 
+  // Fetches the values of the next cycles from memory, given one of this cycle. With many cells
+  // the processor does not do it in time by itself.
+  template <class T>
+  static void fetch_next(const T& value) {
+    constexpr i64 kLineBytes = 64;
+    if constexpr (!kPlain) __builtin_prefetch(&value + kLineBytes / sizeof(T));
+  }
+
   // Hop that a flow takes in a cycle, -1 on the same node.
   i64 hop(i64 cell, i64 cycle, i64 flow) const {
     return route[slot(cell, cycle).candidate * n_flows + flow];

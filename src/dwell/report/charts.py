@@ -20,7 +20,7 @@ from dwell.report.palette import INK, MUTED, PARTS, Style
 if TYPE_CHECKING:
     import polars as pl
 
-    from dwell.report.formatting import Measure
+    from dwell.display import Measure
 
 #: Names of the parts of a latency, and their colours by name.
 PARTS_SHOWN = {"compute": "computing", "queue": "waiting", "network": "network"}
@@ -57,6 +57,12 @@ NO_LIMIT = Limit(math.inf, "")
 def quantity(field: str, title: str | None, **more: Any) -> Spec:
     """Return the encoding of a number; `more` are properties of Vega-Lite, such as ``scale``."""
     return {"field": field, "type": "quantitative", "title": title, **more}
+
+
+def number_of(field: str, measure: Measure) -> Spec:
+    """Return the encoding of a measure in a tooltip; `field` is in the shown unit."""
+    more = {"format": f".{measure.decimals}f"} if measure.fixed else {}
+    return quantity(field, measure.heading, **more)
 
 
 def name_of(field: str, **more: Any) -> Spec:
@@ -197,7 +203,7 @@ def intervals(
     seed = {
         "x": "value",
         "opacity": {"condition": {"test": "seed === datum.seed", "value": 1}, "value": 0.22},
-        "tooltip": [*about, quantity("seed", "seed"), quantity("value", measure.heading)],
+        "tooltip": [*about, quantity("seed", "seed"), number_of("value", measure)],
     }
     mean = {"shape": colours["shape"], "tooltip": [*about, *_mean_and_ends(measure)]}
     marks = [
@@ -356,7 +362,8 @@ def curves(
 
 
 def _mean_and_ends(measure: Measure) -> list[Spec]:
-    return [quantity("mean", measure.heading), quantity("low", "from"), quantity("high", "to")]
+    ends = (measure.called(name) for name in ("from", "to"))
+    return [number_of("mean", measure), *map(number_of, ("low", "high"), ends)]
 
 
 def _of(look: Mapping[str, Spec], *channels: str) -> dict[str, Spec]:

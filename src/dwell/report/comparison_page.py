@@ -6,12 +6,11 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
 
+from dwell.display import Measure
 from dwell.model.bounds import counted
 from dwell.model.disturbed import disturbed
 from dwell.report.figure import Figure
 from dwell.report.formatting import (
-    COST,
-    Measure,
     few_seeds,
     independent_runs,
     shown_policy,
@@ -20,10 +19,11 @@ from dwell.report.formatting import (
 from dwell.report.method import numbered
 from dwell.report.page import Page, Section, page_html
 from dwell.report.policy_blocks import MOST_COLUMNS, PolicyBlocks
-from dwell.report.table import Columns, Table, Text, table_text, wrapped
+from dwell.report.table import WITHOUT_WARMUP, Columns, Table, Text, table_text, wrapped
 from dwell.report.timeline import begins_by_number, run_timeline
 from dwell.study import Comparison, paper_predictions
 from dwell.study.drawn_disturbances import drawn_disturbances
+from dwell.study.metric import METRICS
 
 DTP = "dtp"
 
@@ -78,7 +78,10 @@ def _sections(comparison: Comparison, blocks: PolicyBlocks) -> Iterator[Section]
     if predictions.rows:
         yield Section("Predictions of the paper", [predictions], folded=True)
     yield Section("Results", blocks.results().parts(MOST_COLUMNS), folded=True)
-    figures = [blocks.tail(), blocks.measure(COST, title="J, the cost that DTP seeks to lower")]
+    figures = [
+        blocks.tail(),
+        blocks.measure(METRICS["cost"], title="J, the cost that DTP seeks to lower"),
+    ]
     figures += [blocks.distribution(), *blocks.placed(), blocks.split()]
     yield Section("Figures", figures, folded=True)
     moving = [name for name in comparison.policies if name not in comparison.statics]
@@ -157,12 +160,13 @@ def _beliefs(comparison: Comparison, blocks: PolicyBlocks) -> Table:
     rows = means.filter(~pl.col("policy").is_in(list(comparison.problem.candidates))).join(
         alone.rename({"policy": "candidate"}), on=["scenario", "candidate"], how="left"
     )
+    cost = METRICS["cost"]
     columns: Columns = [
         Text("policy", "policy", "policy"),
         Text("candidate", "placement", "placement"),
-        Measure("estimated", "estimated while idle", decimals=2),
-        Measure("measured", "measured while active", decimals=2),
-        Measure("alone", "measured alone", decimals=2),
+        cost.called("estimated while idle", "estimated"),
+        cost.called("measured while active", "measured"),
+        cost.called("measured alone", "alone"),
         Measure("shadow_fraction", "shadows per alternative", "%", 100.0, 1),
     ]
     return Table(
@@ -172,7 +176,7 @@ def _beliefs(comparison: Comparison, blocks: PolicyBlocks) -> Table:
         rows.to_dicts(),
         Text("scenario", "", "scenario"),
         "Estimates include the cost of switching. Alone: of the static placement, on the same "
-        "realisations.",
+        f"realisations. {WITHOUT_WARMUP}",
         blocks.palette,
     )
 

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from dwell.files import write_whole
+from dwell.report.formatting import SYMBOL
 from dwell.report.palette import PRINTED
 
 if TYPE_CHECKING:
@@ -81,6 +82,7 @@ def svg(figure: Figure, width: float | None = None) -> str:
     import vl_convert
 
     text = vl_convert.vegalite_to_svg(figure.spec(width or (*figure.widths, PAGE_PX)[0]))
+    text = _typeset(text)
     # vl-convert resolves links within the page against a site of Vega; restore them.
     text = text.replace("https://vega.github.io/vega-datasets/#", "#")
     # Two decimals and no ARIA attributes keep a page with many figures small.
@@ -102,14 +104,25 @@ def svg(figure: Figure, width: float | None = None) -> str:
     )
 
 
+def _typeset(drawing: str) -> str:
+    """Lower the indices of symbols in the texts of an SVG: V_D."""
+    # `dy` is in letters of its own element, and lasts; the letter after an index ends it.
+    lowered = r'\1<tspan dy=".3em" font-size="75%">\2</tspan><tspan dy="-.225em">\3</tspan>'
+    return re.sub(
+        r"(?<=>)[^<>]+(?=</text>)",
+        lambda text: re.sub(f"{SYMBOL.pattern}(.?)", lowered, text[0]),
+        drawing,
+    )
+
+
 def printed_svg(figure: Figure, width_pt: float = COLUMN_PT) -> str:
     """Return a figure as an SVG document for a column of a paper, with text of 7 pt."""
-    import vl_convert
-
-    text = str(vl_convert.vegalite_to_svg(_printed(figure, width_pt)))
     # One unit of the drawing is one point.
     return re.sub(
-        r'width="([\d.]+)" height="([\d.]+)"', r'width="\1pt" height="\2pt"', text, count=1
+        r'width="([\d.]+)" height="([\d.]+)"',
+        r'width="\1pt" height="\2pt"',
+        _printed(figure, width_pt),
+        count=1,
     )
 
 
@@ -117,24 +130,23 @@ def pdf(figure: Figure, width_pt: float = COLUMN_PT) -> bytes:
     """Return a figure as PDF for a column of a paper, with text of 7 pt."""
     import vl_convert
 
-    return bytes(vl_convert.vegalite_to_pdf(_printed(figure, width_pt)))
+    return bytes(vl_convert.svg_to_pdf(_printed(figure, width_pt)))
 
 
-def _printed(figure: Figure, width_pt: float) -> Spec:
-    """Return the drawing whose total width, with axes, is `width_pt`, within 1 pt if possible."""
+def _printed(figure: Figure, width_pt: float) -> str:
+    """Return the SVG whose total width, with axes, is `width_pt`, within 1 pt if possible."""
     import vl_convert
 
-    asked = width_pt
-    spec: Spec = {}
+    asked, text = width_pt, ""
     for _ in range(4):
         drawn = figure.spec(asked, letters=LETTERS_PT)
-        spec = _resolved({**drawn, "background": "white"})
-        found = re.search(r'width="([\d.]+)"', vl_convert.vegalite_to_svg(spec))
+        text = vl_convert.vegalite_to_svg(_resolved({**drawn, "background": "white"}))
+        found = re.search(r'width="([\d.]+)"', text)
         off = width_pt - (width_pt if found is None else float(found[1]))
         if 0 <= off < 1:
             break
         asked += off - 0.5
-    return spec
+    return _typeset(text)
 
 
 def _resolved(drawing: Spec) -> Spec:

@@ -8,25 +8,29 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dwell.display import Measure, write_number
 from dwell.errors import SimulationError
 from dwell.model.bounds import counted
 from dwell.model.disturbed import Disturbed, disturbed
+from dwell.model.table_columns import SHARE_OF
 from dwell.report.capacity_page import PHASES
 from dwell.report.charts import coloured, disc, layer, name_of, names, quantity
 from dwell.report.figure import Figure, Spec
-from dwell.report.formatting import COST, L95, RATE, Measure, percent, write_ms, write_number
+from dwell.report.formatting import percent, write_ms
 from dwell.report.page import Definitions, Fact, Page, Section
 from dwell.report.palette import INK, MUTED, Palette
-from dwell.report.table import MOST_ROWS, Columns, Table, Text
+from dwell.report.table import MOST_ROWS, WITH_WARMUP, WITHOUT_WARMUP, Columns, Table, Text
 from dwell.report.timeline import FAR, fleet_timeline, rows_px
 from dwell.report.topology import topology
 from dwell.study import AIM
 from dwell.study.fleet_summary import fleet_numbers, refusals
+from dwell.study.metric import METRICS, metric_of
 
 if TYPE_CHECKING:
     from dwell.record import FleetRun
 
-MOVES = Measure("moves", "moves", decimals=0)
+#: Metrics of a cell.
+RATE, L95, COST = (METRICS[name] for name in ("violation_rate", "l95_ms", "cost"))
 #: Room next to the panels of cells, and between them, pixels.
 BESIDE_PX, GAP_PX = 120, 18
 ROUNDS_PX = 190
@@ -86,9 +90,9 @@ class _FleetPage:
     def _facts(self) -> Iterator[Fact]:
         worst, numbers = self.cells[0], self.numbers
         kept = sum(row["verdict"] == "kept" for row in self.cells)
-        yield Fact("V_D of the worst cell", percent(worst["violation_rate"], 1), worst["cell"])
+        yield Fact("V_D of the worst cell", RATE.text(worst["violation_rate"]), worst["cell"])
         yield Fact("cells that keep the aim", f"{kept}", f"of {len(self.cells)}; under 5 %")
-        yield Fact("J", write_number(numbers["cost"], 2), "mean over cells")
+        yield Fact("J", COST.text(numbers["cost"]), "mean over cells")
         most = max(row["moves"] for row in self.cells)
         yield Fact("moves", write_number(numbers["moves"], 0), f"at most {most} of a cell")
         if self.run.guard:
@@ -194,18 +198,23 @@ class _FleetPage:
             cell = row["cell"]
             spent = {name: at.get((cell, name), 0) for name in self.used}
             windows = sum(spent.values())
-            shares = {f"share {name}": count / windows for name, count in spent.items()}
+            shares = {
+                SHARE_OF.format(candidate=name): count / windows for name, count in spent.items()
+            }
             rows.append({**row, **shares, "page": self.links.get(cell, "")})
         columns: Columns = [
             Text("cell", "cell", "cell", "{page}"),
-            RATE._replace(decimals=2),
+            RATE,
             Text("verdict", "verdict", "word"),
             L95,
             COST,
-            MOVES,
-            *(Measure(f"share {name}", name, "%", 100.0, 0) for name in self.used),
+            Measure("moves", "moves"),
+            *(metric_of(SHARE_OF.format(candidate=name)) for name in self.used),
         ]
-        caption = "L95 as seen at the windows’ closes. Last columns: share of windows by placement."
+        caption = (
+            "L95 as seen at the windows’ closes. Last columns: share of windows by placement. "
+            f"{WITHOUT_WARMUP}"
+        )
         return Table("cell-table", "", columns, rows, caption=caption, palette=self.palette)
 
     # ------------------------------------------------------------------------------- rounds
@@ -268,6 +277,7 @@ class _FleetPage:
                 f"{asked['round'].n_unique()} played)",
                 columns,
                 rows,
+                caption=WITH_WARMUP,
                 palette=self.palette,
             ),
         ]
@@ -280,10 +290,11 @@ class _FleetPage:
         columns: Columns = [
             Text("reason", "reason"),
             Text("to", "to", "placement"),
-            Measure("count", "refusals", decimals=0),
+            Measure("count", "refusals"),
         ]
         caption = (
-            "Moves that a policy had decided on and coordination did not allow, by its closes."
+            "Moves that a policy had decided on and coordination did not allow, by its closes. "
+            f"{WITH_WARMUP}"
         )
         return Table("refused", "", columns, rows, caption=caption, palette=self.palette)
 

@@ -6,20 +6,18 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from dwell.display import Measure
 from dwell.report.charts import NO_LIMIT, Limit, coloured, disc, layer, names, quantity, square
 from dwell.report.figure import Figure, Spec
-from dwell.report.formatting import Measure
 from dwell.report.palette import MUTED, Palette
-from dwell.report.table import MOST_ROWS, Columns, Row, Table, Text
+from dwell.report.table import MOST_ROWS, WITHOUT_WARMUP, Columns, Row, Table, Text
+from dwell.study.metric import METRICS
 
 if TYPE_CHECKING:
     import polars as pl
 
-#: Predicted metrics: column, column of the standard error, name, unit and factor.
-PREDICTED = (
-    ("l95_ms", "l95_error_ms", "L95", "ms", 1.0),
-    ("violation_rate", "violation_error", "V_D", "%", 100.0),
-)
+#: Predicted metrics, each with the column of its standard error.
+PREDICTED = {METRICS["l95_ms"]: "l95_error_ms", METRICS["violation_rate"]: "violation_error"}
 #: Width left for axes and legend next to the two panels, and largest side of a panel, pixels.
 BESIDE_PX, SIDE_PX = 230, 300
 #: Share of the range that is free at each end of an axis.
@@ -47,10 +45,10 @@ def _figure(moves: pl.DataFrame, palette: Palette, deadline_ms: float) -> Figure
     import polars as pl
 
     frame = moves.with_columns(
-        pl.col(f"{when}_{name}") * factor
-        for column, error, *_, factor in PREDICTED
+        pl.col(f"{when}_{name}") * metric.factor
+        for metric, error in PREDICTED.items()
         for when in ("predicted", "seen")
-        for name in (column, error)
+        for name in (metric.column, error)
     )
     used = set(frame["to"])
     colours = {name: colour for name, colour in palette.placements.items() if name in used}
@@ -61,8 +59,8 @@ def _figure(moves: pl.DataFrame, palette: Palette, deadline_ms: float) -> Figure
         {"rows": frame},
         lambda width: {
             "hconcat": [
-                _scatter(frame, column, error, f"{name} ({unit})", limit, colours, width)
-                for (column, error, name, unit, _), limit in zip(PREDICTED, limits, strict=True)
+                _scatter(frame, metric.column, error, metric.heading, limit, colours, width)
+                for (metric, error), limit in zip(PREDICTED.items(), limits, strict=True)
             ],
         },
         "A mark is a move: up, the estimate of the placement at the close at which it was chosen; "
@@ -152,7 +150,8 @@ def _table(
     rows: list[Row] = []
     for move in moves.head(MOST_ROWS).iter_rows(named=True):
         row = dict(move)
-        for column, error, *_ in PREDICTED:
+        for metric, error in PREDICTED.items():
+            column = metric.column
             for when in ("predicted", "seen"):
                 value, off = move[f"{when}_{column}"], move[f"{when}_{error}"]
                 if value is not None and off is not None:
@@ -165,11 +164,11 @@ def _table(
         Text("from", "from", "placement"),
         Text("to", "to", "placement"),
         *(
-            Measure(f"{when}_{column}", f"{name} {when}", unit, factor)
-            for column, _, name, unit, factor in PREDICTED
+            metric.called(f"{metric.name} {when}", f"{when}_{metric.column}")
+            for metric in PREDICTED
             for when in ("predicted", "seen")
         ),
-        Measure("windows", "windows seen", decimals=0),
+        Measure("windows", "windows seen"),
     ]
     return Table(
         "predicted-moves",
@@ -177,6 +176,7 @@ def _table(
         columns,
         rows,
         group,
-        "±: standard error, where it is known; of what was seen, between windows.",
+        "±: standard error, where it is known; of what was seen, between windows. "
+        f"{WITHOUT_WARMUP}",
         palette,
     )

@@ -116,6 +116,7 @@ def page_html(page: Page, *, static: bool = False) -> str:
             static=static,
             style=(TEMPLATES / "page.css").read_text(encoding="utf-8"),
             words=WORDS,
+            symbol=SYMBOL.pattern,
             drawn=svg,
             kind_of=lambda block: kinds[type(block)],
         )

@@ -8,11 +8,23 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dwell.record import shown_reason
 from dwell.record.moves import GUARD
-from dwell.report.charts import coloured, disc, is_wide, layer, limit_rule, name_of, names, quantity
+from dwell.report.charts import (
+    coloured,
+    disc,
+    is_wide,
+    layer,
+    limit_rule,
+    name_of,
+    names,
+    number_of,
+    quantity,
+)
 from dwell.report.figure import Draw, Figure, Spec
 from dwell.report.palette import BAD, INK, MUTED, SHADE, Palette
 from dwell.study import AIM
+from dwell.study.metric import METRICS
 
 if TYPE_CHECKING:
     import polars as pl
@@ -41,7 +53,7 @@ ROW_PX, ROWS_PX = 17, 640
 DASHES: tuple[list[int], ...] = ([], [6, 3], [2, 2], [6, 2, 2, 2])
 #: Scales that panels do not share.
 OWN = ("color", "strokeDash")
-L95 = "L95 seen (ms)"
+RATE, L95 = METRICS["violation_rate"], METRICS["l95_ms"].called("L95 seen")
 WARMUP, UNPROVEN = "warm-up", "clocks unproven"
 AT = quantity("time", "at (s)", format=".1f")
 #: Layer of every panel: shades for warm-up, unproven clocks and disturbances.
@@ -135,8 +147,9 @@ def run_timeline(
     aim, due = limit_rule("y", 100 * AIM, "5 %"), limit_rule("y", deadline_ms, "deadline")
     used = set(frame["placement"])
     colours = {name: colour for name, colour in placements.items() if name in used}
-    rates = _marks("v_d", "V_D (%)", colours, each, _range_of(frame["v_d"], 0.0, 100 * AIM))
-    tails = _marks("l95", L95, colours, each, _range_of(frame["l95"], deadline_ms), log=wide)
+    rates = _marks("v_d", RATE.heading, colours, each, _range_of(frame["v_d"], 0.0, 100 * AIM))
+    tail_ms = _range_of(frame["l95"], deadline_ms)
+    tails = _marks("l95", L95.heading, colours, each, tail_ms, log=wide)
     costs = _range_of(pl.concat([frame["j"], frames["estimates"]["j"]]))
     priced = [_others(placements, costs), *_marks("j", "J", placements, each, costs)]
     panels: list[tuple[float, list[Spec]]] = [
@@ -367,7 +380,7 @@ def _moves(timed: pl.DataFrame) -> pl.DataFrame:
     return timed.filter("migrated").select(
         "time",
         pl.format("{} → {}", "incumbent", "placement").alias("move"),
-        pl.col("reason").cast(pl.String),
+        pl.col("reason").cast(pl.String).map_elements(shown_reason, return_dtype=pl.String),
     )
 
 
@@ -522,7 +535,7 @@ def _placed(cells: Sequence[str], colours: Mapping[str, str]) -> Spec:
             *names("cell", "placement"),
             quantity("begin", "from (s)", format=".1f"),
             quantity("end", "to (s)", format=".1f"),
-            quantity("v_d", "V_D (%)"),
+            number_of("v_d", RATE),
         ],
     }
     return layer("rect", encoding, rows="placed", height={"band": 0.8})
@@ -531,10 +544,10 @@ def _placed(cells: Sequence[str], colours: Mapping[str, str]) -> Spec:
 def _rates() -> list[Spec]:
     """Return the layers of the median of V_D over cells, of its quartiles, and of outliers."""
     about = [AT, *names("worst")]
-    about += [quantity(how, f"{how} (%)") for how in ("max", "q3", "median", "mean", "q1")]
-    up = {"y": quantity("median", "V_D (%)", axis={"tickCount": 4})}
-    band = {"y": quantity("q1", "V_D (%)"), "y2": "q3"}
-    outlier = {"y": quantity("max", "V_D (%)"), "tooltip": about}
+    about += [number_of(how, RATE.called(how)) for how in ("max", "q3", "median", "mean", "q1")]
+    up = {"y": quantity("median", RATE.heading, axis={"tickCount": 4})}
+    band = {"y": quantity("q1", RATE.heading), "y2": "q3"}
+    outlier = {"y": quantity("max", RATE.heading), "tooltip": about}
     return [
         layer("area", band, rows="rates", color=MUTED, opacity=0.45),
         layer("line", up, rows="rates", color=INK, strokeWidth=1.1),

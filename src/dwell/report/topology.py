@@ -7,11 +7,12 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
+from dwell.display import write_number
 from dwell.model import Link, Problem, Trace
 from dwell.model.bounds import counted
 from dwell.report.charts import layer, quantity
 from dwell.report.figure import Figure, Spec
-from dwell.report.formatting import write_ms, write_number
+from dwell.report.formatting import write_ms
 from dwell.report.palette import INK, MUTED, PAPER, SHADE
 
 #: Largest width of a node; height of a line of text; room between nodes and between rows; pixels.

@@ -20,7 +20,7 @@ from dwell.control import (
     plain_rule,
 )
 from dwell.errors import SimulationError
-from dwell.kernels.advance import logged_window, play
+from dwell.kernels.advance import LoggedCycles, play
 from dwell.kernels.arrays import CellArrays, flow_rows, lay_out
 from dwell.kernels.codes import BuiltInPolicy, EventKind, Status, Tier, cell_of, kind_of
 from dwell.kernels.random_draws import draw, draw_shadows
@@ -546,11 +546,11 @@ def _evidence(
     problem: Problem, realisation: Realisation, arrays: CellArrays
 ) -> Callable[[int, int, int], Evidence]:
     """Return the function that extracts a window's evidence from the logs."""
-    flows = flow_rows(problem.pipeline)
+    logged = LoggedCycles(arrays, flow_rows(problem.pipeline))
 
     def cut(first: int, last: int, close_ns: int) -> Evidence:
-        rows = logged_window(arrays, first, last, flows)
-        return Evidence.of(rows, close_ns, realisation.release_ns[first:last].copy())
+        rows = logged.window(first, last)
+        return Evidence(close_ns, realisation.release_ns[first:last].copy(), rows)
 
     return cut
 

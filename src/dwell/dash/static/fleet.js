@@ -84,7 +84,7 @@ class Small {
     // Three good windows are no verdict on a run.
     this.health.classList.toggle("ok", this.cell.verdict !== "missed" && state.health === "ok");
     const { window: seen, decision } = state;
-    say(this.seen, seen ? `window ${seen.number}: L95 ${number(seen.seen.l95_ms, 1)} ms, V_D ${percent(seen.seen.violation_rate, 0)}` : "");
+    say(this.seen, seen ? `window ${seen.number}: L95 ${number(seen.seen.l95_ms, 1)} ms, V_D ${percent(seen.seen.violation_rate, 2)}` : "");
     say(this.last, decision ? `decided: ${panel.decided_in_words(decision)}` : `${state.placement}; no decision yet`);
   }
 }
@@ -187,7 +187,7 @@ export class FleetView {
   facts({ cells, phi }) {
     const rates = cells.flatMap(({ window: seen }) => seen?.seen.violation_rate ?? []);
     const parts = [];
-    if (rates.length) parts.push(`in the last window: worst ${percent(Math.max(...rates), 0)}, mean ${percent(rates.reduce((a, b) => a + b) / rates.length, 0)}`);
+    if (rates.length) parts.push(`in the last window: worst ${percent(Math.max(...rates), 2)}, mean ${percent(rates.reduce((a, b) => a + b) / rates.length, 2)}`);
     if (phi !== null) parts.push(`Φ a cell ${number(phi, 3)}`);
     say(this.part("facts"), parts.join(" · "));
   }

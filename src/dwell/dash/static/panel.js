@@ -81,7 +81,7 @@ export const decided = (root, cell, page) => {
   return (state) => {
     for (const [name, { row, values, mark, button }] of rows) {
       const known = state.candidates?.[name] ?? {};
-      const texts = [number(known.cost, 2), number(known.l95_ms, 1), percent(known.violation_rate, 1)];
+      const texts = [number(known.cost, 2), number(known.l95_ms, 1), percent(known.violation_rate, 2)];
       values.forEach((value, i) => say(value, texts[i]));
       row.classList.toggle("here", name === state.placement);
       const marks = [];
@@ -95,7 +95,7 @@ export const decided = (root, cell, page) => {
     say(why, decision(state, cell));
     const { window } = state;
     say(against.querySelector("caption"), window ? `Predicted against seen: window ${window.number}, under ${window.placement}` : "Predicted against seen: no window yet");
-    const line = (name, value) => [name, number(value?.cost, 2), number(value?.l95_ms, 1), percent(value?.violation_rate, 1)];
+    const line = (name, value) => [name, number(value?.cost, 2), number(value?.l95_ms, 1), percent(value?.violation_rate, 2)];
     predicted.replaceChildren(
       ...[line("predicted", state.predicted), line("seen", window?.seen)].map(([name, ...texts]) =>
         make("tr", {}, make("th", { scope: "row", text: name }), ...cells(texts)),
@@ -111,7 +111,8 @@ export const decided = (root, cell, page) => {
 /** A decision in a few words. */
 export const decided_in_words = ({ incumbent, placement, reason, refused }) => {
   const moves = placement && placement !== incumbent;
-  return `${moves ? `${incumbent} → ${placement}` : incumbent}, ${reason}${refused ? `; ✕ refused: ${refused}` : ""}`;
+  const word = reason === "infeasible" ? REASONS.infeasible() : reason;
+  return `${moves ? `${incumbent} → ${placement}` : incumbent}, ${word}${refused ? `; ✕ refused: ${refused}` : ""}`;
 };
 
 const decision = (state, cell) => {

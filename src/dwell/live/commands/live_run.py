@@ -43,6 +43,7 @@ from dwell.report.palette import Palette
 from dwell.report.phases import PhaseRow, phase_rows, phase_table
 from dwell.report.run_header import RunHeader
 from dwell.report.table import table_text
+from dwell.study.metric import METRICS
 
 #: File that marks the folder of a live run, which the next run may replace.
 MARK = ".dwell-live-run"
@@ -288,9 +289,11 @@ def _print(
             }
         )
         return
-    share = f"{100 * outcome.missed:.1f} % missed, " if outcome.cycles else ""
+    missed = METRICS["violation_rate"].text(outcome.missed)
+    share = f"{missed} missed, " if outcome.cycles else ""
     typer.echo(
-        f"{counted(outcome.cycles, 'cycle')}, {share}{outcome.lost} without a command; "
+        f"{counted(outcome.cycles, 'cycle')} with the warm-up, {share}{outcome.lost} without a "
+        "command; "
         f"{counted(outcome.migrations, 'migration')} by the controller, "
         f"{outcome.guard_moves} by the guard\n"
     )

@@ -27,9 +27,11 @@ from dwell.live.wire.messages import STALE
 from dwell.live.wire.wiring import Role, lane_of, roles
 from dwell.model import Problem
 from dwell.model.bounds import counted
+from dwell.study.metric import METRICS
 
 Health: TypeAlias = Literal["ok", "degraded", "stalled", "silent", "absent"]
 
+RATE = METRICS["violation_rate"]
 #: Least age at which a process counts as silent; a busy machine may be late without a fault.
 LEAST_NS = 1_000_000_000
 #: Time after which an unfinished migration is given up; until then it may delay a window.
@@ -179,8 +181,8 @@ def _symptoms(
     why = [*slow, *unreached, *_notes(status, names)]
     yield from _uneven(problem, status, why)
     if problem.live.degraded_by(rates):
-        rate = sum(rates) / len(rates)
-        yield f"V_D is {rate:.0%} in the last {counted(len(rates), 'window')}{_because(why)}"
+        rate = RATE.text(sum(rates) / len(rates))
+        yield f"{RATE.name} is {rate} in the last {counted(len(rates), 'window')}{_because(why)}"
     for name, found in status["failing"].items():
         placed = problem.candidates[name].items()
         if not {node for _, node in placed}.isdisjoint(status["drained"]):

@@ -23,11 +23,28 @@
     return spec;
   }
 
+  // Lowers the indices of symbols in a drawing, as in the rest of the page: V_D.
+  const symbol = new RegExp(document.body.dataset.symbol);
+  function lowered(text) {
+    const [first, ...parts] = text.textContent.split(symbol);
+    const part = (words, style) => {
+      const span = document.createElementNS(text.namespaceURI, "tspan");
+      span.textContent = words;
+      for (const [name, value] of Object.entries(style)) span.setAttribute(name, value);
+      return span;
+    };
+    const written = [first];
+    for (let i = 0; i < parts.length; i += 3)
+      written.push(parts[i], part(parts[i + 1], { dy: ".3em", "font-size": "75%" }), part(parts[i + 2], { dy: "-.225em" }));
+    if (parts.length) text.replaceChildren(...written);
+  }
+
   function draw(figure, spec) {
     const place = document.createElement("div");
     const options = { ast: true, actions: false, renderer: "svg", hover: true };
     return vegaEmbed(place, fit(spec, figure.clientWidth), options).then((result) => {
       figure.replaceChildren(place);
+      place.querySelectorAll("svg text").forEach(lowered);
       figure.classList.add("live");
       const signals = result.view.getState().signals;
       // What stands in place of policies elsewhere (links, say) is not the form's to choose.
