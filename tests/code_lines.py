@@ -21,7 +21,7 @@ FLATS = {
     "simulator": ("src/dwell",),
 }
 #: The most lines of code.
-MOST = {"simulator": 25_219, "live": 14_510, "lab": 6_829}
+MOST = {"simulator": 25_241, "live": 14_509, "lab": 6_818}
 
 
 def code_lines(text: str) -> int:

@@ -16,8 +16,8 @@ import typer.main
 from typer.testing import CliRunner
 
 from docs import commands as commands_page
+from docs import gallery, site
 from docs import metrics as metrics_page
-from docs import site
 from dwell.cli.commands import app
 
 ROOT = Path(__file__).parents[1]
@@ -179,3 +179,10 @@ def test_public_names_have_a_docstring(name: str) -> None:
     public = importlib.import_module(module)
     assert attribute in public.__all__
     assert inspect.getdoc(pkgutil.resolve_name(f"{module}:{attribute}"))
+
+
+@pytest.mark.parametrize("picture", gallery.PICTURES, ids=lambda picture: picture.name)
+def test_pictures_of_the_gallery_have_their_data(picture: gallery.Picture) -> None:
+    page = (ROOT / "docs" / "start" / "gallery.md").read_text(encoding="utf-8")
+    assert f"images/{picture.name}.svg" in page
+    assert (gallery.IMAGES / f"{picture.name}.csv").is_file()

@@ -60,9 +60,10 @@ def test_it_ends_with_a_verdict_and_with_what_other_placements_would_have_done(c
 
 def test_a_saved_run_without_them_can_be_made_again(cell: Path) -> None:
     call("run", cell, "--out", "here")
-    first = dwell.open_run("here")
-    bare = Run({k: v for k, v in first.meta.items() if k != "placements"}, first._tables)
-    bare.save("here")
+    file = Path("here", "run.json")
+    meta = json.loads(file.read_text())
+    del meta["placements"]
+    file.write_text(json.dumps(meta))
     assert call("run", cell, "--out", "here").exit_code == 0
 
 

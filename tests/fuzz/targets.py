@@ -40,7 +40,7 @@ from dwell.live.wire.messages import (
 from dwell.live.wire.payloads import read_payload
 from dwell.live.wire.transport import Arrival
 from tests.cells.once import with_windows
-from tests.live.small_world import Bench, Passing, World
+from tests.live.small_world import Bench, Passing, World, forget_jobs
 
 NODES = ("R1", "E", "R2")
 DAY_NS = 86_400_000_000_000
@@ -98,7 +98,7 @@ def _world(*, keys: bool) -> World:
     found.run(300)
     for role in found.roles.values():
         if isinstance(role, Bench):
-            role.worker._jobs.clear()
+            forget_jobs(role.worker)
             role.worker.stage = _Alarm(role.worker.task)
     return found
 
@@ -195,16 +195,20 @@ def reach_roles(data: bytes) -> None:
 def reach_sealed_roles(data: bytes) -> None:
     """With keys nothing may move, either."""
     world = _world(keys=True)
-    stamper = world.stamper
-    before = stamper.term, stamper.placement, stamper.cycle, stamper._newest, len(world.arm.applied)
+    before = _course(world)
     _hear(world, data)
     for role in world.roles.values():
-        if isinstance(role, Bench) and role.worker._jobs:
-            role.worker._jobs.clear()
+        if isinstance(role, Bench) and forget_jobs(role.worker):
             raise ReachedError(f"{role.worker.place.who} would call its stage")
-    after = stamper.term, stamper.placement, stamper.cycle, stamper._newest, len(world.arm.applied)
+    after = _course(world)
     if after != before:
         raise ReachedError(f"{before} has become {after}")
+
+
+def _course(world: World) -> tuple[int, str, int, int, int]:
+    """Return what no message without a signature may change."""
+    stamper, applied = world.stamper, len(world.arm.applied)
+    return stamper.term, stamper.placement, stamper.cycle, stamper.newest_order, applied
 
 
 def keep_deciding(data: bytes) -> None:
@@ -257,7 +261,15 @@ def _next_messages(world: World, cell: ControlledCell) -> list[tuple[str, msgspe
     who = stamper.run, stamper.cycle, stamper.term, stamper.placement
     keys = world.keys
     done = Completion(messages.Stamp(*who, now_ns), "control", now_ns, "actuated", (), "R2")
-    told = cell._number, cell.name, "", stamper.run, stamper.term, stamper.placement, stamper.cycle
+    told = (
+        cell.order_number,
+        cell.name,
+        "",
+        stamper.run,
+        stamper.term,
+        stamper.placement,
+        stamper.cycle,
+    )
     return [
         (keys.stamped(), messages.Stamped(*who, now_ns)),
         (keys.done("control"), done),

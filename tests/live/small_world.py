@@ -24,7 +24,7 @@ from dwell.live.roles.worker import Chore, Job, Worker
 from dwell.live.stage import CellActuator, CellStage, Message
 from dwell.live.trust.signing import Seals
 from dwell.live.wire.keys import CONTROLLER, Keys
-from dwell.live.wire.messages import Ask, Order, StageCounts, encode
+from dwell.live.wire.messages import Accepted, Ask, Order, StageCounts, decode, encode
 from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import Role, roles, wire
 from dwell.model import Host, Problem, QoS
@@ -181,6 +181,19 @@ class MemoryRecorder:
     def append(self, rows: Rows, **meta: object) -> None:
         for table, found in rows.items():
             self.rows.setdefault(table, []).extend(found)
+
+
+def queued(worker: Worker) -> tuple[int, int, list[int]]:
+    """Return how many jobs, jobs of shadows, and inputs per join wait at a worker."""
+    joins = [len(joins.waiting) for joins in worker._joins.values()]
+    return len(worker._jobs), len(worker._forked), joins
+
+
+def forget_jobs(worker: Worker) -> bool:
+    """Remove the waiting jobs of a worker; returns whether there were any."""
+    waited = bool(queued(worker)[0])
+    worker._jobs.clear()
+    return waited
 
 
 class Bench:
@@ -409,9 +422,24 @@ class World:
         self.number += 1
         stamper = self.stamper
         order = Order(self.number, controller, run or stamper.run, term or stamper.term, placement)
-        stamper.receive(self.sample(order), self.network.now_ns)
-        assert stamper._answered is not None
-        return stamper._answered[2].refused
+        return self.answer(order).refused
+
+    def answer(self, order: Order) -> Accepted:
+        """Hand an order to the stamper; returns its answer."""
+        answers: list[bytes] = []
+
+        def hear(sample: Arrival) -> None:
+            if sample.key == self.keys.accepted():
+                answers.append(sample.payload)
+
+        self.network.taps.append(hear)
+        self.stamper.receive(self.sample(order), self.network.now_ns)
+        self.network.taps.remove(hear)
+        return decode(answers[-1], Accepted)
+
+    def move_by_guard(self, placement: str) -> None:
+        """Have the stamper move the cell, as its guard does."""
+        self.stamper._move(placement, by_guard=True)
 
     @staticmethod
     def losing(share: float) -> NetworkConditions:

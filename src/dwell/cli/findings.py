@@ -5,10 +5,12 @@ from __future__ import annotations
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import typer
+
+from dwell.errors import DwellError
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +32,28 @@ class Finding:
     found: str
     remedy: str = ""
     needed: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One thing to look for on this computer, with the remedy if it is missing.
+
+    `look` returns whether all is well, and what was found. A DwellError that it raises means that
+    the thing is missing.
+    """
+
+    name: str
+    look: Callable[[], tuple[bool, str]]
+    remedy: str = ""
+    needed: bool = True
+
+    def finding(self) -> Finding:
+        """Look."""
+        try:
+            ok, found = self.look()
+        except DwellError as error:
+            ok, found = False, str(error)
+        return Finding(self.name, ok, found, "" if ok else self.remedy, self.needed)
 
 
 @dataclass(frozen=True, slots=True)

@@ -191,15 +191,7 @@ class CellMetrics(Collector):
             "dwell_silences": [({}, status.get("silences"))],
             "dwell_migrations": [({"reason": one}, moves.get(one)) for one in MOVED_BY],
             "dwell_windows": [({}, status.get("windows"))],
-            "dwell_stage_inputs": [
-                ({**_stage(name), "outcome": end}, count)
-                for name, one in stages.items()
-                for end, count in one["inputs_total"].items()
-            ],
-            "dwell_flow_bytes": [
-                (dict(zip(("source", "target"), name.split("->"), strict=True)), one["bytes_total"])
-                for name, one in flows.items()
-            ],
+            **_totals(stages, flows),
         }
 
     def _certificates(self) -> Samples:
@@ -221,6 +213,21 @@ class CellMetrics(Collector):
                     exemplar = {"run": str(cycle.run), "cycle": str(cycle.number)}
                     of_cell = self._latency.labels(self._problem.name)
                     of_cell.observe(cycle.latency_ns / 1e9, exemplar)
+
+
+def _totals(stages: Mapping[str, Any], flows: Mapping[str, Any]) -> dict[str, Samples]:
+    """Return the counts of the stages' inputs and the flows' bytes since their start."""
+    return {
+        "dwell_stage_inputs": [
+            ({**_stage(name), "outcome": end}, count)
+            for name, one in stages.items()
+            for end, count in one["inputs_total"].items()
+        ],
+        "dwell_flow_bytes": [
+            (dict(zip(("source", "target"), name.split("->"), strict=True)), one["bytes_total"])
+            for name, one in flows.items()
+        ],
+    }
 
 
 def _stage(name: str) -> dict[str, str]:

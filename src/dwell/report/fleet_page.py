@@ -27,6 +27,8 @@ from dwell.study.fleet_summary import fleet_numbers, refusals
 from dwell.study.metric import METRICS, metric_of
 
 if TYPE_CHECKING:
+    import polars as pl
+
     from dwell.record import FleetRun
 
 #: Metrics of a cell.
@@ -219,7 +221,8 @@ class _FleetPage:
 
     # ------------------------------------------------------------------------------- rounds
 
-    def _rounds(self) -> list[Figure | Table]:
+    def _closes(self) -> pl.DataFrame:
+        """Return the end of each cell's windows, ``at``, in s."""
         import polars as pl
 
         cycles = pl.DataFrame(
@@ -228,12 +231,16 @@ class _FleetPage:
                 for name, one in self.problems.items()
             ]
         )
-        closes = self.run.windows.join(cycles, on="cell").select(
+        return self.run.windows.join(cycles, on="cell").select(
             "cell", "window", at=(pl.col("first_cycle") + pl.col("each")) * pl.col("period")
         )
+
+    def _rounds(self) -> list[Figure | Table]:
+        import polars as pl
+
         asked = (
             self.run.decisions.filter(pl.col("phi_before").is_not_null())
-            .join(closes, on=["cell", "window"], how="left")
+            .join(self._closes(), on=["cell", "window"], how="left")
             .sort("round")
             .select(
                 "round",

@@ -115,23 +115,7 @@ def run_timeline(
     deadline_ms, resources = problem.pipeline.deadline_ms, resources_in(windows, problem)
     placements = Palette.of(problem.candidates).placements
     each = 1 if windows.height <= MOST_MARKS else math.ceil(windows.height / MOST_BINS)
-    frame = pl.DataFrame(
-        {
-            "window": windows["window"],
-            "time": begin_s + length_s / 2,
-            "placement": windows["placement"].cast(pl.String),
-            "v_d": windows["violation_rate"] * 100,
-            "l95": windows["seen_l95_ms"],
-            "lost": windows["seen_l95_ms"] >= problem.censor_ms,
-            "j": windows["cost"],
-            "link": [(links or {}).get(number) for number in windows["window"].to_list()],
-        },
-        strict=False,
-    ).with_columns(
-        link=pl.col("link").cast(pl.String),
-        # A lost L95 has no value: the controller's bound is no measurement.
-        l95=pl.when(pl.col("lost").not_()).then(pl.col("l95")),
-    )
+    frame = _seen(windows, begin_s + length_s / 2, problem.censor_ms, links or {})
     if tracking is not None:
         errors = [tracking.rms(begin, begin + length_s)[0] for begin in begin_s.tolist()]
         frame = frame.with_columns(error=pl.Series(errors, dtype=pl.Float64))
@@ -248,6 +232,32 @@ def fleet_timeline(
 
 
 # -------------------------------------------------------------------------------------- data
+
+
+def _seen(
+    windows: pl.DataFrame,
+    middle_s: NDArray[np.float64],
+    censor_ms: float,
+    links: Mapping[int, str],
+) -> pl.DataFrame:
+    """Return the metrics of windows, with one row per window; a lost L95 has no value."""
+    import polars as pl
+
+    frame = pl.DataFrame(
+        {
+            "window": windows["window"],
+            "time": middle_s,
+            "placement": windows["placement"].cast(pl.String),
+            "v_d": windows["violation_rate"] * 100,
+            "l95": windows["seen_l95_ms"],
+            "lost": windows["seen_l95_ms"] >= censor_ms,
+            "j": windows["cost"],
+            "link": [links.get(number) for number in windows["window"].to_list()],
+        },
+        strict=False,
+    )
+    known = pl.when(pl.col("lost").not_()).then(pl.col("l95"))
+    return frame.with_columns(link=pl.col("link").cast(pl.String), l95=known)
 
 
 def _binned(frame: pl.DataFrame, each: int, by: Sequence[str] = ()) -> pl.DataFrame:

@@ -222,7 +222,7 @@ def play_cells(
         ],
     )
     stampers = [
-        _Stamper(cell, CellArrays(whole, i), plan, shared)
+        SimulatedStamper(cell, CellArrays(whole, i), plan, shared)
         for i, (cell, plan) in enumerate(zip(cells, plans, strict=True))
     ]
     first = stampers[0]
@@ -286,7 +286,7 @@ def _host_changes(problem: Problem, realisation: Realisation) -> NDArray[np.int6
     return changes.table[np.isin(changes.table[:, 1], mine)]
 
 
-class _Stamper:
+class SimulatedStamper:
     """Passes closed windows to the controller, and stamps cycles with the ordered placement."""
 
     def __init__(
@@ -360,12 +360,12 @@ class _Stamper:
         """Return the number of cycles released by the decision on the window before `boundary`."""
         if boundary > self.cycles:
             return boundary
-        close_ns = self._close_ns(boundary)
+        close_ns = self.close_ns(boundary)
         if close_ns <= self.release_ns.item(boundary):
             return boundary
         return int(np.searchsorted(self.release_ns, close_ns, side="right"))
 
-    def _close_ns(self, boundary: int) -> int:
+    def close_ns(self, boundary: int) -> int:
         """Return when the window before the cycle `boundary` closes (see `window_close_ns`)."""
         due_ns: int = self.release_ns.item(boundary - 1) + self.due_ns
         return max(due_ns, self.release_ns.item(boundary) + self.grace_ns)
@@ -396,7 +396,7 @@ class _Stamper:
         index = self.made.item(0) - 1
         cycles = self.seen[1].item(0, index)
         boundary = self.seen[0].item(0, index) + cycles
-        close_ns = self._close_ns(boundary)
+        close_ns = self.close_ns(boundary)
         left = self.course.placement
         self.controller.looked = LookedAt(self._window_of(boundary - 1), boundary - 1, cycles)
         if len(self.decided):
@@ -406,7 +406,7 @@ class _Stamper:
             if not self.looks:
                 self.metrics.append((None, None, None))
         else:
-            self._decide(index, boundary, close_ns)
+            self.consult(index, boundary, close_ns)
         if left == self.course.placement:
             self._go_on(boundary)
             return
@@ -428,7 +428,7 @@ class _Stamper:
             window -= 1
         return window
 
-    def _decide(self, index: int, boundary: int, close_ns: int) -> None:
+    def consult(self, index: int, boundary: int, close_ns: int) -> None:
         """Pass the newest metrics to the controller, and stamp the probes that it wants."""
         watch, controller = self.watch, self.controller
         if self.evidence is not None:

@@ -549,7 +549,7 @@ class Issued:
         """Issue a certificate of a year, of which some time is left."""
         if left:
             begun = datetime.now(UTC) - timedelta(days=365) + timedelta(**left)
-            self._patch.setattr("dwell.live.trust.authority._now", lambda: begun)
+            self._patch.setattr("dwell.live.trust.authority.now", lambda: begun)
         role = "controller" if name == "controller" else "node"
         self.authority.issue(name, role)
         self._patch.undo()

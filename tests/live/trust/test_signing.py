@@ -234,7 +234,6 @@ def test_a_replayed_order_moves_nothing(world: World, seals: dict[str, Seals]) -
     for replayed in (there, back, there, there, back):
         assert give(world, replayed) == 0
     assert (world.stamper.term, world.stamper.moves) == (term, moves)
-    assert world.stamper._answered is not None
 
 
 def test_replayed_settings_do_not_come_back(world: World, seals: dict[str, Seals]) -> None:
@@ -244,10 +243,10 @@ def test_replayed_settings_do_not_come_back(world: World, seals: dict[str, Seals
     old = order_of(world, "", number, shadow_fraction=0.5, forks=forks)
     new = order_of(world, "", number + 1, shadow_fraction=0.25)
     assert give(world, ordered(world, old, seals[CONTROLLER])) == 0
-    assert (world.stamper._fraction, world.stamper._forks) == (0.5, forks)
+    assert (world.stamper.shadow_fraction, world.stamper.forks) == (0.5, forks)
     assert give(world, ordered(world, new, seals[CONTROLLER])) == 0
     assert give(world, ordered(world, old, seals[CONTROLLER])) == 0
-    assert (world.stamper._fraction, world.stamper._forks) == (0.25, ())
+    assert (world.stamper.shadow_fraction, world.stamper.forks) == (0.25, ())
 
 
 def test_a_controller_whose_clock_is_behind_learns_the_numbers(
@@ -259,9 +258,9 @@ def test_a_controller_whose_clock_is_behind_learns_the_numbers(
     assert give(world, ordered(world, far, seals[CONTROLLER])) == 0
     world.run(3_000)
     cell = world.cell
-    assert cell._number > 1 << 61
-    assert world.stamper._newest > 1 << 61
-    assert world.stamper._fraction == cell.controller.shadow_fractions["SO"]
+    assert cell.order_number > 1 << 61
+    assert world.stamper.newest_order > 1 << 61
+    assert world.stamper.shadow_fraction == cell.controller.shadow_fractions["SO"]
 
 
 def test_orders_in_any_order_end_where_the_last_says(
@@ -275,7 +274,7 @@ def test_orders_in_any_order_end_where_the_last_says(
         for n, f in enumerate(fractions, 1)
     ]
     give(world, *[sealed[i] for i in (2, 0, 3, 1, 2, 0)])
-    assert world.stamper._fraction == 0.4
+    assert world.stamper.shadow_fraction == 0.4
 
 
 # --------------------------------------------------------------------------- completions

@@ -88,7 +88,7 @@ def run_live(
         typer.echo(f"note: the earlier run in {out}, and its report, are replaced", err=True)
     make_folder(out, MARK, "a live run's")
     problem = on_this_machine(problem)
-    played = _ObservedRun(problem, scenario, seed, timeline)
+    played = ObservedRun(problem, scenario, seed, timeline)
     interrupted = False
     cell = Loopback(problem, out.resolve(), _cpus(problem), seed=seed)
     with interruptible():
@@ -134,7 +134,7 @@ def _announce_left_out() -> tuple[bool, bool]:
 
 
 @dataclass(slots=True)
-class _ObservedRun(Played):
+class ObservedRun(Played):
     """Record of the applied changes and the observer, which the controller does not know."""
 
     observer: CellObserver | None = None
@@ -165,7 +165,7 @@ def _cpus(problem: Problem) -> dict[str, int]:
     }
 
 
-def _watch_from_start(cell: Loopback, seconds: float, played: _ObservedRun) -> None:
+def _watch_from_start(cell: Loopback, seconds: float, played: ObservedRun) -> None:
     """Start the cell, load its observer, and apply the scenario."""
     with working("starting the cell"):
         cell.start()
@@ -182,7 +182,7 @@ def _watch_from_start(cell: Loopback, seconds: float, played: _ObservedRun) -> N
             played.observer.close()
 
 
-def _watch(cell: Loopback, seconds: float, played: _ObservedRun) -> None:
+def _watch(cell: Loopback, seconds: float, played: ObservedRun) -> None:
     """Apply the changes at their times, and print the state of the cell."""
     status: Mapping[str, Any] = {}
     answered_s, lines = 0.0, Lines()
@@ -248,7 +248,7 @@ def _told(run: Run, out: Path, *, reported: bool) -> _Outcome:
     return replace(outcome, phases=phases, report=page)
 
 
-def _counted(played: _ObservedRun, folder: Path) -> _Outcome:
+def _counted(played: ObservedRun, folder: Path) -> _Outcome:
     """Return the results of a run from its journal, and record the scenario in it."""
     meta, tables = read_plain_journal(folder)
     releases, span = tables["cycles"]["release_ns"], None

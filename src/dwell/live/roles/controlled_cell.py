@@ -135,7 +135,7 @@ class ControlledCell:
         self.pinned = ""
         self.drained: set[str] = set()
         self._move: _Move | None = None
-        self._number = now_ns
+        self.order_number = now_ns
         self._setback = SetbackDetector()
         self._began_ns: int | None = None
         self._ask_ns = 0
@@ -264,7 +264,7 @@ class ControlledCell:
         terms = stamp.term - course.term if course.run == stamp.run else 0
         if terms <= ahead and continuity.takes(cycle, now_ns, alone=alone):
             if continuity.newest == cycle != newest:
-                self._cycle_asked = self._number
+                self._cycle_asked = self.order_number
             return True
         if terms > ahead:
             continuity.leaps += 1
@@ -316,7 +316,7 @@ class ControlledCell:
         controller, course, move = self.controller, self.course, self._move
         left = course.placement
         self._unconfirmed = self._told = None
-        self._term_asked = self._number
+        self._term_asked = self.order_number
         self.refused = ""
         if move is not None and move.name == placement and not by_guard:
             self._move, self._unwritten = None, True
@@ -344,7 +344,7 @@ class ControlledCell:
 
     def _begin_run(self, answer: Accepted) -> None:
         """Start with the run and placement of the stamper's first answer."""
-        self._term_asked = self._number
+        self._term_asked = self.order_number
         resume = self._recorder.open(answer.run)
         self._follow(answer)
         self.windows = LiveWindows(self.place.problem, self.offsets, self.controller, resume=resume)
@@ -366,7 +366,7 @@ class ControlledCell:
         if answer.controller != self.name:
             return
         self._require_candidate(answer.placement)
-        if answer.number > self._number:
+        if answer.number > self.order_number:
             raise LiveError(f"an answer to order {answer.number}, which was never sent")
         begins = self.windows is None
         if begins:
@@ -374,7 +374,7 @@ class ControlledCell:
         elif not self._corrected(answer, now_ns):
             return
         # The clock of an earlier controller may have been ahead of this controller's.
-        self._number = max(self._number, answer.newest)
+        self.order_number = max(self.order_number, answer.newest)
         if begins:
             return
         course, move, proven = self.course, self._move, self._proven
@@ -414,13 +414,13 @@ class ControlledCell:
         ahead = continuity.ahead(now_ns)
         if newest is None or newest[0] < answer.run or answer.cycle > newest[1] + ahead:
             continuity.believe((answer.run, answer.cycle - 1), now_ns)
-            self._cycle_asked = self._number
+            self._cycle_asked = self.order_number
         elif upcoming <= newest and answer.number > self._cycle_asked:
             self.place.complain(
                 LiveError(f"the stamper has not stamped cycle {newest[1]}; {answer.cycle} is next")
             )
             continuity.believe((answer.run, answer.cycle - 1), now_ns)
-            self._cycle_asked = self._number
+            self._cycle_asked = self.order_number
             if windows is not None:
                 windows.forget(answer.run, answer.cycle)
         return True
@@ -432,7 +432,7 @@ class ControlledCell:
                 f"the stamper is in term {answer.term}, at {answer.placement}; so it was not moved"
             )
         )
-        self._term_asked = self._number
+        self._term_asked = self.order_number
         self._stay(f"the stamper says that {answer.placement} holds")
         self._follow(answer)
 
@@ -452,8 +452,8 @@ class ControlledCell:
         self.place.put(self.place.keys.order(), order)
 
     def _next_number(self) -> int:
-        self._number += 1
-        return self._number
+        self.order_number += 1
+        return self.order_number
 
     def _order(self, placement: str, now_ns: int) -> Order:
         """Return an order; every order also has the forks and the candidate to prove."""

@@ -113,14 +113,14 @@ class Stamper:
         )
         self.intervals = Intervals(place.who, self._sinks)
         self._partial: dict[int, set[str]] = {}
-        self._fraction = 0.0
-        self._forks: tuple[tuple[str, str], ...] = ()
+        self.shadow_fraction = 0.0
+        self.forks: tuple[tuple[str, str], ...] = ()
         self._charge = ""
         self._charged_ns = 0
         self._answered: tuple[str, int, Accepted] | None = None
         #: Highest number of an accepted order; a new controller's numbers are higher, because they
         #: begin with the time of day.
-        self._newest = 0
+        self.newest_order = 0
         #: CPU time that this process's control group has used, if the kernel counts it.
         self.group_clock: Callable[[], int] = lambda: UNKNOWN
         self.skipped = 0
@@ -200,7 +200,7 @@ class Stamper:
             age_ns = max(beat.sent_ns - heard.at_ns, 0)
             presence.heard(f"{heard.node}->{beat.node}", now_ns - age_ns)
         worker, _, extra = beat.who.partition(".")
-        if beat.moving and self._forks and beat.who in self._workers():
+        if beat.moving and self.forks and beat.who in self._workers():
             # The worker is saving its state for a migration, so its cycles wait.
             self.guard.restart()
         if extra in ("", "1") and "@" in worker:
@@ -284,7 +284,7 @@ class Stamper:
             self._next,
             self.course.by_guard,
             probed if probation.proven(probed, now_ns) else "",
-            self._newest,
+            self.newest_order,
             self.guard.resting,
             probed,
             probation.done(now_ns) if probed else 0,
@@ -309,8 +309,8 @@ class Stamper:
             return f"infeasible: {order.placement!r} is no candidate ({', '.join(self._names)})"
         if order.placement == self.placement:
             return ""
-        if order.number < self._newest:
-            return f"stale order: {order.number}, after {self._newest}"
+        if order.number < self.newest_order:
+            return f"stale order: {order.number}, after {self.newest_order}"
         missing = self.guard.presence.missing(order.placement, now_ns)
         if missing:
             return f"not ready: {', '.join(sorted(missing))} not heard"
@@ -331,16 +331,16 @@ class Stamper:
     def _accept(self, order: Order) -> None:
         if order.run == 0 and order.term == 0:
             return
-        if order.number > self._newest:
-            self._newest = order.number
+        if order.number > self.newest_order:
+            self.newest_order = order.number
             self._settle(order)
         if order.placement and (order.placement != self.placement or self.course.by_guard):
             self._move(order.placement, by_guard=False)
 
     def _settle(self, order: Order) -> None:
         """Adopt the shadow fraction, the forks and the wanted candidate of the newest order."""
-        self._fraction = order.shadow_fraction
-        self._forks = order.forks
+        self.shadow_fraction = order.shadow_fraction
+        self.forks = order.forks
         if self.course.by_guard:
             known = order.want in self.place.problem.candidates
             self.guard.probation.want(order.want if known else None)
@@ -349,9 +349,9 @@ class Stamper:
         """Change the placement: begin a new term, saved before any cycle has it."""
         if by_guard:
             self._ahead = None
-            self._forks = ()
+            self.forks = ()
             # The next order of the controller sets the shadow fraction of the fallback.
-            self._fraction = 0.0
+            self.shadow_fraction = 0.0
         self.moves.append((self._next, placement, "guard" if by_guard else "order"))
         del self.moves[:-1_000]
         self._partial.clear()
@@ -463,14 +463,14 @@ class Stamper:
         shadow = wanted or self._shadowed(cycle)
         if shadow == self.placement:
             shadow = ""
-        return Stamp(self.run, cycle, self.term, self.placement, released_ns, shadow, self._forks)
+        return Stamp(self.run, cycle, self.term, self.placement, released_ns, shadow, self.forks)
 
     def _shadowed(self, cycle: int) -> str:
         """Return the candidate of this cycle's shadow by the estimator's plan; empty if none."""
-        if not self._fraction:
+        if not self.shadow_fraction:
             return ""
         code = self._names.index(self.placement)
-        plan = shadow_stamps(cycle, cycle + 1, code, len(self._names), self._fraction)
+        plan = shadow_stamps(cycle, cycle + 1, code, len(self._names), self.shadow_fraction)
         return self._names[int(plan[0])] if plan[0] >= 0 else ""
 
     # --------------------------------------------------------------------------- beats
