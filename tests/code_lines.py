@@ -21,7 +21,7 @@ FLATS = {
     "simulator": ("src/dwell",),
 }
 #: The most lines of code.
-MOST = {"simulator": 25_069, "live": 14_433, "lab": 6_818}
+MOST = {"simulator": 25_242, "live": 14_669, "lab": 6_818}
 
 
 def code_lines(text: str) -> int:

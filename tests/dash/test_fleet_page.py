@@ -111,12 +111,12 @@ def test_what_makes_no_sense_of_a_fleet_is_refused_by_name(
     assert (code, "a fleet; name the folder of one of its cells" in said) == (2, True)
 
 
-def test_without_fleet_json_its_runs_are_named(fleet_folder: Path, tmp_path: Path) -> None:
+def test_without_fleet_json_its_runs_are_listed(fleet_folder: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(fleet_folder, tmp_path / "pack")
     (folder / FLEET).unlink()
-    code, said = ran(folder)
-    assert code == 2
-    assert "no fleet (it has no fleet.json); it holds small-01, small-02, small-03" in said
+    with serving(tmp_path, folder) as served:
+        listed = served.get("/cells")["runs"]["runs"]
+        assert listed == ["small-01", "small-02", "small-03"]
     (folder / FLEET).write_text("{")
     code, said = ran(folder)
     assert (code, "fleet.json: cannot be read" in said) == (2, True)
@@ -165,7 +165,10 @@ def test_small_multiples_say_how_every_cell_is(shown: Page, served: Served) -> N
     names = [cell["name"] for cell in fleet["cells"]]
     assert shown.locator(".small h4 a").all_inner_texts() == names
     assert shown.locator(".fleet .name").first.inner_text() == "pack"
-    assert names[0] in shown.locator(".facts").inner_text()
+    assert names[0] in shown.locator(".verdict").first.inner_text()
+    assert all(cell["verdict"] in ("kept", "missed", "open") for cell in fleet["cells"])
+    rates = shown.locator(".small .rate").all_inner_texts()
+    assert [rate.split(": ")[1] for rate in rates] == [cell["verdict"] for cell in fleet["cells"]]
     shown.evaluate("window.page.moveTo(4.003)")
     settled(shown)
     state = served.get("/state?at=4.003")
@@ -187,6 +190,7 @@ def test_a_click_opens_a_cell_at_the_same_place_and_leads_back(shown: Page, runs
     name = shown.locator(".small h4 a").first.inner_text()
     shown.locator(".small").first.click()
     wait_for_page(shown, "**/cell/*")
+    settled(shown)
     assert shown.evaluate("window.page.at") == 3
     assert shown.locator(".source").inner_text() == name
     assert f"of {runs.cells[name].cycles.height} cycles" in shown.locator(".facts").inner_text()

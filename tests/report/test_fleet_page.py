@@ -78,7 +78,11 @@ def test_stays_of_a_cell_follow_each_other(run: FleetRun) -> None:
     frames = figure_of(fleet_page(run), "time").frames
     assert frames["moves"].height == run.decisions["migrated"].sum()
     assert frames["nodes"]["used"].to_list() == (run.load["u_E"] * 100).to_list()
-    assert (frames["rates"]["min"] <= frames["rates"]["mean"]).all()
+    rates = frames["rates"]
+    assert (rates["q1"] <= rates["median"]).all()
+    assert (rates["median"] <= rates["q3"]).all()
+    far = rates.filter(pl.col("max") > 2.5 * pl.col("q3") - 1.5 * pl.col("q1"))
+    assert rates["outlier"].drop_nulls().to_list() == far["worst"].to_list()
 
 
 def test_a_long_run_has_fewer_marks(run: FleetRun) -> None:

@@ -57,6 +57,7 @@ def cell_document(problem: Problem) -> Plain:
         "period_ms": pipeline.period_ms,
         "deadline_ms": pipeline.deadline_ms,
         "window_cycles": problem.window_cycles,
+        "dwell_cycles": problem.dwell_cycles,
         "nodes": [
             {"name": node.name, "tier": node.tier, "cores": node.cores}
             for node in fabric.nodes.values()

@@ -1,14 +1,15 @@
-"""What happened in a recorded run, beside its decisions, and the part of it that a view has."""
+"""Events and disturbances of a recorded run on its time line."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from dwell.dash.paged_cell import Plain
-from dwell.model import Problem, Scenario
-from dwell.model.disturbed import disturbed
+from dwell.model import LinkDisturbance, Problem, Scenario
+from dwell.model.disturbed import disturbed, on_link, on_node
 from dwell.record import Run
 
 #: Events of a view at most.
@@ -23,6 +24,56 @@ def disturbances_met(run: Run, planned: Scenario) -> Scenario:
     from dwell.study.drawn_disturbances import disturbances_of
 
     return disturbances_of(run)
+
+
+class Band(NamedTuple):
+    """Time during which a node or a link is disturbed; `begin` and `end` are places."""
+
+    begin: float
+    end: float
+    where: str
+    text: str
+
+
+def bands_of(scenario: Scenario, place: Callable[[float], float], end_s: float) -> list[Band]:
+    """Return the disturbances of a scenario before the end of a run, in the order of their begin.
+
+    Parameters
+    ----------
+    place : callable
+        From seconds to places.
+    """
+    found = {
+        Band(
+            place(max(item.at_s, 0.0)),
+            place(min(item.end_s, end_s)),
+            item.place,
+            on_link(item) if isinstance(item, LinkDisturbance) else on_node(item),
+        )
+        for item in scenario
+        if item.episodes is None and item.at_s < end_s
+    }
+    return sorted(found)
+
+
+def merged(bands: Iterable[Band]) -> list[tuple[float, float]]:
+    """Return the times with any disturbance; bands in the order of their begin."""
+    times: list[tuple[float, float]] = []
+    for band in bands:
+        if times and band.begin <= times[-1][1]:
+            times[-1] = times[-1][0], max(times[-1][1], band.end)
+        else:
+            times.append((band.begin, band.end))
+    return times
+
+
+def disturbed_at(bands: Iterable[Band], at: float) -> dict[str, str]:
+    """Return the disturbances at a place: texts by node or link."""
+    texts: dict[str, list[str]] = {}
+    for band in bands:
+        if band.begin <= at < band.end:
+            texts.setdefault(band.where, []).append(band.text)
+    return {where: ", ".join(some) for where, some in texts.items()}
 
 
 def disturbance_events(scenario: Scenario, problem: Problem, end_s: float) -> Iterator[Plain]:

@@ -19,16 +19,25 @@ from numpy.typing import NDArray
 
 from dwell.dash.paged_cell import NO_WINDOW, UNMEASURED, Plain
 from dwell.dash.recorded_cell import RecordedCell
-from dwell.dash.recorded_events import RecordedEvents, disturbance_events, disturbances_met
+from dwell.dash.recorded_events import (
+    Band,
+    RecordedEvents,
+    bands_of,
+    disturbance_events,
+    disturbances_met,
+    merged,
+)
 from dwell.dash.recorded_windows import RecordedWindows
 from dwell.dash.strip import Strip, binned_means, plain
 from dwell.display import placement_hues
 from dwell.errors import RunError
-from dwell.model import Problem
+from dwell.model import Problem, Scenario
 from dwell.model.fleet import FleetCell
 from dwell.model.number_arrays import Floats
 from dwell.record import FleetRun, Run, open_fleet
 from dwell.record.fleet_run import how_many_are_whole, listed
+from dwell.study.kept_bounds import AIM
+from dwell.study.verdict import verdict_of
 
 #: Bins of all cells together at most: some 90 bytes each.
 MOST_BINS, LEAST_BINS = 8_000, 10
@@ -48,6 +57,8 @@ class _Member:
         In the fleet's file.
     rate : float
         V_D after the warm-up; NaN where no window is.
+    verdict : str or None
+        Word of the verdict on the cell (`dwell.study.verdict`).
     strip : Strip
         Of its windows: L95, and whether it is over the deadline.
     """
@@ -57,6 +68,7 @@ class _Member:
     problem: Problem
     windows: RecordedWindows
     rate: float
+    verdict: str | None
     strip: Strip
 
     @property
@@ -119,7 +131,9 @@ class RecordedFleet:
         self._rounds = _rounds(self._members)
         self._grid, self._load = self._shared_load()
         self._lines = self._over_time()
-        self._events = RecordedEvents(self._all_events())
+        met = [self._met(one) for one in self._members]
+        self._events = RecordedEvents(self._all_events(met))
+        self._bands = self._all_bands(met)
         self.cell = lru_cache(MOST_OPEN)(self._open)
 
     # --------------------------------------------------------------------- what is read
@@ -165,19 +179,29 @@ class RecordedFleet:
         """Return the places of a cell's candidates among the placements; -1 of those not used."""
         return np.array([self._placements.get(name, -1) for name in one.problem.candidates])
 
-    def _all_events(self) -> Iterator[Plain]:
+    def _met(self, one: _Member) -> Scenario:
+        """Return the disturbances of a cell, with the sampled times of episodes."""
+        planned = one.problem.scenario(self._run.fleet.cells[one.place].entry.scenario)
+        return disturbances_met(self._run.cells[one.name], planned)
+
+    def _all_bands(self, met: list[Scenario]) -> list[tuple[float, float]]:
+        """Return the times at which any cell is disturbed."""
+        bands: set[Band] = set()
+        for scenario in met:
+            bands.update(bands_of(scenario, float, self._end))
+        return merged(sorted(bands))
+
+    def _all_events(self, met: list[Scenario]) -> Iterator[Plain]:
         """Yield what happened to the cells: their moves and refusals, and to how many what else."""
         happened: Counter[tuple[float, str]] = Counter()
-        for one in self._members:
+        for one, scenario in zip(self._members, met, strict=True):
             for (_, text), events in groupby(
                 one.windows.events(), lambda one: (one["kind"], one["text"])
             ):
                 first, *again = events
                 times = f" ({len(again) + 1} times)" if again else ""
                 yield {**first, "text": f"{one.name}: {text}{times}"}
-            planned = one.problem.scenario(self._run.fleet.cells[one.place].entry.scenario)
-            met = disturbances_met(self._run.cells[one.name], planned)
-            for event in disturbance_events(met, one.problem, self._end):
+            for event in disturbance_events(scenario, one.problem, self._end):
                 happened[event["at"], event["text"]] += 1
         for (at, text), count in happened.items():
             who = "all cells" if count == len(self._members) else f"{count} of the cells"
@@ -214,13 +238,18 @@ class RecordedFleet:
             "placements": [{"name": name, "hue": self._hues[name]} for name in self._placements],
             "shared": list(self._load),
             "has_phi": bool(len(self._rounds.at)),
-            "mean_rate": plain(np.array([np.mean([one.rate for one in self._members])]), 9)[0],
+            "mean_rate": _known(np.mean([one.rate for one in self._members])),
+            "worst": self._members[0].windows.worst(),
+            "disturbed": self._bands,
+            "verdicts": dict(Counter(one.verdict for one in self._members if one.verdict)),
+            "aim": AIM,
             "cells": [
                 {
                     "place": one.place,
                     "name": one.name,
                     "deadline_ms": one.problem.pipeline.deadline_ms,
-                    "rate": plain(np.array([one.rate]), 9)[0],
+                    "rate": _known(one.rate),
+                    "verdict": one.verdict,
                 }
                 for one in self._members
             ],
@@ -308,7 +337,13 @@ def _member(place: int, cell: FleetCell, run: Run, phase_ms: float) -> _Member:
     )
     counted = windows.rates[windows.counts]
     rate = float(counted.mean()) if len(counted) else np.nan
-    return _Member(place, cell.name, cell.problem, windows, rate, strip)
+    verdict = verdict_of(run, cell.problem, rate).word if len(counted) else None
+    return _Member(place, cell.name, cell.problem, windows, rate, verdict, strip)
+
+
+def _known(value: Any) -> float | None:
+    """Return a number for JSON."""
+    return float(value) if np.isfinite(value) else None
 
 
 def _held(windows: RecordedWindows, at: Any) -> NDArray[np.intp]:

@@ -18,6 +18,8 @@ from dwell.record.moves import GUARD, by_guard
 
 #: What is both estimated and seen of a window, and the columns that say what was seen.
 SEEN = {"l95_ms": "seen_l95_ms", "violation_rate": "seen_violation_rate", "cost": "cost"}
+#: Explanation of the reason of a move to the least bad of all candidates.
+INFEASIBLE = "all candidates are over a cap, this one least"
 
 
 class RecordedWindows:
@@ -120,7 +122,21 @@ class RecordedWindows:
                 yield {**event, "kind": "refused", "text": f"{reason}: {self._refused[row]}"}
             else:
                 kind = "guard" if reason == GUARD else "move"
-                yield {**event, "kind": kind, "text": f"{names[0]} → {names[1]}: {reason}"}
+                why = f"{reason} ({INFEASIBLE})" if reason == "infeasible" else reason
+                yield {**event, "kind": kind, "text": f"{names[0]} → {names[1]}: {why}"}
+
+    def worst(self) -> Plain | None:
+        """Return the window with the largest V_D after the warm-up, then with the largest L95."""
+        rows = np.flatnonzero(self.counts)
+        if not len(rows):
+            return None
+        keys = (-np.nan_to_num(self.seen["l95_ms"][rows]), -self.rates[rows])
+        row = int(rows[np.lexsort(keys)[0]])
+        return {
+            "number": int(self.number[row]),
+            "at": float(self.closes[row]),
+            "rate": float(self.rates[row]),
+        }
 
     def closed(self, at: float) -> int:
         """Return which window was the last to close before a place; -1 where none was."""

@@ -28,6 +28,7 @@ from dwell.errors import DwellError
 
 if TYPE_CHECKING:
     from dwell.dash.recorded_fleet import RecordedFleet
+    from dwell.dash.runs_folder import RunsFolder
 
 _LOG = logging.getLogger(__name__)
 
@@ -58,7 +59,7 @@ ACTS = {"pin": "candidate", "unpin": None, "drain": "node", "undrain": "node"}
 
 @dataclass(slots=True)
 class Dash:
-    """Cells on one page, or a fleet whose cells have a page each.
+    """Cells on one page, or a fleet or a folder of runs with one page per cell or run.
 
     Parameters
     ----------
@@ -66,21 +67,27 @@ class Dash:
         On one time line.
     fleet : RecordedFleet, optional
         Shown instead of them.
+    runs : RunsFolder, optional
+        Listed instead of them.
     line : str
         What the time line counts where there are several, and why; empty for one.
     act : callable, optional
         What carries out acts on the first cell; the page is read-only without.
     read_only : str
         Why it is.
+    difference : callable, optional
+        V_D of the second cell less V_D of the first between two places, in at most so many bins.
     metrics : callable, optional
         From the header `Accept` to the page of the first cell's metrics, and its type.
     """
 
     cells: Sequence[PagedCell] = ()
     fleet: RecordedFleet | None = None
+    runs: RunsFolder | None = None
     line: str = ""
     act: Act | None = None
     read_only: str = "this page only looks; `dwell dash --control` lets it act"
+    difference: Callable[[float, float, int], Plain] | None = None
     metrics: Callable[[str], tuple[bytes, str]] | None = None
     _news: asyncio.Condition = field(default_factory=asyncio.Condition, repr=False)
     _tick: tuple[int, bytes] = field(default=(0, b""), repr=False)
@@ -93,8 +100,11 @@ class Dash:
             *(Route(path, partial(_file, "index.html")) for path in ("/", "/cell/{place:int}")),
             *(Route(f"/static/{name}", partial(_file, name)) for name in static_files()),
             Route("/cells", self._cells),
+            Route("/runs", self._runs),
+            Route("/lines", self._lines),
             Route("/view", self._view),
             Route("/state", self._state),
+            Route("/difference", self._difference),
             Route("/jobs", self._jobs),
             Route("/events", self._events),
             Route("/metrics", self._metrics),
@@ -110,8 +120,12 @@ class Dash:
     # ---------------------------------------------------------------------- what is read
 
     async def _cells(self, request: Request) -> Response:
-        fleet = None
-        if self.fleet is None:
+        fleet = runs = None
+        cells: Sequence[PagedCell]
+        if self.runs is not None:
+            cells = [await self._cell(request)] if "cell" in request.query_params else []
+            runs = {"name": self.runs.name} if cells else self.runs.described()
+        elif self.fleet is None:
             cells = self.cells
         elif "cell" in request.query_params:
             cells = [await self._cell(request)]
@@ -124,17 +138,39 @@ class Dash:
             {
                 "cells": [await run_in_threadpool(cell.described) for cell in cells],
                 "fleet": fleet,
+                "runs": runs,
                 "line": self.line,
+                "difference": self.difference is not None,
                 "control": control,
                 "read_only": None if control else self.read_only,
             }
         )
 
+    async def _runs(self, request: Request) -> Response:
+        runs, since = self._folder(), _number(request, "since", 0.0)
+        return JSONResponse(runs.rows(max(int(since), 0)))
+
+    async def _lines(self, request: Request) -> Response:
+        runs, named = self._folder(), request.query_params.get("cells", "").split(",")
+        places = [int(name) for name in named if PLACE.fullmatch(name)]
+        if len(places) != len(named) or max(places) >= runs.count:
+            raise HTTPException(HTTPStatus.BAD_REQUEST, "cells has to be numbers of runs")
+        return JSONResponse(await run_in_threadpool(runs.lines, places))
+
+    def _folder(self) -> RunsFolder:
+        if self.runs is None:
+            raise HTTPException(HTTPStatus.NOT_FOUND, "this page lists no runs")
+        return self.runs
+
     async def _view(self, request: Request) -> Response:
         shown, begin, end = await self._shown(request), *_places(request)
-        bins = round(_number(request, "bins", 600.0))
-        bins = min(max(bins, LEAST_BINS), MOST_BINS)
-        return JSONResponse(await run_in_threadpool(shown.view, begin, end, bins))
+        return JSONResponse(await run_in_threadpool(shown.view, begin, end, _bins(request)))
+
+    async def _difference(self, request: Request) -> Response:
+        if self.difference is None:
+            raise HTTPException(HTTPStatus.NOT_FOUND, "there is one run alone")
+        begin, end = _places(request)
+        return JSONResponse(await run_in_threadpool(self.difference, begin, end, _bins(request)))
 
     async def _state(self, request: Request) -> Response:
         shown = await self._shown(request)
@@ -153,9 +189,10 @@ class Dash:
     async def _cell(self, request: Request) -> PagedCell:
         name = request.query_params.get("cell", "0")
         place = int(name) if PLACE.fullmatch(name) else -1
-        if self.fleet is not None and 0 <= place < self.fleet.count:
-            return await run_in_threadpool(self.fleet.cell, place)
-        if self.fleet is None and 0 <= place < len(self.cells):
+        several = self.fleet or self.runs
+        if several is not None and 0 <= place < several.count:
+            return await run_in_threadpool(several.cell, place)
+        if several is None and 0 <= place < len(self.cells):
             return self.cells[place]
         raise HTTPException(HTTPStatus.NOT_FOUND, f"no cell {name[:20]!r}")
 
@@ -344,6 +381,10 @@ def _places(request: Request) -> tuple[float, float]:
     if not begin < end:
         raise HTTPException(HTTPStatus.BAD_REQUEST, f"begin {begin:g} is not before end {end:g}")
     return begin, end
+
+
+def _bins(request: Request) -> int:
+    return min(max(round(_number(request, "bins", 600.0)), LEAST_BINS), MOST_BINS)
 
 
 def _number(request: Request, name: str, usual: float | None = None) -> float:

@@ -10,7 +10,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -42,7 +42,8 @@ class Figure:
     """A figure.
 
     `slug` is its name in files and links, unique in a page. `frames` has the data by their names
-    in the drawing. `caption` is plain text.
+    in the drawing. `caption` is plain text. A figure with `widths`, pixels, has one picture for
+    each, of which a page shows the widest that fits; a script does not draw it again.
     """
 
     slug: str
@@ -50,6 +51,7 @@ class Figure:
     frames: Mapping[str, pl.DataFrame]
     draw: Draw
     caption: str = ""
+    widths: Sequence[float] = ()
 
     def spec(self, width: float = PAGE_PX, *, letters: float = LETTERS_PX) -> Spec:
         """Return the drawing with its data and style; lengths and letters in pixels."""
@@ -75,11 +77,12 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def svg(figure: Figure) -> str:
-    """Return the SVG element of a figure for a page."""
+def svg(figure: Figure, width: float | None = None) -> str:
+    """Return the SVG element of a figure for a page, or for a part of it that is `width` wide."""
     import vl_convert
 
-    text = _typeset(vl_convert.vegalite_to_svg(figure.spec()))
+    text = vl_convert.vegalite_to_svg(figure.spec(width or (*figure.widths, PAGE_PX)[0]))
+    text = _typeset(text)
     # vl-convert resolves links within the page against a site of Vega; restore them.
     text = text.replace("https://vega.github.io/vega-datasets/#", "#")
     # Two decimals and no ARIA attributes keep a page with many figures small.
@@ -88,10 +91,11 @@ def svg(figure: Figure) -> str:
     # vl-convert numbers ids across drawings; ids by slug do not depend on earlier drawings.
     names = list(dict.fromkeys(re.findall(r'id="(\w+)"', text)))
     for place, name in enumerate(names):
-        text = re.sub(rf"\b{name}\b", f"{figure.slug}-{place}", text)
+        own = figure.slug if width is None else f"{figure.slug}-{width:.0f}"
+        text = re.sub(rf"\b{name}\b", f"{own}-{place}", text)
     label = escape(figure.title)
-    width = re.search(r'width="([\d.]+)"', text)
-    most = "" if width is None else f' style="max-width:{float(width[1]):.0f}px"'
+    whole = re.search(r'width="([\d.]+)"', text)
+    most = "" if whole is None else f' style="max-width:{float(whole[1]):.0f}px"'
     return re.sub(
         r'<svg ([^>]*?)width="[^"]*" height="[^"]*"',
         rf'<svg role="img" aria-label="{label}"{most} \1',

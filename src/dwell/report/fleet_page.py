@@ -6,6 +6,8 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from dwell.display import Measure, write_number
 from dwell.errors import SimulationError
 from dwell.model.bounds import counted
@@ -18,7 +20,8 @@ from dwell.report.formatting import percent, write_ms
 from dwell.report.page import Definitions, Fact, Page, Section
 from dwell.report.palette import INK, MUTED, Palette
 from dwell.report.table import MOST_ROWS, WITH_WARMUP, WITHOUT_WARMUP, Columns, Table, Text
-from dwell.report.timeline import fleet_timeline, rows_px
+from dwell.report.timeline import FAR, fleet_timeline, rows_px
+from dwell.report.topology import topology
 from dwell.study import AIM
 from dwell.study.fleet_summary import fleet_numbers, refusals
 from dwell.study.metric import METRICS, metric_of
@@ -35,6 +38,8 @@ BESIDE_PX, GAP_PX = 120, 18
 ROUNDS_PX = 190
 #: Largest number of cells for which the table of cells is open.
 UNFOLDED = 24
+#: Most outliers that are named.
+MOST_NAMED = 5
 #: Target of a move in figures if the cell stays.
 STAYS = "no move"
 
@@ -100,6 +105,7 @@ class _FleetPage:
     def _sections(self) -> Iterator[Section]:
         yield Section("", [self._time()])
         yield Section("Cells, the worst first", [self._drawn_cells()])
+        yield Section("Topology", list(self._topologies()))
         yield Section("Cells in numbers", [self._table()], folded=len(self.cells) > UNFOLDED)
         if self.numbers["rounds"]:
             yield Section("Rounds of the ledger", self._rounds())
@@ -117,12 +123,21 @@ class _FleetPage:
             colours=self.used,
             disturbed=self._disturbed(),
             caption=(
-                "A row is a cell, the worst first, in the colour of where it is. V_D: mean over "
-                "cells, and from the least to the most. Dashed: the aim of 5 %. U: all load of a "
-                "shared node, foreign work included. Upright lines: moves; in colour, a guard's. "
-                "Shaded: warm-up and disturbances."
+                "A row is a cell, the worst first, in the colour of its placement. V_D: median and "
+                f"quartiles of the cells; circles: outliers{self._outliers()}. Dashed: the aim of "
+                "5 %. U: all load of a shared node, foreign work included. Upright lines: moves; "
+                "in colour, a guard's. Shaded: warm-up and disturbances."
             ),
         )
+
+    def _outliers(self) -> str:
+        """Return the names of the cells far above the others in V_D of the whole run."""
+        rates = np.array([row["violation_rate"] for row in self.cells])
+        low, high = np.quantile(rates, (0.25, 0.75))
+        far = [
+            row["cell"] for row in self.cells if row["violation_rate"] > high + FAR * (high - low)
+        ]
+        return f"; in the whole run {', '.join(far[:MOST_NAMED])}" if far else ""
 
     def _disturbed(self) -> list[Disturbed]:
         """Return the disturbances of cells, with the number of cells unless all have them."""
@@ -150,6 +165,8 @@ class _FleetPage:
                 "measure": measure.heading,
                 "value": row[measure.column] * measure.factor,
                 "limit": limits[measure].get(row["cell"]),
+                # An axis needs a value in every panel.
+                "at": limits[measure].get(row["cell"], row[measure.column] * measure.factor),
             }
             for measure in limits
             for row in self.cells
@@ -161,6 +178,17 @@ class _FleetPage:
             lambda width: _dots(self.names, [one.heading for one in limits], width),
             "Means over the windows after the warm-up. Dashed: the aim of 5 %, and the deadline.",
         )
+
+    def _topologies(self) -> Iterator[Figure]:
+        """Yield one drawing per entry: its cells are alike."""
+        fleet = self.run.fleet
+        shared = f" All cells share {', '.join(fleet.shared)}." if fleet.shared else ""
+        for place, entry in enumerate(fleet.entries):
+            yield topology(
+                entry.cell,
+                f"topology-{place}",
+                f"{counted(entry.count, 'cell')} of this kind.{shared}",
+            )
 
     def _table(self) -> Table:
         import polars as pl
@@ -309,7 +337,8 @@ def _dots(cells: Sequence[str], headings: Sequence[str], width: float) -> Spec:
         "y": name_of("cell", sort=list(cells), axis={"labelOverlap": True}),
         "tooltip": [*names("cell", "measure"), *(quantity(one, one) for one in ("value", "limit"))],
     }
-    limit = {**where, "x": quantity("limit", None)}
+    shown = {"condition": {"test": "isValid(datum.limit)", "value": 1}, "value": 0}
+    limit = {**where, "x": quantity("at", None), "opacity": shown}
     return {
         "data": {"name": "rows"},
         "facet": name_of("measure", sort=list(headings)),
@@ -336,7 +365,7 @@ def _phi(colours: Mapping[str, str], width: float) -> Spec:
         quantity("phi_before", "Φ before"),
         quantity("phi_after", "Φ after"),
     ]
-    axis = {"tickMinStep": 1, "format": "d", "grid": False}
+    axis = {"tickMinStep": 1, "tickCount": 10, "format": "d", "grid": False}
     scale = {"nice": False, "padding": 8}
     up = quantity("phi_before", "Φ", scale={"zero": False}, axis={"tickCount": 5})
     return {

@@ -36,10 +36,9 @@ VARIANTS = {
 def method_blocks(
     problem: Problem, scenarios: Sequence[str], policies: Iterable[str], prefix: str = ""
 ) -> list[Block]:
-    """Return the descriptions of a cell, its placements, its scenarios and the policies."""
+    """Return the descriptions of a cell, its scenarios and the policies."""
     return [
         Definitions(cell_definitions(problem)),
-        placements_table(problem, prefix),
         scenarios_table(problem, scenarios, prefix),
         Definitions(describe_contenders(problem, policies)),
     ]

@@ -65,8 +65,8 @@ def _figure(moves: pl.DataFrame, palette: Palette, deadline_ms: float) -> Figure
         },
         "A mark is a move: up, the estimate of the placement at the close at which it was chosen; "
         "across, the mean of what its windows showed at their closes until the next move, without "
-        "the first where there are others. Bars: a standard error to each side. Line: seen as "
-        "predicted. Dashed: deadline.",
+        "the first where there are others. Bars: a standard error to each side. Each axis has its "
+        "own range. Line: seen as predicted. Dashed: deadline.",
     )
 
 
@@ -80,10 +80,12 @@ def _scatter(
     width: float,
 ) -> Spec:
     side = min((width - BESIDE_PX) / 2, SIDE_PX)
-    low, high = _range(frame, column, error)
-    scale = {"domain": [low, high], "nice": False, "zero": False}
-    across = quantity(f"seen_{column}", f"{title}, seen", scale=scale, axis={"tickCount": 5})
-    up = quantity(f"predicted_{column}", f"{title}, predicted", scale=scale, axis={"tickCount": 5})
+    ends_of = {when: _range(frame, when, column, error) for when in ("seen", "predicted")}
+    scales = {when: {"domain": [*of], "nice": False, "zero": False} for when, of in ends_of.items()}
+    across, up = (
+        quantity(f"{when}_{column}", f"{title}, {when}", scale=scale, axis={"tickCount": 5})
+        for when, scale in scales.items()
+    )
     about = names(*(name for name in ("scenario", "policy", "run") if name in frame.columns))
     about += [quantity("window", "after window"), *names("from", "to")]
     for when in ("predicted", "seen"):
@@ -117,19 +119,21 @@ def _scatter(
         "layer": [*bars, disc({"tooltip": about}, 26, opacity=0.9)],
     }
     both = {"x": {**across, "field": "at"}, "y": {**up, "field": "at"}}
+    # The part of the line of equality that both ranges have.
+    low = max(begin for begin, _ in ends_of.values())
+    high = min(end for _, end in ends_of.values())
     diagonal = {
-        "data": {"values": [{"at": low}, {"at": high}]},
+        "data": {"values": [{"at": low}, {"at": high}] if low < high else []},
         **layer("line", both, color=MUTED, strokeWidth=1),
     }
-    inside = limit if low <= limit.value <= high else NO_LIMIT
-    return square(side, across, up, inside, diagonal, moves)
+    limits = [limit if low <= limit.value <= high else NO_LIMIT for low, high in ends_of.values()]
+    return square(side, across, up, limits, diagonal, moves)
 
 
-def _range(frame: pl.DataFrame, column: str, error: str) -> tuple[float, float]:
-    """Return the ends of both axes: the range of values and error bars, with a margin."""
+def _range(frame: pl.DataFrame, when: str, column: str, error: str) -> tuple[float, float]:
+    """Return the ends of an axis: the range of values and error bars, with a margin."""
     ends = [
         value + sign * (off or 0.0)
-        for when in ("predicted", "seen")
         for value, off in frame.select(f"{when}_{column}", f"{when}_{error}").rows()
         if value is not None
         for sign in (-1, 1)

@@ -103,6 +103,7 @@ def page_html(page: Page, *, static: bool = False) -> str:
         specs = {
             figure.slug: json.dumps(figure.spec(), separators=(",", ":")).replace("</", "<\\/")
             for figure in page.figures
+            if not figure.widths
         }
     kinds = {Figure: "figure", Table: "table", Definitions: "definitions"}
     return (

@@ -24,10 +24,11 @@ from dwell.report.charts import (
 )
 from dwell.report.figure import Figure
 from dwell.report.formatting import OURS, shown_contender, shown_policy, shown_scenario
-from dwell.report.method import method_blocks
+from dwell.report.method import method_blocks, placements_table
 from dwell.report.page import Block, Definitions
 from dwell.report.palette import Palette
 from dwell.report.table import WITHOUT_WARMUP, Columns, Table, Text
+from dwell.report.topology import topology
 from dwell.study import AIM, over_seeds, under, windows_behind
 from dwell.study.metric import METRICS, metric_of
 
@@ -43,6 +44,8 @@ MORE = (
     *("misses_in_20", "over_5_in_100", "aoi_mean_ms", "aoi_p95_ms", "aoi_peak_ms"),
     "tracking_rms_mm",
 )
+#: Most columns of a table on a page, next to the names of policies.
+MOST_COLUMNS = 5
 #: In percent.
 THE_AIM = Limit(100 * AIM, "the aim, 5 %")
 #: The one sentence that is made of numbers (docs/decisions/0007-pages.md).
@@ -83,6 +86,11 @@ class PolicyBlocks:
     def answer(self) -> list[Block]:
         """Return the first blocks of a page: V_D of all policies, and counts under the aim."""
         return [self.rate(), self.counts()]
+
+    def cell(self) -> list[Block]:
+        """Return the drawing of the cell, and its placements with the nodes of movable tasks."""
+        slug = f"{self.prefix}topology"
+        return [topology(self.problem, slug), placements_table(self.problem, self.prefix)]
 
     def method(self, **about: str) -> list[Block]:
         """Return descriptions of cell, scenarios, policies and versions, and the terms `about`."""

@@ -17,6 +17,7 @@ from dwell.model.bounds import counted
 from dwell.record import OUTCOME_SENTENCES, REASON_SENTENCES, shown_reason
 from dwell.record.moves import Move, moves_in
 from dwell.report.charts import (
+    OUTLINE,
     PART_COLOURS,
     PARTS_SHOWN,
     Limit,
@@ -45,6 +46,7 @@ from dwell.report.phases import phase_rows, phase_table
 from dwell.report.run_header import RunHeader
 from dwell.report.table import MOST_ROWS, WITHOUT_WARMUP, Columns, Table, Text
 from dwell.report.timeline import begins_by_number, resources_in, run_timeline
+from dwell.report.topology import topology
 from dwell.study.metric import METRICS
 from dwell.study.other_placements import PLACEMENTS
 from dwell.study.predicted_moves import predicted_moves
@@ -149,6 +151,7 @@ class _RunPage:
         yield Section("", [self._timeline(), *self._phases()])
         if placements := self.run.meta.get(PLACEMENTS):
             yield Section("If it never moved", [self._never_moving(placements)])
+        yield Section("The cell", [topology(self.header.problem)])
         yield Section("Worst windows", [self._worst_table()])
         for window in self.worst.iter_rows(named=True):
             number = window["window"]
@@ -185,10 +188,10 @@ class _RunPage:
             links=links,
             caption=(
                 "L95 seen: of the latencies at the window's close, where a cycle that has not "
-                "finished counts with its age. Thin lines: J of the other placements as the policy "
-                "estimated it. Dashed: the aim of 5 %, and the deadline. Upright lines: "
-                "migrations; in colour, the guard's. Shaded: warm-up and disturbances. U: all of a "
-                "node's load, foreign work included."
+                "finished counts with its age; a triangle at the top is a lost L95. Thin lines: J "
+                "of the other placements as the policy estimated it. Dashed: the aim of 5 %, and "
+                "the deadline. Upright lines: migrations; in colour, the guard's. Shaded: warm-up "
+                "and disturbances. U: all of a node's load, foreign work included."
                 f"{' Marks of the worst windows lead to their cycles.' if links else ''}"
             ),
         )
@@ -279,7 +282,7 @@ class _RunPage:
         }
         top = {"x": across, "y": {"value": 6}, "tooltip": [cycle, outcome]}
         layers = [
-            in_order(layer("bar", time, rows="parts"), PART_COLOURS),
+            in_order(layer("bar", time, rows="parts", **OUTLINE), PART_COLOURS),
             *limit_rule("y", self.header.deadline_ms, "deadline"),
         ]
         if len(lost):

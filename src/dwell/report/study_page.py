@@ -14,7 +14,7 @@ from dwell.report.figure import Figure
 from dwell.report.formatting import few_seeds, independent_runs
 from dwell.report.method import numbered
 from dwell.report.page import Block, Definitions, Page, Section, page_html
-from dwell.report.policy_blocks import THE_AIM, PolicyBlocks, named, scaled
+from dwell.report.policy_blocks import MOST_COLUMNS, THE_AIM, PolicyBlocks, named, scaled
 from dwell.report.table import WITHOUT_WARMUP, Table, Text
 from dwell.study import StudyRuns, over_seeds
 from dwell.study.metric import Metric, metric_of
@@ -53,22 +53,24 @@ def _sections(study: StudyRuns, blocks: PolicyBlocks) -> Iterator[Section]:
     if study.parameters:
         for place in range(len(study.axes)):
             yield from _by_axis(study, blocks, place)
+        yield Section("The cell and its placements", blocks.cell())
         yield Section("Every point", [_points(study, blocks)], folded=True)
     else:
         yield Section("", blocks.answer())
-        yield Section("Results", [blocks.results()])
+        yield Section("The cell and its placements", blocks.cell())
+        yield Section("Results", blocks.results().parts(MOST_COLUMNS))
         columns = ["cost", "regret", "oracle_regret", *study.metrics]
         drawn = [metric_of(name) for name in columns if name in study.runs.columns]
         figures = [blocks.tail(), blocks.distribution()]
         figures += [blocks.measure(metric, title=metric.title) for metric in drawn]
         yield Section("Figures", [*figures, *blocks.placed(), blocks.split()])
-        yield Section("More numbers", [blocks.more()])
+        yield Section("More numbers", blocks.more().parts(MOST_COLUMNS), folded=True)
     method = blocks.method(
         runs=f"{counted(study.windows, 'window')}, {numbered(study.seeds)}",
         intervals="95 %, two-sided, over seeds, by the studentised bootstrap, each on its own."
         f"{independent_runs(study.runs)}",
     )
-    yield Section("How it was made", method)
+    yield Section("Method", method, folded=True)
 
 
 def _metrics(study: StudyRuns) -> list[Metric]:

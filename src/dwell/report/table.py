@@ -7,7 +7,7 @@ import itertools
 import math
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 from dwell.display import Measure
@@ -104,6 +104,21 @@ class Table:
             self.rows, lambda row: "" if group is None else self._text(group, row).text
         ):
             yield heading, [[self._cell(column, row) for column in columns] for row in rows]
+
+    def parts(self, most: int) -> list[Table]:
+        """Return tables with at most `most` columns after the first, which each of them has."""
+        first, *others = self.columns
+        still = WITHOUT_WARMUP if WITHOUT_WARMUP in self.caption else ""
+        return [
+            replace(
+                self,
+                slug=self.slug if begin == 0 else f"{self.slug}-{begin // most + 1}",
+                title=self.title if begin == 0 else "",
+                caption=self.caption if begin == 0 else still,
+                columns=[first, *others[begin : begin + most]],
+            )
+            for begin in range(0, len(others), most)
+        ]
 
     def _sized(self, column: Text | Measure) -> Text | Measure:
         """Return a column with decimals for the largest of its numbers."""

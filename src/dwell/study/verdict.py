@@ -30,7 +30,7 @@ class RunVerdict:
     rate : float
         V_D of all counted cycles.
     low, high : float or None
-        95 % interval of the windows' mean; None if the windows are not independent.
+        95 % interval of the windows' mean; None if the windows are not independent or too few.
     aim : float
     """
 
@@ -70,5 +70,7 @@ def verdict_of(run: Run, problem: Problem, rate: float) -> RunVerdict:
         if unit_of(cells, len(windows["warmup"])) != WINDOW:
             return RunVerdict("open", rate, None, None, AIM)
     interval = share_interval(rates, windows=len(rates))
+    if not interval.known:
+        return RunVerdict("open", rate, None, None, AIM)
     word = _WORDS[under(rates, AIM, windows=len(rates))]
     return RunVerdict(word, rate, min(interval.low, rate), max(interval.high, rate), AIM)

@@ -323,7 +323,7 @@ def _scatter(
         "layer": marks,
     }
     shade = {"data": {"values": band}, **layer("area", allowed, color=SHADE, clip=True)}
-    return square(size, across, up, limit, shade, groups)
+    return square(size, across, up, [limit, limit], shade, groups)
 
 
 def _panel(group: Group) -> str:

@@ -1,6 +1,6 @@
 // The cells of a fleet as small multiples, worst first, and what they have in common.
 
-import { DASHES, lines } from "./charts.js";
+import { DASHES, lines, throughout } from "./charts.js";
 import { count, draw, make, number, percent, say } from "./dom.js";
 import * as panel from "./panel.js";
 import { get, latest } from "./server.js";
@@ -23,10 +23,12 @@ class Small {
     this.over = draw("path", { class: "over" });
     this.lost = draw("path", { class: "lost" });
     this.due = draw("path", { class: "due" });
+    this.disturbed = throughout(fleet) ? [] : fleet.disturbed;
+    this.bands = draw("path", { class: "band" });
     this.title = draw("title");
     this.height = STRIP + 4 + LANE * fleet.placements.length;
     const size = { viewBox: `0 0 ${WIDE} ${this.height}`, height: this.height, preserveAspectRatio: "none", role: "img" };
-    const svg = draw("svg", size, this.title, this.within, this.over, this.lost, this.due, ...this.lanes);
+    const svg = draw("svg", size, this.title, this.bands, this.within, this.over, this.lost, this.due, ...this.lanes);
     this.lanes.forEach((lane, i) => lane.style.setProperty("fill", fleet.placements[i].hue));
     this.deadline = make("span", { text: number(cell.deadline_ms, 0), class: "deadline" });
     const names = fleet.placements.map(({ name }) => make("span", { text: name, title: name }));
@@ -38,7 +40,7 @@ class Small {
     this.root = make(
       "li",
       { class: "small" },
-      make("h4", {}, this.link, make("span", { class: "rate", text: `V_D ${percent(cell.rate, 2)}` })),
+      make("h4", {}, this.link, make("span", { class: cell.verdict === "missed" ? "rate bad" : "rate", text: `V_D ${percent(cell.rate, 2)}${cell.verdict ? `: ${cell.verdict}` : ""}` })),
       make("p", {}, this.health),
       make("div", { class: "plot" }, make("div", { class: "lanes", "aria-hidden": "true" }, this.deadline, ...names), make("div", { class: "drawn" }, svg)),
       this.seen,
@@ -60,6 +62,7 @@ class Small {
       within.push(bar(Math.max(upper, due), STRIP));
       if (upper < due) over.push(bar(upper, due));
     });
+    this.bands.setAttribute("d", this.disturbed.filter(([from, to]) => to > begin && from < end).map(([from, to]) => `M${x(from)} 0H${x(to)}V${STRIP}H${x(from)}z`).join(""));
     this.within.setAttribute("d", within.join(""));
     this.over.setAttribute("d", over.join(""));
     this.lost.setAttribute("d", gone.join(""));
@@ -78,6 +81,8 @@ class Small {
 
   show(state) {
     panel.health(this.root, state, false);
+    // Three good windows are no verdict on a run.
+    this.health.classList.toggle("ok", this.cell.verdict !== "missed" && state.health === "ok");
     const { window: seen, decision } = state;
     say(this.seen, seen ? `window ${seen.number}: L95 ${number(seen.seen.l95_ms, 1)} ms, V_D ${percent(seen.seen.violation_rate, 2)}` : "");
     say(this.last, decision ? `decided: ${panel.decided_in_words(decision)}` : `${state.placement}; no decision yet`);
@@ -92,12 +97,27 @@ export class FleetView {
     this.part = (name) => this.root.querySelector(`.${name}`);
     this.part("name").textContent = fleet.name;
     this.part("source").textContent = `fleet of ${count(fleet.count)}`;
-    panel.describe(this.root, fleet);
+    panel.describe(this.root, { ...fleet, worst: null });
+    this.judge(fleet);
     this.smalls = fleet.cells.map((cell) => new Small(cell, fleet, page));
     this.part("smalls").append(...this.smalls.map(({ root }) => root));
     this.charts = this.common();
     this.load = latest(() => this.loadView(), (error) => page.failed(error));
     this.loadState = latest(() => this.stateAt(), (error) => page.failed(error));
+  }
+
+  /** Show how many cells kept the aim. */
+  judge({ verdicts, aim, cells, mean_rate }) {
+    const part = this.part("verdict");
+    const judged = Object.values(verdicts).reduce((sum, one) => sum + one, 0);
+    part.hidden = judged === 0;
+    if (part.hidden) return;
+    const { kept = 0, missed = 0, open = 0 } = verdicts;
+    part.classList.toggle("ok", kept === judged);
+    part.classList.toggle("bad", missed > 0);
+    const others = [missed ? `${count(missed)} missed it` : "", open ? `${count(open)} open` : ""].filter(Boolean).join(", ");
+    part.querySelector(".judged").textContent = `${missed ? "▲" : kept === judged ? "●" : "○"} ${count(kept)} of ${count(judged)} cells kept the aim of under ${number(100 * aim, 0)} % missed${others ? `: ${others}` : ""}`;
+    part.querySelector(".more").textContent = `deadlines missed after the warm-up: worst ${percent(cells[0].rate, 2)} (${cells[0].name}), mean ${percent(mean_rate, 2)}`;
   }
 
   /** Less than three windows show nothing. */
@@ -134,7 +154,7 @@ export class FleetView {
       const root = this.part(name);
       root.hidden = named.length === 0;
       if (root.hidden) return [];
-      const chart = lines(root, this.page, 120, named, { ...how, last: true });
+      const chart = lines(root, this.page, this.cell, 120, named, { ...how, last: true });
       const set = (view) => chart.set(name === "phi" ? { windows: view.rounds } : view);
       return [{ set, show: (state) => chart.read((key) => value(state, key)) }];
     });
@@ -150,7 +170,7 @@ export class FleetView {
     this.view = [begin, end];
     this.plots = this.charts.map((chart) => chart.set(view));
     this.smalls.forEach((small, i) => small.set(view.cells[i], this.view, top, this.cell.placements));
-    say(this.part("scale"), `V_D after the warm-up · strips: L95 by window, 0 to ${number(top, 0)} ms; dashed: the deadline; a tick on top: a lost cycle · lanes: where it is`);
+    say(this.part("scale"), `V_D after the warm-up · strips: L95 by window, 0 to ${number(top, 0)} ms; dashed: the deadline; a tick on top: a lost cycle${this.cell.disturbed.length && !throughout(this.cell) ? "; shaded: disturbed" : ""} · lanes: placement`);
     panel.events(this.root, this.cell, view, this.page);
     this.redraw();
   }
@@ -165,9 +185,8 @@ export class FleetView {
   }
 
   facts({ cells, phi }) {
-    const [worst] = this.cell.cells;
     const rates = cells.flatMap(({ window: seen }) => seen?.seen.violation_rate ?? []);
-    const parts = [`V_D: worst ${percent(worst.rate, 2)} (${worst.name}), mean ${percent(this.cell.mean_rate, 2)}`];
+    const parts = [];
     if (rates.length) parts.push(`in the last window: worst ${percent(Math.max(...rates), 2)}, mean ${percent(rates.reduce((a, b) => a + b) / rates.length, 2)}`);
     if (phi !== null) parts.push(`Φ a cell ${number(phi, 3)}`);
     say(this.part("facts"), parts.join(" · "));

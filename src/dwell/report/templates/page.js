@@ -7,6 +7,8 @@
   // A drawing was made for the page's width: parts that are wider than a small screen are fitted.
   function fit(spec, room) {
     if (room >= narrow) return spec;
+    // Names of rows leave room for the marks; the pointer shows a name that is cut off.
+    spec.config.axis.labelLimit = 92;
     const lone = (part) => {
       if (typeof part !== "object" || part === null) return;
       if ("columns" in part && ("facet" in part || "concat" in part)) part.columns = 1;
