@@ -64,9 +64,8 @@ struct Simulation : Tables {
   // the processor does not do it in time by itself.
   template <class T>
   static void fetch_next(const T& value) {
-    constexpr i64 kLineBytes = 64;
-    const i64 values = kLineBytes / static_cast<i64>(sizeof(T));
-    if constexpr (!kPlain) __builtin_prefetch(&value + values);
+    constexpr i64 kLineBytes = 64, kValues = kLineBytes / static_cast<i64>(sizeof(T));
+    if constexpr (!kPlain) __builtin_prefetch(&value + kValues);
   }
 
   // Hop that a flow takes in a cycle, -1 on the same node.
