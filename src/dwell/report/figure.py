@@ -146,7 +146,8 @@ def _printed(figure: Figure, width_pt: float) -> str:
         if 0 <= off < 1:
             break
         asked += off - 0.5
-    return _typeset(text)
+    # Links lead to places of a page, which a printed figure leaves.
+    return _typeset(re.sub(r"</?a\b[^>]*>", "", text))
 
 
 def _resolved(drawing: Spec) -> Spec:
