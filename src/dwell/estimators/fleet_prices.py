@@ -3,7 +3,7 @@
 All cells are simulated together, each under its measured conditions (see
 `dwell.estimators.presents`). Realisations and phases are the same for all placements, so Φ depends
 on the placements alone. A cell without tasks on a shared node does not affect other cells and is
-simulated once.
+simulated once per candidate.
 """
 
 from __future__ import annotations
@@ -170,7 +170,7 @@ class FleetPrices:
         self._first = None
 
     def _of(self, index: int) -> Present:
-        """Return a cell's measured conditions; only the first cell's include shared nodes."""
+        """Return a cell's measured conditions; the first cell's also describe shared nodes."""
         present = self._presents[index]
         threads, down = dict(present.threads), set(present.down)
         for name in self.shared:

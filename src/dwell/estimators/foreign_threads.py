@@ -25,7 +25,7 @@ WINDOWS = 3
 
 
 class Level(NamedTuple):
-    """Foreign threads of a node that its jobs show."""
+    """Estimate of a node's foreign threads from its jobs."""
 
     #: Number in addition to bursts.
     threads: float
@@ -146,5 +146,5 @@ class Stretches:
 
 
 def _turns(node: Node, execution: Execution) -> float:
-    """Return the cores that a job can use; on a fair node each thread competes."""
+    """Return the cores of a job; on a fair node, the number of its threads."""
     return execution.threads if node.scheduler == "fair" else cores_of(node, execution)

@@ -34,7 +34,7 @@ class Learning(Online):
     `shadow_fraction` is the share of cycles sent through each alternative [default: the cell
     file's]. If the file sets `auto`, the share depends on the active candidate
     (`dwell.estimators.shadow_price`). `half_life_windows` is the unit of `MEMORY` and `UNSEEN`
-    [default: the cell file's]; out of its range it raises `ProblemError`.
+    [default: the cell file's]; a value outside its range raises `ProblemError`.
     """
 
     #: Half-lives until newer values replace a measured value, and until a part without new

@@ -63,7 +63,7 @@ def parts_of(pipeline: Pipeline, placement: Placement) -> Iterator[Part]:
 
 
 class Meter:
-    """Computes the times and demands of parts from the jobs and messages of a window.
+    """Times and demands of parts, from the jobs and messages of a window.
 
     On the nodes in `shared`, jobs also wait for jobs of other cells, which the evidence lacks.
     """

@@ -239,9 +239,10 @@ class Pool:
     ) -> bool:
         """Add the values measured in a window; return whether the regime has changed.
 
-        There is at least one value; lost values are infinite. A value is forgotten after `memory`
-        windows. The window has `cycles` cycles [default: one per value]. `tests` is the number of
-        such comparisons, of all parts, per window of the cell.
+        There is at least one value; lost values are infinite. `window` is the number of the
+        decision; a value is forgotten after `memory` decisions. The values are from `cycles` cycles
+        [default: one per value]. `tests` is the number of such comparisons, of all parts, per
+        window of the cell.
         """
         is_first, self.rows.row.last = not self.last, window
         cycles = len(values) if cycles is None else cycles
@@ -297,7 +298,7 @@ class Pool:
         return run if run is not None and run.cycles + cycles <= self.reference.block else None
 
     def _run_on(self, run: _Doubt, apart: PlaceSums, cycles: int) -> _Doubt:
-        """Add values to a run; it ends unless most of its values are larger, or smaller."""
+        """Add values to a run; end it unless most of its values are larger, or smaller."""
         run = _Doubt(run.before, run.apart + apart, run.cycles + cycles)
         row, self.rows.before = self.rows.row, run.before
         row.run_size, (row.run_larger, row.run_smaller, row.run_places) = (

@@ -3,7 +3,7 @@
 Measured conditions (`Present`) are the differences from the undisturbed cell that windows have
 shown: demands of some parts, foreign threads of some nodes, rates of links, nodes that are down.
 All candidates are simulated on the same realisation. Each simulation continues where it stopped,
-and its steps are averaged until the conditions change.
+and its newest steps are averaged until the conditions change.
 """
 
 from __future__ import annotations
@@ -333,7 +333,7 @@ class Playing:
         tables.layers[:] = self._declared_layers
 
     def _fill(self, since: int) -> None:
-        """Set the measured demands of the cycles that are released after cycle `since`."""
+        """Set the measured demands of the cycles from `since` on, except those just released."""
         begin = since + BEYOND if since else 0
         for part, values in self.present.demands.items():
             # An earlier call has set the same values, up to the last cycle.
@@ -437,11 +437,11 @@ def _estimated(
 ) -> tuple[float, float]:
     """Return the mean over `count` steps, with its standard error.
 
-    The same realisation is also simulated as declared, with mean `known` and error `known_error`.
-    If the difference between the two simulations varies less, the mean difference is added to
-    `known` (a control variate; DOI 10.1287/opre.30.5.961). `usual` is the standard deviation of a
-    step as declared, since few steps may vary too little; `cycles` is the number of cycles if the
-    mean is a share of cycles.
+    The same realisation is also simulated as declared; longer simulations give its expected value
+    `known`, with error `known_error`. If the difference between the two varies less than the
+    measured conditions do, its mean is added to `known` (a control variate; DOI
+    10.1287/opre.30.5.961). `usual` is the standard deviation of a step as declared, since few steps
+    may vary too little; `cycles` is the number of cycles if the mean is a share of cycles.
     """
     mean, squares, products, more, more_squares, more_products, apart = steps
     if not apart:

@@ -47,14 +47,14 @@ AGREES = 4.0
 RARE = 300
 #: Longest simulation of a candidate.
 MOST_CYCLES, MOST_EVENTS = 100_000, 10_000_000
-#: Windows at the start in which queues settle, which do not count; first windows that count; the
-#: same with a scenario: the default length of a run.
+#: Windows at the start in which queues settle, which do not count; counted windows of the first
+#: simulation; fewest windows with a scenario, the default length of a run.
 SETTLING, FIRST, DISTURBED = 5, 20, 300
 #: Errors by which the means of the two halves of the windows may differ.
 UNSETTLED = 3.0
 #: Factor on the windows that seem necessary, since the error is itself an estimate.
 AMPLE = 1.2
-#: Number of questions with known prices.
+#: Number of questions whose prices are kept.
 KEPT = 512
 #: Longest simulated window, cycles.
 LONGEST_WINDOW = 4_000

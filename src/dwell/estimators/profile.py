@@ -195,7 +195,7 @@ def _each(prices: Mapping[str, Price], what: str) -> Mapping[str, Any]:
 
 
 def mean_ms(pipeline: Pipeline, task: Task, execution: Execution) -> float:
-    """Return the exact mean execution time of a task, including its scale, milliseconds."""
+    """Return the expected execution time of a task, including its scale, milliseconds."""
     process = execution.exec_ms
     if task.scale is None:
         return process.expectation
