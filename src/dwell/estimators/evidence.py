@@ -27,7 +27,7 @@ UNKNOWN = -1
 class Instants:
     """Instants of the jobs and messages of a window's cycles, nanoseconds; `UNKNOWN` if never.
 
-    An array is None if the engine does not measure it.
+    Arrays that the engine omits are None.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ class Evidence:
         *,
         shadows_share: bool = True,
     ) -> Evidence:
-        """Make the evidence from the properties of these names."""
+        """Make the evidence from the instants of cycles and of their shadows."""
         sent = None if shadows is None else shadows.columns(shadow_placement)
         rows = WindowRows.of(cycles.columns(placement), sent)
         return cls(close_ns, release_ns, rows, shadows_share)

@@ -31,20 +31,10 @@ EARLY = 0.9
 class Learning(Online):
     """Base of the estimators that keep a pool of values per part.
 
-    Parameters
-    ----------
-    shadow_fraction : float, optional
-        Share of cycles sent through each alternative [default: the cell file's]. If the file sets
-        `auto`, the share depends on the active candidate (`dwell.estimators.shadow_price`).
-    half_life_windows : float, optional
-        Unit of `MEMORY` and `UNSEEN` [default: the cell file's].
-    seed : int
-        Seed of the simulations.
-
-    Raises
-    ------
-    ProblemError
-        If `half_life_windows` is out of its range.
+    `shadow_fraction` is the share of cycles sent through each alternative [default: the cell
+    file's]. If the file sets `auto`, the share depends on the active candidate
+    (`dwell.estimators.shadow_price`). `half_life_windows` is the unit of `MEMORY` and `UNSEEN`
+    [default: the cell file's]; a value outside its range raises `ProblemError`.
     """
 
     #: Half-lives until newer values replace a measured value, and until a part without new
@@ -102,7 +92,7 @@ class Learning(Online):
         self._window += 1
         cycles = len(evidence.release_ns)
         changed = self._learn(cycles)
-        # Most windows show no change, and nobody needs the names of their parts.
+        # Without a change the names of the measured parts are unnecessary.
         measured = self._meter.found_parts if changed or self._doubts else []
         for pool in map(self._pools.__getitem__, self._otherwise_parts()):
             if pool.touched and self._window - pool.touched >= max(self.unseen, 1.0):
@@ -162,7 +152,7 @@ class Learning(Online):
             found = None
             if now is not None and self._is_faster(evidence, parts, now.mbps):
                 found = Rate(declared)
-            # After 0, 1, 2, 4, ... decisions.
+            # Try after 0, 1, 2, 4, ... decisions.
             elif not after & (after - 1) and not all(self._pools[p].is_declared for p in parts):
                 found = self._better_rate(link, parts, evidence)
             if found is not None:

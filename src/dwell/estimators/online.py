@@ -1,4 +1,4 @@
-"""Online: common base of the estimators that learn from windows.
+"""Common base of the estimators that learn from windows.
 
 They keep the measured conditions (`Present`): demands of every part of a cycle, foreign threads of
 every node, rates of links, and nodes that are down. Conditions are as declared until evidence shows
@@ -36,7 +36,7 @@ from dwell.model.shadow_plan import by_candidate
 FIRST_STEPS = 6
 #: Largest number of rounds per window for unsure candidates, and steps per round.
 ROUNDS, STEPS = 2, 2
-#: Standard errors between a price difference and the thresholds of a decision that make it sure.
+#: A decision is sure if a price difference is this many standard errors from its thresholds.
 BAND = 2.0
 
 
@@ -49,15 +49,7 @@ class _Declared(NamedTuple):
 
 
 class Online(CellEstimator):
-    """Base of the estimators that learn from windows.
-
-    Attributes
-    ----------
-    shadow_fraction : float, or mapping of str to float
-        Share of cycles sent through each alternative, by active candidate.
-    seed : int
-        Seed of the simulations.
-    """
+    """Base of the estimators that learn from windows; `seed` is the seed of their simulations."""
 
     seed = SEED
 
@@ -154,7 +146,7 @@ class Online(CellEstimator):
 
     @property
     def present(self) -> Present:
-        """The measured conditions that differ from the declared ones."""
+        """The measured conditions that differ from the declared conditions."""
         self._take_in_pending()
         return self._present(self._otherwise())
 
@@ -292,7 +284,7 @@ class Online(CellEstimator):
             self._down, self._has_changed = down, True
 
     def _down_nodes(self, evidence: Evidence, own: Mapping[str, float]) -> Iterator[str]:
-        """Nodes on which nothing has completed since jobs were lost there."""
+        """Yield idle nodes that have lost at least two jobs since their last completed job."""
         limit_ns = evidence.close_ns - self._patience_ns
         if not evidence.rows.unknown(limit_ns)[0]:
             return
@@ -319,7 +311,7 @@ class Online(CellEstimator):
                 yield node
 
     def _names(self, otherwise: Mapping[Part, Floats]) -> list[str]:
-        """Candidates with a part, node or link that differs from its declaration."""
+        """Return the candidates with a part, node or link that differs from its declaration."""
         nodes = {name for name, foreign in self._foreign.items() if foreign.beyond} | self._down
         links = {part.link for part in otherwise if isinstance(part, Message)}
         links |= self._rates.keys()
