@@ -271,7 +271,7 @@ void queue_up(S& s, Server& server, const Waiting& row) {
   push(waiting_of(s, server), server.n_wait++, row);
 }
 
-// Preempts the last in order of the running jobs behind `last`; returns false without such a job.
+// Preempts the last in order of the running jobs behind `last`; returns false if all precede it.
 template <class S>
 [[gnu::noinline]] bool preempt(S& s, Server& server, Waiting last) {
   Running* running = running_of(s, server);
