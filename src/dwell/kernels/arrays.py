@@ -117,7 +117,7 @@ class Arrays:
             self._addresses[row] = table.ctypes.data, table.size
 
     def leave_out(self, rows: Collection[int]) -> None:
-        """Release no cycle of some cells, and close none of their windows."""
+        """Leave some cells out of the simulation: they release no cycles and have no windows."""
         cells, clock, events = self.tables.cells, self.tables.clock[0], self.tables.events
         without = [*rows]
         cells["close_cycle"][without] = cells["n_cycles"][without] + 1
@@ -518,7 +518,7 @@ class _Layout:
         """Add the shadow of a cell: its own workers and samples; it shares all other rows."""
         cells, part = self.rows["cells"], self.parts[index]
         cells[part.row]["shadow"] = len(cells)
-        # Its windows never close.
+        # A shadow has no windows.
         shadow = {"candidate_0": len(self.site_of), "close_cycle": real.cycles + 1}
         shadow["decide_cycles"] = 0
         cells.append(cells[part.row] | shadow | {"shadow": -1, "parent": part.row})

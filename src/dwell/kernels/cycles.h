@@ -315,8 +315,8 @@ void mark_accelerators(S& s) {
 
 // Begins a cycle, or its shadow: the sources become ready.
 //
-// A shadow starts only the sources that it does not share, by an event of their own, like sources
-// with an offset.
+// A shadow starts only the sources that it does not share, each by an event, like sources with an
+// offset.
 template <class S>
 void begin_cycle(S& s, i64 cell, i64 cycle, i64 active, bool is_shadow, i64 now) {
   const Cell& of = s.cell(cell);

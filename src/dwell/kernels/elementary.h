@@ -1,7 +1,7 @@
 #pragma once
 
 // Elementary functions with the same bits from every compiler and on every processor; the functions
-// of the C library differ between processors. They need rounding to nearest.
+// of the C library differ between processors. All operations round to nearest.
 
 #include <bit>
 #include <cstdint>

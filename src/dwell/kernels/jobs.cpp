@@ -49,7 +49,7 @@ constexpr f64 kSlowed = 1.02, kMost = 0.9;
 constexpr f64 kChanged = 5.0;
 constexpr i64 kLeast = 36;
 
-// With clang, std::sort of numbers without it calls the C++ library, which is not linked.
+// Without this comparison clang's std::sort of numbers calls the C++ library, which is not linked.
 constexpr auto kIsLess = [](f64 one, f64 other) { return one < other; };
 
 f64 median(f64* values, i64 n) {
@@ -362,7 +362,8 @@ DWELL_EXPORT i64 dwell_level(const NodeJobs* node, const Window* window, const i
   const bool is_slowed = keep_newest(jobs, values);
   for (i64 i = 0; i < jobs.n; ++i) values[i] = jobs.first[i].threads;
   std::sort(values, values + jobs.n, kIsLess);
-  // The median of the jobs outside bursts, which have the smaller values: bursts add threads.
+  // The median of the jobs outside bursts; they have the smaller values, because bursts add
+  // threads.
   const f64 place = (1.0 - node->bursts) / 2;
   const f64 off = std::sqrt(place * (1.0 - place) / static_cast<f64>(jobs.n));
   const auto at = [&](f64 share) {

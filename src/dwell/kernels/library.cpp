@@ -1,5 +1,4 @@
-// Digest and compiler of the library. The loader compares the digest with the sources in its
-// folder.
+// Digest and compiler of the library. The loader compares the digest with the sources.
 
 #include "export.h"
 

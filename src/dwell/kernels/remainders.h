@@ -1,5 +1,4 @@
-// Remainders: the servers below others, on which shadow jobs run with the cores that own jobs
-// leave.
+// Remainders: servers below others, which give shadow jobs the cores that own jobs leave.
 //
 // Shadow jobs do not delay own jobs, except through a quota or the places of an accelerator. After
 // every event on a server its remainder is computed again.

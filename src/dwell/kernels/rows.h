@@ -45,15 +45,15 @@ struct Crossing;  // of meter.cpp
   field(i64, n_cycles) field(i64, n_windows) field(i64, n_looks)                                 \
   field(i64, n_priced) /* columns of the outputs */                                              \
   field(i64, margin) field(i64, budget)                                                          \
-  field(i64, logs_all) /* whether logs keep all cycles, or only the ring's */             \
+  field(i64, logs_all) /* whether logs keep all cycles, or only the ring's */                    \
   field(i64, n_events) field(i64, first_event) field(i64, used_events) field(i64, free_event)    \
   field(i64, n_held)                                                                             \
   field(i64, is_calendar) field(i64, day_bits) /* a day is 2^day_bits ns; see queue.h */         \
   field(i64, next_change)                                                                        \
-  field(i64, pauses) /* whether a call ends when a decision is due */                 \
+  field(i64, pauses) /* whether a call ends when a decision is due */                            \
   field(i64, closed_cell)                                                                        \
   field(i64, step_key) field(i64, step_ns)                                                       \
-  field(i64, end_ns) /* latest end of a window of any cell */                              \
+  field(i64, end_ns) /* latest end of a window of any cell */                                    \
   field(i64, plays_on) /* up to `end_ns`, even after the last window */
 
 // A window ends `due_ns` after the release of its last cycle, or `grace_ns` after the release of
@@ -68,10 +68,10 @@ struct Crossing;  // of meter.cpp
   field(i64, close_pending) field(i64, window_cycles) field(i64, migrating)                      \
   field(i64, decide_cycles) field(i64, since) field(i64, look_0) field(i64, look)                \
   field(i64, look_cycle) field(i64, look_pending)                                                \
-  field(i64, deadline_ns) field(f64, longest_ms) /* larger latencies count as this */       \
+  field(i64, deadline_ns) field(f64, longest_ms) /* larger latencies count as this */            \
   field(i64, wakes_ns) field(i64, patience_ns) field(i64, waited)                                \
   field(i64, period_ns) field(i64, released) /* cycles */                                        \
-  field(i64, given_up_after) /* cycles after which a shadow is given up */                  \
+  field(i64, given_up_after) /* cycles after which a shadow is given up */                       \
   field(i32, task_0) field(i32, n_tasks) field(i32, flow_0) field(i32, candidate_0)              \
   field(i32, n_candidates) field(i32, n_sinks) field(i32, pair_0)                                \
   field(i32, resource_0) field(i32, n_resources) /* in `cell_servers` */                         \
@@ -201,7 +201,7 @@ struct Crossing;  // of meter.cpp
   field(f64, weight_latency) field(f64, weight_violations) field(f64, weight_robot)              \
   field(f64, weight_edge) field(f64, weight_cloud) field(f64, weight_switching)                  \
   field(f64, target_ms) field(f64, target_robot) field(f64, target_edge)                         \
-  field(f64, target_cloud) /* 0 if clouds have no own weight */                            \
+  field(f64, target_cloud) /* 0 if clouds have no own weight */                                  \
   field(f64, cap_ms) field(f64, cap_utilisation)
 
 // A candidate: its expected metrics, its cumulative sum, and whether its toggled task is on a

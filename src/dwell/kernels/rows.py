@@ -94,7 +94,7 @@ class Tables(NamedTuple):
     flows: Rows  # (flows,)
     outputs: NDArray[np.int32]  # flows out of each task, in the order of the file
     cell_servers: NDArray[np.int32]  # servers of each cell's resources
-    capacity: Floats  # cores, or places, of each of them
+    capacity: Floats  # cores, or places, of each of these servers
     nodes: Rows  # (nodes,)
     site_of: NDArray[np.int32]  # (candidates, tasks) -> site
     route: NDArray[np.int32]  # (candidates, flows) -> hop, or -1 on the same node
@@ -124,10 +124,10 @@ class Tables(NamedTuple):
     ready: Ints  # jobs that the event has made ready
     jobs: Rows  # (cells * slots * tasks,)
     slots: Rows  # (cells * slots,)
-    attempts: Ints  # (cells * slots, flows) attempts lost so far, less one
+    attempts: Ints  # (cells * slots, flows) number of the last lost attempt, from 0
     own_ns: Floats  # (cells, resources of a cell) core-nanoseconds of completed own work
     soonest_ns: Ints  # (candidates, tasks) least time from release to readiness; -1 if unknown
-    ages: Ints  # (W,) of one window
+    ages: Ints  # (W,) scratch: latency, or age if unfinished, of the cycles of a window
     rule: Rows  # (1,), or empty if Python decides
     options: Rows  # (candidates,)
     shown: Floats  # (resources, candidates) last share under a candidate, kept while full; else 1

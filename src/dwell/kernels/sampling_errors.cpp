@@ -10,7 +10,7 @@
 namespace dwell {
 namespace {
 
-// With clang, std::sort of numbers without it calls the C++ library, which is not linked.
+// Without this comparison clang's std::sort of numbers calls the C++ library, which is not linked.
 constexpr auto kIsLess = [](auto one, auto other) { return one < other; };
 // Place of the 95th percentile, and distance of its limits in errors of the place.
 constexpr f64 kPlace = 0.95, kOff = 2.0;

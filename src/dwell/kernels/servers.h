@@ -179,8 +179,8 @@ void tick(S& s, Server& server, i64 now) {
 //
 // With c' = c - b cores left by the background, K threads of jobs and s foreign threads, fair:
 // min(1, c' / (K + s)); fifo and priority: c' / (c + s); in turns: 1 / threads of the job that has
-// the turn. Foreign threads also multiply the speed by `beside`; it is 0 while the quota is used
-// up.
+// the turn. Next to foreign threads the speed is multiplied by `beside`; while the quota is used up
+// it is 0.
 template <class S>
 void set_speed(S& s, Server& server) {
   f64 speed;

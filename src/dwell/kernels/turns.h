@@ -110,7 +110,7 @@ i64 average(const S& s, const Server& server, const Quota& quota) {
   return origin + beyond / n - down;
 }
 
-// Gives the turn to the waiting thread that has received least, if it is free and the quota allows.
+// Gives a free turn to the waiting thread that has received least, if the quota allows.
 template <class S>
 void take_turn(S& s, Server& server, i64 now) {
   Quota& quota = s.quotas[server.quota];

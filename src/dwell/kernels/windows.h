@@ -146,9 +146,9 @@ void announce_look(S& s, i64 cell) {
   s.post(close_ns(of, of.look_cycle - 1), make_key(kDecide, cell, of.look_cycle, 0));
 }
 
-// Whether the guard wakes now: it has not learnt of a completion from cycle `waited` on, or the
-// cycle after the newest known completion is g periods old. If not, the check is repeated when that
-// cycle is g periods old.
+// Whether the guard wakes now: it has learnt of no completion from cycle `waited` on, or the cycle
+// after the newest known completion is g periods old. If not, the check is repeated when that cycle
+// is g periods old.
 template <class S>
 bool wakes_guard(S& s, i64 cell, i64 now) {
   Cell& of = s.cell(cell);

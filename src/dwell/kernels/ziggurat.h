@@ -1,7 +1,7 @@
 #pragma once
 
-// Standard normals by the ziggurat of Marsaglia and Tsang (2000, DOI 10.18637/jss.v005.i08). NumPy
-// samples the same values from the same stream, except for the last bit in the tail.
+// Standard normals by the ziggurat of Marsaglia and Tsang (2000, DOI 10.18637/jss.v005.i08). They
+// equal NumPy's normals from the same stream, except that the last bit may differ in the tail.
 
 #include <array>
 #include <cstddef>
