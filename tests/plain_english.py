@@ -25,7 +25,6 @@ MOST = {
     "docs": 6.7,
     "docs.reference": 5.4,
     "dwell.dash": 15.2,
-    "dwell.kernels": 17.1,
     "lab.docs": 5.9,
 }
 

@@ -1,4 +1,4 @@
-"""The kernel's elementary functions for Python: the same bits on every processor."""
+"""Elementary functions of the kernel for Python, with the same bits on every processor."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dwell.model.number_arrays import Floats
 
 
 def logarithms(x: Floats) -> Floats:
-    """Return natural logarithms to within 1 ulp, for numbers from 2^-1022 on that are finite."""
+    """Return natural logarithms to within 1 ulp, for finite numbers from 2^-1022 on."""
     out = np.empty_like(x)
     _logarithms()(x, x.size, out)
     return out

@@ -113,7 +113,7 @@ class SlowedJobs:
 
 
 class _Scratch:
-    """Memory for the jobs of a window; to allocate it takes longer than the computation."""
+    """Memory for the jobs of a window; its allocation takes longer than the computation."""
 
     def __init__(self) -> None:
         self._memory, self._address = np.empty(0), 0

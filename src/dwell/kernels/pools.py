@@ -1,4 +1,4 @@
-"""What is held of the parts of a cycle (see ``pools.cpp``)."""
+"""Pools of the newest values of each part of a cycle (see ``pools.cpp``)."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from dwell.model.number_arrays import Floats, Ints
 
 #: Room for values, and for windows.
 ROOM = 408
-#: Size of an instant.
+#: Bytes of an instant.
 BYTES = 8
 #: Number of equal parts of the range of the declared values; the kernel searches in one of them.
 GUIDE_PARTS = 512
-#: What `PoolRows.learn` did with the values of a part where Python has to look at the pool: it left
-#: them out; it added them; it added them to a pool that is not as declared and has not changed.
+#: Why Python must look at a pool after `PoolRows.learn`: the values were not added; they were
+#: added; they were added to a pool that is not as declared, and show the same regime.
 NOT_ADDED, ADDED, GROWN = 1, 2, 3
 
 
@@ -57,7 +57,7 @@ class HeldValues:
         return bytes(self.row), self._known, self._held, self._before, bytes(self._chunks)
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
-        # A copy has addresses of its own.
+        # A copy has its own addresses.
         row, self._known, self._held, self._before, chunks = state
         self._values, self._scratch = (-1, np.empty(0)), (c_double * 0)()
         self.row = structs()["Pool"].from_buffer_copy(row)
@@ -74,7 +74,7 @@ class HeldValues:
 
     @property
     def values(self) -> Floats:
-        """The values in the order in which they came: the same array until they change."""
+        """The values in the order of arrival; the same array until they change."""
         row, (changes, values) = self.row, self._values
         if changes != row.changes:
             values = self._held[row.first : row.first + row.size].copy()
@@ -84,7 +84,7 @@ class HeldValues:
 
     @property
     def before(self) -> Floats:
-        """The values, ascending, before the run of windows that is going on; see `Pool`."""
+        """The values, ascending, before the present run of windows (see ``rows.h``)."""
         return self._before[: self.row.n_before].copy() if self.row.n_before else self._known
 
     @before.setter
@@ -108,7 +108,7 @@ class HeldValues:
         return out[0], out[1]
 
     def begin(self, values: Floats, sums: tuple[float, float, float], window: int) -> None:
-        """Hold some values, none of which was measured, in the place of all others."""
+        """Replace all values by values that were not measured."""
         row = self.row
         if len(values) > len(self._held):
             self._held = np.empty(len(values))
@@ -128,12 +128,12 @@ class HeldValues:
         memory: float,
         cycles: int,
     ) -> None:
-        """Add values, and drop the oldest: what is forgotten, and what is beyond the most held.
+        """Add values, and drop the oldest: values beyond the memory or the largest number held.
 
         Parameters
         ----------
         sums : tuple of float
-            Of their places (see `places`).
+            Sums of the values' places (see `places`).
         """
         values = np.ascontiguousarray(values)
         where = values.ctypes.data, len(values)
@@ -157,7 +157,7 @@ class PoolRows:
         self._of_groups = groups.ctypes.data, *groups.shape, self._support.ctypes.data
 
     def __reduce__(self) -> tuple[type[PoolRows], tuple[Sequence[HeldValues], Ints]]:
-        # A copy is of the copies of pools.
+        # A copy refers to the copies of the pools.
         return PoolRows, (self._pools, self._groups)
 
     def others(self) -> list[int]:
@@ -167,7 +167,10 @@ class PoolRows:
         return self._out[:n].tolist() if n else []
 
     def weakest(self) -> list[list[int]]:
-        """Return of each group the fewest measured values of a part, and the oldest window."""
+        """Return for each group the fewest measured values of a part, and the earliest window.
+
+        The window is the earliest one of the newest values of each part.
+        """
         _weakest()(self._addresses[0], *self._of_groups)
         return self._support.tolist()
 
@@ -185,9 +188,9 @@ class PoolRows:
         Parameters
         ----------
         least : float
-            Deviations that are another regime.
+            Fewest deviations from chance that show another regime.
         parts : int64 array, shape (n,), optional
-            Numbers of the parts; all that were found where None.
+            Numbers of the parts; if None, all parts that were found.
 
         Returns
         -------
@@ -209,7 +212,7 @@ class PoolRows:
 def places(
     known: Floats, values: Floats, patience_ms: float = math.inf
 ) -> tuple[float, float, float]:
-    """Add up where values lie among known ones, each at a place p between 0 and 1.
+    """Add up the places p of values among known values; places are between 0 and 1.
 
     Parameters
     ----------
@@ -245,18 +248,18 @@ class TimesRow(NamedTuple):
 def fill(
     rows: Sequence[TimesRow], values: Floats, stretched: float, begin: int, offset: int
 ) -> None:
-    """Let cycles meet known values in turn (see `dwell.estimators.presents`).
+    """Fill the times of cycles with known values in turn (see `dwell.estimators.presents`).
 
     Parameters
     ----------
     rows : sequence of TimesRow
-        Nanoseconds; as they were if all values are lost.
+        Nanoseconds; unchanged if all values are lost.
     values : float64 array
-        Milliseconds; what is infinite is left out.
+        Milliseconds; infinite values are left out.
     stretched : float
-        What the values are divided by.
+        Divisor of the values.
     begin, offset : int
-        First cycle that is filled, and which cycle the first of a row stands for.
+        First column that is filled, and the cycle of column 0.
     """
     values = np.ascontiguousarray(values)
     where = values.ctypes.data, len(values), stretched, begin + offset

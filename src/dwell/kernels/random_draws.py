@@ -83,7 +83,7 @@ def draw(
     shared : collection of str
         Nodes that the cell shares with others; their changes are sampled without the prefix.
     disturbances : sequence of Disturbance
-        All disturbances of shared nodes; they replace those of the scenario for these nodes.
+        All disturbances of shared nodes; for these nodes they replace the scenario's disturbances.
 
     Raises
     ------
@@ -183,8 +183,8 @@ def draw_shadows(
 ) -> Realisation:
     """Sample execution times, delays and losses of the shadow jobs in a realisation.
 
-    Releases, disturbances, scales and the rows of traces equal those of the realisation, because
-    they belong to the cycle or to the fabric.
+    Releases, disturbances, scales and the rows of traces are the same as in the realisation,
+    because they belong to the cycle or to the fabric.
 
     Parameters
     ----------

@@ -10,7 +10,7 @@
 namespace dwell {
 namespace {
 
-// Without it, std::sort of numbers is a function of the C++ library with clang, which links none.
+// Without this comparison clang's std::sort of numbers calls the C++ library, which is not linked.
 constexpr auto kIsLess = [](auto one, auto other) { return one < other; };
 // Place of the 95th percentile, and distance of its limits in errors of the place.
 constexpr f64 kPlace = 0.95, kOff = 2.0;
@@ -48,7 +48,7 @@ f64 percentile_error(i64 n, f64 off, At at) {
 }
 
 // Writes the mean of `n` values, the sum of the squares of their deviations from it, and the sum of
-// the products of successive ones.
+// the products of successive deviations.
 template <class Value>
 void write_moments(i64 n, Value value, f64* out) {
   f64 sum = 0.0, squares = 0.0, products = 0.0;
@@ -110,7 +110,7 @@ DWELL_EXPORT void dwell_held_error(const Pool* pool, f64* scratch, f64* out) noe
   out[1] = std::max(few * deviation / std::sqrt(count), of_place);
 }
 
-// Returns the error of the 95th percentile of latencies, and sorts some of them.
+// Returns the error of the 95th percentile of latencies; changes their order.
 DWELL_EXPORT f64 dwell_tail_error(i64* latency_ns, i64 n, f64 most_ms, f64 off) noexcept {
   i64 from = 0;
   return percentile_error(n, off, [&](i64 place) {

@@ -21,9 +21,9 @@ class SeriesSums(NamedTuple):
     Parameters
     ----------
     mean, squares, products : float
-        Mean; sums of squared deviations from it, and of products of successive ones.
+        Mean; sums of squared deviations from it, and of products of successive deviations.
     more, more_squares, more_products : float
-        The same of the differences.
+        The same for the differences.
     apart : float
         Sum of the absolute differences.
     """
@@ -38,7 +38,7 @@ class SeriesSums(NamedTuple):
 
 
 class Steps:
-    """Means that the newest steps of a simulation have shown.
+    """Mean metrics of the newest steps of a simulation.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class Steps:
         return self._table[: self._count]
 
     def add(self, means: Sequence[float]) -> None:
-        """Add a step; the oldest leaves when there are too many."""
+        """Add a step; a full table drops the oldest."""
         self.keep(len(self._table) - 1)
         self._table[self._count] = means
         self._count += 1
@@ -74,7 +74,7 @@ class Steps:
             self._count = most
 
     def sums(self) -> tuple[SeriesSums, SeriesSums, list[float]]:
-        """Return the sums of L95, those of V_D, and of each column after `PAIRS`."""
+        """Return the sums for L95, for V_D, and for each column after `PAIRS`."""
         _step_sums()(self._address, self._count, self._table.shape[1], self._out)
         sums: list[float] = self._out[:]
         return SeriesSums(*sums[:7]), SeriesSums(*sums[7:14]), sums[14:]
