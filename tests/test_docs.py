@@ -29,6 +29,7 @@ EXECUTED = (
     "docs/start/first-result.md",
     "docs/reference/estimators.md",
     "docs/start/live-tutorial.md",
+    "docs/howto/accelerators.md",
     "docs/howto/profiling.md",
     "docs/howto/studies.md",
     "docs/start/tutorial.md",
