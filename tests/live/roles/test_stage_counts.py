@@ -28,7 +28,7 @@ from dwell.live.wire.wiring import roles
 from dwell.model import Problem
 from tests.live.memory_transport import NetworkConditions
 from tests.live.seeded_faults import ENDS, unbalanced
-from tests.live.small_world import EXEC_MS, MS, Bench, Passing, World, canonical, on
+from tests.live.small_world import EXEC_MS, MS, Bench, Passing, World, canonical, on, queued
 
 #: Time in which a block of a second and what was told of it are complete.
 COUNTED_MS = 5_000
@@ -127,7 +127,7 @@ def test_a_killed_worker_loses_what_waited_for_it(problem: Problem) -> None:
     world = World(cell, policy="SO", exec_ms={**EXEC_MS, "perception": 90.0})
     for _ in looks(world, COUNTED_MS / 1e3):
         pass
-    while len(world.worker("perception@E")._jobs) < 5:
+    while queued(world.worker("perception@E"))[0] < 5:
         world.run(1)
     world.kill("perception@E")
     world.start("perception@E")
