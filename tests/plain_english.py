@@ -24,7 +24,6 @@ PAGES = ("docs", "lab/docs")
 MOST = {
     "docs": 6.7,
     "docs.reference": 5.4,
-    "dwell.dash": 15.2,
     "dwell.estimators": 18.6,
     "dwell.kernels": 17.1,
     "lab.docs": 5.9,
