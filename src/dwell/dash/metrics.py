@@ -48,7 +48,7 @@ SENTENCES: Mapping[Kind, Mapping[str, str]] = {
         "dwell_window_unproven": "Whether clocks or losses of messages leave the last window "
         "unproven.",
         "dwell_process_heard": "Whether the controller hears a process of the cell.",
-        "dwell_process_ready": "Whether a process that is heard can do its work.",
+        "dwell_process_ready": "Whether a process can do its work, if the controller hears it.",
         "dwell_certificate_days": "Days until the certificate ends that a node or the controller "
         "uses; negative afterwards.",
         "dwell_certificate_expiry_timestamp_seconds": "Instant at which a subject's newest "
@@ -59,7 +59,7 @@ SENTENCES: Mapping[Kind, Mapping[str, str]] = {
     },
     "info": {
         "dwell_placement": "Placement of the newest cycle.",
-        "dwell_task_placement": "Where a task runs under the placement of the newest cycle.",
+        "dwell_task_placement": "Node of a task under the placement of the newest cycle.",
     },
     "counter": {
         "dwell_cycles": "Cycles since the observer began, by what became of them.",
@@ -68,8 +68,8 @@ SENTENCES: Mapping[Kind, Mapping[str, str]] = {
         "was too slow.",
         "dwell_silences": "Calls of hold() or zero() since the controller began, except for one "
         "that lasts.",
-        "dwell_migrations": "Moves of the cell since the controller began, by reason; those of the "
-        "guard among them.",
+        "dwell_migrations": "Moves of the cell since the controller began, by reason, including "
+        "the guard's moves.",
         "dwell_windows": "Closed windows of the run.",
         "dwell_stage_inputs": "Inputs of a stage since its state folder was made, by outcome.",
         "dwell_flow_bytes": "Payloads sent in a flow since its sender's state folder was made.",
