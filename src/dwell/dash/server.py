@@ -87,7 +87,7 @@ class Dash:
     runs: RunsFolder | None = None
     line: str = ""
     act: Act | None = None
-    read_only: str = "this page only looks; `dwell dash --control` lets it act"
+    read_only: str = "this page is read-only; `dwell dash --control` allows commands"
     difference: Callable[[float, float, int], Plain] | None = None
     metrics: Callable[[str], tuple[bytes, str]] | None = None
     _news: asyncio.Condition = field(default_factory=asyncio.Condition, repr=False)

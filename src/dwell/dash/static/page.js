@@ -385,7 +385,7 @@ class Page {
 
   drain(node) {
     const drained = (this.cells[0].state?.drained ?? []).includes(node);
-    return this.act(drained ? "undrain" : "drain", { node }, drained ? `Let stages run on ${node} again` : `Have no stage run on ${node}`);
+    return this.act(drained ? "undrain" : "drain", { node }, drained ? `Let stages run on ${node} again` : `Keep all stages off ${node}`);
   }
 }
 

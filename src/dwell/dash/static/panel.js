@@ -128,9 +128,9 @@ const decision = (state, cell) => {
   } else parts.push("No decision yet.");
   if (state.pinned) parts.push(`Pinned to ${state.pinned}; decisions of the policy have no effect.`);
   if (state.drained?.length) parts.push(`Drained: ${state.drained.join(", ")}.`);
-  if (state.fallback) parts.push("The guard has put it there.");
+  if (state.fallback) parts.push("The guard chose this placement.");
   if (proving) parts.push(`Proving ${proving.candidate}: ${proving.done} of ${proving.needed} probes.`);
-  if (state.mode === "advise") parts.push("Mode: advise; nothing is ordered.");
+  if (state.mode === "advise") parts.push("Mode: advise; the controller sends no orders.");
   return parts.join(" ");
 };
 
