@@ -15,16 +15,16 @@ from dwell.errors import DwellError
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Result of looking at one thing.
+    """Result of one check.
 
     Parameters
     ----------
     name : str
-        The thing, in a few words.
+        Name of the thing, in a few words.
     remedy : str
-        Empty if there is nothing to do.
+        Action that repairs it; empty if no action is needed.
     needed : bool
-        Whether the part cannot work without.
+        Whether its part needs it to work.
     """
 
     name: str
@@ -38,8 +38,8 @@ class Finding:
 class Check:
     """One thing to look for on this computer, with the remedy if it is missing.
 
-    `look` returns whether all is well, and what was found. A DwellError that it raises means that
-    the thing is missing.
+    `look` returns whether all is well, with a description. If it raises a DwellError, the thing is
+    missing.
     """
 
     name: str
@@ -86,7 +86,7 @@ def print_findings(findings: Iterable[Finding], *, broken: str, lacking: str) ->
     Parameters
     ----------
     broken, lacking : str
-        Marks of what is needed and not well, and of what is not well and not needed.
+        Marks of failed findings: on needed parts, and on optional parts.
     """
     columns = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
     for finding in findings:

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 #: Bytes of a run's default name at most; file systems take 255.
 LONGEST_NAME = 200
-#: Metrics on the terminal by column; the rare ones only if they are not 0.
+#: Metrics on the terminal by column; `RARE` metrics only if they are not 0.
 SHOWN = (
     *("l95_ms", "p50_ms", "p95_ms", "cost", "lost", "in_flight", "longest_misses"),
     *("misses_in_20", "misses_in_100", "aoi_mean_ms", "aoi_p95_ms", "aoi_peak_ms"),

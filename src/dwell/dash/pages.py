@@ -20,28 +20,26 @@ if TYPE_CHECKING:
 
 
 def recorded_page(folder: Path, beside: Path | None) -> Dash:
-    """Read a recorded run, two for one time line, the runs of a fleet, or a folder of runs.
+    """Read a recorded run, two runs on one time line, the runs of a fleet, or a folder of runs.
 
-    Raises
-    ------
-    RunError
-        If a folder has none of these or is damaged, or if all runs of a fleet are incomplete.
+    Raises `RunError` if a folder has none of these or is damaged, or if all runs of a fleet are
+    incomplete.
     """
     with ThreadPoolExecutor(1) as reader:
         reading = reader.submit(_read, folder, beside)
-        # Meanwhile: both take as long.
+        # Import the server while the other thread reads; both take equally long.
         from dwell.dash.server import Dash
 
         return Dash(**reading.result())
 
 
 def _require_run(folder: Path) -> None:
-    """Refuse a folder that is not one run."""
+    """Refuse a fleet, or a folder without a run."""
     if is_run(folder) or not folder.is_dir():
         return
     if is_fleet(folder):
         raise RunError(f"{folder}: a fleet; name the folder of one of its cells")
-    raise RunError(f"{folder}: not a run; name the folder of one run on each side of --beside")
+    raise RunError(f"{folder}: not a run; --beside compares two folders with one run each")
 
 
 def _read(folder: Path, beside: Path | None) -> dict[str, Any]:
@@ -79,23 +77,11 @@ def live_page(
     control: bool,
     mcap: Path | None = None,
 ) -> Iterator[Dash]:
-    """Observe a live cell.
+    """Observe a live cell, and record it to a new file `mcap` if that is given.
 
-    Parameters
-    ----------
-    environment : mapping of str to str
-        With the variables of `dwell.live.host.security`.
-    control : bool
-        Whether the page may act.
-    mcap : Path, optional
-        File to record it to; there must be none.
-
-    Raises
-    ------
-    TrustError
-        If it may not with these keys, or without any.
-    OSError
-        If the file is there, or cannot be made.
+    `environment` has the variables of `dwell.live.host.security`; `control` allows the page to send
+    commands. Raises `TrustError` if the keys do not allow this, and `OSError` if the file exists or
+    cannot be created.
     """
     from dwell.cellfile import load_without_traces
     from dwell.dash.metrics import CellMetrics
@@ -118,7 +104,7 @@ def live_page(
 
 
 def _require_operator(observer: Observer) -> None:
-    """Refuse to act with the keys of somebody who may only look, or without keys on a network."""
+    """Refuse commands with the keys of an observer, or without keys for a cell on a network."""
     from dwell.live.host.security import exposed
 
     keyring = observer.security.keyring
@@ -132,7 +118,7 @@ def _require_operator(observer: Observer) -> None:
 
 
 def _logged(observer: Observer) -> Callable[[str, str], Mapping[str, Any]]:
-    """Return what carries out acts, and says of each when, what, by whose certificate, and how."""
+    """Return a function that sends commands; it logs time, command, certificate and result."""
     keyring = observer.security.keyring
     who = "without keys" if keyring is None else f"by {keyring.own.common_name}"
 

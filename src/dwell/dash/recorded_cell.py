@@ -1,4 +1,4 @@
-"""RecordedCell: a run's folder as the page sees it; also one that another process still writes."""
+"""RecordedCell: the folder of a run on the page; another process may still write the run."""
 
 from __future__ import annotations
 
@@ -33,26 +33,18 @@ from dwell.model.instants import NEVER_NS
 from dwell.model.number_arrays import Floats
 from dwell.record import Run, open_run
 
-#: Cycles before a place among which the newest one in effect is looked for.
+#: Number of cycles before a place to search for the newest cycle in effect.
 LOOK_BACK = 4_000
-#: Facts of a run that the page shows, and the policy whose placement they name instead.
+#: Facts of a run that the page shows; policy for which the page shows the placement.
 ABOUT, STATIC = ("kind", "scenario", "policy", "estimator", "seed"), "Static"
-#: A run that is being written is read again after this many times what that takes, and a while.
+#: Pause before a growing run is read again: this multiple of the reading time, and at least 1 s.
 REST, LEAST_REST_S = 5.0, 1.0
 
 
 class RecordedCell:
-    """See the module and `PagedCell`.
+    """A recorded run on the page (see `PagedCell`); `unit` is the unit of its time line.
 
-    Parameters
-    ----------
-    unit : {"s", "cycle"}
-        What its time line counts.
-
-    Raises
-    ------
-    RunError
-        If the folder is no run, is damaged, or has no cycles.
+    Raises `RunError` if the folder is no run, is damaged, or has no cycles.
     """
 
     live = False
@@ -64,7 +56,7 @@ class RecordedCell:
         self.contents = self._read()
 
     def _bytes(self) -> int:
-        """Return how long the folder's files are."""
+        """Return the total size of the folder's files."""
         return sum(file.stat().st_size for file in self.folder.glob("*") if file.is_file())
 
     def _read(self) -> _Contents:
@@ -75,7 +67,7 @@ class RecordedCell:
         return contents
 
     def refreshed(self) -> bool:
-        """See `PagedCell`; what cannot be read meanwhile is read the next time."""
+        """See `PagedCell`; if reading fails, the next call tries again."""
         if not self.contents.growing or time.monotonic() < self._read_again_s:
             return False
         with self._reading:
@@ -92,7 +84,7 @@ class RecordedCell:
 
     @property
     def run(self) -> Run:
-        """The run as it was read last."""
+        """The run as last read."""
         return self.contents.run
 
     def described(self) -> Plain:
@@ -115,19 +107,16 @@ class RecordedCell:
 def difference(
     one: RecordedCell, other: RecordedCell, begin: float, end: float, bins: int
 ) -> Plain:
-    """Return V_D of the second run less V_D of the first between two places, per bin."""
+    """Return V_D of the second run minus V_D of the first between two places, per bin."""
     first, second = one.contents, other.contents
     length = max(first.window, second.window)
     return difference_of_misses(second.strip, first.strip, begin, end, bins, length)
 
 
 def policy_of(run: Run, placed: NDArray[np.int32]) -> str | None:
-    """Return the policy without its parameters, or the placement that never moves.
+    """Return the name of the policy; for a run that never moves, the name of its placement.
 
-    Parameters
-    ----------
-    placed : int32 array
-        Index of each window's placement in the candidates.
+    `placed` has the index of each window's placement in the candidates.
     """
     policy = run.meta.get("policy")
     if policy is None:
@@ -139,7 +128,7 @@ def policy_of(run: Run, placed: NDArray[np.int32]) -> str | None:
 
 
 def same_realisation(one: Run, other: Run) -> bool:
-    """Whether two runs met the same draws, cycle by cycle."""
+    """Whether two runs are simulated with the same random samples, cycle by cycle."""
     simulated = one.is_simulated and other.is_simulated
     drawn = [(run.meta.get("seed"), run.meta.get("scenario")) for run in (one, other)]
     return simulated and drawn[0] == drawn[1] and one.problem.drawn == other.problem.drawn
@@ -244,7 +233,7 @@ class _Contents:
         }
 
     def _age_ms(self, at: float, row: int) -> float | None:
-        """Return the age of the newest cycle in effect at a place."""
+        """Return the age in ms of the newest completed cycle at a place; None if unknown."""
         if row < 0:
             return None
         now_ms = float(self._release_ns[row]) / 1e6

@@ -12,15 +12,15 @@ from dwell.model import LinkDisturbance, Problem, Scenario
 from dwell.model.disturbed import disturbed, on_link, on_node
 from dwell.record import Run
 
-#: Events of a view at most.
+#: Largest number of events in a view.
 MOST_EVENTS = 300
 
 
 def disturbances_met(run: Run, planned: Scenario) -> Scenario:
-    """Return what a run met: what was planned, with its episodes as they were drawn."""
+    """Return the disturbances of a run, with the sampled times of planned episodes."""
     if all(item.episodes is None for item in planned):
         return planned
-    # Loads the simulator, which draws.
+    # Imported here: it loads the simulator, which samples the episodes.
     from dwell.study.drawn_disturbances import disturbances_of
 
     return disturbances_of(run)
@@ -36,12 +36,9 @@ class Band(NamedTuple):
 
 
 def bands_of(scenario: Scenario, place: Callable[[float], float], end_s: float) -> list[Band]:
-    """Return the disturbances of a scenario before the end of a run, in the order of their begin.
+    """Return the disturbances that begin before the end of a run, sorted by their begin.
 
-    Parameters
-    ----------
-    place : callable
-        From seconds to places.
+    `place` converts seconds to places on the time line.
     """
     found = {
         Band(
@@ -57,7 +54,7 @@ def bands_of(scenario: Scenario, place: Callable[[float], float], end_s: float) 
 
 
 def merged(bands: Iterable[Band]) -> list[tuple[float, float]]:
-    """Return the times with any disturbance; bands in the order of their begin."""
+    """Return the periods with any disturbance; the bands must be sorted by their begin."""
     times: list[tuple[float, float]] = []
     for band in bands:
         if times and band.begin <= times[-1][1]:
@@ -68,7 +65,7 @@ def merged(bands: Iterable[Band]) -> list[tuple[float, float]]:
 
 
 def disturbed_at(bands: Iterable[Band], at: float) -> dict[str, str]:
-    """Return the disturbances at a place: texts by node or link."""
+    """Return the texts of the disturbances at a place, by node or link."""
     texts: dict[str, list[str]] = {}
     for band in bands:
         if band.begin <= at < band.end:
@@ -77,7 +74,7 @@ def disturbed_at(bands: Iterable[Band], at: float) -> dict[str, str]:
 
 
 def disturbance_events(scenario: Scenario, problem: Problem, end_s: float) -> Iterator[Plain]:
-    """Yield what a scenario did until its run ended; places are seconds."""
+    """Yield the begin and end of each disturbance until the end of the run, in seconds."""
     for item in disturbed(scenario, problem.fabric):
         for at_s, word in ((item.begin_s, "begins"), (item.end_s, "ends")):
             if 0 <= at_s <= end_s:
@@ -86,14 +83,14 @@ def disturbance_events(scenario: Scenario, problem: Problem, end_s: float) -> It
 
 
 class RecordedEvents:
-    """Events in the order of their places."""
+    """Events of a run, sorted by their places."""
 
     def __init__(self, events: Iterable[Plain]) -> None:
         self._events: Sequence[Plain] = sorted(events, key=lambda event: event["at"])
         self._at = np.array([event["at"] for event in self._events])
 
     def view(self, begin: float, end: float) -> Plain:
-        """Return the last events between two places, and how many are before them."""
+        """Return the last `MOST_EVENTS` events between two places, and the number omitted."""
         low, high = np.searchsorted(self._at, (begin, end))
         events = self._events[low:high]
         return {

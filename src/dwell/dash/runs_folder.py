@@ -1,7 +1,7 @@
 """RunsFolder: the runs in a folder, with the numbers of each.
 
-The names are known at once. A thread reads the runs one after another, so that a page of 10,000
-runs opens immediately; running ones are read again.
+The page shows the names immediately, even of 10,000 runs. A thread reads the runs one after another
+and then reads the growing runs again.
 """
 
 from __future__ import annotations
@@ -35,14 +35,9 @@ EVERY_S = 3.0
 
 
 class RunsFolder:
-    """See the module.
+    """Runs and fleets of a folder; the place of a run is its index in the order of names.
 
-    A run's place is its index in the order of names.
-
-    Raises
-    ------
-    RunError
-        If the folder contains no run.
+    Raises `RunError` if the folder contains no run and no fleet.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -65,12 +60,12 @@ class RunsFolder:
         return {"name": self.name, "runs": listed, "more": max(self._more, 0)}
 
     def rows(self, since: int) -> Plain:
-        """Return the rows after the first `since` ones; a later row of a run replaces its first."""
+        """Return the rows from index `since` on; a later row of a run replaces the earlier."""
         upto = len(self._rows)
         return {"rows": self._rows[since:upto], "upto": upto}
 
     def lines(self, places: Sequence[int]) -> list[Plain]:
-        """Return V_D over time of several runs, in points that are means of windows."""
+        """Return V_D of several runs over time, in per cent; each point is a mean of windows."""
         found = []
         for place in places[:MOST_DRAWN]:
             windows = self.cell(place).contents.windows
@@ -133,7 +128,7 @@ def _row(place: int, path: Path) -> Plain:
 
 
 def _reason(error: Exception, path: Path) -> str:
-    """Return the first line of an error, with files named from the run's folder on."""
+    """Return the first line of an error, with file names relative to the run's folder."""
     text = (str(error) or type(error).__name__).splitlines()[0]
     return text.replace(f"{path}{os.sep}", "")
 

@@ -42,8 +42,8 @@ class Figure:
     """A figure.
 
     `slug` is its name in files and links, unique in a page. `frames` has the data by their names
-    in the drawing. `caption` is plain text. A figure with `widths`, pixels, has one picture for
-    each, of which a page shows the widest that fits; a script does not draw it again.
+    in the drawing. `caption` is plain text. A figure with `widths`, in pixels, has one
+    picture per width; the page shows the widest picture that fits, and no script redraws it.
     """
 
     slug: str

@@ -165,7 +165,7 @@ def _guarded(run: Run, moved_s: Sequence[tuple[float, str]]) -> list[float]:
     for move in moves(run):
         if not move.by_guard:
             continue
-        # The last window has no next window, hence no upper bound.
+        # Without a next window there is no upper bound.
         until_ns = released_ns.get(first.get(move.window + 1, -1), math.inf)
         before_s = [at_s for at_s, name in moved_s if name == move.target]
         mine = [at_s for at_s in before_s if at_s * 1e9 <= until_ns + 1]

@@ -183,8 +183,7 @@ def interval_row(values: Mapping[str, Interval]) -> dict[str, float | None]:
 def table_text(table: Table, *, width: int | None = None) -> str:
     """Return a table as text: title, rows and caption.
 
-    `width` is the width of the terminal in columns; long cells fold. None does not limit the
-    width of rows.
+    `width` is the width of the terminal in columns, or None for rows of any width; long cells fold.
     """
     from rich.console import Console
     from rich.table import Table as Grid

@@ -492,7 +492,7 @@ def _marks(
     *,
     log: bool = False,
 ) -> list[Spec]:
-    """Return the marks of a panel, each for `each` windows; `ends` are those of its axis."""
+    """Return the marks of a panel, one per `each` windows; `ends` are the ends of its y axis."""
     scale: Spec = {"domain": [*ends], "nice": False, "zero": False}
     if log:
         scale |= {"type": "log", "domain": [max(ends[0], ends[1] * 1e-4), ends[1]]}

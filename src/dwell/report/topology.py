@@ -113,7 +113,7 @@ def _places(
             step = (width - size) / (len(row) - 1) if len(row) > 1 else 0.0
             left = 0.0 if len(row) > 1 else (width - size) / 2
             if len(row) == 1 and tier == "cloud":
-                # Right of the edge, so that links to robots are visible.
+                # A cloud on the right keeps its links to robots visible.
                 left = width - size
             for i, name in enumerate(row):
                 places[name] = _Box(left + i * step, y, size, height)

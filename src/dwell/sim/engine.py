@@ -63,7 +63,8 @@ def simulate(
         ``cusum+corrected``), a candidate's name for a fixed placement, or None for the policy of
         the cell file. The simulation leaves the caller's object unchanged.
     estimator : Estimator, str, or None
-        An object with ``estimate``, an estimator's name, or None for that of the cell file.
+        An object with ``estimate``, an estimator's name, or None for the estimator of
+        the cell file.
     seed : int
         Seed of all random streams; one seed gives all policies the same realisation.
     windows : int
@@ -158,7 +159,7 @@ def _play(
     *,
     shadow: bool = False,
 ) -> PlayedRealisation | None:
-    """Simulate a realisation; return None if the guard wants probes and there is no shadow."""
+    """Simulate a realisation; return None if the guard wants probes but has no shadow."""
     controller = Controller(problem, policy, estimator)
     cell = PlayedCell(problem, realisation, controller, guard and controller.guarded)
     played = play_cells([cell], jobs=jobs, by_window=by_window, shadow=shadow)
@@ -191,7 +192,7 @@ def play_cells(
     shadow: bool = False,
     progress: Progress | None = None,
 ) -> list[PlayedRealisation] | None:
-    """Simulate cells together; return None if a cell without a shadow wants probes.
+    """Simulate cells together; return None if a cell wants probes but has no shadow.
 
     Parameters
     ----------
@@ -256,7 +257,7 @@ def play_cells(
 
 
 def _shadow_plan(cell: PlayedCell, probes: bool) -> ShadowPlan | None:
-    """Return the plan of a cell's shadows; None if it needs none."""
+    """Return the plan of a cell's shadows, if it needs shadows."""
     if not (probes or cell.controller.sends_shadows):
         return None
     return ShadowPlan(0, cell.realisation.cycles, [*cell.controller.shadow_fractions.values()])

@@ -231,7 +231,7 @@ def priced_cells(fleet: Fleet, problems: Iterable[Problem]) -> list[PricedCell]:
 def tabled_cells(fleet: Fleet, seed: int) -> list[PricedCell]:
     """Return the cells for the table of loads.
 
-    Random phases are replaced by even ones, which makes one table valid for all seeds.
+    Even phases replace random phases: one table is then valid for all seeds.
     """
     spread = fleet.changed(phases="even") if fleet.phases == "random" else fleet
     return priced_cells(spread, phased(spread, seed))
@@ -276,7 +276,7 @@ def coordinations(
     seed: int,
     progress: Progress | None = None,
 ) -> Iterator[Coordination | None]:
-    """Yield the coordination of each cell's moves; None without coordination."""
+    """Yield the coordination of each cell's moves, or None if cells move independently."""
     if fleet.coordination == "ledger":
         ledger = FleetLedger(
             priced_cells(fleet, problems.values()),

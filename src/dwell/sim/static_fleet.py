@@ -56,7 +56,7 @@ class StaticCell(NamedTuple):
 class StaticFleet:
     """Simulates a fleet in several sizes under one seed; samples each cell once for all sizes.
 
-    The results equal those of `simulate_fleet` under static policies.
+    The results equal the results of `simulate_fleet` under static policies.
     """
 
     def __init__(self, *, seed: int, duration_ns: int) -> None:

@@ -3,14 +3,14 @@
 import { colour, count, draw, make, number, percent, say } from "./dom.js";
 
 export const DASHES = [[], [7, 3], [2, 2], [7, 2, 2, 2], [11, 3, 3, 3], [4, 4], [9, 2, 2, 2, 2, 2]];
-/** Bins in which a miss is a cross; in more of them, a line. */
+/** Largest number of bins whose misses are crosses; misses of more bins are lines. */
 const CROSSES = 120;
 const LANE = 16;
-/** Room right of the strips: half of the last number of their axis. */
+/** Space right of the strips, for half of the last number on their axis. */
 export const RIGHT = 24;
 const LETTER = 6.4;
 
-/** Room left of the strips and of the jobs, for the longest name of a row. */
+/** Space left of the strips and of the jobs, for the longest name of a row. */
 export const leftOf = (cells, width) => {
   const names = cells.flatMap(({ candidates, tasks = [], has_jobs }) => [
     ...(candidates ?? []).map(({ name }) => name),
@@ -23,7 +23,7 @@ export const leftOf = (cells, width) => {
 /** Width of a text in letters; the letters of Chinese, Japanese and Korean are twice as wide. */
 export const wide = (text) => [...text].reduce((sum, letter) => sum + (letter.codePointAt(0) > 0x2e7f ? 1.9 : 1), 0);
 
-/** A text that fits a width in pixels. */
+/** Shorten a text to a width in pixels. */
 export const fitted = (text, width) => {
   let room = width / LETTER;
   if (wide(text) <= room) return text;
@@ -37,7 +37,7 @@ export const fitted = (text, width) => {
   return `${cut}…`;
 };
 
-/** Shade the times with a disturbance; one that lasts throughout is stated in words. */
+/** Shade the times with a disturbance, except if the whole run is disturbed: a text states this. */
 const bands = (u, cell) => {
   if (throughout(cell)) return;
   const { left, top, width, height } = u.bbox;
@@ -56,7 +56,7 @@ export const throughout = ({ disturbed = [], begin, end, period_ms, unit }) => {
   return disturbed.length === 1 && disturbed[0][0] <= begin && disturbed[0][1] >= end - slack;
 };
 
-/** Set up one strip; all of them have one x, one cursor, and one way to zoom: by dragging. */
+/** Set up one strip; all strips share the x scale and the cursor, and zoom by dragging. */
 const strip = (root, page, cell, height, { series, scales, axes, drawn, padding }) => {
   const select = (u) => {
     const { left, width } = u.select;
@@ -120,7 +120,7 @@ const across = (page, shown) =>
 
 const upright = (page, more = {}) => axis({ size: (u) => leftOf(page.described, u.width), ...more });
 
-/** Latency: a bar from the least to the largest of each bin; above it a mark for every bin with a miss. */
+/** Latency: a bar from the smallest to the largest value of each bin, and a mark above each bin with a miss. */
 const latency = (root, page, cell) => {
   let data = null;
   let top = 1;
@@ -141,7 +141,7 @@ const latency = (root, page, cell) => {
       if (counts[i] === 1 || high[i] - low[i] < top / 200) {
         ctx.fillRect(x(place) - dot / 2, y(high[i]) - dot / 2, dot, dot);
       } else line(ctx, x(place), y(low[i]), x(place), y(high[i]));
-      // What is above the scale has an arrow.
+      // An arrow marks values above the scale.
       if (high[i] > top) triangle(ctx, x(place), bbox.top + 4 * ratio, 3.5 * ratio);
     });
     ctx.globalAlpha = 1;
@@ -194,7 +194,7 @@ const triangle = (ctx, x, y, size) => {
   ctx.fill();
 };
 
-/** Placement: a lane a candidate, so that a colour need not be told from another. */
+/** Placement: each candidate has its own lane, which identifies it without its colour. */
 const ribbon = (root, page, cell) => {
   let data = null;
   const names = cell.candidates.map(({ name }) => name);
@@ -250,7 +250,7 @@ const ribbon = (root, page, cell) => {
   };
 };
 
-/** Lines of a value a window; a legend names them, by dashes too, with the values at the place. */
+/** Lines with one value per window; the legend has their names, dashes and current values. */
 export const lines = (root, page, cell, height, named, { scale, written, last }) => {
   const series = named.map(({ hue, dash, width }) => ({
     stroke: () => (hue.startsWith("--") ? colour(hue) : hue),
@@ -312,11 +312,11 @@ export const charts = (root, page, cell) => {
   const setters = [latency(part("latency"), page, cell), ribbon(part("ribbon"), page, cell), costs.set, used.set];
   let plots = [];
   return {
-    /** Draw what is between two places. */
+    /** Draw the data between two places. */
     set: (view) => {
       plots = setters.map((set) => set(view));
     },
-    /** Say the values of one state in the legends. */
+    /** Write the values of a state into the legends. */
     read: (state) => {
       costs.read((key) =>
         key === "cost" ? number(state.window?.seen.cost, 2) : number(state.candidates?.[key.slice(2)]?.cost, 2),
@@ -324,9 +324,9 @@ export const charts = (root, page, cell) => {
       used.read((key) => percent(state.used?.[key.slice(2)]));
     },
     redraw: () => plots.forEach((plot) => plot.redraw(false)),
-    /** Ends of the upright scales. */
+    /** Ends of the y scales. */
     scales: () => plots.map(({ scales: { y } }) => [y.min, y.max]),
-    /** Draw again on the scales that all cells of the page share. */
+    /** Redraw on the scales that all cells of the page share. */
     rescale: () => plots.forEach((plot) => plot.redraw()),
   };
 };
@@ -342,7 +342,7 @@ export const extremes = ({ bins, windows }) => {
   };
 };
 
-/** V_D of one run less V_D of another: bars from 0, up where the second run misses more. */
+/** V_D of the second run minus V_D of the first: bars from 0, upwards if the second misses more. */
 export const difference = (root, page, cell) => {
   let data = null;
   const drawn = (u) => {

@@ -1,8 +1,8 @@
-// Elements and numbers. A text is only ever text: nothing here, or anywhere, parses markup.
+// Elements and numbers. Texts are set as text: the page never parses them as markup.
 
 const SVG = "http://www.w3.org/2000/svg";
 
-/** Write a text. HTML elements get V_D with a lowered index. */
+/** Write a text; HTML elements show the D of V_D as a subscript. */
 const write = (element, text) => {
   const [first, ...parts] = element.namespaceURI === SVG ? [text] : String(text).split("V_D");
   element.replaceChildren(first, ...parts.flatMap((part) => ["V", make("sub", { text: "D" }), part]));
@@ -50,7 +50,7 @@ export const ago = (ms) => {
   return ms < 120000 ? `${Math.round(ms / 1000)} s` : `${Math.round(ms / 60000)} min`;
 };
 
-/** A place on the time line, as people read it. */
+/** Text of a place on the time line. */
 export const place = (at, unit) => {
   if (unit === "cycle") return `cycle ${count(Math.floor(at))}`;
   return `${at.toLocaleString("en", { minimumFractionDigits: 1, maximumFractionDigits: 1 })} s`;

@@ -1,4 +1,4 @@
-// The cells of a fleet as small multiples, worst first, and what they have in common.
+// The cells of a fleet as small multiples, worst first, and the charts of the fleet.
 
 import { DASHES, lines, throughout } from "./charts.js";
 import { count, draw, make, number, percent, say } from "./dom.js";
@@ -6,15 +6,15 @@ import * as panel from "./panel.js";
 import { get, latest } from "./server.js";
 
 const BINS = 400;
-/** Heights: of the marks of lost cycles, down to the foot of the strip below, of a lane; widths are shares of a thousand. */
+/** Heights of the marks of lost cycles, of the strip with these marks, and of a lane; width of the drawing. */
 const MARKS = 7;
 const STRIP = 50;
 const LANE = 9;
 const WIDE = 1000;
-/** Names of cells that are told of one placement. */
+/** Largest number of cell names shown per placement. */
 const NAMED = 24;
 
-/** One cell: its name, which leads to its own page, how it is, and its strip over the ribbon. */
+/** One cell: its name (a link to its page), its health, and its strip above the ribbon. */
 class Small {
   constructor(cell, fleet, page) {
     this.cell = cell;
@@ -56,7 +56,7 @@ class Small {
     const [within, over, gone] = [[], [], []];
     at.forEach((from, i) => {
       if (lost[i]) gone.push(`M${x(from)} 0V${MARKS - 2}`);
-      // L95 of a window is without end where it is that of a lost cycle.
+      // L95 is infinite if it falls on a lost cycle.
       const upper = lost[i] ? MARKS : y(high[i]);
       const bar = (top, bottom) => `M${x(from)} ${top.toFixed(1)}H${x(at[i + 1] ?? end)}V${bottom.toFixed(1)}H${x(from)}z`;
       within.push(bar(Math.max(upper, due), STRIP));
@@ -81,7 +81,7 @@ class Small {
 
   show(state) {
     panel.health(this.root, state, false);
-    // Three good windows are no verdict on a run.
+    // Health covers only the last windows: a run that missed its aim is not green.
     this.health.classList.toggle("ok", this.cell.verdict !== "missed" && state.health === "ok");
     const { window: seen, decision } = state;
     say(this.seen, seen ? `window ${seen.number}: L95 ${number(seen.seen.l95_ms, 1)} ms, V_D ${percent(seen.seen.violation_rate, 2)}` : "");
@@ -120,12 +120,12 @@ export class FleetView {
     part.querySelector(".more").textContent = `deadlines missed after the warm-up: worst ${percent(cells[0].rate, 2)} (${cells[0].name}), mean ${percent(mean_rate, 2)}`;
   }
 
-  /** Less than three windows show nothing. */
+  /** The shortest view: three windows. */
   get least() {
     return (3 * this.cell.window_cycles * this.cell.period_ms) / 1000;
   }
 
-  /** What all cells have in common, over time. */
+  /** Charts over time of all cells together: placements, load of shared nodes, Φ. */
   common() {
     const { placements, shared, cells, has_phi } = this.cell;
     const dashed = (i) => DASHES[i % DASHES.length];
@@ -145,7 +145,7 @@ export class FleetView {
       ],
       [
         "phi",
-        has_phi ? [{ key: "phi", label: "Φ a cell", hue: "--ink", dash: [] }] : [],
+        has_phi ? [{ key: "phi", label: "Φ per cell", hue: "--ink", dash: [] }] : [],
         { scale: { range: (_, low, high) => (low === null ? [0, 1] : uPlot.rangeNum(low, high, 0.1, false)) }, written: (value) => number(value, 1) },
         (state) => (state.round === null ? "–" : `${number(state.phi, 3)}, round ${count(state.round)}`),
       ],
@@ -188,11 +188,11 @@ export class FleetView {
     const rates = cells.flatMap(({ window: seen }) => seen?.seen.violation_rate ?? []);
     const parts = [];
     if (rates.length) parts.push(`in the last window: worst ${percent(Math.max(...rates), 2)}, mean ${percent(rates.reduce((a, b) => a + b) / rates.length, 2)}`);
-    if (phi !== null) parts.push(`Φ a cell ${number(phi, 3)}`);
+    if (phi !== null) parts.push(`Φ per cell ${number(phi, 3)}`);
     say(this.part("facts"), parts.join(" · "));
   }
 
-  /** Which cells are where. */
+  /** List the cells by placement. */
   who({ cells }) {
     const body = this.part("who");
     const names = this.cell.placements.map(() => []);

@@ -1,4 +1,4 @@
-// The jobs of a few cycles, each on its node, on the time line of the strips.
+// The jobs of a few cycles by task and node, on the time line of the strips.
 
 import { fitted, leftOf, RIGHT } from "./charts.js";
 import { draw, number, say } from "./dom.js";

@@ -1,4 +1,4 @@
-// The page: one time line, the cells on it, and how people go along it.
+// The page: one time line, its cells, and the controls to move along it.
 
 import { charts, difference, extremes } from "./charts.js";
 import { count, make, place, say } from "./dom.js";
@@ -9,11 +9,11 @@ import { RunsView } from "./runs.js";
 import { act, get, latest } from "./server.js";
 import { Topology } from "./topology.js";
 
-/** Seconds that a live page shows, and cycles that are few enough to show their jobs. */
+/** Seconds that a live page shows, and largest number of cycles whose jobs are shown. */
 const FOLLOWED_S = 60;
 const FEW_CYCLES = 40;
 const BINS = 700;
-/** Without news for so long, a live page does not claim to show the present. */
+/** Time without events after which a live page shows the cell as absent. */
 const STALE_MS = 3000;
 
 const element = (id) => document.getElementById(id);
@@ -39,7 +39,7 @@ class CellView {
     panel.describe(this.root, cell);
   }
 
-  /** Less than two cycles show nothing. */
+  /** The shortest view: two cycles. */
   get least() {
     return 2 * (this.page.unit === "cycle" ? 1 : this.cell.period_ms / 1000);
   }
@@ -79,7 +79,7 @@ class CellView {
 }
 
 class Page {
-  /** Show cells, or a fleet; a cell of a fleet is asked for by its number there. */
+  /** Show cells or a fleet; `numbered` is the number of a cell in its fleet, or of a run in its folder. */
   constructor({ cells: alone, fleet, runs, line, control, read_only, difference: differs }, numbered, at) {
     const cells = alone.length ? alone : [fleet];
     this.described = cells;
@@ -125,7 +125,7 @@ class Page {
     return known.length ? uPlot.rangeNum(Math.min(...known), Math.max(...known), 0.1, false) : [0, 1];
   }
 
-  /** Show where one of two runs misses more deadlines. */
+  /** Show the difference of missed deadlines between two runs. */
   compare([first, second]) {
     const root = element("difference");
     root.hidden = false;
@@ -151,7 +151,7 @@ class Page {
     element("back-to-fleet").replaceChildren(link);
   }
 
-  /** Have a link lead to the same place on another page, and the browser's way back to it here. */
+  /** Let a link keep the place on the time line, forwards and with the browser's back button. */
   lead(link) {
     link.addEventListener("click", () => {
       link.hash = String(this.at);
@@ -214,7 +214,7 @@ class Page {
     } else this.moveTo(this.at + windows * length);
   }
 
-  /** Show the window that closes at a place, with one before it and one after. */
+  /** Show the window that ends at a place, with one window before it and one after. */
   toWindow(at) {
     const length = this.windowLength(this.cells[0].cell);
     this.follow(false);
@@ -320,7 +320,7 @@ class Page {
     });
   }
 
-  // ------------------------------------------------------------------------ what is new
+  // ------------------------------------------------------------------------ events
 
   readEvents() {
     const source = new EventSource("/events");
@@ -364,7 +364,7 @@ class Page {
     say(element("connection"), `✕ ${error.message}`);
   }
 
-  // ---------------------------------------------------------------------------- acting
+  // ---------------------------------------------------------------------------- commands
 
   async act(what, about, words) {
     if (!confirm(`${words}?`)) return;
@@ -385,16 +385,16 @@ class Page {
 
   drain(node) {
     const drained = (this.cells[0].state?.drained ?? []).includes(node);
-    return this.act(drained ? "undrain" : "drain", { node }, drained ? `Let stages run on ${node} again` : `Have no stage run on ${node}`);
+    return this.act(drained ? "undrain" : "drain", { node }, drained ? `Let stages run on ${node} again` : `Keep all stages off ${node}`);
   }
 }
 
-// A page that plays for hours asks a million times; the browser need not remember when.
+// Hours of playing make a million requests; the browser need not store their times.
 performance.setResourceTimingBufferSize(0);
-/** Where the page before this one was, and the number of the cell in a fleet. */
+/** Place of the previous page on the time line, and the number of the cell in the fleet. */
 const before = location.hash.length > 1 ? Number(location.hash.slice(1)) : NaN;
 const [, numbered] = location.pathname.match(/^\/cell\/(\d+)$/) ?? [];
-// The token is in the cookie by now: it need not stay in the address, nor in the history.
+// The cookie has the token: remove it from the address and the history.
 history.replaceState(null, "", location.pathname);
 try {
   const found = await get("/cells", numbered === undefined ? {} : { cell: numbered });

@@ -1,4 +1,4 @@
-// What a cell's state says in words: health, candidates, the last decision, events, who is heard.
+// State of a cell in words: health, candidates, last decision, events, processes.
 
 import { ago, count, make, number, percent, place, say } from "./dom.js";
 
@@ -23,7 +23,7 @@ export const health = (root, state, stale) => {
   say(element, `${HEALTH[word] ?? "?"} ${word}${state.headline ? `: ${state.headline}` : ""}`);
 };
 
-/** Show the constant part of a cell, or of a fleet. */
+/** Show the constant data of a cell or of a fleet. */
 export const describe = (root, { about, notes, verdict, moves, never_moving, worst }) => {
   const parts = Object.entries(about).map(([name, value]) => (name === "kind" ? value : `${name} ${value}`));
   root.querySelector(".where-caption").textContent = parts.join(" · ");
@@ -53,7 +53,7 @@ const moved = ({ migrations, returns, guard_moves }) => {
   return migrations || guard_moves ? `${count(migrations)} ${migrations === 1 ? "move" : "moves"}, ${count(returns)} undone${by_guard}` : "no moves";
 };
 
-/** Build what is said of decisions once; returns what shows a state there. */
+/** Build the tables of decisions once; return a function that shows a state in them. */
 export const decided = (root, cell, page) => {
   const rows = new Map();
   const body = make("tbody");
@@ -126,11 +126,11 @@ const decision = (state, cell) => {
     if (last.refused) parts.push(`✕ Refused: ${last.refused}.`);
     if (last.delta_j !== null && last.delta_j !== undefined) parts.push(`ΔJ ${number(last.delta_j, 3)}.`);
   } else parts.push("No decision yet.");
-  if (state.pinned) parts.push(`Pinned to ${state.pinned}, whatever is decided.`);
+  if (state.pinned) parts.push(`Pinned to ${state.pinned}; decisions of the policy have no effect.`);
   if (state.drained?.length) parts.push(`Drained: ${state.drained.join(", ")}.`);
-  if (state.fallback) parts.push("The guard has put it there.");
+  if (state.fallback) parts.push("The guard chose this placement.");
   if (proving) parts.push(`Proving ${proving.candidate}: ${proving.done} of ${proving.needed} probes.`);
-  if (state.mode === "advise") parts.push("Mode: advise; nothing is ordered.");
+  if (state.mode === "advise") parts.push("Mode: advise; the controller sends no orders.");
   return parts.join(" ");
 };
 
@@ -158,7 +158,7 @@ export const events = (root, cell, view, page) => {
   const key = JSON.stringify([view.events, view.more_events]);
   if (list.dataset.key === String(key.length) + key.slice(-200)) return;
   list.dataset.key = String(key.length) + key.slice(-200);
-  const more = view.more_events ? `; ${count(view.more_events)} before them: come closer` : "";
+  const more = view.more_events ? `; ${count(view.more_events)} earlier: zoom in` : "";
   say(root.querySelector(".events-said"), `${count(view.events.length)} in view${more}`);
   list.replaceChildren(
     ...view.events.toReversed().map((event) =>

@@ -4,7 +4,7 @@ import { DASHES } from "./charts.js";
 import { colour, count, draw, make, number, percent, say } from "./dom.js";
 import { get, latest } from "./server.js";
 
-/** Rows shown at first and per further request, and most runs in one plot. */
+/** Rows shown at first and added per click, and largest number of runs in one plot. */
 const ROWS = 200;
 const MOST_DRAWN = 8;
 const EVERY_MS = 1000;

@@ -1,4 +1,4 @@
-// Computers by tier, and the stages where they run; a stage that moves slides.
+// Computers by tier with the stages that run there; a stage slides when it moves.
 
 import { fitted } from "./charts.js";
 import { draw, percent } from "./dom.js";
@@ -10,10 +10,10 @@ const FOOT = 18;
 const GAP = 14;
 const LEAST_NODE = 150;
 const BETWEEN = 52;
-/** More links than this carry no label while nothing disturbs them. */
+/** Largest number of node pairs whose links have a label while undisturbed. */
 const LABELLED = 12;
 
-/** Rows of nodes, the cloud on top and the robots below, as many side by side as fit. */
+/** Rows of nodes, from the cloud at the top to the robots; each row has as many nodes as fit. */
 const rowsOf = (nodes, width) => {
   const most = Math.max(1, Math.floor((width + GAP) / (LEAST_NODE + GAP)));
   return TIERS.flatMap((tier) => {
@@ -53,7 +53,7 @@ export class Topology {
     for (const row of rowsOf(nodes, wide)) {
       const width = Math.min(230, (wide - GAP * (row.length + 1)) / row.length);
       const height = HEAD + FOOT + SLOT * Math.max(1, ...row.map((node) => mayRun(node).length));
-      // One cloud is right of the edge, so that its links to robots are visible.
+      // A single cloud is on the right: its links to robots then do not cross the edge.
       const left = row.length === 1 && row[0].tier === "cloud" ? wide - width - GAP / 2 : (wide - row.length * width - (row.length - 1) * GAP) / 2;
       row.forEach((node, i) => {
         const x = row.length === 2 ? (i === 0 ? GAP / 2 : wide - width - GAP / 2) : left + i * (width + GAP);
@@ -96,7 +96,7 @@ export class Topology {
       const [x2, y2] = [b.x + b.width / 2, b.y + b.height / 2];
       const line = draw("line", { x1, y1, x2, y2 });
       const words = this.crowded ? "" : this.narrow ? text.split(",")[0] : text;
-      // A label needs room: between two rows there is some, between neighbours in a row often none.
+      // A label fits between two rows, but often not between neighbours in a row.
       const [upper, lower] = a.y < b.y ? [a, b] : [b, a];
       let [x, y, room] = [0, y1 + 4, true];
       if (upper.y === lower.y) {
@@ -144,7 +144,7 @@ export class Topology {
     return group;
   }
 
-  /** Put every stage where it runs, and say how busy every computer is. */
+  /** Move each stage to its computer, and show the load of each computer. */
   show(state) {
     this.state = state;
     const candidate = this.cell.candidates.find(({ name }) => name === state.placement);

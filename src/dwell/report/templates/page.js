@@ -1,5 +1,5 @@
 "use strict";
-// Draws the page's figures again, with what can be chosen and seen; sorts its tables.
+// Replaces the page's pictures with interactive figures, and sorts its tables.
 (() => {
   const views = [];
   const narrow = 600;
@@ -47,12 +47,12 @@
       place.querySelectorAll("svg text").forEach(lowered);
       figure.classList.add("live");
       const signals = result.view.getState().signals;
-      // What stands in place of policies elsewhere (links, say) is not the form's to choose.
+      // The form chooses policies only; the lines of some figures are other things, such as links.
       views.push({ view: result.view, lines: signals.policies, seeds: "seed" in signals });
     });
   }
 
-  // One after the other, so that the page stays at hand; what is folded, when it is opened.
+  // Draw the figures one by one, to keep the page responsive; folded figures when they are opened.
   async function drawAll(part) {
     for (const figure of part.querySelectorAll("[data-figure]:not(.live)")) {
       if (figure.closest("details:not([open])")) continue;
